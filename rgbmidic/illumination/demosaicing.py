@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.illumination import PAD, malvar, pad_mosaic
-from rgbmidic._kernels.mesh import TILE, fill_unknown, predict
+from rgbmidic._kernels.demosaicing import TILE, fill_unknown, predict, prediction_taps
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.colour_factors import (
@@ -46,6 +46,7 @@ from rgbmidic.illumination.colour_factors import (
     widened,
 )
 from rgbmidic.illumination.crosstalk import Crosstalk, needed
+from rgbmidic.illumination.displacement import LightDisplacement, light_displacement, seen_lights
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
@@ -147,6 +148,10 @@ OFFSET_VARIANCE = 10.0
 """Variance of an unknown constant under the texture: makes the filter's coefficients sum to one."""
 SPARKLE_VARIANCE = 0.29
 """Variance (px²) of the aperture through which sparkle is seen: a square pixel, 1/12, and a lens blur of 0.45 px."""
+DISPLACEMENT_STEP, _MOST_STEPS = 0.02, 32
+"""Fineness (px) in which a light's displacement is rounded, and the most steps of it."""
+DISSIMILAR = 4.0
+"""Variance (1/px²) of a displaced light's texture that the others do not have, over its displacement squared."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,7 +163,7 @@ class FilterTable:
     index : (h, w) int32
         Row of `taps` for each tile.
     taps : (T, 2, n, size², 16) float32
-        As `rgbmidic._kernels.mesh.predict` takes them.
+        As `rgbmidic._kernels.demosaicing.predict` takes them.
     size : int
         Side of the square of samples.
     """
@@ -176,6 +181,7 @@ def prediction_filters(
     *,
     size: int = SIZE,
     seen: FloatArray | None = None,
+    displacement: FloatArray | None = None,
 ) -> FilterTable:
     """Return the table of filters for tiles whose channels have some variance of their own.
 
@@ -183,7 +189,7 @@ def prediction_filters(
     ----------
     specific : (3, h, w)
         Channel-specific variance in each tile, relative to the common one.
-    noise : (3,)
+    noise : (3,) or (3, h, w)
         Variance of the camera noise of each channel relative to the channel's own variance.
     texture
         Autocorrelation of the common texture, and of the channel-specific component.
@@ -191,35 +197,69 @@ def prediction_filters(
         Bayer pattern.
     size
         Side of the square of samples, `SIZE` or `WIDE`.
-    seen : (3, k), or None
-        Crosstalk over each channel's slope on the common texture; None: the channels' own components have nothing to
-        do with each other.
+    seen : (3, k) or (3, k, h, w), or None
+        Fraction of each light in the slope of each channel (`seen_lights`); None: each channel sees a light of its own.
+    displacement : (k, 2, h, w), or None
+        Of each light's texture in x and y, px; None: none.
 
     Returns
     -------
     FilterTable
         With one output for each channel.
     """
+    tiles = specific.shape[1:]
     level = np.round(LEVELS_PER_OCTAVE * np.log2(np.clip(specific, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
-    code = (level[0] * 1000 + level[1]) * 1000 + level[2]
-    _, first, index = np.unique(code, return_index=True, return_inverse=True)
+    seen = np.eye(3) if seen is None else seen
+    if displacement is None:
+        displacement = np.zeros((seen.shape[1], 2, *tiles))
+    steps = np.clip(np.round(displacement / DISPLACEMENT_STEP), -_MOST_STEPS, _MOST_STEPS).astype(np.int64)
+    code = np.zeros(tiles, dtype=np.int64)
+    for one in (*level, *steps.reshape(-1, *tiles)):
+        code = code * (2 * _MOST_STEPS + 1) + one + _MOST_STEPS
+    _, first, index, number = np.unique(code, return_index=True, return_inverse=True, return_counts=True)
+    index = index.ravel()
+
+    def averaged(values: npt.ArrayLike, count: int) -> FloatArray:
+        """Mean (T, ...) over the tiles of each entry."""
+        given = np.asarray(values, dtype=np.float64)
+        whole = np.broadcast_to(given if given.ndim > count else given[..., None, None], (*given.shape[:count], *tiles))
+        sums = [np.bincount(index, one.ravel()) for one in whole.reshape(-1, *tiles)]
+        return np.stack(sums, axis=1).reshape(-1, *given.shape[:count]) / number.reshape(-1, *(1,) * count)
+
     variance = 2.0 ** (level.reshape(3, -1).T[first] / LEVELS_PER_OCTAVE)
-    # a specimen's colour has no slope on the common texture that could tell how the channels see it
-    sparkle = _correlations(variance, np.eye(3) if seen is None else seen)
-    together = texture.specific * np.eye(3) + (1 - texture.specific) * sparkle
-    taps = _solved(1 / (1 + variance), together, np.asarray(noise, dtype=np.float64), texture, cfa, size)
-    lanes = np.tile(taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2), TILE // 2)
-    return FilterTable(
-        index=index.reshape(level.shape[1:]).astype(np.int32),
-        taps=lanes.astype(np.float32),
-        size=size,
+    moved = DISPLACEMENT_STEP * np.moveaxis(steps.reshape(*steps.shape[:2], -1)[..., first], -1, 0)
+    of_lights = averaged(seen, 2)
+    together = texture.specific * np.eye(3) + (1 - texture.specific) * _correlations(variance, of_lights)
+    fraction = 1 / (1 + variance)
+    # glints are not the texture displaced alone
+    agree = 1 / np.sqrt(1 + DISSIMILAR * (moved**2).sum(axis=2))
+    alike = agree[:, :, None] * agree[:, None]
+    lights = range(alike.shape[1])
+    alike[:, lights, lights] = 1
+    offset, phases = np.arange(size) - size // 2, list(np.ndindex(2, 2))
+    channels = np.stack([cfa_channels(cfa)[np.ix_((offset + p) % 2, (offset + q) % 2)] for p, q in phases])
+    taps = np.empty((len(variance), 4, 3, size, size))
+    prediction_taps(
+        np.sqrt(fraction),
+        np.sqrt(1 - fraction),
+        together,
+        of_lights,
+        alike,
+        moved.astype(np.float64),
+        np.maximum(averaged(noise, 1), 1e-8),
+        *_covariances(texture, size),
+        OFFSET_VARIANCE,
+        channels.astype(np.int64),
+        taps,
     )
+    lanes = np.tile(taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2), TILE // 2)
+    return FilterTable(index=index.reshape(tiles).astype(np.int32), taps=lanes.astype(np.float32), size=size)
 
 
 def _correlations(variance: FloatArray, seen: FloatArray) -> FloatArray:
     """Correlations (T, 3, 3) of the channels' own components of `variance` (T, 3), which are those of the lights."""
-    lights = np.maximum(variance @ np.linalg.pinv(seen**2).T, 0)
-    products = np.einsum("cl,tl,dl->tcd", seen, lights, seen)
+    lights = np.maximum(np.einsum("tlc,tc->tl", np.linalg.pinv(seen**2), variance), 0)
+    products = np.einsum("tcl,tl,tdl->tcd", seen, lights, seen)
     # what the lights do not explain is the channel's alone
     of_lights = np.diagonal(products, axis1=1, axis2=2)
     root = np.sqrt(np.maximum(of_lights, variance))
@@ -228,51 +268,18 @@ def _correlations(variance: FloatArray, seen: FloatArray) -> FloatArray:
     return np.asarray(correlations)
 
 
-def _solved(
-    fraction: FloatArray, together: FloatArray, noise: FloatArray, texture: TextureModel, cfa: str, size: int
-) -> FloatArray:
-    """Return filters (T, 4, 3, size²) for fractions (T, 3) of the common texture.
-
-    The channels' own components are correlated as `together` (T, 3, 3). Covariances and Bayer pattern are alike left
-    and right of the centre, and above and below it, and so are the filters: what is solved for is the sum of the
-    samples that lie alike, of which there are 9 among 25.
-    """
-    common, fine = _covariances(texture, size)
-    # what a colour shows of its own is as coarse as the common texture where the specimen is coloured
-    specific = texture.specific * common + (1 - texture.specific) * fine
-    alike, first = _alike(size)
-    shared, own = alike.T @ common @ alike, alike.T @ specific @ alike
-    centre, own_centre = (alike.T @ part[:, size * size // 2] for part in (common, specific))
-    noisy, root, own_root = np.maximum(noise, 1e-8), np.sqrt(fraction), np.sqrt(1 - fraction)
-    of_texture, of_own = (part[:, :, None] * part[:, None] for part in (root, own_root))
-    of_own *= together
-    taps = np.empty((len(fraction), 4, 3, size * size))
-    cell, offset = cfa_channels(cfa), np.arange(size) - size // 2
-    for phase, (p, q) in enumerate(np.ndindex(2, 2)):  # of the centre of the square
-        channel = cell[np.ix_((offset + p) % 2, (offset + q) % 2)].ravel()[first]
-        wanted = of_texture[:, channel] * centre[:, None] + of_own[:, channel] * own_centre[:, None]
-        samples = of_texture[:, channel[:, None], channel] * shared + of_own[:, channel[:, None], channel] * own
-        samples += np.diag(noisy[channel])
-        taps[:, phase] = (alike @ np.linalg.solve(samples, wanted)).transpose(0, 2, 1)
-    return taps
-
-
-@lru_cache
-def _alike(size: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Return unit vectors (size², m) that are equal where samples lie alike about the centre, and one of these each."""
-    distance = np.abs(np.arange(size) - size // 2)
-    _, first, group = np.unique(distance[:, None] * size + distance, return_index=True, return_inverse=True)
-    alike = (group.reshape(-1, 1) == np.arange(first.size)).astype(np.float64)
-    return alike / np.sqrt(alike.sum(axis=0)), first
-
-
 @lru_cache(maxsize=64)
-def _covariances(texture: TextureModel, size: int) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance between the samples of the square: of the texture, and of the sparkle of a reflection."""
-    offset = np.arange(size) - size // 2
-    points = np.stack(np.meshgrid(offset, offset, indexing="ij"), -1).reshape(-1, 2)
-    apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
-    return texture(apart) + OFFSET_VARIANCE, np.exp(-(apart**2) / (4 * SPARKLE_VARIANCE))
+def _covariances(texture: TextureModel, size: int) -> tuple[FloatArray, float, FloatArray]:
+    """Return the texture's autocorrelation at squared distances (px²), their step, and that of a colour's own component
+    by the distance in rows and columns."""
+    step = 1 / 256
+    table = texture(np.sqrt(step * np.arange(int(2.0 * (size + 1) ** 2 / step))))
+    lag = np.arange(1 - size, size)
+    square = np.asarray(lag[:, None] ** 2 + lag**2, dtype=np.float64)
+    sparkle = np.exp(-square / (4 * SPARKLE_VARIANCE))
+    # what a colour shows of its own is as coarse as the common texture where the specimen is coloured
+    coarse = texture(np.sqrt(square)) + OFFSET_VARIANCE
+    return table, step, np.asarray(texture.specific * coarse + (1 - texture.specific) * sparkle)
 
 
 SMALLEST_FRAME = 64
@@ -293,12 +300,15 @@ class Reconstruction:
         How each channel sees the texture, on a grid of 8 px.
     mean : (3, h, w) float32
         Local mean of each channel on a grid of 4 px.
+    displacement : LightDisplacement
+        Of the lights' textures against each other, on a grid of 8 px.
     """
 
     channels: LinearChannels
     texture: TextureModel
     factors: ColourFactors
     mean: FloatImage
+    displacement: LightDisplacement
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -355,11 +365,18 @@ class ReflectionAwareDemosaicer:
         texture = learn_texture(moments) if self.texture is None else self.texture
         matrix = np.eye(3) if self.crosstalk is None else self.crosstalk.matrix
         factors = colour_factors(moments, texture.band, matrix, coloured=texture.specific)
-        noise = np.median(factors.noise / (1 + factors.specific), axis=(1, 2))
+        displacement = light_displacement(moments, factors, texture, matrix, mosaic.cfa)
         # a colour left to itself has only every other sample, so it needs to look farther
         size = SIZE if texture.specific < 0.5 else WIDE
-        seen = matrix / np.median(factors.slope, axis=(1, 2))[:, None]
-        table = prediction_filters(_per_tile(factors.specific), noise, texture, mosaic.cfa, size=size, seen=seen)
+        table = prediction_filters(
+            _per_tile(factors.specific),
+            _per_tile(factors.noise / (1 + factors.specific)),
+            texture,
+            mosaic.cfa,
+            size=size,
+            seen=seen_lights(matrix, _per_tile(factors.slope)),
+            displacement=_per_tile(displacement.significant),
+        )
         mixing = np.eye(3) if mixing is None else mixing
         out, unknown = _predict(moments, factors, table, mixing, damaged=damaged)
         valid = np.ones(out.shape, dtype=bool)
@@ -367,15 +384,17 @@ class ReflectionAwareDemosaicer:
             known = _validity(saturated, unknown, mosaic.cfa)
             valid = np.stack([known[matters].all(axis=0) for matters in needed(mixing)])
         channels = LinearChannels(values=out, valid=valid, full_scale=mosaic.full_scale)
-        return Reconstruction(channels=channels, texture=texture, factors=factors, mean=moments.mean)
+        return Reconstruction(
+            channels=channels, texture=texture, factors=factors, mean=moments.mean, displacement=displacement
+        )
 
 
 def _per_tile(grid: FloatArray) -> FloatArray:
-    """Average a grid of blocks over the tiles; the last one may be narrower."""
+    """Average grids (..., h, w) of blocks over the tiles; the last one may be narrower."""
     ratio = TILE // BLOCK
-    missing = [(0, 0), *((0, -side % ratio) for side in grid.shape[1:])]
+    missing = [*[(0, 0)] * (grid.ndim - 2), *((0, -side % ratio) for side in grid.shape[-2:])]
     padded = np.pad(grid, missing, mode="edge") if np.any(missing) else grid
-    parts = [padded[:, row::ratio, column::ratio] for row, column in np.ndindex(ratio, ratio)]
+    parts = [padded[..., row::ratio, column::ratio] for row, column in np.ndindex(ratio, ratio)]
     return np.asarray(sum(parts) / ratio**2)
 
 

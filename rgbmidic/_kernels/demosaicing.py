@@ -1,0 +1,272 @@
+"""Demosaicing by local linear prediction: its filters, the prediction, and what the lights' displacement is read from.
+
+The filters are fixed in a tile, chosen from a table.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rgbmidic._kernels.interpolation import between
+from rgbmidic._kernels.threads import compiled, helper, over_ranges
+
+__all__ = ["TILE", "displacement_sums", "fill_unknown", "predict", "prediction_taps"]
+
+
+TILE = 16
+"""Side in px of the squares within which the filters are the same."""
+_SIZE, _WIDE = 5, 7
+"""Sides of the square of samples: the usual one, whose taps are added in one go, and the wide one."""
+_STRIP = 256
+"""Columns at a time: what a core's caches hold of their filters."""
+
+
+@helper()
+def _channel(i, j, red_row, red_column):
+    if i % 2 == red_row:
+        return 0 if j % 2 == red_column else 1
+    return 1 if j % 2 == red_column else 2
+
+
+@over_ranges("out")
+@compiled()
+def fill_unknown(start, stop, padded, fraction, red_row, red_column, pad, out, unknown):
+    """Replace samples that are NaN by the common texture predicted from the known ones around.
+
+    `padded` as written by `scaled_contrast`; `fraction` (3, h, w) is that of the common texture in each tile. `out`,
+    a copy of `padded`, receives ``sqrt(fraction) * texture``; where too little is known within one pixel it receives 0
+    and `unknown` (like `padded`) is set.
+    """
+    height, width = padded.shape
+    for i in range(start, stop):
+        for j in range(width):
+            if np.isfinite(padded[i, j]):
+                continue
+            ti = min(max(i - pad, 0) // TILE, fraction.shape[1] - 1)
+            tj = min(max(j - pad, 0) // TILE, fraction.shape[2] - 1)
+            total = weight = near = 0.0
+            for a in range(max(i - 2, 0), min(i + 3, height)):
+                for b in range(max(j - 2, 0), min(j + 3, width)):
+                    if np.isfinite(padded[a, b]):
+                        s = fraction[_channel(a - pad, b - pad, red_row, red_column), ti, tj]
+                        distance = (a - i) ** 2 + (b - j) ** 2
+                        w = np.exp(-0.8 * distance)
+                        total += w * np.sqrt(s) * padded[a, b]
+                        weight += w * s
+                        near += s if distance <= 2 else 0.0
+            own = fraction[_channel(i - pad, j - pad, red_row, red_column), ti, tj]
+            out[i, j] = np.sqrt(own) * total / weight if near > 0.5 else 0.0
+            unknown[i, j] = near <= 0.5
+
+
+# contraction to fused multiply-add alone: NaN and infinity keep their meaning
+@helper(fastmath={"contract"}, forceinline=True)
+def _filtered(r0, r1, r2, r3, r4, lines, out):
+    """Sum of the products of five rows of samples with the taps `lines` (25, _STRIP)."""
+    for j in range(out.size):
+        total = np.float32(0.0)
+        for b in range(_SIZE):
+            upper = lines[b, j] * r0[j + b] + lines[_SIZE + b, j] * r1[j + b]
+            lower = lines[3 * _SIZE + b, j] * r3[j + b] + lines[4 * _SIZE + b, j] * r4[j + b]
+            total += upper + lines[2 * _SIZE + b, j] * r2[j + b] + lower
+        out[j] = total
+
+
+@helper(fastmath={"contract"}, forceinline=True)
+def _add_row(row, lines, out):
+    """Add the products of a row of samples with a row of the taps of the wide square, (7, _STRIP)."""
+    for j in range(out.size):
+        total = out[j]
+        for b in range(_WIDE):
+            total += lines[b, j] * row[j + b]
+        out[j] = total
+
+
+@helper()
+def _spread(taps, parity, channel, index, first, lines):
+    """Write the filters of tiles, tap by tap, along the pixels from the tile `first` on."""
+    for tile in range(first, min(first + lines.shape[1] // TILE, index.size)):
+        chosen = taps[index[tile], parity, channel]
+        for k in range(lines.shape[0]):
+            source, line = chosen[k], lines[k, (tile - first) * TILE :]
+            for j in range(TILE):
+                line[j] = source[j]
+
+
+@over_ranges("index")
+@compiled(fastmath={"contract"})
+def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, mean_block, mixing, out):
+    """Mixtures of the channels ``mean + scale * sum of taps x samples around`` from the scaled contrast.
+
+    Parameters
+    ----------
+    start, stop
+        Range of rows of tiles that this call does.
+    size
+        Side of the square of samples, px: 5 or 7.
+    padded : (H + 2 pad, 16 w + 2 pad) float32
+        Scaled contrast, finite, with pad = size // 2.
+    index : (h, w) int32
+        Which filters each tile of 16 x 16 px uses.
+    taps : (T, 2, 3, size², 16) float32
+        By row parity, channel and tap; the last axis runs over the columns of the tile, which alternate between two
+        phases.
+    scale, mean : (3, h, W) float32
+        Rows of grids, widened to the pixels.
+    scale_block, mean_block
+        Sides of their blocks, px.
+    mixing : (n, 3) float32
+        Factors of the channels in each output.
+    out : (n, H, W) float32
+        Written: the mixtures.
+    """
+    rows, columns = out.shape[1:]
+    strip = _STRIP if size == _SIZE else _STRIP // 2
+    lines, channels = np.empty((size * size, strip), np.float32), np.empty((3, TILE, strip), np.float32)
+    for ti in range(start, stop):
+        top, bottom = ti * TILE, min((ti + 1) * TILE, rows)
+        for left in range(0, columns, strip):
+            number = min(strip, columns - left)
+            for c in range(3):
+                for parity in range(2):
+                    _spread(taps, parity, c, index[ti], left // TILE, lines)
+                    for i in range(top + parity, bottom, 2):
+                        made = channels[c, i - top, :number]
+                        if size == _SIZE:
+                            _filtered(
+                                padded[i, left:],
+                                padded[i + 1, left:],
+                                padded[i + 2, left:],
+                                padded[i + 3, left:],
+                                padded[i + 4, left:],
+                                lines,
+                                made,
+                            )
+                        else:
+                            for j in range(number):
+                                made[j] = 0
+                            for k in range(_WIDE):
+                                _add_row(padded[i + k, left:], lines[k * _WIDE : (k + 1) * _WIDE], made)
+                        low, high, part = between(i, mean_block, mean.shape[1])
+                        above, below = mean[c, low, left:], mean[c, high, left:]
+                        low, high, ahead = between(i, scale_block, scale.shape[1])
+                        gain, other = scale[c, low, left:], scale[c, high, left:]
+                        for j in range(number):
+                            level = above[j] + part * (below[j] - above[j])
+                            made[j] = level + (gain[j] + ahead * (other[j] - gain[j])) * made[j]
+            for n in range(len(out)):
+                red, green, blue = mixing[n]
+                for i in range(top, bottom):
+                    r, g, b, target = channels[0, i - top], channels[1, i - top], channels[2, i - top], out[n, i, left:]
+                    for j in range(number):
+                        target[j] = red * r[j] + green * g[j] + blue * b[j]
+
+
+@over_ranges("out", grain=4, least=0)
+@compiled(fastmath={"contract"})
+def prediction_taps(
+    start, stop, common, own, together, seen, alike, displacement, noise, texture, step, fine, offset, channels, out
+):
+    """Filters of the best linear prediction (simple kriging) from a square of samples, for T entries of a table.
+
+    The contrast of channel c over its standard deviation is ``common_c sum_l seen_cl (a_l + a_0) + own_c e_c`` and
+    noise: lights l show the texture displaced, with the covariance ``alike_lm C(x - y - d_l + d_m)``, a_0 is an unknown
+    constant of variance `offset`, and the channels' own components have the correlations `together`.
+
+    Parameters
+    ----------
+    start, stop
+        Range of entries that this call does.
+    common, own : (T, 3) float64
+        Roots of the fractions of a channel's variance.
+    together : (T, 3, 3) float64
+    seen : (T, 3, k) float64
+        The rows sum to 1.
+    alike : (T, k, k) float64
+    displacement : (T, k, 2) float64
+        d in x and y, px.
+    noise : (T, 3) float64
+        Variance.
+    texture : (n,) float64
+        C at the squared distances 0, `step`, 2 `step` ... px².
+    fine : (2 size - 1, 2 size - 1) float64
+        Covariance of a channel's own component by the distance in rows and columns.
+    channels : (4, size, size) int64
+        Of the samples, for each phase of the middle one in the 2 x 2 cell.
+    out : (T, 4, 3, size, size) float64
+        Written.
+    """
+    size, lights = channels.shape[1], seen.shape[2]
+    reach, count = size - 1, size * size
+    covariance = np.empty((3, 3, 2 * size - 1, 2 * size - 1))
+    matrix, wanted, lagged = np.empty((count, count)), np.empty((count, 3)), np.empty((lights, lights))
+    for entry in range(start, stop):
+        d = displacement[entry]
+        for i in range(2 * size - 1):
+            for j in range(2 * size - 1):
+                for a in range(lights):
+                    for b in range(lights):
+                        x, y = j - reach - d[a, 0] + d[b, 0], i - reach - d[a, 1] + d[b, 1]
+                        place = min((x * x + y * y) / step, texture.size - 1.001)
+                        low = int(place)
+                        value = texture[low] + (place - low) * (texture[low + 1] - texture[low])
+                        lagged[a, b] = alike[entry, a, b] * value
+                for c in range(3):
+                    for e in range(3):
+                        total = offset
+                        for a in range(lights):
+                            for b in range(lights):
+                                total += seen[entry, c, a] * seen[entry, e, b] * lagged[a, b]
+                        both = own[entry, c] * own[entry, e] * together[entry, c, e]
+                        covariance[c, e, i, j] = common[entry, c] * common[entry, e] * total + both * fine[i, j]
+        for phase in range(4):
+            colour = channels[phase].ravel()
+            for m in range(count):
+                row, column, c = m // size, m % size, colour[m]
+                for n in range(m + 1):
+                    matrix[m, n] = covariance[c, colour[n], row - n // size + reach, column - n % size + reach]
+                matrix[m, m] += noise[entry, c]
+                for e in range(3):
+                    wanted[m, e] = covariance[c, e, row - size // 2 + reach, column - size // 2 + reach]
+            # Cholesky, then both triangular solves
+            for m in range(count):
+                for n in range(m + 1):
+                    total = matrix[m, n]
+                    for q in range(n):
+                        total -= matrix[m, q] * matrix[n, q]
+                    matrix[m, n] = np.sqrt(total) if m == n else total / matrix[n, n]
+                for e in range(3):
+                    total = wanted[m, e]
+                    for q in range(m):
+                        total -= matrix[m, q] * wanted[q, e]
+                    wanted[m, e] = total / matrix[m, m]
+            for back in range(count):
+                m = count - 1 - back
+                for e in range(3):
+                    value = wanted[m, e] / matrix[m, m]
+                    out[entry, phase, e, m // size, m % size] = value
+                    for q in range(m):
+                        wanted[q, e] -= matrix[m, q] * value
+
+
+@over_ranges("sums", axis=2)
+@compiled()
+def displacement_sums(start, stop, residual, gradient_x, gradient_y, block, red_row, red_column, sums):
+    """Sum ``r gx``, ``r gy``, ``(gx gx + gy gy) / 2``, ``r r`` and 1 over the samples of each channel in each block.
+
+    r, gx and gy (H, W) are those of the channel sampled at a pixel; `sums` is (3, 5, h, w) float32. What is not finite
+    is left out.
+    """
+    rows, columns = residual.shape
+    for bi in range(start, stop):
+        sums[:, :, bi] = 0
+        for i in range(bi * block, min((bi + 1) * block, rows)):
+            for j in range(columns):
+                r, x, y = residual[i, j], gradient_x[i, j], gradient_y[i, j]
+                if np.isfinite(r + x + y):
+                    total = sums[_channel(i, j, red_row, red_column), :, bi, j // block]
+                    total[0] += r * x
+                    total[1] += r * y
+                    total[2] += np.float32(0.5) * (x * x + y * y)
+                    total[3] += r * r
+                    total[4] += np.float32(1.0)
