@@ -21,6 +21,7 @@ import numpy.typing as npt
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, UnsolvableError, compare, iterate
+from rgbmidic.correlation.light_bias import LightBias
 from rgbmidic.correlation.nodes import (
     LOST,
     Evidence,
@@ -359,6 +360,10 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     fitted = estimate.displacement
     residual = weighting.residual.without(*recovery.bend(fitted, geometry.linear_offset))
     std = standard_uncertainty(residual, equations, weighting.precision, recovery)
+    if weighting.precision is not None:
+        bias = LightBias.of(weighting.residual, equations.weights)
+        fitted = fitted + bias.values
+        std = np.hypot(std, bias.of_recovered())
     squares = weighting.residual.squares(equations.weights)
     misfits = misfit(mesh, squares, equations.textured)
     node_status = _judged(estimate, equations, weighting, mismatched, std, misfits)
