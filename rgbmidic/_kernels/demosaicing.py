@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from rgbmidic._kernels.interpolation import between
+from rgbmidic._kernels.interpolation import _FAST, between
 from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
 __all__ = ["TILE", "displacement_sums", "fill_unknown", "predict", "prediction_taps"]
 
 
-TILE = 16
+TILE = 32
 """Side in px of the squares within which the filters are the same."""
 _SIZE, _WIDE = 5, 7
 """Sides of the square of samples: the usual one, whose taps are added in one go, and the wide one."""
@@ -104,11 +104,11 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
         Range of rows of tiles that this call does.
     size
         Side of the square of samples, px: 5 or 7.
-    padded : (H + 2 pad, 16 w + 2 pad) float32
+    padded : (H + 2 pad, 32 w + 2 pad) float32
         Scaled contrast, finite, with pad = size // 2.
     index : (h, w) int32
-        Which filters each tile of 16 x 16 px uses.
-    taps : (T, 2, 3, size², 16) float32
+        Which filters each tile of 32 x 32 px uses.
+    taps : (T, 2, 3, size², 32) float32
         By row parity, channel and tap; the last axis runs over the columns of the tile, which alternate between two
         phases.
     scale, mean : (3, h, W) float32
@@ -162,8 +162,8 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
                         target[j] = red * r[j] + green * g[j] + blue * b[j]
 
 
-@over_ranges("out", grain=4, least=0)
-@compiled(fastmath={"contract"})
+@over_ranges("out", least=0)
+@compiled(fastmath=_FAST)
 def prediction_taps(
     start, stop, common, own, together, seen, alike, displacement, noise, texture, step, fine, offset, channels, out
 ):
@@ -180,28 +180,42 @@ def prediction_taps(
     common, own : (T, 3) float64
         Roots of the fractions of a channel's variance.
     together : (T, 3, 3) float64
-    seen : (T, 3, k) float64
+        Correlations of the channels' own components.
+    seen : (3, k) float64
         The rows sum to 1.
     alike : (T, k, k) float64
+        Correlations of the lights' textures.
     displacement : (T, k, 2) float64
         d in x and y, px.
     noise : (T, 3) float64
         Variance.
     texture : (n,) float64
         C at the squared distances 0, `step`, 2 `step` ... px².
+    step
+        px².
     fine : (2 size - 1, 2 size - 1) float64
         Covariance of a channel's own component by the distance in rows and columns.
+    offset
+        Variance.
     channels : (4, size, size) int64
         Of the samples, for each phase of the middle one in the 2 x 2 cell.
     out : (T, 4, 3, size, size) float64
         Written.
     """
-    size, lights = channels.shape[1], seen.shape[2]
+    size, lights = channels.shape[1], seen.shape[1]
     reach, count = size - 1, size * size
     covariance = np.empty((3, 3, 2 * size - 1, 2 * size - 1))
-    matrix, wanted, lagged = np.empty((count, count)), np.empty((count, 3)), np.empty((lights, lights))
+    matrix, factor = np.empty((count, count)), np.empty((count, count))
+    wanted, lagged = np.empty((3, count)), np.empty((lights, lights))
+    pairs = np.empty((3, 3, lights, lights))
     for entry in range(start, stop):
         d = displacement[entry]
+        for c in range(3):
+            for e in range(3):
+                for a in range(lights):
+                    for b in range(lights):
+                        shown = common[entry, c] * seen[c, a] * common[entry, e] * seen[e, b]
+                        pairs[c, e, a, b] = shown * alike[entry, a, b]
         for i in range(2 * size - 1):
             for j in range(2 * size - 1):
                 for a in range(lights):
@@ -209,16 +223,15 @@ def prediction_taps(
                         x, y = j - reach - d[a, 0] + d[b, 0], i - reach - d[a, 1] + d[b, 1]
                         place = min((x * x + y * y) / step, texture.size - 1.001)
                         low = int(place)
-                        value = texture[low] + (place - low) * (texture[low + 1] - texture[low])
-                        lagged[a, b] = alike[entry, a, b] * value
+                        lagged[a, b] = texture[low] + (place - low) * (texture[low + 1] - texture[low])
                 for c in range(3):
                     for e in range(3):
-                        total = offset
+                        total = common[entry, c] * common[entry, e] * offset
+                        total += own[entry, c] * own[entry, e] * together[entry, c, e] * fine[i, j]
                         for a in range(lights):
                             for b in range(lights):
-                                total += seen[entry, c, a] * seen[entry, e, b] * lagged[a, b]
-                        both = own[entry, c] * own[entry, e] * together[entry, c, e]
-                        covariance[c, e, i, j] = common[entry, c] * common[entry, e] * total + both * fine[i, j]
+                                total += pairs[c, e, a, b] * lagged[a, b]
+                        covariance[c, e, i, j] = total
         for phase in range(4):
             colour = channels[phase].ravel()
             for m in range(count):
@@ -227,46 +240,83 @@ def prediction_taps(
                     matrix[m, n] = covariance[c, colour[n], row - n // size + reach, column - n % size + reach]
                 matrix[m, m] += noise[entry, c]
                 for e in range(3):
-                    wanted[m, e] = covariance[c, e, row - size // 2 + reach, column - size // 2 + reach]
-            # Cholesky, then both triangular solves
-            for m in range(count):
-                for n in range(m + 1):
-                    total = matrix[m, n]
-                    for q in range(n):
-                        total -= matrix[m, q] * matrix[n, q]
-                    matrix[m, n] = np.sqrt(total) if m == n else total / matrix[n, n]
+                    wanted[e, m] = covariance[c, e, row - size // 2 + reach, column - size // 2 + reach]
+            for q in range(count):  # Cholesky, column by column
+                scale = 1 / np.sqrt(matrix[q, q])
+                column_of = factor[q]
+                for m in range(q, count):
+                    column_of[m] = matrix[m, q] * scale
+                for m in range(q + 1, count):
+                    value, line = column_of[m], matrix[m]
+                    for n in range(q + 1, m + 1):
+                        line[n] -= value * column_of[n]
                 for e in range(3):
-                    total = wanted[m, e]
-                    for q in range(m):
-                        total -= matrix[m, q] * wanted[q, e]
-                    wanted[m, e] = total / matrix[m, m]
-            for back in range(count):
-                m = count - 1 - back
-                for e in range(3):
-                    value = wanted[m, e] / matrix[m, m]
-                    out[entry, phase, e, m // size, m % size] = value
-                    for q in range(m):
-                        wanted[q, e] -= matrix[m, q] * value
+                    value = wanted[e, q] * scale
+                    wanted[e, q] = value
+                    for m in range(q + 1, count):
+                        wanted[e, m] -= column_of[m] * value
+            for e in range(3):
+                for back in range(count):
+                    q = count - 1 - back
+                    value = wanted[e, q]
+                    for m in range(q + 1, count):
+                        value -= factor[q, m] * wanted[e, m]
+                    wanted[e, q] = value / factor[q, q]
+                    out[entry, phase, e, q // size, q % size] = wanted[e, q]
 
 
 @over_ranges("sums", axis=2)
-@compiled()
-def displacement_sums(start, stop, residual, gradient_x, gradient_y, block, red_row, red_column, sums):
-    """Sum ``r gx``, ``r gy``, ``(gx gx + gy gy) / 2``, ``r r`` and 1 over the samples of each channel in each block.
+@compiled(fastmath={"contract"})
+def displacement_sums(start, stop, padded, taps, block, red_row, red_column, sums):
+    """Sum ``r gx``, ``r gy``, ``(gx gx + gy gy) / 2``, ``r r`` and 1 over samples of each channel in each block.
 
-    r, gx and gy (H, W) are those of the channel sampled at a pixel; `sums` is (3, 5, h, w) float32. What is not finite
-    is left out.
+    What is not finite is left out.
+
+    Parameters
+    ----------
+    start, stop
+        Range of rows of blocks that this call does.
+    padded : (H + 4, W + 4) float32
+        Scaled contrast.
+    taps : (2, 3, 25, n) float32
+        Filters of r, gx and gy by row parity; the last axis runs over columns, which alternate between two phases. n is
+        a multiple of `block`.
+    block
+        Side of the blocks, px.
+    red_row, red_column
+        Position of red in the 2 x 2 cell.
+    sums : (3, 5, h, w) float32
+        Written.
     """
-    rows, columns = residual.shape
+    rows, columns = padded.shape[0] - 4, padded.shape[1] - 4
+    strip = taps.shape[3]
+    made, total = np.empty((3, strip), np.float32), np.empty(5, np.float32)
     for bi in range(start, stop):
         sums[:, :, bi] = 0
         for i in range(bi * block, min((bi + 1) * block, rows)):
-            for j in range(columns):
-                r, x, y = residual[i, j], gradient_x[i, j], gradient_y[i, j]
-                if np.isfinite(r + x + y):
-                    total = sums[_channel(i, j, red_row, red_column), :, bi, j // block]
-                    total[0] += r * x
-                    total[1] += r * y
-                    total[2] += np.float32(0.5) * (x * x + y * y)
-                    total[3] += r * r
-                    total[4] += np.float32(1.0)
+            for left in range(0, columns, strip):
+                number = min(strip, columns - left)
+                for n in range(3):
+                    _filtered(
+                        padded[i, left:],
+                        padded[i + 1, left:],
+                        padded[i + 2, left:],
+                        padded[i + 3, left:],
+                        padded[i + 4, left:],
+                        taps[i % 2, n],
+                        made[n, :number],
+                    )
+                for phase in range(2):
+                    channel = _channel(i, phase, red_row, red_column)
+                    for first in range(0, number, block):
+                        total[:] = 0
+                        for j in range(first + phase, min(first + block, number), 2):
+                            r, x, y = made[0, j], made[1, j], made[2, j]
+                            if np.isfinite(r):
+                                total[0] += r * x
+                                total[1] += r * y
+                                total[2] += np.float32(0.5) * (x * x + y * y)
+                                total[3] += r * r
+                                total[4] += np.float32(1.0)
+                        for n in range(5):
+                            sums[channel, n, bi, (left + first) // block] += total[n]

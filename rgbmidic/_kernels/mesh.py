@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from rgbmidic._kernels.interpolation import _FAST
-from rgbmidic._kernels.threads import compiled, helper, over_ranges
+from rgbmidic._kernels.threads import compiled, over_ranges
 
 __all__ = [
     "claim_pixels",

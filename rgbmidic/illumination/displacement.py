@@ -20,11 +20,11 @@ import numpy as np
 from scipy.linalg import pinv
 from scipy.signal import convolve2d, correlate2d
 
-from rgbmidic._kernels.demosaicing import TILE, displacement_sums, predict
+from rgbmidic._kernels.demosaicing import displacement_sums
 from rgbmidic.frames.data import cfa_channels
-from rgbmidic.illumination.colour_factors import BLOCK, MEAN_BLOCK, ColourFactors, Moments, scaled
+from rgbmidic.illumination.colour_factors import BLOCK, ColourFactors, Moments, scaled
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, FloatImage
 
 HARMLESS = 0.03
 """Distance (px) of two lights at which each counts half for the other. Half and twice of it change the error of raised
@@ -33,7 +33,7 @@ ALONE = 0.1
 """What a light with which no other agrees counts: the square of it is its weight against lights that agree."""
 WINDOW = 20.0
 """Standard deviation (px) of the window in which a displacement is taken: glints change their place over some 50 px."""
-SIGNIFICANT = 2.0
+SIGNIFICANT = 1.25
 """Standard deviations of a displacement that chance may make in each direction."""
 NEIGHBOURS = 0.02
 """Variance, over the texture's, by which the other colours' prediction may be wrong."""
@@ -41,13 +41,15 @@ STEP = 0.25
 """Distance (px) over which the derivative of the autocorrelation is taken."""
 SIZE, REACH = 5, 8
 """Side of the square of samples of a prediction, px; rows and columns over which predictions are correlated."""
+_STRIP = 256
+"""Columns that the kernel takes at a time: what a core's fastest cache holds of their filters."""
 UNKNOWN = 10.0
 """Variance of an unknown constant under the texture, over the texture's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightDisplacement:
-    """Displacement of the lights' textures from where the lights that agree show it.
+    """Displacement of the lights' textures from their mean.
 
     Attributes
     ----------
@@ -63,13 +65,12 @@ class LightDisplacement:
     @property
     def significant(self) -> FloatArray:
         """The displacement shrunk towards 0 by what chance explains of it (James and Stein 1961), (k, 2, h, w)."""
-        square = np.maximum((self.values**2).sum(axis=1), 1e-12)
-        return np.asarray(self.values * np.maximum(1 - 2 * (SIGNIFICANT * self.std) ** 2 / square, 0)[:, None])
+        chance = 2 * SIGNIFICANT**2 * (self.std**2).sum(axis=0)
+        gain = 1 - chance / np.maximum((self.values**2).sum(axis=(0, 1)), 1e-12)
+        return np.asarray(self.values * np.maximum(gain, 0))
 
 
-def agreement(
-    displacement: FloatArray, variance: FloatArray, precision: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def agreement(displacement: FloatArray, variance: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
     """How far lights are to be believed about a place, and how far those that are agree with another one.
 
     Parameters
@@ -122,28 +123,19 @@ def light_displacement(
     slope = np.median(factors.slope, axis=(1, 2))
     octave = np.round(np.log2(np.maximum(np.median(factors.noise, axis=(1, 2)), 2.0**-20)))
     taps, response, chance = _filters(texture, tuple((2.0**octave).tolist()), cfa)
-    rows, columns = moments.contrast.shape
-    padded = scaled(moments, (1 / factors.slope).astype(np.float32), pad=SIZE // 2, width=-(-columns // TILE) * TILE)
-    index = np.zeros((-(-rows // TILE), -(-columns // TILE)), dtype=np.int32)
-    out = np.empty((3, rows, columns), dtype=np.float32)
-    flat = np.ones((3, 1, columns), dtype=np.float32)
-    predict(padded, index, taps, SIZE, flat, rows, 0 * flat, rows, np.eye(3, dtype=np.float32), out)
-    sums = np.empty((3, 5, *(-(-side // BLOCK) for side in out.shape[1:])), dtype=np.float32)
-    displacement_sums(*out, BLOCK, *moments.red, sums)
-    around = [_smooth(one) for one in sums.swapaxes(0, 1)]
-    square = around[2] + np.float32(1e-12)
+    padded = scaled(moments, (1 / factors.slope).astype(np.float32), pad=SIZE // 2)
+    sums = np.empty((3, 5, *(-(-side // BLOCK) for side in moments.contrast.shape)), dtype=np.float32)
+    displacement_sums(padded, taps, BLOCK, *moments.red, sums)
+    around = [_smooth(one).astype(np.float64) for one in sums.swapaxes(0, 1)]
+    square = around[2] + 1e-12
     shift = np.stack(around[:2], axis=1) / square[:, None]
     back = pinv(response @ seen_lights(matrix, slope), rtol=0.05)
     back -= back.mean(axis=0)
     # standard deviation of as many independent products: a window holds so many blocks
     alone = np.sqrt(around[3] / (square * np.maximum(around[4], 1e-6) * (4 * np.pi * (WINDOW / BLOCK) ** 2)))
-    values, spread = np.tensordot(back, shift, axes=1), np.einsum("lc,ld,cd,cyx,dyx->lyx", back, back, chance, alone, alone)
-    unmix = np.linalg.pinv(matrix)
-    level = np.stack([cv2.resize(one, sums.shape[:1:-1], interpolation=cv2.INTER_AREA) for one in moments.mean])
-    light, level = (np.tensordot(unmix, one, axes=1) for one in (factors.slope, level))
-    contrast = light / np.maximum(level, 1e-3 * level.max())
-    weights, _ = agreement(values, spread, np.maximum(contrast, 1e-3) ** 2 / np.maximum(spread, 1e-12))
-    return LightDisplacement(values=values - (weights[:, None] * values).sum(axis=0), std=np.sqrt(spread))
+    values = np.tensordot(back, shift, axes=1)
+    variance = np.maximum(np.einsum("lc,ld,cd,cyx,dyx->lyx", back, back, chance, alone, alone), 1e-12)
+    return LightDisplacement(values=values, std=np.sqrt(variance))
 
 
 def seen_lights(matrix: FloatArray, slope: FloatArray) -> FloatArray:
@@ -162,15 +154,15 @@ def _smooth(grids: FloatArray) -> FloatArray:
 
 
 @lru_cache(maxsize=64)
-def _filters(texture: TextureModel, noise: tuple[float, ...], cfa: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _filters(texture: TextureModel, noise: tuple[float, ...], cfa: str) -> tuple[FloatImage, FloatArray, FloatArray]:
     """Filters of residual and gradient from the samples of the other colours, and what they make of a displacement.
 
     Returns
     -------
     tuple
-        Taps as `rgbmidic._kernels.demosaicing.predict` takes them; (3, 3): displacement found for each channel (row)
-        per displacement of each channel's texture; (3, 3): covariance of two channels' sums of residual times gradient
-        over the root of the variances of as many independent products (Isserlis' theorem).
+        Taps as `rgbmidic._kernels.demosaicing.displacement_sums` takes them; (3, 3): displacement found for each
+        channel (row) per displacement of each channel's texture; (3, 3): covariance of two channels' sums of residual
+        times gradient over the root of the variances of as many independent products (Isserlis' theorem).
     """
     cell, offset, middle = cfa_channels(cfa), np.arange(SIZE) - SIZE // 2, SIZE**2 // 2
     places = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)  # x, y
@@ -215,5 +207,5 @@ def _filters(texture: TextureModel, noise: tuple[float, ...], cfa: str) -> tuple
             total[own, other] += (square + cross)[met].sum()
             if first == second:
                 alone[own] += square[REACH, REACH]
-    lanes = np.tile(taps.transpose(0, 2, 3, 1), TILE // 2)[None].astype(np.float32)
+    lanes: FloatImage = np.tile(taps.transpose(0, 2, 3, 1), _STRIP // 2).astype(np.float32)
     return lanes, moved / unit[:, None], total / np.sqrt(alone[:, None] * alone)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -23,6 +24,9 @@ from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.linear import LinearChannels
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+
+if TYPE_CHECKING:  # reading a result takes no kernels
+    from rgbmidic.illumination.displacement import LightDisplacement
 
 __all__ = [
     "DARK",
@@ -175,6 +179,9 @@ class IlluminationImages:
         Grey level of a just saturated camera sample (DN above black).
     reflection : ndarray, shape (k, h, w), or None
         What `reflection_index` interpolates, on a grid of blocks of 8 px.
+    displacement : LightDisplacement or None
+        Of the lights' textures against each other in this frame, on the same grid: a light whose reflection is seen on
+        the flanks of raised droplets shows the texture displaced. None where the separation does not look for it.
     texture : TextureModel or None
         The speckle's autocorrelation as the separation took it: hand it on to the other frames of a test; None where
         the separation does not use it.
@@ -189,6 +196,7 @@ class IlluminationImages:
     names: tuple[str, ...]
     full_scale: float
     reflection: FloatArray | None = None
+    displacement: LightDisplacement | None = None
     texture: TextureModel | None = None
     origin: tuple[int, int] = (0, 0)
     registration: Registration | None = None

@@ -89,6 +89,7 @@ def separate(
         names=crosstalk.lights,
         full_scale=linear.full_scale,
         reflection=_reflection(model, crosstalk),
+        displacement=model.displacement,
         texture=model.texture,
     )
 
@@ -131,7 +132,12 @@ def demosaic(
 def reconstructed_lights(reconstruction: Reconstruction, crosstalk: Crosstalk) -> IlluminationImages:
     """The lights of a frame, and their reflection index, from what the reflection-aware method made of its channels."""
     images = unmix(reconstruction.channels, crosstalk)
-    return replace(images, reflection=_reflection(reconstruction, crosstalk), texture=reconstruction.texture)
+    return replace(
+        images,
+        reflection=_reflection(reconstruction, crosstalk),
+        displacement=reconstruction.displacement,
+        texture=reconstruction.texture,
+    )
 
 
 def _chosen(method: str, mosaic: LinearMosaic) -> str:

@@ -188,6 +188,8 @@ def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, 
     ratio = float(np.clip(agreement, finest, coarsest))
     fine = np.append(energies[:, 1] - ratio * energies[:, 0], ratio - 1)
     model = _mixture(np.concatenate([distance[odd], distance[even]]), product, best, band=(unit, fine))
+    if not model.band.diagonal > 0:  # noise alone: nothing is known
+        return TextureModel.of_speckle(4.0)
     return replace(model, specific=_coarse_fraction(model, sums, counts, correlations))
 
 

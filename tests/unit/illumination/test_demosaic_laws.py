@@ -14,7 +14,7 @@ from rgbmidic.illumination.demosaicing import MalvarDemosaicer, NormalisedMosaic
 from rgbmidic.illumination.separation import DEMOSAICERS, separate
 from rgbmidic.illumination.texture import TextureModel
 
-SHAPE = (128, 144)
+SHAPE = (160, 160)  # whole tiles: a flip must not move them
 TEXTURE = TextureModel.of_speckle(4.2)
 INSIDE = np.s_[:, 24:-24, 24:-24]
 

@@ -10,6 +10,7 @@ from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.illumination.colour_factors import colour_factors, gather_moments, learn_texture
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaicing import (
+    DISSIMILAR,
     OFFSET_VARIANCE,
     SPARKLE_VARIANCE,
     Demosaicer,
@@ -151,19 +152,25 @@ def test_filters_of_nothing_in_common_use_the_own_colour_alone():
         assert abs(others).max() < 0.01
 
 
-def test_filters_are_the_best_prediction_of_what_crosstalk_shows_of_a_sparkling_light():
-    """Against the covariances written out: green sparkles, and red and blue see a quarter and a half of it."""
+@pytest.mark.parametrize("displacement", [np.zeros((3, 2)), np.array([[0.06, -0.02], [-0.18, 0.1], [0.06, 0]])])
+def test_filters_are_the_best_prediction_of_what_crosstalk_shows_of_lights(displacement):
+    """Against the covariances written out: green sparkles, and the lights' textures are displaced."""
     texture, noise, size = TextureModel.of_speckle(4.0), 0.01, 5
-    seen, sparkle = np.array([[1, 0.25, 0], [0, 1, 0], [0, 0.5, 1]]), np.array([0, 0.5, 0])
+    seen, sparkle = np.array([[0.75, 0.25, 0], [0, 1, 0], [0, 0.5, 0.5]]), np.array([0, 0.5, 0])
     variance = seen**2 @ sparkle
-    table = prediction_filters(variance.reshape(3, 1, 1), (noise,) * 3, texture, "RGGB", size=size, seen=seen)
+    options = {"size": size, "seen": seen, "displacement": displacement[:, :, None, None]}
+    table = prediction_filters(variance.reshape(3, 1, 1), (noise,) * 3, texture, "RGGB", **options)
     offset = np.arange(size) - size // 2
-    points = np.stack(np.meshgrid(offset, offset, indexing="ij"), axis=-1).reshape(-1, 2)
+    points = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)  # x, y
 
     def covariance(first, a, second, b):
         """Of channel a at one point with channel b at another, each over its own standard deviation."""
-        square = ((first - second) ** 2).sum()
-        common, own = float(texture(square**0.5)) + OFFSET_VARIANCE, np.exp(-square / (4 * SPARKLE_VARIANCE))
+        own = np.exp(-((first - second) ** 2).sum() / (4 * SPARKLE_VARIANCE))
+        common = OFFSET_VARIANCE
+        for light, other in np.ndindex(3, 3):
+            apart = displacement[light] - displacement[other]
+            alike = np.exp(-DISSIMILAR * (apart**2).sum()) * float(texture(np.hypot(*(first - second - apart))))
+            common += seen[a, light] * seen[b, other] * alike
         return (common + seen[a] @ (sparkle * seen[b]) * own) / np.sqrt((1 + variance[a]) * (1 + variance[b]))
 
     for p, q in np.ndindex(2, 2):

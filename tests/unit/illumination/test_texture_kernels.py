@@ -4,8 +4,8 @@ import naive_texture
 import numpy as np
 import pytest
 
+from rgbmidic._kernels import demosaicing as kriging
 from rgbmidic._kernels import illumination as texture
-from rgbmidic._kernels import mesh as kriging
 from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.illumination.colour_factors import colour_moments, of_mosaic, widened
 from rgbmidic.illumination.demosaicing import red_position

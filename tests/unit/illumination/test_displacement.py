@@ -1,0 +1,79 @@
+"""Displacement of the lights' textures against each other: found from a mosaic, with its uncertainty, and harmless."""
+
+import colour_scenes as scenes
+import numpy as np
+import pytest
+from scipy.ndimage import shift
+
+from rgbmidic._kernels.demosaicing import displacement_sums
+from rgbmidic.illumination.displacement import agreement
+from rgbmidic.illumination.separation import separate
+
+SHAPE = (192, 192)
+MEAN = np.array([1500, 2000, 1100])[:, None, None]
+INSIDE = np.s_[:, 24:-24, 24:-24]
+
+
+def lights_displaced(by, **options):
+    """Lights of one speckle (3, H, W), each displaced by its own (x, y) px."""
+    albedo = scenes.speckle(SHAPE, **options)
+    return MEAN * np.stack([shift(albedo, (y, x), order=5, mode="mirror") for x, y in by])
+
+
+@pytest.mark.parametrize("by", [[(0, 0), (0.15, 0), (0, 0)], [(0.05, -0.1), (0, 0.1), (-0.05, 0)]])
+def test_displacement_is_found_through_crosstalk_noise_and_mosaic(by):
+    found = separate(scenes.mosaic_of(lights_displaced(by)), scenes.CROSSTALK).displacement
+    expected = np.array(by) - np.mean(by, axis=0)
+    np.testing.assert_allclose(found.values.mean(axis=(2, 3)), expected, atol=0.02)
+    assert np.median(found.std) < 0.02
+
+
+def test_uncertainty_is_that_of_the_draws():
+    """Of textures at one place: their displacement over its standard uncertainty, 12 speckles and noises."""
+    ratios = []
+    for seed in range(12):
+        mosaic = scenes.mosaic_of(lights_displaced([(0, 0)] * 3, seed=seed), seed=seed)
+        found = separate(mosaic, scenes.CROSSTALK).displacement
+        ratios.append((found.values / found.std[:, None])[:, :, 4:-4, 4:-4])
+    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+def test_displaced_lights_do_not_pull_the_others():
+    """The green light lies .2 px to the right: where red's and blue's images lie then, and what their noise is."""
+    lights = lights_displaced([(0, 0), (0.2, 0), (0, 0)])
+    found = separate(scenes.mosaic_of(lights), scenes.CROSSTALK).values
+    slope = np.gradient(lights, axis=2)
+    moved = -((found - lights) * slope)[INSIDE].sum(axis=(1, 2)) / (slope**2)[INSIDE].sum(axis=(1, 2))
+    assert np.abs(moved).max() < 0.015  # .07 where all lights count as one texture
+
+
+def test_a_light_counts_by_its_precision_and_by_those_that_agree():
+    place = np.array([[0.0, 0.0], [0.15, 0.0], [0.0, 0.01]])[:, :, None, None]
+    chance, even = np.full((3, 1, 1), 1e-6), np.ones((3, 1, 1))
+    weights, agree = (part[..., 0, 0] for part in agreement(place, chance, even))
+    np.testing.assert_allclose(weights.sum(), 1)
+    assert weights[1] < 0.04
+    assert agree > 0.4
+    # by chance as far apart: all count alike
+    weights, _ = agreement(place, np.full((3, 1, 1), 0.02), even)
+    np.testing.assert_allclose(weights.ravel(), 1 / 3)
+    # of two nobody knows which is right
+    weights, agree = agreement(place[:2], chance[:2], np.array([3.0, 1.0])[:, None, None])
+    np.testing.assert_allclose(weights.ravel(), [0.75, 0.25])
+    assert agree.item() < 0.05
+
+
+def test_sums_are_those_written_out():
+    rng, shape, block = np.random.default_rng(4), (20, 37), 8
+    padded = rng.normal(size=(shape[0] + 4, shape[1] + 4)).astype(np.float32)
+    padded[9, 11] = np.nan
+    pair = rng.normal(size=(2, 3, 25, 2)).astype(np.float32)
+    sums = np.empty((3, 5, *(-(-side // block) for side in shape)), dtype=np.float32)
+    displacement_sums(padded, np.tile(pair, 16), block, 0, 1, sums)
+    expected = np.zeros_like(sums)
+    for i, j in np.ndindex(*shape):
+        r, x, y = pair[i % 2, :, :, j % 2] @ padded[i : i + 5, j : j + 5].ravel()
+        channel = 1 if i % 2 == j % 2 else 0 if i % 2 == 0 else 2
+        if np.isfinite(r):
+            expected[channel, :, i // block, j // block] += r * x, r * y, (x * x + y * y) / 2, r * r, 1
+    np.testing.assert_allclose(sums, expected, rtol=1e-4, atol=2e-2)
