@@ -188,8 +188,6 @@ def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, 
     ratio = float(np.clip(agreement, finest, coarsest))
     fine = np.append(energies[:, 1] - ratio * energies[:, 0], ratio - 1)
     model = _mixture(np.concatenate([distance[odd], distance[even]]), product, best, band=(unit, fine))
-    if not model.band.diagonal > 0:  # noise alone: nothing is known
-        return TextureModel.of_speckle(4.0)
     return replace(model, specific=_coarse_fraction(model, sums, counts, correlations))
 
 
@@ -226,13 +224,15 @@ def _mixture(
         return TextureModel.of_speckle(4.0)
     kept = solution[:-1] > 0
     weights = solution[:-1][kept] / total
-    return TextureModel(
+    model = TextureModel(
         weights=tuple(weights.tolist()),
         widths=tuple(widths[kept].tolist()),
         offset=min(float(1 - weights.sum()), 0.0),
         specific=specific,
         correlation=correlation,
     )
+    # of noise alone nothing is known
+    return model if model.band.diagonal > 0 else TextureModel.of_speckle(4.0)
 
 
 def _coarse_fraction(model: TextureModel, sums: FloatArray, counts: FloatArray, correlations: FloatArray) -> float:
