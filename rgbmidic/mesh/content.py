@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.settings import regular
@@ -52,7 +51,7 @@ class MeshContent:
     points: FloatArray
     numbers: IntArray
     blocks: Sequence[tuple[str, IntArray, IntArray]]
-    sets: Mapping[str, npt.ArrayLike]
+    sets: Mapping[str, Collection[int]]
     fields: Mapping[str, FloatArray] = field(default_factory=dict)
     numbering: str = "labels of the file"
     unread: Collection[str] = ()
@@ -77,11 +76,11 @@ class MeshContent:
         cls,
         nodes: Sequence[tuple[int, Sequence[float]]],
         elements: Sequence[tuple[str, int, Sequence[int]]],
-        sets: Mapping[str, npt.ArrayLike],
+        sets: Mapping[str, Collection[int]],
         unread: Collection[str],
     ) -> Self:
         """Take nodes (label, place) and elements (shape, label, labels of the nodes)."""
-        unique("element", [label for _, label, _ in elements])
+        unique("element", np.array([label for _, label, _ in elements], dtype=np.int64))
         if odd := [label for label, place in nodes if len(place) != 3]:
             raise InputError(f"node {odd[0]} has not three coordinates")
         index, blocks = {label: i for i, (label, _) in enumerate(nodes)}, []
@@ -99,9 +98,9 @@ class MeshContent:
         return cls(points=points, numbers=numbers, blocks=blocks, sets=sets, unread=unread)
 
 
-def unique(what: str, labels: npt.ArrayLike) -> None:
+def unique(what: str, labels: IntArray) -> None:
     """Refuse labels that are there twice."""
-    known, count = np.unique(np.asarray(labels), return_counts=True)
+    known, count = np.unique(labels, return_counts=True)
     if (count > 1).any():
         raise InputError(f"{what} {known[count > 1][0]} is stated {count[count > 1][0]} times")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -31,13 +32,15 @@ _SOLID = {
     "pyramid": ((0, 1, 2, 3), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
 }
 """Corners of the sides of cells, in VTK's order, which all formats have here."""
-_READERS = {
+_READERS: Mapping[str, Callable[[Path], MeshContent]] = {
     **{".inp": read_abaqus, ".msh": read_gmsh, ".vtu": read_vtu},
     **dict.fromkeys((".bdf", ".nas", ".fem"), read_nastran),
     **{ending: partial(read_with_meshio, kind=kind) for ending, kind in FORMATS.items()},
 }
-_UNREADABLE = (ValueError, ArithmeticError, LookupError, OSError, EOFError, StopIteration, RecursionError)
-_UNREADABLE += (TypeError, MemoryError)
+_UNREADABLE = (
+    *(ValueError, TypeError, ArithmeticError, LookupError, OSError, EOFError),
+    *(StopIteration, RecursionError, MemoryError),
+)
 """What text that is no mesh leads to: no number, one beyond its type, too few of them, a file that is not there."""
 
 
@@ -75,7 +78,7 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
     except RgbmidicError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
     except _UNREADABLE as error:
-        raise InputError(f"{path} is not a readable mesh: {str(error) or 'it ends early'}") from None
+        raise InputError(f"{path} is not a readable mesh: {str(error)[:120] or 'it ends early'}") from None
     faces, numbers = _faces(content, path, part)
     axes, chosen = _plane(content.points, faces, path)
     corners, numbers = _triangles(content.points[:, axes], faces[chosen], numbers[chosen], path)
@@ -105,7 +108,7 @@ def _faces(content: MeshContent, path: Path, part: str | None) -> tuple[IntArray
             there = ", ".join(sorted(alike or content.sets)) or "none"
             raise InputError(f'{path} has no set "{part}" of elements; it has {there}')
         members = content.sets[part if part in alike else alike[0]]
-        inside = [np.isin(numbers, members) for *_, numbers in blocks]
+        inside = [np.isin(numbers, list(members)) for *_, numbers in blocks]
         blocks = [(shape, nodes[m], numbers[m]) for (shape, nodes, numbers), m in zip(blocks, inside, strict=True)]
     for table in (_PLANAR, _SOLID):
         sides = [

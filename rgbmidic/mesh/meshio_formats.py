@@ -41,7 +41,7 @@ def read_with_meshio(path: Path, kind: str) -> MeshContent:
     except RgbmidicError:
         raise
     except Exception as error:  # of meshio's readers any may come, from text that is no mesh
-        raise InputError(f"{path} is not a readable mesh ({kind}: {first_line(error)})") from None
+        raise InputError(f"{path} is not a readable mesh ({kind}: {first_line(error)[:120]})") from None
     if said.getvalue():
         logger.warning("%s: %s", path, " ".join(said.getvalue().split()))
     points = np.zeros((len(mesh.points), 3))

@@ -11,7 +11,7 @@ import zlib
 from base64 import b64decode
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from xml.etree import ElementTree
 
 import numpy as np
@@ -115,7 +115,7 @@ class _Arrays:
     """Reads the arrays of a file, as its root element states and with what is appended to it."""
 
     def __init__(self, root: ElementTree.Element, appended: bytes, raw: bool) -> None:
-        self._order = "<" if root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
+        self._order: Literal["<", ">"] = ">" if root.get("byte_order") == "BigEndian" else "<"
         self._header = np.dtype(root.get("header_type", "UInt32").lower()).newbyteorder(self._order)
         self._packing, self._appended, self._raw = root.get("compressor"), appended, raw
         if self._packing not in (None, *_UNPACK):
