@@ -22,8 +22,8 @@ __all__ = ["CORNERS", "MOST_BYTES", "MeshContent", "sized", "text_of", "unique"]
 
 CORNERS = {"triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
 """Shapes that are read, and their corners, in VTK's order."""
-MOST_BYTES = 2**30
-"""Largest file, or unpacked content of one: ten million nodes and elements in text (chosen)."""
+MOST_BYTES = 2**28
+"""Largest file, or unpacked content of one: two million nodes and elements in text (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -59,12 +59,13 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
     unit
         Unit of length of the file, one of `rgbmidic.settings.LENGTH_UNITS`.
     part
-        Only the elements of this set: an Abaqus element set or part, a gmsh physical group. None: all.
+        Only the elements of this set: an Abaqus element set, a gmsh physical group, a Nastran property. None: all.
 
     Raises
     ------
     InputError
-        The file is missing or not readable, meshio is missing, or there is no plane.
+        The file is missing, not readable, larger than what is read or at odds with itself (a number that is stated
+        twice or not at all, elements that overlap); meshio is missing; or there is no plane.
     """
     path = Path(path)
     if unit not in LENGTH_UNITS:
@@ -130,9 +131,7 @@ def _faces(content: MeshContent, path: Path, part: str | None) -> tuple[IntArray
         return faces, numbers
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     if count.max() > 2 or not (count == 1).any():
-        raise InputError(
-            f"element {numbers[first[count.argmax()]]} of {path} overlaps another: they have the same nodes"
-        )
+        raise InputError(f"the solids of {path} overlap, element {numbers[first[count.argmax()]]} among them")
     free = np.sort(first[count == 1])
     return faces[free], numbers[free]
 
