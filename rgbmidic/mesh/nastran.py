@@ -21,7 +21,6 @@ _SHAPES = {
     **{"CTETRA": "tetra", "CPYRAM": "pyramid", "CPYRA": "pyramid", "CPENTA": "wedge", "CHEXA": "hexahedron"},
 }
 """Elements that have faces, whose corners are the first nodes (MSC Nastran, Quick Reference Guide)."""
-_INCLUDE = re.compile(r"\s*INCLUDE\s+['\"]?([^'\"]*)['\"]?\s*", re.IGNORECASE)
 
 
 def read_nastran(path: Path) -> MeshContent:
@@ -57,11 +56,14 @@ def _cards(path: Path) -> Iterator[tuple[str, list[str]]]:
         raise ValueError("it has no BEGIN BULK")
     for line in lines:
         first, given = _fields(line)
-        if first and name:
+        if not first:
+            fields += given
+            continue
+        if name:
             yield name, fields
-        name, fields = (first, given) if first else (name, fields + given)
-        if name == "ENDDATA":
+        if first == "ENDDATA":
             return
+        name, fields = first, given
     raise EOFError("it ends without ENDDATA")
 
 
@@ -77,7 +79,8 @@ def _fields(line: str) -> tuple[str, list[str]]:
 def _lines(path: Path, read: set[str]) -> Iterator[str]:
     """Lines without blank ones and comments, with those of files that are included."""
     for line in text_of(path, read).splitlines():
-        if found := _INCLUDE.fullmatch(line):
-            yield from _lines(path.parent / found[1].strip(), read)
-        elif line := line.partition("$")[0].expandtabs(8).rstrip():
+        line = line.partition("$")[0].expandtabs(8).rstrip()
+        if line.lstrip()[:7].upper() == "INCLUDE":
+            yield from _lines(path.parent / line.lstrip()[7:].strip(" '\""), read)
+        elif line:
             yield line

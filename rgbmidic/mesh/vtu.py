@@ -10,6 +10,7 @@ import lzma
 import zlib
 from base64 import b64decode
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -36,7 +37,7 @@ _THIN = {0, 1, 2, 3, 4, 21, 35}
 """Points and lines."""
 _UNPACK: Mapping[str, Any] = {
     "vtkZLibDataCompressor": zlib.decompressobj,
-    "vtkLZMADataCompressor": lzma.LZMADecompressor,
+    "vtkLZMADataCompressor": partial(lzma.LZMADecompressor, memlimit=MOST_BYTES),
 }
 
 
@@ -58,12 +59,10 @@ def read_vtu(path: Path) -> MeshContent:
     (points,), point_data, cells, cell_data = data[0].values(), *data[1:]
     types, ends, nodes = (cells[name].ravel() for name in ("types", "offsets", "connectivity"))
     counts = (int(pieces[0].get("NumberOfPoints", -1)), int(pieces[0].get("NumberOfCells", -1)))
-    if (
-        (len(points), len(types)) != counts
-        or len(ends) != len(types)
-        or {x.dtype.kind for x in (ends, nodes)} - set("iu")
-    ):
-        raise InputError("points and cells are not those that it announces")
+    if points.shape != (counts[0], 3) or not len(types) == len(ends) == counts[1]:
+        raise InputError("its points and cells are not those that it announces")
+    if not {ends.dtype.kind, nodes.dtype.kind} <= {"i", "u"}:
+        raise InputError("its cells name their nodes by real numbers")
     width = np.diff(ends.astype(np.int64), prepend=0)
     if (width < 0).any() or width.sum() != len(nodes):
         raise InputError("the offsets of its cells are not those of its connectivity")
@@ -72,7 +71,7 @@ def read_vtu(path: Path) -> MeshContent:
     for kind in dict.fromkeys(types.tolist()):
         chosen = np.flatnonzero(types == kind)
         if (shape := _SHAPES.get(kind)) is None:
-            unread |= {f"type {kind}"} - {f"type {thin}" for thin in _THIN}
+            unread |= set() if kind in _THIN else {f"type {kind}"}
             continue
         if (width[chosen] < CORNERS[shape]).any():
             raise InputError(f"a {shape} has fewer nodes than corners")

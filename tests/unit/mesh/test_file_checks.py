@@ -144,7 +144,7 @@ def test_polygons_are_left_out_with_a_word(tmp_path: Path, caplog: pytest.LogCap
 
 def test_files_that_are_included_belong_to_the_mesh(tmp_path: Path, alarm: None) -> None:
     (tmp_path / "grids.bdf").write_text(GRIDS)
-    mesh = read(tmp_path, "a.bdf", BDF.replace(GRIDS, "INCLUDE 'grids.bdf'\n"))
+    mesh = read(tmp_path, "a.bdf", BDF.replace(GRIDS, "include 'grids.bdf'  $ all\n"))
     assert mesh.areas.sum() == 200
     (tmp_path / "nodes.txt").write_text(NODES)
     text = INP.replace("*Node\n" + NODES, "*Node, input=nodes.txt\n")
@@ -225,6 +225,7 @@ def test_a_vtu_whose_cells_do_not_fit_is_refused(tmp_path: Path) -> None:
     for change, message in (
         ({"offsets": [4, 7]}, "the offsets of its cells"),
         ({"offsets": [3, 8]}, "a quad has fewer nodes than corners"),
+        ({"Points": POINTS[:, :2]}, "not those that it announces"),
         ({"types": [9]}, "not those that it announces"),
         ({"U": POINTS[1:]}, "U of nodes are not as many"),
     ):
