@@ -66,7 +66,9 @@ class MeshContent:
         if far.any():
             place = ", ".join(f"{x:g}" for x in self.points[far][0])
             raise InputError(f"node {self.numbers[far][0]} lies at ({place}): coordinates are finite numbers")
-        for _, nodes, labels in self.blocks:
+        for shape, nodes, labels in self.blocks:
+            if nodes.ndim != 2 or nodes.shape[1] < CORNERS[shape]:
+                raise InputError(f"a {shape} has fewer nodes than corners")
             wrong = ((nodes < 0) | (nodes >= len(self.points))).any(axis=1)
             if wrong.any():
                 raise InputError(f"element {labels[wrong][0]} has a node that the file does not state")

@@ -33,7 +33,7 @@ _SHAPES = {
     **dict.fromkeys((12, 25, 29, 33), "hexahedron"),
 }
 """Shapes of VTK's numbers of cell types (vtkCellType.h), linear and quadratic: their corners come first."""
-_THIN = {0, 1, 2, 3, 4, 21, 35}
+_THIN = {1, 2, 3, 4, 21, 35}
 """Points and lines."""
 _UNPACK: Mapping[str, Any] = {
     "vtkZLibDataCompressor": zlib.decompressobj,

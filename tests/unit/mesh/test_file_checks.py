@@ -164,6 +164,12 @@ def test_nastran_s_fields_are_wide_or_narrow_and_go_on(tmp_path: Path) -> None:
     assert read_mesh(tmp_path / "a.nas", part="8").areas.sum() == 100
 
 
+def test_cells_with_fewer_nodes_than_corners_are_refused(tmp_path: Path) -> None:
+    meshio.write(tmp_path / "a.xdmf", meshio.Mesh(POINTS, [("triangle", [[0, 1, 4]])]), data_format="XML")
+    text = (tmp_path / "a.xdmf").read_text()
+    refused(tmp_path, "a.xdmf", text.replace('"Triangle"', '"Quadrilateral"'), "a quad has fewer nodes than corners")
+
+
 def array(values: Any, kind: str, header: str, packing: str, order: str, form: str, at: list[bytes]) -> str:
     """A DataArray of a .vtu as VTK writes it; what is appended is added to `at`."""
     values, size = np.asarray(values), np.dtype(order + header)
