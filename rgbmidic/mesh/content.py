@@ -85,16 +85,16 @@ class MeshContent:
         unique("element", np.array([label for _, label, _ in elements], dtype=np.int64))
         if odd := [label for label, place in nodes if len(place) != 3]:
             raise InputError(f"node {odd[0]} has not three coordinates")
-        index, blocks = {label: i for i, (label, _) in enumerate(nodes)}, []
-        for _, label, corners in elements:
+        index, cells = {label: i for i, (label, _) in enumerate(nodes)}, dict[str, list[list[int]]]()
+        for shape, label, corners in elements:
             if lost := [node for node in corners if node not in index]:
                 raise InputError(f"element {label} has node {lost[0]}, which the file does not state")
-        for shape in dict.fromkeys(shape for shape, *_ in elements):
-            chosen = [(label, [index[node] for node in corners]) for kind, label, corners in elements if kind == shape]
-            if few := [label for label, corners in chosen if len(corners) < CORNERS[shape]]:
-                raise InputError(f"element {few[0]} has fewer nodes than a {shape} has corners")
-            labels, corners = zip(*((label, corners[: CORNERS[shape]]) for label, corners in chosen), strict=True)
-            blocks.append((shape, np.array(corners), np.array(labels, dtype=np.int64)))
+            if len(corners) < CORNERS[shape]:
+                raise InputError(f"element {label} has fewer nodes than a {shape} has corners")
+            cells.setdefault(shape, []).append([label, *(index[node] for node in corners[: CORNERS[shape]])])
+        blocks = [
+            (shape, rows[:, 1:], rows[:, 0]) for shape, rows in zip(cells, map(np.array, cells.values()), strict=True)
+        ]
         points = np.array([place for _, place in nodes], dtype=np.float64).reshape(-1, 3)
         numbers = np.array([label for label, _ in nodes], dtype=np.int64)
         return cls(points=points, numbers=numbers, blocks=blocks, sets=sets, unread=unread)
