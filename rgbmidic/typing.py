@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["AnyArray", "BoolArray", "FloatArray", "FloatImage"]
+__all__ = ["AnyArray", "BoolArray", "FloatArray", "FloatImage", "IntArray"]
 
 AnyArray = npt.NDArray[Any]
 FloatArray = npt.NDArray[np.float64]
@@ -13,3 +13,5 @@ FloatArray = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
 """Grey levels and weights at pixels: single precision."""
 BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+"""Indices, and labels of nodes and elements."""

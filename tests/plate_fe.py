@@ -15,8 +15,7 @@ from textures import Texture
 
 from rgbmidic import correlate
 from rgbmidic.fields.nodal import Places
-from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.mesh.files import FiniteElementMesh, Placement
+from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh
 from rgbmidic.results import FrameRecord
 from rgbmidic.results.comparison import Comparison, FrameComparison, Simulation
 from rgbmidic.typing import FloatArray

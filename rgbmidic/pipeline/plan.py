@@ -30,7 +30,7 @@ from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import QUANTISATION
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
-from rgbmidic.mesh.files import on_image
+from rgbmidic.mesh.placement import on_image
 from rgbmidic.pipeline.source import (
     FrameSequence,
     LightSeparation,

@@ -14,7 +14,7 @@ import pytest
 from rgbmidic import CameraCalibration, FiniteElementMesh, Placement, Tri3Mesh, read_mesh
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh import Region
-from rgbmidic.mesh.files import on_image
+from rgbmidic.mesh.placement import on_image
 
 meshio = pytest.importorskip("meshio")
 
@@ -266,8 +266,8 @@ def test_files_that_are_no_mesh_are_refused(tmp_path: Path, name: str, content: 
 
 
 def test_a_missing_meshio_is_told_with_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = written(tmp_path / "a.vtu")
-    for module in ("meshio", "meshio.vtu"):
+    path = written(tmp_path / "a.vtk")
+    for module in ("meshio", "meshio.vtk"):
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(InputError, match=r'needs the package meshio.*: pip install "rgbmidic\[fe\]"'):
         read_mesh(path)

@@ -1,0 +1,124 @@
+"""Abaqus' input files, with the labels of nodes and elements (meshio keeps neither, nor more than one ``*NODE``)."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from rgbmidic.errors import InputError
+from rgbmidic.mesh.content import CORNERS, MeshContent, text_of
+
+__all__ = ["read_abaqus"]
+
+logger = logging.getLogger(__name__)
+
+_ELEMENT = re.compile(
+    r"(?:(CPS|CPE|CPEG|CAX|CGAX|S|STRI|M3D|R3D|SFM3D|DC2D|DCAX|DS|AC2D|ACAX)|C3D|DC3D|AC3D|SC)(\d+)", re.IGNORECASE
+)
+"""Elements that have faces: planar ones or solids; others (beams, springs, cohesive ones) are not read."""
+_PLANAR = {"3": "triangle", "6": "triangle", "65": "triangle", "4": "quad", "8": "quad", "9": "quad"}
+_SOLIDS = {
+    **{"4": "tetra", "10": "tetra", "5": "pyramid", "13": "pyramid", "6": "wedge", "15": "wedge"},
+    **dict.fromkeys(("8", "20", "27"), "hexahedron"),
+}
+"""Shapes by the number in an element's name, which is that of its nodes (STRI65: six, with five unknowns)."""
+_GENERATED = {"NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM"}
+
+_Rows = list[list[str]]
+
+
+def read_abaqus(path: Path) -> MeshContent:
+    """Read nodes, elements and element sets of an input file, of its one part that has elements, or without parts."""
+    parts = dict[str, tuple[list[tuple[int, list[float]]], list[tuple[str, int, list[int]]]]]()
+    sets, unread, part = dict[str, set[int]](), set[str](), ""
+    stated = list[tuple[dict[str, str], _Rows]]()
+    for keyword, options, rows in _cards(path, set()):
+        nodes, elements = parts.setdefault(part, ([], []))
+        if keyword in _GENERATED or (keyword == "NODE" and options.get("SYSTEM", "R").upper() != "R"):
+            raise InputError(
+                f"{path}: *{keyword} is not read: write nodes and elements out, in rectangular coordinates"
+            )
+        if keyword in ("PART", "END PART"):
+            part = options.get("NAME", "")
+        elif keyword == "INSTANCE" and any(float(x or 0) for row in rows for x in row):
+            logger.warning("%s: the translation of an *INSTANCE is not applied: nodes lie as in their part", path)
+        elif keyword == "NODE":
+            nodes += [(int(n), [float(x or 0) for x in (*place[:3], "", "", "")[:3]]) for n, *place in rows]
+        elif keyword == "ELEMENT":
+            shape, cells = _elements(options["TYPE"], rows)
+            if shape is None:
+                unread.add(f"type {options['TYPE'].upper()}")
+            else:
+                elements += [(shape, label, corners) for label, *corners in cells]
+            if "ELSET" in options:
+                _set(sets, options["ELSET"]).update(label for label, *_ in cells)
+        elif keyword == "ELSET":
+            stated.append((options, rows))
+    meshed = {name: found for name, found in parts.items() if found[1]}
+    if len(meshed) > 1:
+        raise InputError(f"{path} has parts that number their nodes alike ({', '.join(meshed)}): write one of them")
+    if not meshed:
+        raise InputError(f"{path} has no elements that are read: plane ones, shells, membranes or solids")
+    nodes, elements = next(iter(meshed.values()))
+    labels = {label for _, label, _ in elements}
+    for options, rows in stated:
+        members = _set(sets, options["ELSET"])
+        for row in rows:
+            if "GENERATE" in options:
+                first, last, *step = map(int, filter(None, row))
+                span = range(first, last + 1, *step[:1])
+                members.update(
+                    labels.intersection(span) if len(span) < len(labels) else filter(span.__contains__, labels)
+                )
+                continue
+            for name in filter(None, row):
+                if not name.isdigit() and name.lower() not in map(str.lower, sets):
+                    raise InputError(f"the set {options['ELSET']} has {name}, a set that is not stated before")
+                members.update([int(name)] if name.isdigit() else _set(sets, name))
+    return MeshContent.labelled(nodes, elements, {name: list(has) for name, has in sets.items()}, unread)
+
+
+def _set(sets: dict[str, set[int]], name: str) -> set[int]:
+    """Return the set of a name, which may be written in upper or lower case."""
+    return sets.setdefault(next((known for known in sets if known.lower() == name.lower()), name), set())
+
+
+def _elements(name: str, rows: _Rows) -> tuple[str | None, list[list[int]]]:
+    """Shape of a type of elements, None of one that is not read, and the label and corners of each."""
+    planar, size = found.groups() if (found := _ELEMENT.match(name)) else (None, "")
+    if (shape := (_PLANAR if planar else _SOLIDS).get(size)) is None:
+        return None, []
+    width = 1 + (6 if size == "65" else int(size))
+    every = [int(number) for row in rows for number in filter(None, row)]
+    if len(every) % width:
+        raise InputError(f"elements of type {name} have {width - 1} nodes")
+    return shape, [every[i : i + 1 + CORNERS[shape]] for i in range(0, len(every), width)]
+
+
+def _cards(path: Path, read: set[str]) -> Iterator[tuple[str, dict[str, str], _Rows]]:
+    """Keyword, options and rows of data of every card, in their order, with files that are included."""
+    keyword, options, rows = "", dict[str, str](), _Rows()
+    for line in (*_lines(path, read), "*"):
+        entries = [entry.strip() for entry in line.split(",")]
+        if not line.startswith("*"):
+            rows.append(entries)
+            continue
+        if keyword == "INCLUDE":
+            yield from _cards(path.parent / options["INPUT"], read)
+        elif keyword:
+            yield keyword, options, rows
+        elif rows:
+            raise InputError(f'{path} begins with "{rows[0][0][:40]}", which is no keyword')
+        keyword = entries[0][1:].upper()
+        options = {key.strip().upper(): value.strip() for key, _, value in (x.partition("=") for x in entries[1:])}
+        rows = []
+        if keyword in ("NODE", "ELEMENT") and "INPUT" in options:
+            rows = [[x.strip() for x in row.split(",")] for row in _lines(path.parent / options["INPUT"], read)]
+
+
+def _lines(path: Path, read: set[str]) -> list[str]:
+    """Lines of a file without blank ones and comments."""
+    lines = map(str.strip, text_of(path, read).splitlines())
+    return [line for line in lines if line and not line.startswith("**")]

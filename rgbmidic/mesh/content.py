@@ -1,0 +1,122 @@
+"""What a mesh file states, whatever its format: nodes, elements, sets of elements; checked once, here.
+
+A file defines every number once and refers only to what it defines, its nodes lie somewhere, and it is not larger than
+what is read.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from rgbmidic.errors import InputError
+from rgbmidic.settings import regular
+from rgbmidic.typing import FloatArray, IntArray
+
+__all__ = ["CORNERS", "MOST_BYTES", "MeshContent", "sized", "text_of", "unique"]
+
+CORNERS = {"triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
+"""Shapes that are read, and their corners, in VTK's order."""
+MOST_BYTES = 2**28
+"""Largest file, or unpacked content of one: two million nodes and elements in text (chosen)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeshContent:
+    """What a mesh file states.
+
+    Attributes
+    ----------
+    points : ndarray, shape (N, 3)
+        Nodes, in the file's unit.
+    numbers : ndarray, shape (N,), int64
+        Their labels.
+    blocks
+        Shape of cells, one of `CORNERS`; indices (m, corners or more) of their nodes; labels (m,).
+    sets
+        Labels of elements, by the name of their set.
+    fields : mapping of str to ndarray, shape (N, ...)
+        Nodal data.
+    numbering : str
+        Origin of the labels, in words.
+    unread : collection of str
+        Types of elements that are left out.
+    """
+
+    points: FloatArray
+    numbers: IntArray
+    blocks: Sequence[tuple[str, IntArray, IntArray]]
+    sets: Mapping[str, Collection[int]]
+    fields: Mapping[str, FloatArray] = field(default_factory=dict)
+    numbering: str = "labels of the file"
+    unread: Collection[str] = ()
+
+    def __post_init__(self) -> None:
+        """Check that every node is stated once and lies somewhere, and that elements have nodes that are stated."""
+        if lost := [key for key, x in {"numbers": self.numbers, **self.fields}.items() if len(x) != len(self.points)]:
+            raise InputError(f"{lost[0]} of nodes are not as many as nodes")
+        unique("node", self.numbers)
+        # single precision is what most formats hold: what is beyond its range has no square in double
+        far = ~(np.abs(self.points) <= np.finfo(np.float32).max).all(axis=1)
+        if far.any():
+            place = ", ".join(f"{x:g}" for x in self.points[far][0])
+            raise InputError(f"node {self.numbers[far][0]} lies at ({place}): coordinates are finite numbers")
+        for shape, nodes, labels in self.blocks:
+            if nodes.ndim != 2 or nodes.shape[1] < CORNERS[shape]:
+                raise InputError(f"a {shape} has fewer nodes than corners")
+            wrong = ((nodes < 0) | (nodes >= len(self.points))).any(axis=1)
+            if wrong.any():
+                raise InputError(f"element {labels[wrong][0]} has a node that the file does not state")
+
+    @classmethod
+    def labelled(
+        cls,
+        nodes: Sequence[tuple[int, Sequence[float]]],
+        elements: Sequence[tuple[str, int, Sequence[int]]],
+        sets: Mapping[str, Collection[int]],
+        unread: Collection[str],
+    ) -> Self:
+        """Take nodes (label, place) and elements (shape, label, labels of the nodes)."""
+        unique("element", np.array([label for _, label, _ in elements], dtype=np.int64))
+        if odd := [label for label, place in nodes if len(place) != 3]:
+            raise InputError(f"node {odd[0]} has not three coordinates")
+        index, cells = {label: i for i, (label, _) in enumerate(nodes)}, dict[str, list[list[int]]]()
+        for shape, label, corners in elements:
+            if lost := [node for node in corners if node not in index]:
+                raise InputError(f"element {label} has node {lost[0]}, which the file does not state")
+            if len(corners) < CORNERS[shape]:
+                raise InputError(f"element {label} has fewer nodes than a {shape} has corners")
+            cells.setdefault(shape, []).append([label, *(index[node] for node in corners[: CORNERS[shape]])])
+        blocks = [
+            (shape, rows[:, 1:], rows[:, 0]) for shape, rows in zip(cells, map(np.array, cells.values()), strict=True)
+        ]
+        points = np.array([place for _, place in nodes], dtype=np.float64).reshape(-1, 3)
+        numbers = np.array([label for label, _ in nodes], dtype=np.int64)
+        return cls(points=points, numbers=numbers, blocks=blocks, sets=sets, unread=unread)
+
+
+def unique(what: str, labels: IntArray) -> None:
+    """Refuse labels that are there twice."""
+    known, count = np.unique(labels, return_counts=True)
+    if (count > 1).any():
+        raise InputError(f"{what} {known[count > 1][0]} is stated {count[count > 1][0]} times")
+
+
+def sized(path: Path) -> Path:
+    """The path itself, of a regular file that is not larger than what is read."""
+    if (size := regular(path).stat().st_size) > MOST_BYTES:
+        raise InputError(f"{path} has {size} bytes; meshes of up to {MOST_BYTES} are read")
+    return path
+
+
+def text_of(path: Path, read: set[str]) -> str:
+    """Text of a file that another may include; it is added to those that are `read`, which are not read again."""
+    if (place := os.path.realpath(path)) in read:
+        raise InputError(f"{path} is included twice, or includes itself")
+    read.add(place)
+    return sized(path).read_text(encoding="utf-8-sig", errors="replace")

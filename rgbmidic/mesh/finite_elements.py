@@ -1,0 +1,143 @@
+"""The planar part of a finite-element mesh, as three-node triangles with the labels of their file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import InputError
+from rgbmidic.typing import BoolArray, FloatArray, IntArray
+
+__all__ = ["ROUNDING", "FiniteElementMesh", "cross"]
+
+ROUNDING = 1e-4
+"""What rounding leaves of a distance, as a fraction of the mesh's extent: single precision and the eight columns of
+Nastran 1e-6 to 1e-5 (derived)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FiniteElementMesh:
+    """The planar part of a finite-element mesh, as three-node triangles.
+
+    Attributes
+    ----------
+    name : str
+        The file.
+    points : ndarray, shape (N, 2), float64
+        Nodes in mm, in the mesh's own axes: the coordinates `axes` of the file.
+    node_numbers : ndarray, shape (N,), int64
+        Labels of the nodes in the file.
+    elements : ndarray, shape (E, 3), int32
+        Triangles, counter-clockwise in the mesh's axes; a quadrilateral gives two, and only corner nodes are kept.
+    element_numbers : ndarray, shape (E,), int64
+        Labels, in the file, of the elements that the triangles come from.
+    fields : mapping of str to ndarray, shape (N, ...)
+        Nodal data of the file (none of Abaqus and of gmsh in text), in its own unit and components: a vector's
+        component along x is ``[:, axes[0]]``.
+    axes : tuple of int
+        Which coordinates (0, 1, 2) of the file are x and y.
+    unit_mm : float
+        Millimetres per unit of length of the file; multiply a displacement in `fields` by it.
+    numbering : str
+        Origin of the numbers, in words.
+    """
+
+    name: str
+    points: FloatArray
+    node_numbers: IntArray
+    elements: npt.NDArray[np.int32]
+    element_numbers: IntArray
+    fields: Mapping[str, FloatArray] = field(default_factory=dict)
+    axes: tuple[int, int] = (0, 1)
+    unit_mm: float = 1.0
+    numbering: str = "labels of the file"
+
+    def __post_init__(self) -> None:
+        """Check the arrays, convert them to their types and order the corners."""
+        points, elements = np.array(self.points, dtype=np.float64), np.array(self.elements, dtype=np.int32)
+        if points.ndim != 2 or points.shape[1] != 2 or elements.ndim != 2 or elements.shape[1] != 3:
+            raise InputError(
+                f"{self.name}: points are (N, 2) and elements (E, 3), not {points.shape}, {elements.shape}"
+            )
+        if not np.isfinite(points).all() or not len(elements) or elements.min() < 0 or elements.max() >= len(points):
+            raise InputError(f"{self.name}: points must be finite and elements must name existing ones")
+        area = cross(points, elements)
+        if not (np.abs(area) > 1e-12 * np.ptp(points, axis=0).max() ** 2).all():
+            number = np.asarray(self.element_numbers)[np.argmin(np.abs(area))]
+            raise InputError(f"{self.name}: element {number} has no area")
+        elements[area < 0] = elements[area < 0][:, [0, 2, 1]]
+        for key, values, count in (
+            ("points", points, len(points)),
+            ("elements", elements, len(elements)),
+            ("node_numbers", np.array(self.node_numbers, dtype=np.int64), len(points)),
+            ("element_numbers", np.array(self.element_numbers, dtype=np.int64), len(elements)),
+        ):
+            if len(values) != count:
+                raise InputError(f"{self.name}: {key} needs {count} entries, not {len(values)}")
+            values.setflags(write=False)
+            object.__setattr__(self, key, values)
+
+    def part(self, chosen: BoolArray) -> Self:
+        """Return the chosen triangles (E,), and their nodes."""
+        used, index = np.unique(self.elements[chosen], return_inverse=True)
+        return replace(
+            self,
+            points=self.points[used],
+            node_numbers=self.node_numbers[used],
+            elements=index.reshape(-1, 3).astype(np.int32),
+            element_numbers=self.element_numbers[chosen],
+            fields={key: values[used] for key, values in self.fields.items()},
+        )
+
+    @property
+    def areas(self) -> FloatArray:
+        """Area (E,) of every triangle, square mm."""
+        return cross(self.points, self.elements) / 2
+
+    def overlap(self) -> tuple[int, int] | None:
+        """Numbers of two elements whose triangles overlap by more than rounding; None: no two do.
+
+        The triangles are sorted into strips along x, and those within a strip by their left ends. Two of them overlap
+        by the least depth along the normals of their sides (separating axis theorem).
+        """
+        corners = self.points[self.elements]
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        extent = np.ptp(self.points, axis=0)
+        strips = int(np.ceil(np.sqrt(len(corners))))
+        first, last = (
+            ((side[:, 1] - self.points[:, 1].min()) / extent[1] * strips).astype(np.int64) for side in (low, high)
+        )
+        count = last - first + 1
+        triangle = np.repeat(np.arange(len(count)), count)
+        strip = first[triangle] + np.arange(len(triangle)) - (np.cumsum(count) - count)[triangle]
+        order = np.lexsort((low[triangle, 0], strip))
+        triangle, strip = triangle[order], strip[order]
+        left, right = (strip * 2 + (side[triangle, 0] - self.points[:, 0].min()) / extent[0] for side in (low, high))
+        end = np.searchsorted(left, right)
+        one, step = np.arange(len(triangle)), 1
+        while len(one := one[one + step < end[one]]):
+            a, b = triangle[one], triangle[one + step]
+            beside = (low[a, 1] < high[b, 1]) & (low[b, 1] < high[a, 1])
+            a, b = a[beside], b[beside]
+            depth = np.minimum(_depth(corners[a], corners[b]), _depth(corners[b], corners[a]))
+            if (depth > ROUNDING * extent.max()).any():
+                return int(self.element_numbers[a[depth.argmax()]]), int(self.element_numbers[b[depth.argmax()]])
+            step += 1
+        return None
+
+
+def _depth(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Depth (n,) of triangles `other` (n, 3, 2) within `one`, which turns as the axes do, from its nearest side."""
+    side = np.roll(one, -1, axis=1) - one
+    inward = np.stack([-side[..., 1], side[..., 0]], axis=2) / np.linalg.norm(side, axis=2, keepdims=True)
+    return np.asarray(np.einsum("nsk,nsck->nsc", inward, other[:, None] - one[:, :, None]).max(axis=2).min(axis=1))
+
+
+def cross(points: FloatArray, elements: npt.NDArray[np.integer]) -> FloatArray:
+    """Twice the signed area (...) of triangles (..., 3)."""
+    first, second = (points[elements[..., corner]] - points[elements[..., 0]] for corner in (1, 2))
+    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])

@@ -1,0 +1,86 @@
+"""Nastran's bulk data, in fixed and free fields, with its labels and included files.
+
+meshio drops ``INCLUDE``, elements in large fields and coordinate systems without a word.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from rgbmidic.errors import InputError
+from rgbmidic.mesh.content import CORNERS, MeshContent, text_of
+
+__all__ = ["read_nastran"]
+
+_SHAPES = {
+    **dict.fromkeys(("CTRIA3", "CTRIAR", "CTRIA6", "CPLSTN3", "CPLSTN6", "CPLSTS3", "CPLSTS6"), "triangle"),
+    **dict.fromkeys(("CQUAD4", "CQUADR", "CQUAD8", "CQUAD", "CSHEAR"), "quad"),
+    **dict.fromkeys(("CPLSTN4", "CPLSTN8", "CPLSTS4", "CPLSTS8"), "quad"),
+    **{"CTETRA": "tetra", "CPYRAM": "pyramid", "CPYRA": "pyramid", "CPENTA": "wedge", "CHEXA": "hexahedron"},
+}
+"""Elements that have faces, whose corners are the first nodes (MSC Nastran, Quick Reference Guide)."""
+
+
+def read_nastran(path: Path) -> MeshContent:
+    """Read nodes and elements; the elements of a property are a set."""
+    nodes, elements = list[tuple[int, list[float]]](), list[tuple[str, int, list[int]]]()
+    sets, unread = dict[str, list[int]](), set[str]()
+    for name, fields in _cards(path):
+        if name in ("GRID", "GRDSET"):
+            label, system, *place = (*fields, "", "", "", "")[:5]
+            if system not in ("", "0"):
+                raise InputError(f"{name} {label} has the coordinate system {system}: write nodes in the basic one")
+            if name == "GRID":
+                nodes.append((int(label), [_real(x) for x in place]))
+        elif (shape := _SHAPES.get(name)) is not None:
+            label, property_, *corners = fields
+            elements.append((shape, int(label), [int(node) for node in corners[: CORNERS[shape]]]))
+            sets.setdefault(property_ or label, []).append(int(label))
+        elif name.startswith("C") and not name.startswith("CORD"):
+            unread.add(name)
+    return MeshContent.labelled(nodes, elements, sets, unread)
+
+
+def _real(text: str) -> float:
+    """Value of a real number, whose exponent may be a sign and digits alone."""
+    return float(re.sub(r"(?<=[\d.])(?=[+-])", "E", text.upper().replace("D", "E"))) if text else 0.0
+
+
+def _cards(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Name and fields of every entry of the bulk data, without marks of continuation."""
+    name, fields = "", list[str]()
+    lines = _lines(path, set())
+    if not any(re.match(r"\s*BEGIN\s+BULK", line, re.IGNORECASE) for line in lines):
+        raise ValueError("it has no BEGIN BULK")
+    for line in lines:
+        first, given = _fields(line)
+        if not first:
+            fields += given
+            continue
+        if name:
+            yield name, fields
+        if first == "ENDDATA":
+            return
+        name, fields = first, given
+    raise EOFError("it ends without ENDDATA")
+
+
+def _fields(line: str) -> tuple[str, list[str]]:
+    """Name of an entry, empty of one that goes on, and its eight fields, or four large ones."""
+    first = (line.split(",")[0] if "," in line else line[:8]).strip().upper()
+    number, width = (4, 16) if "*" in first else (8, 8)
+    given = line.split(",")[1:] if "," in line else [line[i : i + width] for i in range(8, 72, width)]
+    name = "" if first.startswith(("+", "*")) else first.rstrip("*").rstrip()
+    return name, [entry.strip() for entry in (*given, *[""] * number)[:number]]
+
+
+def _lines(path: Path, read: set[str]) -> Iterator[str]:
+    """Lines without blank ones and comments, with those of files that are included."""
+    for line in text_of(path, read).splitlines():
+        line = line.partition("$")[0].expandtabs(8).rstrip()
+        if line.lstrip()[:7].upper() == "INCLUDE":
+            yield from _lines(path.parent / line.lstrip()[7:].strip(" '\""), read)
+        elif line:
+            yield line

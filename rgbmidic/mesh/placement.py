@@ -1,0 +1,255 @@
+"""Position of a finite-element mesh on the image, fitted to pairs of points.
+
+A placement is a similarity of the mesh's plane to the image, or a rigid motion of it to the plane of a calibrated
+camera (Umeyama, IEEE Transactions on Pattern Analysis and Machine Intelligence 13, 1991).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic._kernels.mesh import claim_pixels
+from rgbmidic.errors import InputError, RegionError
+from rgbmidic.mesh.finite_elements import FiniteElementMesh
+from rgbmidic.mesh.region import Region
+from rgbmidic.mesh.tri3 import Tri3Mesh
+from rgbmidic.typing import FloatArray
+
+__all__ = ["Placement", "Plane", "on_image"]
+
+logger = logging.getLogger(__name__)
+
+
+class Plane(Protocol):
+    """Map between px of the image and mm on a plane: `rgbmidic.CameraCalibration`."""
+
+    def to_mm(self, points: FloatArray) -> FloatArray:
+        """Return mm on the plane (N, 2) of points (N, 2) in px."""
+
+    def to_px(self, points: FloatArray) -> FloatArray:
+        """Return px of points (N, 2) in mm on the plane."""
+
+    def jacobian(self, points: FloatArray) -> FloatArray:
+        """Return the derivative (N, 2, 2) of `to_mm` at points (N, 2) in px: ``[n, mm axis, px axis]``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Placement:
+    """Position of a mesh in mm on the image.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (2, 2)
+        Maps the mesh's mm to px, or to mm on the camera's plane if there is a `camera`.
+    shift : ndarray, shape (2,)
+        Position of the mesh's origin, in the same unit.
+    camera
+        Lens and plane; None: the image is similar to the mesh (rotated, shifted and scaled).
+    pairs : ndarray, shape (n, 4)
+        The pairs (x_mm, y_mm, x_px, y_px) that it was fitted to.
+    """
+
+    matrix: FloatArray
+    shift: FloatArray
+    camera: Plane | None = None
+    pairs: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
+
+    @classmethod
+    def fit(cls, pairs: npt.ArrayLike, camera: Plane | None = None, *, where: str = "mesh.points") -> Self:
+        """Fit a placement to pairs of points by least squares.
+
+        Without a camera it is a similarity: shift, rotation and scale. With one it is a rigid motion, for both have mm.
+        Whether the image shows the mesh or its mirror image is what fits three or more pairs better; where they do not
+        decide, the mesh's y axis points up (and the image's down). The log states a doubt, and residuals beyond those
+        of points set by hand.
+
+        Parameters
+        ----------
+        pairs : array_like, shape (n, 4)
+            (x_mm, y_mm, x_px, y_px), two or more.
+        camera
+            Lens and plane.
+        where
+            Name of the pairs in messages.
+
+        Raises
+        ------
+        InputError
+            Fewer than two pairs, or two at one place.
+        """
+        given = np.array(pairs, dtype=np.float64)
+        if given.ndim != 2 or given.shape[1] != 4 or len(given) < 2 or not np.isfinite(given).all():
+            raise InputError(f"{where} is two or more pairs [x_mm, y_mm, x_px, y_px] of finite numbers, not {pairs!r}")
+        for part, what in ((given[:, :2], "on the mesh"), (given[:, 2:], "on the image")):
+            same = np.argwhere(np.triu((part[:, None] == part).all(axis=2), 1))
+            if len(same):
+                raise InputError(f"{where}: pairs {same[0].tolist()} are one point {what}")
+        if camera is not None:
+            on_plane, on_mesh = (part - part.mean(axis=0) for part in (camera.to_mm(given[:, 2:]), given[:, :2]))
+            stretch = np.linalg.norm(on_plane) / np.linalg.norm(on_mesh)
+            if not 1 / _STRETCHED < stretch < _STRETCHED:
+                raise InputError(
+                    f"the pairs of {where} lie {stretch:.4g} times as far apart on the camera's plane as on the mesh, "
+                    "where both are in mm: look at mesh.unit, the points and the calibration"
+                )
+        best, other = (cls._fitted(given, camera, reflected) for reflected in (True, False))
+        if len(given) > 2 and max(best.rms, other.rms) < _DECIDED * max(min(best.rms, other.rms), _POINTING):
+            logger.warning(
+                "%s does not decide whether the image shows the mesh or its mirror image: up is taken", where
+            )
+        elif len(given) > 2 and other.rms < best.rms:
+            best = other
+        if best.rms > _DECIDED * _POINTING:
+            off = np.hypot(*best.residuals.T)
+            text = "%s leaves residuals of %.1f px rms, the largest, %.1f px, at %s[%d]: check the pairs"
+            logger.warning(text, where, best.rms, off.max(), where, off.argmax())
+        return best
+
+    @classmethod
+    def _fitted(cls, pairs: FloatArray, camera: Plane | None, reflected: bool) -> Self:
+        """Fit one of both senses of rotation, in complex numbers: ``w = a z + b`` of z or its conjugate."""
+        image = pairs[:, 2:] if camera is None else camera.to_mm(pairs[:, 2:])
+        sign = -1.0 if reflected else 1.0
+        z, w = pairs[:, 0] + sign * 1j * pairs[:, 1], image[:, 0] + 1j * image[:, 1]
+        a = np.vdot(z - z.mean(), w - w.mean()) / np.vdot(z - z.mean(), z - z.mean())
+        a /= 1 if camera is None else abs(a)
+        b = w.mean() - a * z.mean()
+        matrix = np.array([[a.real, -sign * a.imag], [a.imag, sign * a.real]])
+        return cls(matrix=matrix, shift=np.array([b.real, b.imag]), camera=camera, pairs=pairs)
+
+    @property
+    def reflected(self) -> bool:
+        """Whether a counter-clockwise turn of the mesh (x right, y up) is one on the screen, where y points down."""
+        return bool(np.linalg.det(self.matrix) < 0)
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Distance (n, 2) in px from the image's point of every pair to where the mesh's is placed."""
+        return self.to_px(self.pairs[:, :2]) - self.pairs[:, 2:]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square length of the residuals, px."""
+        return float(np.sqrt((self.residuals**2).sum(axis=1).mean()))
+
+    @property
+    def mm_per_pixel(self) -> float | None:
+        """Millimetres of the mesh in a px; None with a camera, which has a scale of its own at every pixel."""
+        return None if self.camera is not None else float(1 / np.sqrt(abs(np.linalg.det(self.matrix))))
+
+    @property
+    def mm_per_pixel_std(self) -> float:
+        """Standard uncertainty of `mm_per_pixel` from the residuals; 0 where two pairs leave none, or with a camera."""
+        free = 2 * len(self.pairs) - 4
+        if self.camera is not None or free < 1 or self.mm_per_pixel is None:
+            return 0.0
+        spread = ((self.pairs[:, 2:] - self.pairs[:, 2:].mean(axis=0)) ** 2).sum()
+        return float(self.mm_per_pixel * np.sqrt((self.residuals**2).sum() / free / spread))
+
+    def to_px(self, points: FloatArray) -> FloatArray:
+        """Return where points (N, 2) of the mesh, in mm, lie on the image, px."""
+        places = points @ self.matrix.T + self.shift
+        return places if self.camera is None else self.camera.to_px(places)
+
+    def to_mm(self, points: FloatArray) -> FloatArray:
+        """Return points (N, 2) of the image, in px, in mm in the mesh's axes."""
+        places = points if self.camera is None else self.camera.to_mm(points)
+        return np.asarray((places - self.shift) @ np.linalg.inv(self.matrix).T)
+
+    def jacobian(self, points: FloatArray) -> FloatArray:
+        """Derivative (N, 2, 2) of `to_mm` at points (N, 2) in px: ``[n, mesh axis, px axis]``, mm per px."""
+        back = np.linalg.inv(self.matrix)
+        if self.camera is None:
+            return np.broadcast_to(back, (len(points), 2, 2)).copy()
+        return np.asarray(back @ self.camera.jacobian(points))
+
+    def vectors_to_mm(self, points: FloatArray, vectors: FloatArray) -> FloatArray:
+        """Displacements (N, 2) in mm in the mesh's axes, of `vectors` (N, 2) in px from `points` (N, 2) in px."""
+        return self.to_mm(points + vectors) - self.to_mm(points)
+
+    def vectors_to_px(self, points: FloatArray, vectors: FloatArray) -> FloatArray:
+        """Displacements (N, 2) in px, of `vectors` (N, 2) in mm from `points` (N, 2) in mm, in the mesh's axes."""
+        return self.to_px(points + vectors) - self.to_px(points)
+
+    def to_document(self) -> dict[str, Any]:
+        """Return all but the camera in plain values, as the provenance of a result holds it."""
+        return {name: getattr(self, name).tolist() for name in ("matrix", "shift", "pairs")}
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], camera: Plane | None = None) -> Self:
+        """Return the placement of such values, and the `camera` that it was fitted with."""
+        values = {name: np.array(document[name], dtype=np.float64) for name in ("matrix", "shift", "pairs")}
+        return cls(**values, camera=camera)
+
+    def summary(self) -> str:
+        """Return what it is, in words."""
+        turned = np.degrees(np.arctan2(self.matrix[1, 0], self.matrix[0, 0]))
+        scale = (
+            "" if self.mm_per_pixel is None else f"{self.mm_per_pixel:.6g} ± {self.mm_per_pixel_std:.2g} mm per px, "
+        )
+        fit = f"{len(self.pairs)} pairs, residuals {self.rms:.2g} px rms"
+        return f"{scale}x axis at {turned:.2f} degrees, y axis {'up' if self.reflected else 'down'}; {fit}"
+
+
+def on_image(
+    finite_elements: FiniteElementMesh, placement: Placement, shape: tuple[int, int], inside: Region | None = None
+) -> tuple[FiniteElementMesh, Tri3Mesh, Region]:
+    """Place a mesh on images of `shape` (H, W); the log states how much of it is left out.
+
+    Parameters
+    ----------
+    finite_elements, placement
+        The mesh, and where it lies.
+    shape
+        Rows and columns of the images.
+    inside
+        Only triangles whose centre lies in it.
+
+    Returns
+    -------
+    tuple
+        The part of the mesh that is measured, wholly within the image; the same in px; and the pixels that it covers.
+
+    Raises
+    ------
+    RegionError
+        No element is left.
+    """
+    corners = placement.to_px(finite_elements.points)[finite_elements.elements]
+    last = np.array([shape[1] - 1, shape[0] - 1])
+    within = np.asarray(((corners >= 0) & (corners <= last)).all(axis=(1, 2)), dtype=bool).reshape(-1)
+    kept = within.copy()
+    if inside is not None:
+        column, row = np.clip(np.round(corners[within].mean(axis=1)).astype(int), 0, last).T
+        kept[within] = inside.mask[row, column]
+    if not kept.any():
+        low, high = np.nanmin(corners, axis=(0, 1)), np.nanmax(corners, axis=(0, 1))
+        raise RegionError(
+            f"no element of {finite_elements.name} lies in the {'region' if within.any() else 'image'}: mesh.points "
+            f"place it at x {low[0]:.0f} to {high[0]:.0f}, y {low[1]:.0f} to {high[1]:.0f} px of an image of "
+            f"{shape[1]} x {shape[0]} px"
+        )
+    every = len(kept)
+    for count, where in ((every - int(within.sum()), "the image"), (int((within & ~kept).sum()), "the region")):
+        if count:
+            logger.warning("%s: %d of %d triangles lie outside %s: left out", finite_elements.name, count, every, where)
+    part = finite_elements.part(kept)
+    mesh = Tri3Mesh(nodes=placement.to_px(part.points), elements=part.elements)
+    owner = np.full(shape, -1, dtype=np.int32)
+    claim_pixels(mesh.nodes, mesh.elements, owner)
+    return part, mesh, Region.from_mask(owner >= 0)
+
+
+_POINTING = 0.5
+"""Residuals (px) that a point set by hand may have, and that decide nothing: a click is on a whole pixel (chosen)."""
+_DECIDED = 3.0
+"""How many times larger the residuals of the other sense must be for pairs to decide (chosen: beyond any scatter)."""
+_STRETCHED = 1.05
+"""Ratio of lengths on the mesh and on a camera's plane beyond which they contradict each other (chosen: a wrong unit is
+25 or more, a scale that is known to 5 % is no calibration)."""

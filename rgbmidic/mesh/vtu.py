@@ -1,0 +1,163 @@
+"""VTK's unstructured grids in XML (``.vtu``): in text, in base64 or raw, packed or not; and labels that VTK files keep.
+
+The layout is that of "VTK XML Formats" (docs.vtk.org). meshio's reader takes a node -1 for the last, only the last of
+several pieces, and unpacks without a limit.
+"""
+
+from __future__ import annotations
+
+import lzma
+import zlib
+from base64 import b64decode
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+from xml.etree import ElementTree
+
+import numpy as np
+
+from rgbmidic.errors import InputError
+from rgbmidic.mesh.content import CORNERS, MOST_BYTES, MeshContent, sized
+from rgbmidic.typing import AnyArray, IntArray
+
+__all__ = ["NUMBERS", "labels_of", "read_vtu"]
+
+NUMBERS = ("GlobalNodeId", "node_number", "node_id", "NodeId", "GlobalElementId", "element_number", "element_id")
+"""Names under which VTK files keep labels: ParaView's of both, this package's own, and those of converters."""
+_SHAPES = {
+    **dict.fromkeys((5, 22, 34), "triangle"),
+    **dict.fromkeys((9, 23, 28, 30), "quad"),
+    **{10: "tetra", 24: "tetra", 14: "pyramid", 27: "pyramid"},
+    **dict.fromkeys((13, 26, 31, 32), "wedge"),
+    **dict.fromkeys((12, 25, 29, 33), "hexahedron"),
+}
+"""Shapes of VTK's numbers of cell types (vtkCellType.h), linear and quadratic: their corners come first."""
+_THIN = {1, 2, 3, 4, 21, 35}
+"""Points and lines."""
+_UNPACK: Mapping[str, Any] = {
+    "vtkZLibDataCompressor": zlib.decompressobj,
+    "vtkLZMADataCompressor": partial(lzma.LZMADecompressor, memlimit=MOST_BYTES),
+}
+
+
+def read_vtu(path: Path) -> MeshContent:
+    """Read the one piece of a file."""
+    head, mark, tail = sized(path).read_bytes().partition(b"<AppendedData")
+    encoding, _, appended = tail.partition(b"_")
+    try:
+        root = ElementTree.fromstring(head + b"</VTKFile>" if mark else head)
+        arrays = _Arrays(root, appended, b"raw" in encoding)
+        if len(pieces := root.findall("UnstructuredGrid/Piece")) != 1:
+            raise ValueError(f"it has {len(pieces)} pieces of an unstructured grid: write it as one")
+        data: list[dict[str, AnyArray]] = [
+            {item.get("Name", ""): arrays.read(item) for item in pieces[0].iterfind(f"{section}/DataArray")}
+            for section in ("Points", "PointData", "Cells", "CellData")
+        ]
+    except (ElementTree.ParseError, zlib.error, lzma.LZMAError) as error:
+        raise InputError(f"{path} is not a readable mesh: {error}") from None
+    (points,), point_data, cells, cell_data = data[0].values(), *data[1:]
+    types, ends, nodes = (cells[name].ravel() for name in ("types", "offsets", "connectivity"))
+    counts = (int(pieces[0].get("NumberOfPoints", -1)), int(pieces[0].get("NumberOfCells", -1)))
+    if points.shape != (counts[0], 3) or not len(types) == len(ends) == counts[1]:
+        raise InputError("its points and cells are not those that it announces")
+    if not {ends.dtype.kind, nodes.dtype.kind} <= {"i", "u"}:
+        raise InputError("its cells name their nodes by real numbers")
+    width = np.diff(ends.astype(np.int64), prepend=0)
+    if (width < 0).any() or width.sum() != len(nodes):
+        raise InputError("the offsets of its cells are not those of its connectivity")
+    numbers, labels, numbering = labels_of(point_data, cell_data, counts, 0)
+    blocks, unread = [], set[str]()
+    for kind in dict.fromkeys(types.tolist()):
+        chosen = np.flatnonzero(types == kind)
+        if (shape := _SHAPES.get(kind)) is None:
+            unread |= set() if kind in _THIN else {f"type {kind}"}
+            continue
+        if (width[chosen] < CORNERS[shape]).any():
+            raise InputError(f"a {shape} has fewer nodes than corners")
+        first = (ends[chosen].astype(np.int64) - width[chosen])[:, None]
+        blocks.append((shape, nodes[first + np.arange(CORNERS[shape])].astype(np.int64), labels[chosen]))
+    return MeshContent(
+        points=points.astype(np.float64),
+        numbers=numbers,
+        blocks=blocks,
+        sets={},
+        fields={key: x.astype(np.float64) for key, x in point_data.items() if key not in NUMBERS},
+        numbering=numbering,
+        unread=unread,
+    )
+
+
+def labels_of(
+    point_data: Mapping[str, Any], cell_data: Mapping[str, Any], counts: tuple[int, int], first: int
+) -> tuple[IntArray, IntArray, str]:
+    """Return the labels of points and cells among their data, else counted from `first`, and where they are from."""
+    numbers, labels = (np.arange(first, first + count) for count in counts)
+    stated = f"counted from {first} in the order of the file, which has no labels that can be read"
+    for name in NUMBERS:
+        if name in point_data:
+            numbers, stated = _whole(name, point_data[name], counts[0]), f'point data "{name}"'
+        if name in cell_data:
+            labels = _whole(name, cell_data[name], counts[1])
+    return numbers, labels, stated
+
+
+def _whole(name: str, values: Any, count: int) -> IntArray:
+    """Labels, of which some converters make real numbers."""
+    given = np.asarray(values, dtype=np.float64).ravel()
+    if len(given) != count or not (np.abs(given) < 2**53).all() or (given % 1 != 0).any():
+        raise InputError(f'the numbers "{name}" are not {count} whole ones')
+    return given.astype(np.int64)
+
+
+class _Arrays:
+    """Reads the arrays of a file, as its root element states and with what is appended to it."""
+
+    def __init__(self, root: ElementTree.Element, appended: bytes, raw: bool) -> None:
+        self._order: Literal["<", ">"] = ">" if root.get("byte_order") == "BigEndian" else "<"
+        self._header = np.dtype(root.get("header_type", "UInt32").lower()).newbyteorder(self._order)
+        self._packing, self._appended, self._raw = root.get("compressor"), appended, raw
+        if self._packing not in (None, *_UNPACK):
+            raise InputError(f"it is packed by {self._packing}; {' and '.join(_UNPACK)} are read")
+
+    def read(self, item: ElementTree.Element) -> AnyArray:
+        """Return the values of an array, (n,) or (n, components)."""
+        kind = np.dtype(item.get("type", "").lower()).newbyteorder(self._order)
+        form, text = item.get("format", "ascii"), (item.text or "").strip()
+        if form == "ascii":
+            values = np.array(text.split(), dtype=kind)
+        elif form == "binary":
+            values = np.frombuffer(self._bytes(text.encode(), raw=False), kind)
+        else:
+            values = np.frombuffer(self._bytes(self._appended[int(item.get("offset", "")) :], raw=self._raw), kind)
+        width = int(item.get("NumberOfComponents") or 1)
+        return values if width == 1 else values.reshape(-1, width)
+
+    def _bytes(self, stream: bytes, raw: bool) -> bytes:
+        """Content at the beginning of a stream, which is preceded by its size, or by the sizes of its packed blocks."""
+
+        def take(at: int, size: int) -> tuple[bytes, int]:
+            end = at + (size if raw else -(-size // 3) * 4)
+            taken = stream[at:end] if raw else b64decode(stream[at:end])[:size]
+            if len(taken) < size:
+                raise EOFError
+            return taken, end
+
+        wide = self._header.itemsize
+        first, at = take(0, wide)
+        count = int(np.frombuffer(first, self._header)[0])
+        if self._packing is None:  # in base64 the size is a stream of its own, or of one with the content
+            return take(at, count)[0] if raw or stream[at - 1 : at] == b"=" else take(0, wide + count)[0][wide:]
+        sizes, at = take(0, wide * (3 + count))
+        _, largest, _, *lengths = np.frombuffer(sizes, self._header).tolist()
+        if count * largest > MOST_BYTES:
+            raise InputError(f"an array has {count * largest} bytes; up to {MOST_BYTES} are read")
+        packed, _ = take(at, sum(lengths))
+        blocks, start = [], 0
+        for length in lengths:
+            unpacking = _UNPACK[self._packing]()
+            blocks.append(unpacking.decompress(packed[start : start + length], largest + 1))
+            start += length
+            if not unpacking.eof or len(blocks[-1]) > largest:
+                raise InputError("a packed block is cut, or larger than it states")
+        return b"".join(blocks)
