@@ -85,21 +85,23 @@ def agreement(displacement: FloatArray, variance: FloatArray, precision: FloatAr
     Returns
     -------
     tuple of ndarray, shape (k, h, w) and (h, w)
-        Weights of the lights, their sum 1; the weighted mean, 0 to 1, of the others' agreement with each.
+        Weights of the lights, their sum 1; the weighted mean, 0 to 1, of how far each agrees with its nearest.
     """
     believed = precision / np.maximum(precision.sum(axis=0), 1e-30)
-    alike = np.zeros_like(believed)
+    alike, nearest = np.zeros_like(believed), np.zeros_like(believed)
     lights = range(len(believed))
     for light in lights:
         for other in lights:
             if other != light:
                 apart = ((displacement[light] - displacement[other]) ** 2).sum(axis=0)
                 beyond = np.maximum(apart - 2 * (variance[light] + variance[other]), 0)
-                alike[light] += believed[other] / (1 + beyond / HARMLESS**2)
+                near = 1 / (1 + beyond / HARMLESS**2)
+                alike[light] += believed[other] * near
+                nearest[light] = np.maximum(nearest[light], near)
         alike[light] /= np.maximum(1 - believed[light], 1e-6)
     weights = believed * (ALONE + alike) ** 2
     weights /= np.maximum(weights.sum(axis=0), 1e-30)
-    return weights, (weights * alike).sum(axis=0)
+    return weights, (weights * nearest).sum(axis=0)
 
 
 def light_displacement(
