@@ -165,9 +165,8 @@ def test_what_runs_at_cracks_is_what_the_provenance_says(normalise, brightness, 
         illumination={"normalise": normalise},
         solver={"brightness": brightness},
     )
-    runs = (
-        {"normalise": 30.0, "brightness": "mean"} if normalise == "auto" else {"normalise": 12.0, "brightness": "none"}
-    )
+    sigma, correction = (30.0, "mean") if normalise == "auto" else (12.0, "none")
+    runs = {"normalise": sigma, "brightness": correction}
     plan = Plan.from_settings(stated, source=[frame(0), frame(1)])
     assert {"normalise": plan.normalise, "brightness": plan.solver.brightness} == runs
     result = measure(stated, tmp_path / "out", source=[frame(0), frame(1)])
