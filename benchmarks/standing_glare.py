@@ -17,7 +17,7 @@ from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.source import Separation, correlated, reference_images
 from rgbmidic.scene.camera import REFERENCE_CROSSTALK
-from rgbmidic.settings import ELEMENT_SIZE, IlluminationSettings, SolverSettings
+from rgbmidic.settings import ELEMENT_SIZE, SolverSettings
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import Statistics
 
@@ -146,7 +146,7 @@ def standing_glare(quick: bool) -> Iterator[Row]:
     """
     crosstalk = Crosstalk(matrix=CROSSTALK, lights=("red", "green", "blue"))
     calibration = Calibration(crosstalk=crosstalk, noise=NoiseModel(gain=GAIN, read_noise=READ_NOISE))
-    settings, solver = IlluminationSettings(), SolverSettings()
+    solver = SolverSettings()
     for draw in range(1 if quick else 6):
         plate = HoledPlate.drawn(draw)
         renderer, region = _Renderer(plate), plate.region()
@@ -155,10 +155,10 @@ def standing_glare(quick: bool) -> Iterator[Row]:
             Separation(calibration=calibration), frames[: plate.rest], Window.whole(frames[0][0].values.shape[-2:])
         )
         mesh = Tri3Mesh.from_region(region, ELEMENT_SIZE)
-        reference = Reference.prepare(correlated(images, settings), region, mesh=mesh, prefilter=solver.prefilter)
+        reference = Reference.prepare(correlated(images), region, mesh=mesh, prefilter=solver.prefilter)
         start, errors, stated = Start(displacement=np.zeros_like(mesh.nodes)), [], []
         for number in range(plate.rest, len(frames)):
-            ready = correlated(separation(frames[number]), settings)
+            ready = correlated(separation(frames[number]))
             found = track(reference, Deformed.prepare(ready, prefilter=solver.prefilter), start, solver, Statistics())
             start = start.after(mesh, found.displacement, found.measured)
             errors.append(found.displacement - plate.displacement(mesh.nodes, number))

@@ -393,7 +393,12 @@ def frames(
 @app.command()
 @command.frame_options
 def inspect(
-    frames: Annotated[list[Path], typer.Argument(metavar="FRAME...", help="A raw frame; in succession one per light.")],
+    frames: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FRAME...", help="A raw frame; in succession one per light; or TEST.toml: its reference."
+        ),
+    ],
     statement: dict[str, Any],
     test: Annotated[Path | None, typer.Option("--test", help="TEST.toml of the test.")] = None,
     calibration: Annotated[Path | None, typer.Option("--calibration", help="Calibration file.")] = None,
@@ -411,6 +416,10 @@ def inspect(
 
     if out is not None:
         check_folder(out, report.FILES, overwrite=overwrite)
+    if any(path.suffix.lower() == ".toml" for path in frames):
+        if test is not None or len(frames) > 1:
+            raise InputError("a TEST.toml stands for the frames of its reference: give it alone, or frames and --test")
+        test, frames = frames[0], []
     settings = read_settings(test)
     _explain_first_run()
     with progress_of("inspecting") as progress:
@@ -418,7 +427,7 @@ def inspect(
             frames,
             test=settings,
             calibration=calibration,
-            frame=state_frames(settings, count=len(frames), **statement),
+            frame=state_frames(settings, count=max(len(frames), 1), **statement),
             region=command.read_place(region, "--region", "X0,Y0,X1,Y1") if region else None,
             element_size=element_size,
             accept=tuple(accept) if accept else None,

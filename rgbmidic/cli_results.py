@@ -210,6 +210,8 @@ def report(
     from rgbmidic.results import Result
 
     file, chosen, settings = out or result / REPORT, frame_indices(frames), read_settings(test)
+    if file.suffix.lower() not in (".html", ".htm"):  # which browsers do not open as a page
+        file = file.with_name(f"{file.name}.html")
     opened = Result.open(result, partial=partial)
     write_report(opened, file, settings=settings, frames=chosen, overwrite=overwrite)
     print(file)

@@ -13,7 +13,7 @@ import operator
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path, PurePath
 from types import NoneType, UnionType
@@ -25,9 +25,9 @@ __all__ = [
     "BAYER_PATTERNS",
     "ELEMENT_SIZE",
     "LENGTH_UNITS",
+    "LOCAL_MEAN",
     "PROBE_NAME",
     "SMALLEST_HALVED",
-    "WIDER_AT_CRACKS",
     "ChannelSettings",
     "FrameKind",
     "FrameSettings",
@@ -42,6 +42,7 @@ __all__ = [
     "bounded",
     "check_names",
     "convert_value",
+    "grey_levels",
     "plain",
     "read_range",
     "read_section",
@@ -188,10 +189,12 @@ class FrameSettings(_Checked):
         )
 
 
-WIDER_AT_CRACKS = 3.0
-"""Width of the local mean where a mesh has cracks, over `IlluminationSettings.normalise`: a gap changes so wide a mean
-nearly alike all over an element, and the gain of the means takes that out. With 5 the gap is followed no better and a
-slope of the brightness worse (rendered cracks open by up to 5 px)."""
+LOCAL_MEAN = 10.0
+"""Width (px) of the local mean. Chosen: two to three speckles."""
+_WIDER_AT_CRACKS = 3.0
+"""How many times as wide it is where a mesh has cracks: a gap changes so wide a mean nearly alike all over an element,
+and the gain of the means takes that out. With 5 the gap is followed no better and a slope of the brightness worse
+(rendered cracks open by up to 5 px)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -205,14 +208,13 @@ class IlluminationSettings(_Checked):
         Malvar's for frames too small for it.
     normalise
         Standard deviation in px of the local mean by which each light's image is divided before the solve; 0: grey
-        levels are not changed. Where the mesh has cracks it is three times as wide, and ``solver.brightness``, which is
-        then ``"mean"`` unless it is ``"local"``, corrects the rest.
+        levels are not changed; ``"auto"``: 10 px, or 30 px where the mesh has cracks (`grey_levels`).
     """
 
     section = "illumination"
 
     demosaic: Literal["auto", "reflection-aware", "malvar", "normalised"] = "auto"
-    normalise: float = bounded(10.0, at_least=0)
+    normalise: float | Literal["auto"] = bounded("auto", at_least=0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -326,7 +328,8 @@ class SolverSettings(_Checked):
     brightness
         Grey-level correction: ``"global"``, a gain and offset per light; ``"local"``, both as linear shape functions on
         the mesh; ``"mean"``, a gain as linear shape functions, from the mean grey levels around the nodes, each on its
-        side of a crack.
+        side of a crack; ``"auto"``, none, or ``"mean"`` where the mesh has cracks and images are divided by their local
+        mean (`grey_levels`).
     fill
         Longest distance in px over which nodes that are not measured get a value carried over from measured ones,
         flagged and with an uncertainty that grows with the distance; 0 leaves them NaN.
@@ -340,10 +343,25 @@ class SolverSettings(_Checked):
 
     prefilter: Literal["none", "binomial", "gaussian"] = "binomial"
     rigid: Literal["none", "translation", "translation+rotation"] = "none"
-    brightness: Literal["none", "global", "local", "mean"] = "none"
+    brightness: Literal["auto", "none", "global", "local", "mean"] = "auto"
     fill: float = bounded(0.0, at_least=0)
     tolerance: float = bounded(1e-3, above=0)
     max_iterations: int = bounded(50, at_least=1)
+
+
+def grey_levels(
+    normalise: float | Literal["auto"], solver: SolverSettings, *, cracked: bool
+) -> tuple[float, SolverSettings]:
+    """Width (px) of the local mean and settings of the solve that hold for a mesh: ``"auto"`` resolved, else as stated.
+
+    A local mean takes in the gap of an open crack, and the other side, which may be lit otherwise. So it is wider where
+    a mesh has cracks, and means over the elements around each node, on one side and without the gap, do the rest.
+    """
+    if normalise == "auto":
+        normalise = LOCAL_MEAN * (_WIDER_AT_CRACKS if cracked else 1.0)
+    if solver.brightness == "auto":
+        solver = replace(solver, brightness="mean" if cracked and normalise else "none")
+    return normalise, solver
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -916,7 +934,7 @@ def convert_value(value: Any, hint: Any, where: str, base: Path | str = "") -> A
         if value is None and NoneType in kinds:
             return None
         words = [word for kind in kinds[1:] if get_origin(kind) is Literal for word in get_args(kind)]
-        if value in words:
+        if (type(value), value) in ((type(word), word) for word in words):  # 1 is no True
             return value
         if words and isinstance(value, str):
             known = ", ".join(_quoted(word) if isinstance(word, str) else str(word).lower() for word in words)

@@ -57,6 +57,8 @@ def random_record(seed: int) -> FrameRecord:
         "iterations": len(history),
         "history": history,
         "inputs": [[f"/data/{seed}.dng", f"{seed:02x}"]],
+        "machine": "a processor, a BLAS",
+        "checksum": 7 * seed,
         "node_status": blank,
         "match": random.uniform(0.9, 1),
         "best_match": random.uniform(0.9, 1),

@@ -25,7 +25,7 @@ from rgbmidic.fields import at_nodes, at_pixels, high_pass
 from rgbmidic.illumination import IlluminationImages
 from rgbmidic.lab.measures import Goniometry, area_means, area_stds, residual_percent
 from rgbmidic.pipeline import correlated
-from rgbmidic.settings import ELEMENT_SIZE, IlluminationSettings, SolverSettings
+from rgbmidic.settings import ELEMENT_SIZE, SolverSettings
 from rgbmidic.weights import SetUpThreshold, Statistics, threshold_weights
 
 if TYPE_CHECKING:
@@ -172,7 +172,7 @@ def _seen(
         names=tuple(images.names[light] for light in lights),
         full_scale=images.full_scale,
     )
-    values = correlated(chosen, IlluminationSettings()) if METHODS[method].default else chosen.values
+    values = correlated(chosen) if METHODS[method].default else chosen.values
     if threshold is None:
         return values, chosen.valid.astype(np.float32)
     return values, threshold_weights(chosen, threshold=threshold, blur=BLUR)

@@ -26,6 +26,7 @@ __all__ = [
     "aside",
     "compiled",
     "helper",
+    "machine",
     "one_blas_thread",
     "over_ranges",
     "set_threads",
@@ -40,6 +41,17 @@ _VARIABLE = "RGBMIDIC_THREADS"
 _chosen: list[int] = []
 _limits: list[Any] = []
 _lock = threading.Lock()
+
+
+@cache
+def machine() -> str:
+    """Processor and BLAS libraries of this process, on which the last bits of a result depend."""
+    import scipy.linalg  # noqa: F401 which has a library of its own
+    from llvmlite.binding import get_host_cpu_name
+
+    found = [one for one in ThreadpoolController().info() if one["user_api"] == "blas"]
+    libraries = {f"{one['internal_api']} {one['version']} {one.get('architecture', '')}".strip() for one in found}
+    return ", ".join([str(get_host_cpu_name()), *sorted(libraries)])
 
 
 def threads() -> int:

@@ -45,7 +45,7 @@ _PASS_ITERATIONS = 12
 """Most iterations of a pass: from within half a speckle 4 to 5 do (measured on the truth tests)."""
 _PATIENCE = 1
 """Iterations of a pass after which a tenth of the nodes may still move: with the weights of the next pass they do so
-faster. With 5 a plate under glare took 9 to 22 iterations instead of 6 to 11 (benchmarks/fast_event.py)."""
+faster. Chosen; with twice of it results do not change (benchmarks/constants.py)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -199,7 +199,7 @@ _SMOOTHNESS = 1e-3
 with half or twice of it lights differ by 4e-4 px at most (benchmarks/constants.py)."""
 
 
-def corrected_values(residual: Residual, kind: Literal["none", "global", "local", "mean"]) -> FloatImage:
+def corrected_values(residual: Residual, kind: Literal["auto", "none", "global", "local", "mean"]) -> FloatImage:
     """Bring the reference to the brightness and contrast of the deformed images (paper, section 2.2).
 
     f is taken as ``a g + b``; what is returned is ``(f - b) / a`` of the uncorrected reference.
@@ -211,7 +211,7 @@ def corrected_values(residual: Residual, kind: Literal["none", "global", "local"
     kind
         ``"global"``: one gain and offset per light. ``"local"``: gain and offset as linear shape functions on the mesh.
         ``"mean"``: a gain as linear shape functions, that of the mean grey levels in the elements around each node,
-        which are all on its side of a crack. ``"none"``: the reference itself.
+        which are all on its side of a crack. ``"none"``, ``"auto"``: the reference itself.
 
     Returns
     -------
@@ -219,7 +219,7 @@ def corrected_values(residual: Residual, kind: Literal["none", "global", "local"
         Reference grey levels.
     """
     reference = residual.reference
-    if kind == "none":
+    if kind in ("none", "auto"):
         return reference.values
     if kind == "mean":
         sums = zip(reference.values, residual.weights, residual.moments[..., 2], strict=True)

@@ -145,8 +145,8 @@ class Solution:
 
 
 _UNSETTLED = 0.02
-"""Fraction of the nodes whose loss is as bad as iterations that did not converge: of a fragment that turns, 1 to 3 of
-900 nodes still move by some .002 px (benchmarks/fast_event.py), while the solve that converges has lost all of it."""
+"""Fraction of the nodes whose loss is as bad as iterations that did not converge. Chosen: at the rim of a fragment that
+turns some nodes in a thousand may swing for good, while a solve that converges elsewhere has lost all of it."""
 
 
 def rank(status: int, node_status: npt.NDArray[np.uint8]) -> tuple[bool, float]:

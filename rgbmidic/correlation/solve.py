@@ -54,15 +54,14 @@ __all__ = [
 FIRST_PASS = 0.01
 """Increment (px) at which the first pass hands over to the pass with weights warped anew. At .05 an iteration
 less is needed, but from another start the result differs by up to 2.3e-4 px."""
-_REFINED = {"none": 1, "global": 1, "local": 4, "mean": 2}
+_REFINED = {"none": 1, "auto": 1, "global": 1, "local": 4, "mean": 2}
 """Passes whose residual still changes weights and grey levels, for each grey-level correction."""
 _STARTED = 0.25
 """Correlation coefficient at the initial guess under which an element waits until its neighbours have brought it
 nearer. Chosen; with half or twice of it results do not change (benchmarks/constants.py)."""
 _RETURNS = 2
-"""Passes after which elements may take part again. At a fragment's edge some come and go with every pass: with 4 plates
-under glare took up to 22 iterations instead of 16; with 1 the frames of a turning fragment take a twentieth less, but
-what a crack or another body pulls at first is left out for good (benchmarks/fast_event.py)."""
+"""Passes after which elements may take part again. Chosen: at a fragment's edge some come and go with every pass, which
+costs iterations; after a single pass what a crack or another body pulls at first is left out for good."""
 _WANDERING = 0.1
 """Motion (px) in the last iteration of a pass, and more than half of that in the one before, from which the elements
 around a node are left out after `_RETURNS` passes: its own pixels match nothing. Chosen: ten times what ends the first
@@ -70,7 +69,7 @@ pass."""
 _ELSEWHERE = 0.05
 """Motion (px) of more than `_SWINGING` of the nodes from where weights and grey levels were learnt, after which those
 of several lights are learnt once more: what all lights alike show of the motion hides which of them is the precise one.
-Under glare rms errors are up to 3 % less for it, for two iterations; at .02 as much (benchmarks/fast_event.py)."""
+Chosen: a hundredth of a speckle, which a residual still shows."""
 _SETTLED = 1e-3
 """Fraction of the weight that may still change for the passes to end. Chosen; with half or twice of it lights do not
 change (benchmarks/constants.py)."""
@@ -215,7 +214,7 @@ def settled(weighting: Weighting, equations: Equations) -> bool:
 
 def refining(problem: Problem, weighting: Weighting, number: int) -> bool:
     """Whether the residual of a pass still changes weights or grey levels."""
-    learns = problem.method is not None or problem.options.brightness != "none"
+    learns = problem.method is not None or problem.options.brightness not in ("none", "auto")
     return learns and number <= weighting.returned + _REFINED[problem.options.brightness]
 
 

@@ -308,6 +308,8 @@ _COLOUR_MAP, _ORIENTATION = 320, 274
 class TiffFile(FrameSource):
     """A TIFF file of one image with 1 or 3 channels; a table of colours is refused."""
 
+    packages = ("tifffile",)
+
     def _shape(self) -> tuple[int, int]:
         with _only_page(self.path) as page:
             return int(page.imagelength), int(page.imagewidth)
@@ -453,6 +455,8 @@ class CameraRaw(FrameSource):
     Orientation and default crop of the file are not applied: pixels stay where they are on the sensor. Refused are
     files that LibRaw cannot decode, images already demosaiced, and colour filter arrays that are no Bayer pattern.
     """
+
+    packages = ("rawpy",)
 
     def _shape(self) -> tuple[int, int]:
         with _libraw(self.path) as raw:

@@ -107,6 +107,11 @@ class FrameSeries:
             except FrameError:
                 continue
 
+    @property
+    def packages(self) -> list[str]:
+        """Packages whose version decides on what is read (`FrameSource.packages`)."""
+        return sorted({package for sources in self.lights for source in sources for package in source.packages})
+
     def read(self, index: int, window: Window | None = None) -> tuple[Mosaic | ChannelFrame, ...]:
         """Read state `index` or a part of it: one frame per light fired in succession, else a single one.
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, wraps
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import ClassVar, Protocol, TypeVar
 
 from rgbmidic.errors import FrameError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
@@ -39,6 +39,9 @@ class FrameSource(ABC):
     camera
         What a calibration states of it.
     """
+
+    packages: ClassVar[tuple[str, ...]] = ()
+    """Packages, beside numpy and OpenCV, whose version decides on what is read."""
 
     path: Path
     stated: FrameSettings

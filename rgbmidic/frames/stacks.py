@@ -156,6 +156,8 @@ class Hdf5File(Movie):
         Its name in the file; empty: the only one that can be frames.
     """
 
+    packages = ("h5py",)
+
     dataset: str = field(init=False)
 
     def __post_init__(self) -> None:
@@ -290,6 +292,8 @@ _UNITS |= {"ms": 10**3, "msec": 10**3, "µs": 10**6, "us": 10**6, "usec": 10**6,
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TiffStack(Movie):
     """A TIFF file of several frames of one size, in the order of the file."""
+
+    packages = ("tifffile",)
 
     def _header(self) -> _Hyperstack:
         return _stack(self.path)

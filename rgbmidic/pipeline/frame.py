@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.threads import aside
+from rgbmidic._kernels.threads import aside, machine
 from rgbmidic.correlation import (
     Deformed,
     PrecisionMethod,
@@ -38,10 +39,10 @@ from rgbmidic.frames.data import Window
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.images import normalise as divide_by_local_mean
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.plan import Plan, exposure_fault, too_small
-from rgbmidic.pipeline.source import RawState, beside_cracks, correlated
+from rgbmidic.pipeline.plan import SATURATED, Plan, check_exposed, exposure_fault, too_small
+from rgbmidic.pipeline.source import RawState, correlated
 from rgbmidic.results import FrameRecord
-from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, check_names
+from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, check_names, grey_levels
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import Statistics, as_weights, precision_method
@@ -168,12 +169,18 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     here = plan.window.part_of(window)
     with stage("reading"):
         state, inputs = read_state(plan, index, window)
+    there = state
+    if not isinstance(state, IlluminationImages):
+        there = tuple(replace(frame, values=frame.values[..., *here]) for frame in state)
+    if (share := check_exposed(there, plan.region.mask, name)) > plan.saturated + SATURATED:
+        words = "%s: %.0f %% of the samples in the region are saturated, %.0f %% in the reference: look at the exposure"
+        logger.warning(words, name, 100 * share, 100 * plan.saturated)
     with stage("separation"):
         images = plan.lights(state, window)
     if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     with stage("preparation"):
-        weights, ready = plan.frame_weights(images, index), correlated(images, plan.illumination)
+        weights, ready = plan.frame_weights(images, index), correlated(images, plan.normalise)
         deformed = Deformed.prepare(ready, weights, prefilter=plan.solver.prefilter, origin=window.origin)
         step = -(-max(plan.window.shape) // _THUMBNAIL)
         thumbnail = _in_bytes(weights[:, *here][:, ::step, ::step])
@@ -181,9 +188,6 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     method = precision_method(plan.weights, settings.weights.method)
     solution = reference_update.track(deformed, start, plan.solver, method)
     if solution.status is not Status.CONVERGED:
-        there = state
-        if not isinstance(state, IlluminationImages):
-            there = tuple(replace(frame, values=frame.values[..., *here]) for frame in state)
         causes = _causes(plan, there, images, reference.offset(deformed), solution)
         solution = replace(solution, reason="; ".join([solution.reason, *causes]))
         end = "cannot be measured" if solution.status is Status.FAILED else "did not converge"
@@ -197,6 +201,7 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     _tell_dark(name, images.names, brightness)
     match, best, reference_updates = _compared(plan, index, start, reference_update, deformed, solution)
     reflection = images.reflection_index(step, here)
+    samples = (there,) if isinstance(there, IlluminationImages) else there
     return {
         "solution": kept,
         "number": plan.series.numbers[index],
@@ -208,6 +213,8 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         "weights_thumbnail": thumbnail,
         "reflection_thumbnail": None if reflection is None else _in_bytes(reflection),
         "inputs": inputs,
+        "machine": machine(),
+        "checksum": zlib.crc32(b"".join(one.values.tobytes() for one in samples)),
     }
 
 
@@ -251,7 +258,7 @@ def next_reference(plan: Plan, before: ReferenceUpdate, index: int, solution: So
     """
     window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
     images = plan.lights(read_state(plan, index, window)[0], window)
-    ready = correlated(images, plan.illumination)
+    ready = correlated(images, plan.normalise)
     return before.updated(solution, ready, plan.frame_weights(images, index), window.origin)
 
 
@@ -302,7 +309,7 @@ def correlate(
     weights: npt.ArrayLike | None = None,
     initial: npt.ArrayLike | None = None,
     deformed_weights: npt.ArrayLike | None = None,
-    normalise: float | None = None,
+    normalise: float | Literal["auto"] | None = None,
     statistics: bool | PrecisionMethod = True,
     mesh_error: bool = False,
     **options: Any,
@@ -326,8 +333,8 @@ def correlate(
     deformed_weights
         Like `weights`, on the deformed images.
     normalise
-        Standard deviation in px of the Gaussian of the local mean by which every image is first divided; wider if there
-        are cracks (see `IlluminationSettings`). None: grey levels are not changed.
+        Standard deviation in px of the Gaussian of the local mean by which every image is first divided; ``"auto"``: 10
+        px, 30 px if there are cracks. None: grey levels are not changed.
     statistics
         True: weight the lights by the statistics of the residual around each pixel (`rgbmidic.weights.Statistics`).
         False: only by `weights`. Or an object with a method of your own.
@@ -368,9 +375,9 @@ def correlate(
     if not isinstance(region, Region):
         region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
     mesh = Tri3Mesh.from_region(region, element_size, cracks)
-    solver = solver_settings(options)
-    if normalise is not None:
-        sigma, solver = beside_cracks(mesh, normalise, solver)
+    cracked = len(mesh.crack_edges) > 0
+    sigma, solver = grey_levels(0.0 if normalise is None else normalise, solver_settings(options), cracked=cracked)
+    if sigma:
         f, g = (divide_by_local_mean(stack, sigma, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
     given = as_weights(weights, f.shape, "weights"), as_weights(deformed_weights, f.shape, "deformed_weights")
     second = aside(Deformed.prepare, g, given[1], prefilter=solver.prefilter)

@@ -11,9 +11,10 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain, combinations
 from threading import Lock
+from typing import Any
 
 import numpy as np
 
@@ -38,24 +39,28 @@ from rgbmidic.pipeline.source import (
     Separation,
     Series,
     WindowedSeparation,
-    beside_cracks,
     correlated,
     light_images,
     open_sequence,
     reference_images,
 )
-from rgbmidic.settings import WIDER_AT_CRACKS, IlluminationSettings, RegionSettings, SolverSettings, TestSettings
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings, grey_levels
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, prepare_weights
+from rgbmidic.weights.threshold import ThresholdWeights, blurred
 
 __all__ = [
     "HARDLY_ENOUGH",
+    "SATURATED",
+    "SPECKLES",
     "Choice",
     "Plan",
     "UpdatedReferences",
+    "check_exposed",
     "check_texture",
     "exposure_fault",
     "finite_elements_of",
+    "light_levels",
     "neighbour_correlation",
     "read_region",
     "too_small",
@@ -92,6 +97,8 @@ class UpdatedReferences:
             return self._kept[-1][1]
 
 
+SPECKLES = 3.0
+"""Least number of speckles on the side of an element (iDICs Good Practices Guide, for subsets)."""
 _REACH = 96.0
 """px around what is looked at that the separation's local statistics use: three standard deviations of their windows
 with all that is between (`rgbmidic.lab.inspection.prediction.MARGIN`)."""
@@ -115,8 +122,8 @@ class Plan:
     ----------
     settings
         What TEST.toml says.
-    illumination, solver
-        Of these, what holds for the mesh (`beside_cracks`).
+    normalise, solver
+        Width of the local mean (px) and settings of the solve that hold for the mesh (`grey_levels`).
     series
         The frames.
     separation
@@ -131,6 +138,8 @@ class Plan:
         The reference state as the solve needs it, with the mesh.
     speckle
         Size of the speckle in the reference's region, px; None where it is not known.
+    saturated
+        Fraction of the reference's samples in the region that are saturated.
     element_size
         Side of the elements, px.
     window
@@ -141,6 +150,8 @@ class Plan:
         Why the elements have their size, where ``mesh.element_size`` is ``"auto"``; else None.
     refinement
         In which frame and how far the mesh was refined (``mesh.refine``), in a sentence; else None.
+    calibration
+        Figures of the calibration, for the provenance (`Calibration.figures`).
     timings
         Whether to tell the time that each stage of a frame takes.
     updates
@@ -148,7 +159,7 @@ class Plan:
     """
 
     settings: TestSettings
-    illumination: IlluminationSettings
+    normalise: float
     solver: SolverSettings
     series: Series
     separation: LightSeparation
@@ -157,12 +168,14 @@ class Plan:
     images: IlluminationImages
     reference: Reference
     speckle: float | None
+    saturated: float
     window: Window
     element_size: float
     finite_elements: FiniteElementMesh | None = None
     placement: Placement | None = None
     choice: Choice | None = None
     refinement: str | None = None
+    calibration: dict[str, Any] = field(default_factory=dict)
     timings: bool = False
     updates: UpdatedReferences = field(default_factory=UpdatedReferences, repr=False, compare=False)
 
@@ -203,7 +216,8 @@ class Plan:
             the settings.
         """
         _check_given(settings, source, separation, weights, mesh)
-        series, calibration = _series_and_calibration(settings, source)
+        whole_calibration = None if settings.calibration_file is None else Calibration.read(settings.calibration_file)
+        series, calibration = _series_and_calibration(settings, source, whole_calibration)
         separate = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
         whole = any(one is not None for one in (source, weights, mesh, region))
         finite_elements, placement = None, None
@@ -215,15 +229,14 @@ class Plan:
             region, window = _region_and_window(settings, region, series.shape)
             if mesh is not None:
                 mesh = Tri3Mesh(nodes=mesh.nodes - window.origin, elements=mesh.elements)
-        rest = _Rest.read(settings, series, separate, window)
+        rest = _Rest.read(settings, series, separate, window, region, calibration)
         if separation is not None and isinstance(rest.states[0], IlluminationImages):
             raise ConfigurationError("the source gives images of the lights, which need no separation: give only one")
-        rest.check_calibrated(calibration, region, window, settings)
         size = settings.side if mesh is None else mesh.size
         if mesh is None:
             mesh = Tri3Mesh.from_region(region, size, [np.subtract(path, window.origin) for path in settings.cracks])
-        sigma, solver = beside_cracks(mesh, settings.illumination.normalise, settings.solver)
-        illumination = replace(settings.illumination, normalise=sigma)
+        cracked = len(mesh.crack_edges) > 0
+        sigma, solver = grey_levels(settings.illumination.normalise, settings.solver, cracked=cracked)
         weights = weights or prepare_weights(
             settings,
             rest.images,
@@ -232,10 +245,14 @@ class Plan:
             frames=len(series),
             images_of=lambda index: light_images(rest.separation, series.read(index, window), window),
         )
+        counted = as_weights(weights.reference(rest.images), rest.images.values.shape, "weights of the reference")
+        assert counted is not None
+        if settings.weights.method == "threshold":
+            _tell_no_effect(weights, counted, rest.images, region, settings.weights.blur)
         reference = Reference.prepare(
-            correlated(rest.images, illumination),
+            correlated(rest.images, sigma),
             region,
-            as_weights(weights.reference(rest.images), rest.images.values.shape, "weights of the reference"),
+            counted,
             mesh=mesh,
             prefilter=solver.prefilter,
             origin=window.origin,
@@ -249,7 +266,7 @@ class Plan:
         rest.check_seen(reference, region)
         return cls(
             settings=settings,
-            illumination=illumination,
+            normalise=sigma,
             solver=solver,
             series=series,
             separation=rest.separation,
@@ -258,10 +275,12 @@ class Plan:
             images=rest.images,
             reference=reference,
             speckle=speckle,
+            saturated=check_exposed(rest.states[0], region.mask, rest.names),
             window=window,
             element_size=size,
             finite_elements=finite_elements,
             placement=placement,
+            calibration=whole_calibration.figures() if whole_calibration else {},
         )
 
     def lights(self, state: RawState, window: Window) -> IlluminationImages:
@@ -302,31 +321,26 @@ class _Rest:
     separation: LightSeparation
 
     @classmethod
-    def read(cls, settings: TestSettings, series: Series, separation: LightSeparation, window: Window) -> _Rest:
-        """Read and separate them one by one."""
+    def read(
+        cls,
+        settings: TestSettings,
+        series: Series,
+        separation: LightSeparation,
+        window: Window,
+        region: Region,
+        calibration: Calibration | None,
+    ) -> _Rest:
+        """Read, check and separate them one by one."""
         indices = settings.frames.reference
+        names = ", ".join(map(series.name, indices))
         states = [series.read(index, window) for index in indices[:2]]
+        _check_raw(states, names, settings, window, region, calibration)
         others = (series.read(index, window) for index in indices[2:])
         images, learnt = reference_images(separation, chain(states, others), window)
-        return cls(names=", ".join(map(series.name, indices)), states=states, images=images, separation=learnt)
-
-    def check_calibrated(
-        self, calibration: Calibration | None, region: Region, window: Window, settings: TestSettings
-    ) -> None:
-        """Refuse frames that contradict their `calibration`, of which they are a `window`."""
-        raw = [state for state in self.states if not isinstance(state, IlluminationImages)]
-        if calibration is None or not raw:
-            return
-        if not window.is_whole:
-            calibration = calibration.cropped(window.origin, window.shape)
-        repeat = raw[1] if len(raw) > 1 else None
-        for found in check_state(raw[0], calibration, region.mask, self.names, accept=settings.accept, repeat=repeat):
-            if not found.certain:
-                file = settings.calibration_file
-                logger.warning("%s may not be what %s calibrates: %s", self.names, file, found.text)
+        return cls(names=names, states=states, images=images, separation=learnt)
 
     def check_seen(self, reference: Reference, region: Region) -> None:
-        """Refuse a reference that no light sees or that shows no texture."""
+        """Refuse a reference that no light sees or that shows no texture; warn of a light that is off."""
         if not reference.pixel_weights.any():
             fault = exposure_fault(self.states[0], region.mask)
             raise FrameError(
@@ -334,6 +348,56 @@ class _Rest:
                 f"{fault or 'it is saturated, dark or excluded by the weights'}"
             )
         check_texture(self.states[0], region.mask, self.names)
+        levels = light_levels(self.images, region)
+        off = [f"{light} ({level:.1%})" for light, level in levels.items() if level < DARK]
+        if off and not isinstance(self.states[0], IlluminationImages):
+            logger.warning(
+                "the reference (%s) shows no light of %s: the median in the region is under %.0f %% of the full scale; "
+                "are the lamps on?",
+                self.names,
+                ", ".join(off),
+                100 * DARK,
+            )
+
+
+def _check_raw(
+    states: Sequence[RawState],
+    names: str,
+    settings: TestSettings,
+    window: Window,
+    region: Region,
+    calibration: Calibration | None,
+) -> None:
+    """Refuse raw frames that contradict the stated levels or their `calibration`, and warn of doubtful ones."""
+    raw = [state for state in states if not isinstance(state, IlluminationImages)]
+    for frame in raw[0] if raw else ():
+        if shifted := _shifted(samples := frame.values[..., region.mask], frame.white_level):
+            raise FrameError(f"the reference ({names}): {shifted}")
+        if (largest := samples.max()) > _ABOVE * frame.white_level:
+            logger.warning(
+                "the samples of the reference (%s) reach %d, far above white_level %g: is it that of the camera, and "
+                "is the order of the bytes (frames.dtype) right?",
+                names,
+                largest,
+                frame.white_level,
+            )
+    if raw and (share := check_exposed(raw[0], region.mask, f"the reference ({names})")) > SATURATED:
+        logger.warning("%.0f %% of the samples in the region of the reference (%s) are saturated", 100 * share, names)
+    if calibration is None or not raw:
+        return
+    if not window.is_whole:
+        calibration = calibration.cropped(window.origin, window.shape)
+    repeat = raw[1] if len(raw) > 1 else None
+    for found in check_state(raw[0], calibration, region.mask, names, accept=settings.accept, repeat=repeat):
+        if not found.certain:
+            logger.warning("%s may not be what %s calibrates: %s", names, settings.calibration_file, found.text)
+
+
+def light_levels(images: IlluminationImages, region: Region) -> dict[str, float]:
+    """Median grey level of each light in the region, as a fraction of the full scale; 0 where nothing is usable."""
+    known = (light[np.isfinite(light)] for light in images.values[:, region.mask])
+    medians = (float(np.median(light)) / images.full_scale if light.size else 0.0 for light in known)
+    return dict(zip(images.names, medians, strict=True))
 
 
 def _check_given(
@@ -377,9 +441,10 @@ def _check_given(
         )
 
 
-def _series_and_calibration(settings: TestSettings, source: FrameSequence | None) -> tuple[Series, Calibration | None]:
+def _series_and_calibration(
+    settings: TestSettings, source: FrameSequence | None, calibration: Calibration | None
+) -> tuple[Series, Calibration | None]:
     """The frames, of the settings or a `source`, and the calibration cropped to them."""
-    calibration = None if settings.calibration_file is None else Calibration.read(settings.calibration_file)
     series: Series
     if source is None:
         series = open_series(settings.frames, settings.base, calibration)
@@ -405,17 +470,13 @@ def finite_elements_of(
     return part, placement, mesh, region
 
 
-_ORDINARY = 3.0
-"""Speckles on the side of an element that the uncertainty of smaller ones is compared with (issue 25)."""
-
-
 def _tell_small(mesh: Tri3Mesh, speckle: float | None, finite_elements: FiniteElementMesh) -> None:
     """Warn of finite elements that are small for the speckle, with the uncertainty to expect.
 
     It goes with the inverse of the element's side (`rgbmidic.scene.forecast.node_constant`).
     """
     sides = np.sqrt(2 * mesh.areas)
-    small = np.zeros(sides.size, dtype=bool) if speckle is None else sides < _ORDINARY * speckle
+    small = np.zeros(sides.size, dtype=bool) if speckle is None else sides < SPECKLES * speckle
     if speckle is None or not small.any():
         return
     least = int(np.argmin(sides))
@@ -426,16 +487,31 @@ def _tell_small(mesh: Tri3Mesh, speckle: float | None, finite_elements: FiniteEl
         finite_elements.name,
         int(small.sum()),
         sides.size,
-        _ORDINARY,
+        SPECKLES,
         speckle,
         typical,
         finite_elements.element_numbers[least],
         sides[least],
-        _ORDINARY * speckle / typical,
-        _ORDINARY * speckle / sides[least],
-        _ORDINARY,
+        SPECKLES * speckle / typical,
+        SPECKLES * speckle / sides[least],
+        SPECKLES,
         _ENOUGH,
     )
+
+
+def _tell_no_effect(
+    weights: LightWeights, counted: FloatImage, images: IlluminationImages, region: Region, blur: float
+) -> None:
+    """Warn of a threshold that excludes nothing in the region of the reference."""
+    inside = region.mask
+    if isinstance(weights, ThresholdWeights) and (counted > 0)[:, inside].sum() == images.valid[:, inside].sum():
+        logger.warning(
+            "weights.threshold = %.3g excludes nothing in the reference: no light, blurred over %g px, exceeds %.2g of "
+            'the dynamic range in the region. State a lower one, or weights.method = "statistics"',
+            weights.threshold,
+            blur,
+            blurred(images, blur)[:, inside].max() / images.full_scale,
+        )
 
 
 def _region_and_window(settings: TestSettings, region: Region | None, frame: tuple[int, int]) -> tuple[Region, Window]:
@@ -451,18 +527,20 @@ def _region_and_window(settings: TestSettings, region: Region | None, frame: tup
 
 def _window(points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int]) -> Window:
     """What lies within `reach` of points (N, 2), and what its images depend on."""
-    split = settings.cracks or settings.mesh_file is not None
-    widths = settings.illumination.normalise * (WIDER_AT_CRACKS if split else 1.0), settings.weights.blur
-    return Window.around(points, reach + max(_REACH, 3 * max(widths)), frame)
+    may_crack = bool(settings.cracks) or settings.mesh_file is not None
+    sigma, _ = grey_levels(settings.illumination.normalise, settings.solver, cracked=may_crack)
+    return Window.around(points, reach + max(_REACH, 3 * max(sigma, settings.weights.blur)), frame)
 
 
 def _speckle(images: IlluminationImages, region: Region) -> float | None:
-    """Size of the speckle (px), the median over the lights, in the middle of the region; None where none shows any."""
+    """Size of the speckle (px), the median over the lights that are on, in the middle of the region; None: unknown."""
     part = [
         slice(max(int(np.median(inside)) - _LOOKED_AT // 2, int(inside[0])), int(inside[-1]) + 1)
         for inside in (np.flatnonzero(region.mask.any(axis=axis)) for axis in (1, 0))
     ]
-    pictures = [values[part[0], part[1]][:_LOOKED_AT, :_LOOKED_AT] for values in images.values]
+    levels = light_levels(images, region).values()
+    lit = [level >= DARK for level in levels] if max(levels) >= DARK else [True] * len(images.names)
+    pictures = [values[part[0], part[1]][:_LOOKED_AT, :_LOOKED_AT] for values in images.values[lit]]
     known = [np.where(np.isfinite(one), one, np.nanmean(one)) for one in pictures if np.isfinite(one).any()]
     sizes = [size for one in known if (size := speckle_diameter(one.astype(np.float64))) is not None]
     return float(np.median(sizes)) if sizes else None
@@ -576,19 +654,55 @@ def exposure_fault(state: RawState, inside: BoolArray) -> str | None:
     return "; ".join(told) or None
 
 
+SATURATED = 0.1
+"""Fraction of the samples in the region that are saturated, beyond that of the reference, from which a frame is
+over-exposed. Chosen: reflections saturate a few per cent; three times the exposure saturates a fifth and more."""
+_ABOVE = 2.0
+"""Samples this many times the white level have a bit more than it: it is not the camera's, or deliberately low."""
+
+
+_BLIND = 0.98
+"""Fraction from which the lights are not separated: with .985 they still were, with .99 no texture was left to learn
+from in two of three frames (measured)."""
+
+
+def check_exposed(state: RawState, inside: BoolArray, name: str) -> float:
+    """Fraction of the raw samples in a region (H, W) that are saturated; 0 for images of the lights.
+
+    Raises
+    ------
+    FrameError
+        Hardly any is not.
+    """
+    if isinstance(state, IlluminationImages):
+        return 0.0
+    share = float(np.mean([(frame.values[..., inside] >= frame.white_level).mean() for frame in state]))
+    if share > _BLIND:
+        raise FrameError(f"no light sees the region in {name}: {exposure_fault(state, inside)}")
+    return share
+
+
+def _shifted(samples: AnyArray, white: float) -> str | None:
+    """What is wrong with samples of which the lowest bits are all 0, and the `white` level not that of the others."""
+    bits, largest = int(np.bitwise_or.reduce(samples, axis=None)), int(samples.max())
+    step = bits & -bits  # all samples are multiples of it
+    if not (step > 2 and largest > white and white * step <= 65536):
+        return None
+    return (
+        f"the samples reach {largest} and are all multiples of {step}, as of a camera whose levels lie in the high "
+        f"bits; white_level is {white:g}: should it be {65536 - step}?"
+    )
+
+
 def _fault(frame: Mosaic | ChannelFrame, inside: BoolArray) -> str | None:
     samples, white, black = frame.values[..., inside], frame.white_level, float(frame.black_level.mean())
-    bits = int(np.bitwise_or.reduce(samples, axis=None))
-    step = bits & -bits  # all samples are multiples of it
+    if shifted := _shifted(samples, white):
+        return shifted
     largest = int(samples.max())
-    if step > 2 and largest > white:
-        return (
-            f"the samples reach {largest} and are all multiples of {step}, as of a camera whose levels lie in the high "
-            f"bits; white_level is {white:g}: should it be {65536 - step}?"
-        )
-    saturated, dark = (samples >= white).mean(), (samples < black + DARK * (white - black)).mean()
-    if saturated > 0.5:
-        return f"{saturated:.0%} of the samples in the region are saturated (white_level {white:g})"
+    over, dark = (samples >= white).mean(), (samples < black + DARK * (white - black)).mean()
+    if over > 0.5:
+        above = f"; the largest is {largest}" if largest > white else ""
+        return f"{over:.0%} of the samples in the region are saturated (white_level {white:g}{above})"
     if dark > 0.5:
         return (
             f"{dark:.0%} of the samples in the region are dark: within {DARK:.0%} of the dynamic range from the black "

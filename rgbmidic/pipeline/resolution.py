@@ -24,7 +24,7 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.pixel_map import quadratic_fit
 from rgbmidic.mesh.tri3 import refined
 from rgbmidic.pipeline.frame import read_state
-from rgbmidic.pipeline.plan import Choice, Plan
+from rgbmidic.pipeline.plan import SPECKLES, Choice, Plan
 from rgbmidic.pipeline.source import correlated
 from rgbmidic.settings import ELEMENT_SIZE, TestSettings
 from rgbmidic.typing import BoolArray, FloatArray
@@ -32,7 +32,6 @@ from rgbmidic.weights import as_weights, precision_method
 
 __all__ = [
     "SIZES",
-    "SPECKLES",
     "Choice",
     "GaugeFigures",
     "ResolutionStudy",
@@ -47,8 +46,6 @@ logger = logging.getLogger(__name__)
 SIZES = (10.0, 16.0, 25.0, 40.0, 63.0)
 """Element sizes (px) that are tried where none are stated: the default (the paper's) and steps of 1.6, which change the
 noise by as much and the discretisation error of a smooth field by 4 (its third power)."""
-SPECKLES = 3.0
-"""Least number of speckles on the side of an element (iDICs Good Practices Guide, for subsets)."""
 _LEAST = 4.0
 """Smallest elements, px (`Tri3Mesh.from_region`)."""
 _FEWEST = 3.0
@@ -466,7 +463,7 @@ def _deformed(plan: Plan, index: int) -> Deformed:
     window = plan.window_of()
     images = plan.lights(read_state(plan, index, window)[0], window)
     weights = plan.frame_weights(images, index)
-    ready = correlated(images, plan.illumination)
+    ready = correlated(images, plan.normalise)
     return Deformed.prepare(ready, weights, prefilter=plan.solver.prefilter, origin=window.origin)
 
 
@@ -480,7 +477,7 @@ def on_mesh(plan: Plan, mesh: Tri3Mesh) -> Plan:
     """The same test on another mesh of its region, in px of the window."""
     images, origin = plan.images, plan.window.origin
     reference = Reference.prepare(
-        correlated(images, plan.illumination),
+        correlated(images, plan.normalise),
         plan.region,
         as_weights(plan.weights.reference(images), images.values.shape, "weights of the reference"),
         mesh=mesh,

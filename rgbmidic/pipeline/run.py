@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -23,16 +23,16 @@ from rgbmidic._kernels import are_compiled
 from rgbmidic.correlation import Solution, Start, Status
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.errors import FrameError, InputError, ResultError, RgbmidicError
-from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.frame import next_reference, read_state, solve_frame, solver_settings
-from rgbmidic.pipeline.plan import Choice, Plan
+from rgbmidic.pipeline.plan import Choice, Plan, light_levels
 from rgbmidic.pipeline.resolution import choose, on_mesh, refine
 from rgbmidic.pipeline.schedule import STRIDE, Schedule, dependants, following, is_key, loses, parent, rank_of
 from rgbmidic.pipeline.source import FrameSequence, LightSeparation, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 from rgbmidic.results.files import PROVENANCE, read_provenance
+from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.results.store import listed, read_mesh
 from rgbmidic.settings import (
     ELEMENT_SIZE,
@@ -160,6 +160,7 @@ def measure(
         if not schedule.done:
             with open_workers(plan, min(workers, len(places)), scheduler) as others:
                 schedule.run(others, progress)
+        _tell_repeated(plan, store, places)
         if frames is None:
             store.finish()
     return Result.open(out, partial=frames is not None, check=False)
@@ -208,6 +209,22 @@ def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
     store.discard(again)
 
 
+def _tell_repeated(plan: Plan, store: ResultStore, places: range) -> None:
+    """Warn of frames with the samples of the frame before, bit for bit."""
+    sums = [kept["checksum"] for kept in store.table().each(["checksum"], places)]
+    pairs = zip(places[1:], sums[1:], sums, strict=False)
+    repeated = [place for place, mine, before in pairs if mine == before != NO_CHECKSUM]
+    if repeated:
+        names = [plan.series.name(index) for index in plan.series.chosen]
+        what = "all frames repeat" if len(repeated) == len(places) - 1 else "frames that repeat"
+        logger.warning(
+            "%s the one before, bit for bit, which camera noise makes impossible: %s; were frames lost and filled up, "
+            "or files copied?",
+            what,
+            listed(repeated, names),
+        )
+
+
 def _places(chosen: range, frames: range | None) -> range:
     """Places in the result of the frames that are to be measured.
 
@@ -227,7 +244,7 @@ def _places(chosen: range, frames: range | None) -> range:
 def _store(
     plan: Plan, out: Path, part: range | None, objects: dict[str, str], *, overwrite: bool, resume: bool
 ) -> ResultStore:
-    series, calibration = plan.series, plan.settings.calibration_file
+    series = plan.series
     recording = series.recording
     begun = (resume or part is not None) and (out / PROVENANCE).exists()
     fingerprint, unread = series.fingerprint(read_provenance(out).get("unread_files", ()) if begun else ())
@@ -240,12 +257,14 @@ def _store(
         lights=plan.images.names,
         settings=plan.settings,
         inputs={" + ".join(plan.settings.frames.path) or "source": fingerprint, **objects},
+        readers=getattr(series, "packages", ()),
         references=[place for place, index in enumerate(series.chosen) if index in plan.settings.frames.reference],
         reference=plan.images.values,
         notes={
             **getattr(plan.weights, "notes", {}),
             **({} if plan.choice is None else {"element_size": asdict(plan.choice)}),
             **({} if plan.refinement is None else {"refinement": plan.refinement}),
+            "grey_levels": {"normalise": plan.normalise, "brightness": plan.solver.brightness},
             "frame_rate": recording.frame_rate,
             "exposure_ns": recording.exposure_ns,
             "lost_frames": series.lost,
@@ -253,7 +272,7 @@ def _store(
             "frame_shape": list(plan.window.frame),
             "reference_origin": list(plan.window.origin),
             "reference_exposure": list(_exposure(plan)),
-            "calibration_figures": Calibration.read(calibration).figures() if calibration else {},
+            "calibration_figures": plan.calibration,
         },
     )
     if part is not None:
@@ -265,11 +284,9 @@ def _store(
 
 def _exposure(plan: Plan) -> Iterator[dict[str, Any]]:
     """Yield of each light the median grey level in the region of the reference, and the part that is not usable."""
-    images, inside = plan.images, plan.region.mask
-    for light, values in zip(images.names, images.values, strict=True):
-        usable = (part := values[inside])[np.isfinite(part)]
-        level = float(np.median(usable)) / images.full_scale if usable.size else 0.0
-        yield {"light": light, "median": level, "excluded": 1 - usable.size / max(part.size, 1)}
+    levels, inside = light_levels(plan.images, plan.region), plan.images.values[:, plan.region.mask]
+    for (light, level), part in zip(levels.items(), inside, strict=True):
+        yield {"light": light, "median": level, "excluded": float(1 - np.isfinite(part).mean())}
 
 
 def measure_sequence(
@@ -279,7 +296,7 @@ def measure_sequence(
     reference: Any = None,
     region: Sequence[float] | Region | None = None,
     element_size: float = ELEMENT_SIZE,
-    normalise: float = 10.0,
+    normalise: float | Literal["auto"] = "auto",
     statistics: bool = True,
     update_reference: bool = False,
     separation: LightSeparation | None = None,
@@ -310,7 +327,7 @@ def measure_sequence(
         Side of the triangles in px.
     normalise
         Standard deviation in px of the Gaussian of the local mean by which every image is first divided; 0: grey levels
-        are not changed.
+        are not changed; ``"auto"``: 10 px, 30 px if the mesh has cracks.
     statistics
         Weight every light by the inverse variance of its own residual around each pixel, robustly.
     update_reference
@@ -390,13 +407,17 @@ def _solutions(plan: Plan, latest: _Latest, states: Iterable[Any]) -> Iterator[S
     """The solution of each state, from the starts and with the second tries of `Schedule`."""
     starts: dict[int, Start] = {}
     updates: dict[tuple[int, ...], ReferenceUpdate] = {(): ReferenceUpdate.none(plan.reference)}
+    last = NO_CHECKSUM
     for position, latest.state in enumerate(states):
         index, before = plan.series.chosen[position], parent(position)
         start = Start(displacement=None) if before is None else starts[before]
-        found, after = _solved(plan, index, start, updates, key=is_key(position))
+        found, after, checksum = _solved(plan, index, start, updates, key=is_key(position))
+        if checksum == last != NO_CHECKSUM:
+            logger.warning("state %d repeats the one before, bit for bit", position)
+        last = checksum
         if is_key(position) and loses(found, start):
             closer = starts[position - 1]
-            again, after_again = _solved(plan, index, closer, updates, key=True)
+            again, after_again, _ = _solved(plan, index, closer, updates, key=True)
             if rank_of(again) < rank_of(found):
                 found, after, start = again, after_again, closer
             elif not found.measured.any():
@@ -417,13 +438,13 @@ def _solutions(plan: Plan, latest: _Latest, states: Iterable[Any]) -> Iterator[S
 
 def _solved(
     plan: Plan, index: int, start: Start, updates: dict[tuple[int, ...], ReferenceUpdate], *, key: bool
-) -> tuple[Solution, Start]:
-    """The solution of the latest state from a start, and where the one after it starts."""
+) -> tuple[Solution, Start, int]:
+    """The solution of the latest state from a start, where the one after it starts, and the state's checksum."""
     try:
         given = replace(start, unmeasured=0.0) if key else start
         values = solve_frame(plan, index, given, updates[start.reference_updates[-2:]])
     except RgbmidicError as error:
         logger.warning("%s failed: %s", plan.series.name(index), error)
         mesh, lights = plan.reference.mesh, len(plan.images.names)
-        return Solution.failed(mesh, lights, str(error), np.zeros(0)), start
-    return values["solution"], following(plan, FrameRecord.from_solution(**values).values, start)
+        return Solution.failed(mesh, lights, str(error), np.zeros(0)), start, NO_CHECKSUM
+    return values["solution"], following(plan, FrameRecord.from_solution(**values).values, start), values["checksum"]

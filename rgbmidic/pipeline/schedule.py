@@ -41,7 +41,7 @@ __all__ = [
     "rank_of",
 ]
 
-logger = logging.getLogger("rgbmidic.pipeline.frame")
+logger = logging.getLogger(__name__)
 
 _LOSS = 0.01
 """Share of the nodes that a key frame may lose against the one it starts from before it is measured again from the

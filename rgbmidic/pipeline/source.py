@@ -26,8 +26,7 @@ from rgbmidic.illumination.images import IlluminationImages, normalise
 from rgbmidic.illumination.linear import LinearChannels, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.settings import WIDER_AT_CRACKS, FrameSettings, IlluminationSettings, SolverSettings
+from rgbmidic.settings import LOCAL_MEAN, FrameSettings
 from rgbmidic.typing import AnyArray, FloatImage
 
 __all__ = [
@@ -38,7 +37,6 @@ __all__ = [
     "Series",
     "SourceSeries",
     "WindowedSeparation",
-    "beside_cracks",
     "correlated",
     "describe",
     "light_images",
@@ -246,6 +244,14 @@ class SourceSeries:
         values = np.asarray(state)
         if values.dtype.kind != "f" or values.ndim not in (2, 3):
             return (self._raw(values, name),)
+        stated = {"frames.kind": self.stated.kind, "frames.cfa": self.stated.cfa, "calibration.file": self.camera}
+        of_raw = [key for key, value in stated.items() if value not in (None, "monochrome")]
+        if of_raw:
+            raise ConfigurationError(
+                f"{name} of {_class(self.source)} is {values.dtype}: arrays of floats are images of the lights, and "
+                f"{' and '.join(of_raw)} {'is' if len(of_raw) == 1 else 'are'} stated, of raw frames: give whole "
+                "numbers, which are raw frames, or leave that out"
+            )
         values = values if values.ndim == 3 else values[None]
         lights = getattr(self.source, "lights", None) or [f"light {light + 1}" for light in range(len(values))]
         valid = np.isfinite(values)
@@ -469,18 +475,6 @@ def reference_images(
     return replace(mean, values=(total / count).astype(np.float32), valid=valid), separation
 
 
-def beside_cracks(mesh: Tri3Mesh, sigma: float, solver: SolverSettings) -> tuple[float, SolverSettings]:
-    """Width (px) of the local mean and settings of the solve that hold for a mesh: others where it has cracks.
-
-    A local mean takes in the gap of an open crack, and the other side, which may be lit otherwise. So it is made wider,
-    and means over the elements around each node, on one side and without the gap, do the rest.
-    """
-    if not sigma or not len(mesh.crack_edges):
-        return sigma, solver
-    return WIDER_AT_CRACKS * sigma, solver if solver.brightness == "local" else replace(solver, brightness="mean")
-
-
-def correlated(images: IlluminationImages, settings: IlluminationSettings) -> FloatImage:
-    """What the solve correlates (k, H, W): the lights' images, locally normalised unless the settings say no."""
-    sigma = settings.normalise
+def correlated(images: IlluminationImages, sigma: float = LOCAL_MEAN) -> FloatImage:
+    """What the solve correlates (k, H, W): the lights' images, over their local mean of width `sigma` (0: as is)."""
     return normalise(images.values, sigma, images.full_scale) if sigma else images.values

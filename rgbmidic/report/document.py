@@ -326,6 +326,7 @@ class _Report:
         page.heading("Provenance")
         rows = [("measured", f"{kept['created']} to {kept.get('finished', 'not finished')}")]
         rows += [("result", str(self.physical.result.path.resolve())), ("platform", kept.get("platform", ""))]
+        rows.append(("processor and BLAS", kept["machine"]))
         rows += [(f"version of {name}", text) for name, text in kept["versions"].items()]
         if (calibration := kept.get("calibration")) is not None:
             rows.append(("calibration", f"{calibration['file']}, SHA-256 {calibration['sha256']}"))

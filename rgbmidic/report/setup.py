@@ -13,7 +13,7 @@ import numpy as np
 
 from rgbmidic.report.style import time_axis
 from rgbmidic.results import QUANTITIES, Result, speckle_diameter
-from rgbmidic.settings import WIDER_AT_CRACKS, SetupSettings
+from rgbmidic.settings import SetupSettings
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -80,18 +80,15 @@ lengths (`rgbmidic.lab.resolution.cut_offs`)."""
 def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
     """Yield the parameters of the analysis, in the order of the guide; settings that were not kept are left out."""
     result, set_, mesh = physical.result, physical.result.setting, physical.mesh
-    demosaic, normalise = set_("illumination", "demosaic"), set_("illumination", "normalise")
+    demosaic, ran = set_("illumination", "demosaic"), result.provenance.get("grey_levels", {})
     chosen = result.provenance.get("element_size")  # of element_size = "auto"
     stated = set_("mesh", "element_size") if chosen is None else chosen["element_size"]
     size = float(mesh.size if stated is None else stated)
     separation = f"demosaicing `{demosaic}`, crosstalk unmixed by calibration"
     separated = len(result.lights) > 1 and demosaic is not None
     strain = "plane fitted to the displacements of the nodes in a virtual strain gauge"
-    correction, levels = set_("solver", "brightness"), "as they are"
-    if normalise:
-        cracked = len(mesh.crack_edges) > 0
-        levels = f"divided by their local mean, σ = {normalise * (WIDER_AT_CRACKS if cracked else 1):g} px"
-        correction = "mean" if cracked and correction != "local" else correction
+    normalise = ran.get("normalise")
+    levels = f"divided by their local mean, σ = {normalise:g} px" if normalise else "as they are"
     refinement, gauge = result.provenance.get("refinement"), physical.gauges.length  # of mesh.refine
     legs = np.sqrt(2 * mesh.areas)
     ends = (float(f"{end:.3g}") for end in (legs.min(), legs.max())) if refinement else (size,)
@@ -111,7 +108,7 @@ def analysis_rows(physical: Physical, floor: NoiseFloor | None) -> Rows:
         ("shape functions", "linear over the mesh; values at the nodes by a quadratic through the nodes around"),
         ("matching criterion", "weighted sum of squared differences over all lights at once"),
         ("interpolant", "cubic B-spline"),
-        ("grey-level correction", correction),
+        ("grey-level correction", ran.get("brightness")),
         ("rigid motion between lights", set_("solver", "rigid")),
         ("strain", f"{physical.measure_name}: {strain}"),
         ("virtual strain gauge", f"{physical.in_units(gauge)}, at every node"),

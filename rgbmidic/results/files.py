@@ -30,6 +30,7 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic._kernels.threads import machine
 from rgbmidic._version import __version__
 from rgbmidic.errors import AnotherTestError, ResultError, disk_faults
 from rgbmidic.fields import CameraCalibration
@@ -269,14 +270,16 @@ def _may_live(holder: dict[str, Any]) -> bool:
 
 
 SCHEMA_NAME = "rgbmidic-result"
-SCHEMA_VERSION = 9
+SCHEMA_VERSION = 10
 """Goes up with every change of the quantities or files: a result of another version is refused, not guessed at."""
 
 PROVENANCE = "provenance.json"
 PUT_BACK = "put back the file that was there, or delete it and go on with --resume"
 """What to do about a file of another run."""
 _SEAL = "sha256"
-_PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tifffile")
+_PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tifffile", "h5py")
+_ALWAYS = ("rgbmidic", *_PACKAGES[:4])
+"""Packages whose version decides on the bits of any result; the others read formats of frames."""
 READING = ("scale", "probes", "setup", "channels")
 """Sections of the settings that state how a result is read, and not what is measured."""
 _NAMED = 3
@@ -291,6 +294,8 @@ class Origin:
     ----------
     nodes, elements
         The mesh: (N, 2) positions in px and (E, 3) node indices.
+    readers
+        Names of the packages, beside those that every result needs, by which the frames are read.
     finite_elements, placement
         The same mesh in mm with the numbers of its nodes and elements, and where it lies; None: it is of no file.
     names, lights
@@ -313,6 +318,7 @@ class Origin:
     lights: Sequence[str]
     settings: TestSettings | None = None
     inputs: Mapping[str, str] = field(default_factory=dict)
+    readers: Sequence[str] = ()
     finite_elements: FiniteElementMesh | None = None
     placement: Placement | None = None
     references: Sequence[int] = (0,)
@@ -335,8 +341,8 @@ class Origin:
         for name in _PACKAGES:
             with suppress(importlib.metadata.PackageNotFoundError):
                 versions[name] = importlib.metadata.version(name)
-        document["versions"] = versions
-        document["platform"] = platform.platform()
+        document |= {"versions": versions, "readers": list(self.readers)}
+        document |= {"platform": platform.platform(), "machine": machine()}
         if self.settings is not None:
             document |= {"settings": self.settings.to_mapping(), "base": str(self.settings.base)}
             if (file := self.settings.calibration_file) is not None:
@@ -375,7 +381,8 @@ def check_same(path: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> No
         Settings, calibration, inputs, frames, mesh, lights, references, or a version differ; the message says which.
     """
     before, after = dict(_compared(was)), dict(_compared(now))
-    names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
+    # 25 and 25.0 are one number; 1 is a frame, true is not
+    names = [name for name in {**before, **after} if _typed(before.get(name)) != _typed(after.get(name))]
     if names:
         differences = "; ".join(
             f"{name} was {_short(before.get(name))}, now {_short(after.get(name))}" for name in names[:_NAMED]
@@ -399,7 +406,12 @@ def _compared(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     yield "the number of frames", document["frames"]["count"]
     yield "the list of frames", document["frames"]["sha256"]
     yield from ((name, document[name]) for name in ("lights", "references"))
-    yield from ((f"the version of {name}", text) for name, text in document["versions"].items() if name != "python")
+    for name in (*_ALWAYS, *document["readers"]):
+        yield f"the version of {name}", document["versions"].get(name)
+
+
+def _typed(value: Any) -> tuple[bool, Any]:
+    return isinstance(value, bool), value
 
 
 def _short(value: Any) -> str:

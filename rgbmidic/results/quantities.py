@@ -18,7 +18,7 @@ from rgbmidic.typing import AnyArray
 if TYPE_CHECKING:
     from rgbmidic.correlation.solution import Solution
 
-__all__ = ["FINITE_ELEMENTS", "QUANTITIES", "SHARED", "UNKNOWN_TIME", "FrameRecord", "ResultQuantity"]
+__all__ = ["FINITE_ELEMENTS", "NO_CHECKSUM", "QUANTITIES", "SHARED", "UNKNOWN_TIME", "FrameRecord", "ResultQuantity"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +99,8 @@ class ResultQuantity:
         return value[:, int(column)] if column else value
 
 
+NO_CHECKSUM = -1
+"""`checksum` of a frame that could not be measured at all."""
 UNKNOWN_TIME = np.iinfo(np.int64).min
 """`time_ns` of a frame whose time is not known."""
 
@@ -109,6 +111,8 @@ _BYTE: dict[str, Any] = {"dtype": np.uint8, "blank": 0}
 _EXACT: dict[str, Any] = {"dtype": np.float64}
 _NUMBER = "number of the frame; missing frames leave gaps"
 _INPUTS = "path and SHA-256 of each file that the frame was read from"
+_MACHINE = "processor and BLAS library that it was measured with, on which the last bits depend; empty if it failed"
+_CHECKSUM = "CRC-32 of the frame's samples where the reference was read; -1 if it failed. Noise makes all differ"
 _AT_NODE = "relative to the reference, at the node"
 _NOT_FIT = "(not the best linear fit's nodal value)"
 _FRACTION = "fraction of each light in the information that determines a node"
@@ -155,6 +159,8 @@ _TABLE = (
     ResultQuantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
     ResultQuantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
     ResultQuantity("inputs", ("file", 2), "", "", _INPUTS, **_TEXT),
+    ResultQuantity("machine", (), "", "", _MACHINE, **_TEXT),
+    ResultQuantity("checksum", (), "", "", _CHECKSUM, dtype=np.int64, blank=NO_CHECKSUM),
     ResultQuantity("node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS),
     ResultQuantity("u", _NODE, "px", "displacement.0", f"displacement in x {_AT_NODE} {_NOT_FIT}", **_EXACT),
     ResultQuantity("v", _NODE, "px", "displacement.1", f"displacement in y {_AT_NODE}", **_EXACT),

@@ -7,6 +7,7 @@ starts first; all else follows from what it has fingerprints of, so that whoever
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -51,6 +52,8 @@ __all__ = [
     "read_names",
     "read_reference",
 ]
+
+logger = logging.getLogger(__name__)
 
 _NAMES, _MESH, _REFERENCE, _FRAMES = "frames.json", "mesh.npz", "reference.npz", "solution"
 _LISTED = 5
@@ -355,6 +358,13 @@ def _start(path: Path, origin: Origin) -> bytes:
         write_json(path / PROVENANCE, sealed(stated), new=True)
     kept = read_provenance(path)
     check_same(path, kept, stated)
+    if kept["machine"] != stated["machine"]:
+        logger.warning(
+            "%s was begun with %s, and goes on with %s: the last bits of its frames may differ",
+            path,
+            kept["machine"],
+            stated["machine"],
+        )
     with writing(path):
         (path / _FRAMES).mkdir(exist_ok=True)
     run, sizes = fingerprint(kept), {"light": len(origin.lights)}

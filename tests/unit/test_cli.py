@@ -20,6 +20,7 @@ import tifffile
 import typer
 from cine_files import write_cine
 from results import make_origin, make_result, random_record, smooth_record
+from small_tests import colour_test
 
 from rgbmidic import __version__, cli, report
 from rgbmidic.command import FRAME_OPTIONS, execute, gather, read_shape
@@ -329,6 +330,8 @@ def test_report(command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert command("report", result.path, "--out", tmp_path / "a.html", "--frames", "0,1", "--overwrite")[0] == 0
     assert [file for file, _ in written] == [result.path / "report.html", tmp_path / "a.html"]
     assert written[1][1] == {"settings": None, "frames": [0, 1], "overwrite": True}
+    assert command("report", result.path, "--out", tmp_path / "rep")[1] == f"{tmp_path / 'rep.html'}\n"
+    assert written[2][0] == tmp_path / "rep.html"
     status, _, error = command("report", tmp_path)
     assert status == 2
     assert "is not a result folder" in error
@@ -450,6 +453,17 @@ def test_a_shape_is_written_one_way_and_read_in_two(text: str, shape: tuple[int,
 def test_a_wrong_shape_is_answered_with_an_example(command: Run, tmp_path: Path) -> None:
     status, _, error = command("inspect", tmp_path / "a.raw", "--shape", "512 768")
     assert (status, error) == (2, "error: --shape is ROWSxCOLUMNS, such as 512x768, not '512 768'\n")
+
+
+def test_a_test_is_inspected_by_its_reference(command: Run, tmp_path: Path) -> None:
+    test = colour_test(tmp_path / "test", [(0.0, 0.0), (0.3, 0.1)])
+    file = test.folder / "TEST.toml"
+    file.write_text(file.read_text().replace("[region]", "reference = 1\n[region]"))
+    status, out, error = command("inspect", file, "--out", tmp_path / "out")
+    assert (status, error) == (0, "")
+    assert out == command("inspect", test.frames[1], "--test", file, "--out", tmp_path / "out", "--overwrite")[1]
+    for arguments in ((file, file), (file, "--test", file)):
+        assert command("inspect", *arguments)[2].startswith("error: a TEST.toml stands for the frames of its reference")
 
 
 def test_the_first_run_says_that_kernels_are_compiled(

@@ -26,6 +26,7 @@ from rgbmidic.settings import (
     SolverSettings,
     TestSettings,
     WeightSettings,
+    grey_levels,
     read_test,
 )
 
@@ -394,7 +395,7 @@ def test_settings_built_in_python_are_checked_as_those_read(built: Any, name: st
     value = getattr(built, name)
     inner = np.asarray(value, dtype=object).ravel()[0] if isinstance(value, tuple) else value
     wrong: list[Any] = [3j, {}, object(), [[[[1]]]]]
-    wrong += ["true", *([1] if name != "mesh_refine" else [])] if isinstance(inner, bool) else [True]  # or a frame
+    wrong += ["true", *([1] if name != "mesh_refine" else [1.0])] if isinstance(inner, bool) else [True]  # or a frame
     wrong += ["1e-3", float("nan")] if isinstance(inner, int | float) else [3]
     wrong += [1.5] if type(inner) is int else []
     section = next(section.split()[0] for section, settings in BUILT.items() if settings is built)
@@ -407,6 +408,31 @@ def test_settings_built_in_python_are_checked_as_those_read(built: Any, name: st
         with pytest.raises(ConfigurationError, match=rf"^{prefix}{key.get(name, name)} must be") as caught:
             replace(built, **{name: instead})
         assert "\n" not in str(caught.value)
+
+
+def test_a_number_is_no_word() -> None:
+    """1 == True, but states a frame; 1.0 states none."""
+    test = BUILT["test"]
+    assert [replace(test, mesh_refine=one).mesh_refine is one for one in (1, True, False)] == [True] * 3
+    with pytest.raises(ConfigurationError, match=r"^mesh\.refine must be a whole number, not 1\.0"):
+        replace(test, mesh_refine=1.0)
+
+
+@pytest.mark.parametrize(
+    ("normalise", "brightness", "cracked", "runs"),
+    [
+        ("auto", "auto", False, (10, "none")),
+        ("auto", "auto", True, (30, "mean")),
+        (10, "auto", True, (10, "mean")),
+        (0, "auto", True, (0, "none")),
+        ("auto", "none", True, (30, "none")),
+        (20, "global", True, (20, "global")),
+        (20, "mean", False, (20, "mean")),
+    ],
+)
+def test_stated_grey_levels_hold_at_cracks(normalise: Any, brightness: Any, cracked: bool, runs: Any) -> None:
+    sigma, solver = grey_levels(normalise, SolverSettings(brightness=brightness), cracked=cracked)
+    assert (sigma, solver.brightness) == runs
 
 
 def test_a_wrong_number_is_told_at_construction_by_its_field() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
-from rgbmidic.frames import open_source
+from rgbmidic.frames import open_series, open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.crosstalk import align, unmix
@@ -46,7 +46,7 @@ Progress = Callable[[int, int, str], None]
 
 
 def inspect_files(
-    files: Sequence[Path | str],
+    files: Sequence[Path | str] = (),
     *,
     test: TestSettings | None = None,
     calibration: Path | str | None = None,
@@ -59,7 +59,7 @@ def inspect_files(
     Parameters
     ----------
     files
-        One file, or one per light.
+        One file, or one per light; none: the first frame of the test's reference.
     test
         Settings of a test; its sections state how the frame is read, separated and measured.
     calibration
@@ -79,8 +79,16 @@ def inspect_files(
     stated = frame or (test.frames if test else FrameSettings(path=("frame",)))
     calibrated = calibration or (test.calibration_file if test else None)
     known = None if calibrated is None else Calibration.read(calibrated)
-    paths = [Path(file) for file in files]
-    frames = tuple(open_source(path, stated, known).read(0) for path in paths)
+    if files:
+        paths = [Path(file) for file in files]
+        frames = tuple(open_source(path, stated, known).read(0) for path in paths)
+        name, where = " + ".join(legible(path.name) for path in paths), " + ".join(map(str, paths))
+    elif test is not None:
+        series, index = open_series(stated, test.base, known), stated.reference[0]
+        frames = series.read(index)
+        name = where = series.name(index)
+    else:
+        raise InputError("there is nothing to inspect: neither a frame nor a test is given")
     shape = frames[0].values.shape[-2], frames[0].values.shape[-1]
     known = known and known.cropped(stated.crop_origin, shape)
     place = Region.from_rectangle(region, shape) if region is not None else None
@@ -91,7 +99,7 @@ def inspect_files(
         else:
             _, _, mesh, place = finite_elements_of(test, shape)
             sides = mesh.size
-    how: dict[str, Any] = {"name": " + ".join(legible(path.name) for path in paths)}
+    how: dict[str, Any] = {"name": name}
     if test is not None:
         how |= {"element_size": sides, "accept": test.accept}
         how |= {"demosaic": test.illumination.demosaic, "prefilter": test.solver.prefilter}
@@ -99,7 +107,7 @@ def inspect_files(
     try:
         return inspect_frame(frames, calibration=known, region=place, **how)
     except InputError as error:
-        raise FrameError(f"{' + '.join(map(str, paths))}: {error}") from None
+        raise FrameError(f"{where}: {error}") from None
 
 
 def inspect_frame(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import multiprocessing
 import os
 import resource
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -126,6 +128,38 @@ def test_the_result_of_another_test_is_refused_with_the_difference(
         ResultStore.resume(out, origin)
     assert not list(out.glob("in_use.*"))
     np.testing.assert_array_equal(Result.open(out, partial=True).frame(1).u, random_record(1).u)
+
+
+def test_a_frame_number_is_no_true(tmp_path: Path) -> None:
+    settings = replace(_settings(tmp_path, 0.001), mesh_refine=True)
+    ResultStore.create(tmp_path / "out", make_origin(3, settings=settings)).release()
+    with pytest.raises(ResultError, match=r"mesh\.refine was true, now 1; give"):
+        ResultStore.resume(tmp_path / "out", make_origin(3, settings=replace(settings, mesh_refine=1)))
+
+
+@pytest.mark.parametrize(("readers", "refused"), [((), False), (("tifffile",), False), (("rawpy",), True)])
+def test_only_versions_of_what_reads_the_frames_decide(
+    readers: tuple[str, ...], refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    origin = make_origin(3, readers=readers)
+    ResultStore.create(tmp_path / "out", origin).release()
+    known = importlib.metadata.version
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "0.0.1" if name == "rawpy" else known(name))
+    with pytest.raises(ResultError, match="the version of rawpy was") if refused else nullcontext():
+        ResultStore.resume(tmp_path / "out", origin).release()
+
+
+def test_another_processor_is_warned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    origin = make_origin(3)
+    ResultStore.create(tmp_path / "out", origin).release()
+    ResultStore.resume(tmp_path / "out", origin).release()
+    assert not caplog.records
+    was = provenance.read_provenance(tmp_path / "out")["machine"]
+    monkeypatch.setattr(provenance, "machine", lambda: "abacus, by hand")
+    ResultStore.resume(tmp_path / "out", origin).release()
+    assert f"begun with {was}, and goes on with abacus, by hand" in caplog.text
 
 
 def test_how_a_result_is_read_may_change_while_it_is_measured(tmp_path: Path) -> None:

@@ -238,7 +238,7 @@ def test_damage_of_each_part_is_told(tmp_path: Path) -> None:
     assert "not a result folder" in damaged("provenance.json", None)
     assert "damaged" in damaged("provenance.json", b"{")
     assert "schema" in damaged("provenance.json", b"[]")
-    assert "schema version 10" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 10}')
+    assert "schema version 11" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 11}')
     assert "schema version 3" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 3}')
     whole = make_result(tmp_path / "whole").provenance
     for part, odd in {"frames": [1], "lights": [1], "settings": {"a": 1}, "references": ["a"], "inputs": None}.items():
