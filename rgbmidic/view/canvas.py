@@ -169,8 +169,9 @@ class Canvas:
         now = [Mark(str(kind), float(x), float(y), str(name)) for kind, x, y, name in rows]
         before = kept = self._states[state]
         if len(now) < len(before):  # some were removed, the others are in their order
-            left = list(now)
-            kept = [mark for mark in before if mark in left[:1] and left.pop(0)]
+            kept = []
+            for mark in before:
+                kept += [mark] * (now[len(kept) : len(kept) + 1] == [mark])
         now = [replace(mark, key=same.key) for mark, same in zip(now, kept, strict=False)] + now[len(kept) :]
         self._states[state] = now
         old, new = ({mark.key: mark for mark in marks} for marks in (before, now))

@@ -187,8 +187,13 @@ class RegionDrawing:
         numbers = [mark.kind.split(" ")[1] for mark in self.marks if mark.kind.startswith(("hole ", MASK))]
         self._hole = max(map(int, numbers), default=0) + 1
 
+    def settle(self) -> None:
+        """Draw the lines of marks that were set just now."""
+        if self._coming:
+            self.draw()
+
     def draw(self) -> None:
-        """Draw the marks and the lines."""
+        """Draw the lines."""
         self._coming = False
         outline, holes = rings(self.marks)
         masks = [(ring, _COLOURS[(at + 2) % 7]) for at, own in enumerate(masks_of(self.marks).values()) for ring in own]
@@ -220,7 +225,7 @@ class RegionDrawing:
         self._canvas.place(marks)
         if not self._coming:
             self._coming = True
-            self._document.add_timeout_callback(self.draw, _SOON)
+            self._document.add_timeout_callback(self.settle, _SOON)
 
 
 class SetupControls(Controls):
