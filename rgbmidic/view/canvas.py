@@ -171,7 +171,8 @@ class Canvas:
         if len(now) < len(before):  # some were removed, the others are in their order
             kept = []
             for mark in before:
-                kept += [mark] * (now[len(kept) : len(kept) + 1] == [mark])
+                if now[len(kept) : len(kept) + 1] == [mark]:
+                    kept.append(mark)
         now = [replace(mark, key=same.key) for mark, same in zip(now, kept, strict=False)] + now[len(kept) :]
         self._states[state] = now
         old, new = ({mark.key: mark for mark in marks} for marks in (before, now))
