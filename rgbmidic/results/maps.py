@@ -427,8 +427,14 @@ class Maps:
         InputError
             The place is outside the mesh, or the gauge is too short.
         """
-        centre = np.array([self.physical.rectified.place((x, y), 1)])
-        return Physical.named(self._strain_of(frame, StrainGauges.at_points(self.physical.covariance, centre, length)))
+        return Physical.named(self._strain_of(frame, self._gauge(*self.physical.rectified.place((x, y, length), 1))))
+
+    @cached_property
+    def _gauge(self) -> Callable[[float, float, float], StrainGauges]:
+        """Virtual gauge at a place; those used last are kept: 15 ms each where there are 8,000 nodes."""
+        return lru_cache(200)(
+            lambda x, y, length: StrainGauges.at_points(self.physical.covariance, np.array([[x, y]]), length)
+        )
 
     def _measured(self, frame: int) -> FloatArray:
         """Read u, v and their uncertainties (4, N) against the test's reference, in rectified px."""
