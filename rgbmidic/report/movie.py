@@ -485,6 +485,8 @@ def _draw(drawer: _Drawer, frames: list[int], send: Any) -> None:
         canvas = drawer.opened()
         for frame in frames:
             send.send(canvas.page(frame))
+    except BrokenPipeError:  # who asked for the pages was killed
+        return
     except RgbmidicError as error:
         send.send(error)
 

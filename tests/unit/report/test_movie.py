@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 from dataclasses import replace
@@ -91,6 +92,17 @@ def test_pages_are_the_same_for_any_number_of_processes(maps: Maps, monkeypatch:
     assert not np.array_equal(alone[0], alone[1])
     assert handlers == [signal.SIG_IGN] * 2  # inherited: a Ctrl-C while they import is no traceback of theirs
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_process_whose_pages_nobody_takes_ends_in_silence(maps: Maps) -> None:
+    drawer = movie._Drawer.of(maps, ("u",), [0, 1], None, images=None, curve=None, colours=None)
+    receive, send = multiprocessing.Pipe(duplex=False)
+    receive.close()
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        movie._draw(drawer, [0, 1], send)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_over_raw_frames_the_field_lies_where_the_specimen_is(tmp_path: Path) -> None:
