@@ -1,16 +1,19 @@
-"""Draws the figures of the pages as SVG, each for a light and a dark background.
+"""Draws the figures of the pages as SVG, each for a light and a dark background, and takes the viewer's pictures.
 
     python docs/figures.py [NAME ...] [--demo FOLDER]
 
 What shows a measurement comes from the demo's own files (``rgbmidic demo`` makes them, in FOLDER if it is not there).
+The pictures of the viewer need chromium and chromium-driver, and show the path of FOLDER: choose one like /data/demo.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 import tomllib
 from collections.abc import Callable
@@ -306,6 +309,33 @@ def tutorial() -> None:
             cv2.imwrite(str(page.parent / "images" / f"{name}.png"), small, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
+def viewer(demo: Path) -> None:
+    """Open the demo's result and its test in a browser, and keep docs/images/view_*.png of both."""
+    sys.path.insert(0, str(ROOT / "tests"))
+    from PIL import Image
+    from viewer import Page, chromium, click, serving
+
+    def keep(name: str) -> None:
+        picture = Image.open(io.BytesIO(driver.get_screenshot_as_png())).convert("RGB")
+        picture.quantize(256, dither=Image.Dither.NONE).save(IMAGES / f"view_{name}.png", optimize=True)
+
+    marks = "marks=point:140,140;strain_gauge:170,330;line:60,220;line:380,220"
+    with chromium() as driver:
+        driver.set_window_size(1280, 860)
+        with serving(demo / "result") as address:
+            page = Page(driver, f"{address}?field=exx&theme=light&{marks}")
+            page.until("model('lines').data.xs.length && model('probes').data.text.length === 3")
+            page.until("!model('head').text.includes('looked through')")
+            keep("result")
+        with serving(demo / "test" / "test.toml") as address:
+            page = Page(driver, f"{address}?theme=light")
+            driver.execute_script(*click("Inspect"))
+            page.until(
+                "model('plot').title.text.startsWith('expected uncertainty') && model('tiles').data.x.length > 1"
+            )
+            keep("setup")
+
+
 SKETCHES: dict[str, Callable[[str], None]] = {"set_up": set_up, "way": way, "house": house}
 MEASURED: dict[str, Callable[[str, Demo], None]] = {"reflection": reflection, "match": match, "weights": weights}
 
@@ -313,20 +343,24 @@ MEASURED: dict[str, Callable[[str, Demo], None]] = {"reflection": reflection, "m
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "names", nargs="*", metavar="NAME", help=f"of {', '.join([*SKETCHES, *MEASURED])}, tutorial; none: all"
+        "names", nargs="*", metavar="NAME", help=f"of {', '.join([*SKETCHES, *MEASURED])}, tutorial, viewer; none: all"
     )
     parser.add_argument("--demo", type=Path, default=Path("rgbmidic-demo"), metavar="FOLDER")
     arguments = parser.parse_args()
-    every = [*SKETCHES, *MEASURED, "tutorial"]
+    every = [*SKETCHES, *MEASURED, "tutorial", "viewer"]
     names = arguments.names or every
     if unknown := set(names) - {*every}:
         parser.error(f"unknown: {', '.join(unknown)}; allowed are {', '.join(every)}")
     if "tutorial" in names:
         tutorial()
         names = [name for name in names if name != "tutorial"]
-    if measured := [name for name in names if name in MEASURED]:
-        if not arguments.demo.is_dir():
-            subprocess.run(["rgbmidic", "demo", "--out", str(arguments.demo)], check=True)
+    measured = [name for name in names if name in MEASURED]
+    if (measured or "viewer" in names) and not arguments.demo.is_dir():
+        subprocess.run(["rgbmidic", "demo", "--out", str(arguments.demo)], check=True)
+    if "viewer" in names:
+        viewer(arguments.demo.resolve())
+        names = [name for name in names if name != "viewer"]
+    if measured:
         demo = Demo(arguments.demo)
     for theme in THEMES:
         for name in names:

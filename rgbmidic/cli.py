@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -207,7 +206,6 @@ def _continuation_hint(test: Path, out: Path, frames: str, *, resume: bool) -> I
         return file.read_bytes() if (file := out / PROVENANCE).is_file() else b""
 
     before_it = begun()
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, which a background job ignores
     try:
         yield
     except KeyboardInterrupt:
@@ -217,8 +215,6 @@ def _continuation_hint(test: Path, out: Path, frames: str, *, resume: bool) -> I
         else:
             note("nothing was begun: run the same command again")
         raise
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 @app.command()

@@ -8,6 +8,7 @@ import io
 import logging
 import math
 import re
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Mapping
@@ -76,6 +77,7 @@ def main(app: typer.Typer) -> None:
 
 def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> int:
     """Run a command; its exit status: 0, 1 where it failed, 2 where the input is wrong, 130 where it was stopped."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, which a background job ignores
     try:
         status = app(args=arguments, standalone_mode=False) or 0
         if status != INTERRUPTED:  # typer's own answer to Ctrl-C
@@ -93,6 +95,8 @@ def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> i
         if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
             return fail(disk_reason(error), FAILURE)
         return fail(f"{type(error).__name__}: {error} (run again with --debug for the details)", FAILURE)
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def fail(message: str, status: int) -> int:

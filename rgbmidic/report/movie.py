@@ -10,10 +10,14 @@ import csv
 import multiprocessing
 import signal
 import subprocess
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
 from pathlib import Path
+from threading import Event, Timer
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
@@ -50,6 +54,9 @@ _ENCODERS = {
     ".webm": "-c:v libvpx-vp9 -crf 28 -b:v 0 -deadline realtime -cpu-used 5 -row-mt 1 -pix_fmt yuv420p -f webm",
 }
 """Quality at which text of 9 points keeps its edges; both need an even number of rows and columns."""
+_PATIENCE = 300.0
+"""Seconds after which an ffmpeg that neither takes a page nor ends is ended. Measured: noise of 3840 x 2160 px takes .5
+s a page, and 12 s at the end for the pages held back; the largest page has 8 times as many, and others may compute."""
 MOVIES = (*_ENCODERS, ".gif")
 """Endings of the files that `write_movie` writes."""
 
@@ -478,35 +485,55 @@ def _draw(drawer: _Drawer, frames: list[int], send: Any) -> None:
         canvas = drawer.opened()
         for frame in frames:
             send.send(canvas.page(frame))
+    except BrokenPipeError:  # who asked for the pages was killed
+        return
     except RgbmidicError as error:
         send.send(error)
 
 
 def _video(file: BinaryIO, pages: Iterator[Page], fps: float, encoder: list[str]) -> None:
-    """Encode pages by ffmpeg into the file that is open for it."""
-    first = next(pages)
+    """Encode pages by ffmpeg, which gets the whole path of the open file: `-b.mp4` is an option, `file:b.mp4` a URL."""
+    first, path = next(pages), Path(file.name).absolute()
     rows, columns = first.shape[:2]
     exe, *options = encoder
     source = ["-f", "rawvideo", "-pix_fmt", "rgba", "-s", f"{columns}x{rows}", "-r", f"{fps:g}", "-i", "-"]
     even = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white"]
-    command = [exe, "-y", "-loglevel", "error", *source, *even, *options, file.name]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
-    assert process.stdin is not None
-    assert process.stderr is not None
+    command = [exe, "-y", "-loglevel", "error", *source, *even, *options, str(path)]
+    with tempfile.TemporaryFile() as errors:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=errors, start_new_session=True)
+        pipe, late = process.stdin, Event()
+        assert pipe is not None
+
+        def end() -> None:
+            late.set()
+            process.kill()
+
+        try:
+            with suppress(BrokenPipeError):  # it says why on stderr
+                for page in chain([first], pages):
+                    _within(_PATIENCE, partial(pipe.write, page.tobytes()), end)
+                _within(_PATIENCE, pipe.close, end)
+            status = _within(_PATIENCE, process.wait, end)
+        finally:
+            process.kill()
+            process.wait()
+        errors.seek(0)
+        said = errors.read().decode(errors="replace").strip().splitlines()
+    if late.is_set():
+        raise ResultError(f"ffmpeg could not write the movie: {exe} did nothing for {_PATIENCE:g} s and was ended")
+    if status != 0 or not path.stat().st_size:
+        reason = said[-1] if said else f"it ended with status {status} and {path.stat().st_size} bytes"
+        raise ResultError(f"ffmpeg could not write the movie: {reason}")
+
+
+def _within(seconds: float, act: Callable[[], Any], late: Callable[[], object]) -> Any:
+    """Call `act`; `late` is called where that takes longer, and lets it end."""
+    timer = Timer(seconds, late)
+    timer.start()
     try:
-        with suppress(BrokenPipeError):  # it says why on stderr
-            process.stdin.write(first.tobytes())
-            for page in pages:
-                process.stdin.write(page.tobytes())
-            process.stdin.close()
-        said = process.stderr.read().decode(errors="replace").strip()
-        if process.wait() != 0:
-            raise ResultError(
-                f"ffmpeg could not write the movie: {said.splitlines()[-1] if said else process.returncode}"
-            )
+        return act()
     finally:
-        process.kill()
-        process.wait()
+        timer.cancel()
 
 
 def _gif(file: BinaryIO, pages: Iterator[Page], fps: float, samples: list[Page]) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from rgbmidic.errors import InputError
 from rgbmidic.results.files import writing
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
@@ -57,6 +58,8 @@ NUMBERS, BAR, GAP, LEGEND = 0.65, 0.95, 0.15, 2.2
 text's extent at 9 points."""
 _BELOW, _ABOVE = 0.52, 0.3
 """Inches: room for the numbers below a panel, and for its title; two lines and one line of 9 points."""
+_LEAST = 0.2
+"""Inches of a panel that still shows something: 3 mm of a page, 20 px of a movie of 960."""
 _CLIPPED, _WILD = 0.5, 0.1
 """Colours span all values but this percentage at each end, and what lies within this fraction of that span beyond.
 Chosen: a single outlier in a field of 200 nodes does not set the range."""
@@ -106,6 +109,11 @@ def draw_figure(
     -------
     Figure
         The figure, which `save_figure` writes.
+
+    Raises
+    ------
+    InputError
+        There is no room for so many panels.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -115,7 +123,11 @@ def draw_figure(
     rows = count // columns
     total = min(_WIDTH, max(6.0, 4.5 * columns))
     width = (total - NUMBERS) / columns - beside
-    height = min(width * aspect, (tallest - 2 * GAP) / rows - _BELOW - _ABOVE)
+    highest = (tallest - 2 * GAP) / rows - _BELOW - _ABOVE
+    if min(width, highest) < _LEAST:
+        most = (_WIDTH - NUMBERS) / (beside + _LEAST) if rows == 1 else (tallest - 2 * GAP) / (_LEAST + _BELOW + _ABOVE)
+        raise InputError(f"one picture has room for {int(most)} panels of this shape, not for {count}: show fewer")
+    height = min(width * aspect, highest)
     heading = 2 * GAP if title else 0.0
     whole = rows * (height + _BELOW + _ABOVE) + heading
     with mpl.rc_context(STYLE):

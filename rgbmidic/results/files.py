@@ -8,6 +8,7 @@ Provenance of a result: what all its frames share, kept so that a later run can 
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import importlib.metadata
 import io
@@ -166,6 +167,8 @@ def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool
 def check_file(out: Path, *, overwrite: bool) -> None:
     """Refuse a file that is already there, unless it may be replaced, or whose folder is not.
 
+    What a process of this host that was killed left of the file is removed.
+
     Raises
     ------
     ResultError
@@ -178,6 +181,10 @@ def check_file(out: Path, *, overwrite: bool) -> None:
             )
         if not out.parent.is_dir():
             raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
+        for part in out.parent.glob(f"{glob.escape(out.name)}.*.*.part"):
+            host, _, process = part.name.removeprefix(f"{out.name}.").removesuffix(".part").rpartition(".")
+            if process.isdecimal() and not _may_live({"host": host, "process": int(process)}):
+                part.unlink(missing_ok=True)
 
 
 def writing(path: Path | str) -> AbstractContextManager[None]:

@@ -20,6 +20,7 @@ from rgbmidic.fields import (
     NodalCovariance,
     RigidMotion,
     Strain,
+    StrainGauges,
     Units,
     frame_covariance,
     length_of,
@@ -418,6 +419,23 @@ class Maps:
         motion = self._rigid(moved)
         return moved if motion is None else motion.removed(self._covariance.mesh.nodes, moved)
 
+    def strain_at(self, frame: int, x: float, y: float, length: float) -> dict[str, FloatArray]:
+        """Compute the strain of one virtual gauge at a place of the image, px; each quantity, (1,), by its name.
+
+        Raises
+        ------
+        InputError
+            The place is outside the mesh, or the gauge is too short.
+        """
+        return Physical.named(self._strain_of(frame, self._gauge(*self.physical.rectified.place((x, y, length), 1))))
+
+    @cached_property
+    def _gauge(self) -> Callable[[float, float, float], StrainGauges]:
+        """Virtual gauge at a place; those used last are kept: 15 ms each where there are 8,000 nodes."""
+        return lru_cache(200)(
+            lambda x, y, length: StrainGauges.at_points(self.physical.covariance, np.array([[x, y]]), length)
+        )
+
     def _measured(self, frame: int) -> FloatArray:
         """Read u, v and their uncertainties (4, N) against the test's reference, in rectified px."""
         read = next(self.result.table.each(_MOVED, [frame]))
@@ -460,10 +478,10 @@ class Maps:
     @cached_property
     def _strain(self) -> Callable[[int], Mapping[str, FloatArray]]:
         """Strain by name of a frame; of the last two it is kept, for several fields of one frame."""
-        return lru_cache(2)(lambda frame: Physical.named(self._strain_of(frame)))
+        return lru_cache(2)(lambda frame: Physical.named(self._strain_of(frame, self.physical.gauges)))
 
-    def _strain_of(self, frame: int) -> Strain:
-        gauges, moved = self.physical.gauges, self._measured(frame)
+    def _strain_of(self, frame: int, gauges: StrainGauges) -> Strain:
+        moved = self._measured(frame)
         if self.since is None:
             gradient, covariance = gauges.gradient(*moved)
         else:  # both gradients of the same nodes, which have data in both frames

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Self
 from urllib.parse import urlencode
@@ -55,12 +55,15 @@ class Mark:
         Place in px on the reference.
     name
         Name of the probe of which it is the first mark; empty: its kind and number.
+    key
+        The same for a mark that is moved or renamed, however many have its values.
     """
 
     kind: str
     x: float
     y: float
     name: str = ""
+    key: object = field(default_factory=object, compare=False, repr=False, kw_only=True)
 
 
 class Steps:

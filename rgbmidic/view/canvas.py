@@ -28,6 +28,8 @@ _BAR = 80
 """Px of the screen for the colour bar: seven digits of 12 px, which change with the frame."""
 _SOON = 40
 """Ms in which the moves of a view are collected: the picture follows at 25 a second."""
+_SENT = 100
+"""States of the marks that the browser may not have yet: it asks for one frame at a time, each of which moves them."""
 
 
 def plain_plot(**options: Any) -> Any:
@@ -48,6 +50,10 @@ def columns(names: str, rows: Iterable[Sequence[Any]] = ()) -> dict[str, list[An
 class Canvas:
     """Plot of a window of the image: field, colour bar, marks, and the tools to move it and to set marks.
 
+    The browser sets marks while the server is busy, so that what either of them sends may cross what the other sent.
+    Each state of the marks that the server sends has a number, the name of a column that the browser sends back; what
+    the browser sends is the difference from that state, which is merged.
+
     Parameters
     ----------
     document
@@ -65,6 +71,8 @@ class Canvas:
     ----------
     plot, marks, tools
         The plot, the marks on it, and its tools: to move it, then one for each of `kinds`.
+    set
+        The marks as they were placed, with what was set, moved and removed on the plot since.
     window
         The part of the image in view.
     wanted
@@ -100,7 +108,9 @@ class Canvas:
         )
         self.bar = bk.ColorBar(color_mapper=self.colours, width=14, major_label_text_font_size="12px")
         self.plot.add_layout(self.bar, "right")
-        self.marks = bk.ColumnDataSource(columns("x y kind name"), name="marks" if like is None else None)
+        self.marks = bk.ColumnDataSource(columns("x y kind name 0"), name="marks" if like is None else None)
+        self._states, self.set = {0: list[Mark]()}, list[Mark]()
+        self.marks.on_change("data", lambda attr, old, new: self._merge())
         dot = {"size": 9, "fill_color": "white", "line_color": "black", "line_width": 1.5}
         dots = self.plot.scatter("x", "y", source=self.marks, level="overlay", **dot)
         pan, wheel = bk.PanTool(), bk.WheelZoomTool(zoom_on_axis=False)
@@ -142,16 +152,36 @@ class Canvas:
         if self.colours.palette != list(colours):  # which takes as long to check as a frame to paint
             self.colours.palette = list(colours)
 
-    @property
-    def set(self) -> list[Mark]:
-        """The marks as they are on the plot."""
-        rows = zip(*(self.marks.data[key] for key in ("kind", "x", "y", "name")), strict=True)
-        return [Mark(str(kind), float(x), float(y), str(name)) for kind, x, y, name in rows]
-
     def place(self, marks: Sequence[Mark]) -> None:
         """Place marks on the plot, unless they are there."""
-        if list(marks) != self.set:
-            self.marks.data = columns("x y kind name", [(mark.x, mark.y, mark.kind, mark.name) for mark in marks])
+        self.set, last = list(marks), max(self._states)
+        if self._states[last] != self.set:
+            self._states[last + 1] = self.set
+            self._states = dict(list(self._states.items())[-_SENT:])
+            rows = [(mark.x, mark.y, mark.kind, mark.name, 0) for mark in marks]
+            self.marks.data = columns(f"x y kind name {last + 1}", rows)
+
+    def _merge(self) -> None:
+        """Take what the browser has set, moved or removed since the state that it had."""
+        data = self.marks.data
+        state = max((int(key) for key in data if key.isdigit()), default=max(self._states))
+        rows = zip(*(data[key] for key in ("kind", "x", "y", "name")), strict=True)
+        now = [Mark(str(kind), float(x), float(y), str(name)) for kind, x, y, name in rows]
+        before = kept = self._states[state]
+        if len(now) < len(before):  # some were removed, the others are in their order
+            kept = []
+            for mark in before:
+                if now[len(kept) : len(kept) + 1] == [mark]:
+                    kept.append(mark)
+        now = [replace(mark, key=same.key) for mark, same in zip(now, kept, strict=False)] + now[len(kept) :]
+        self._states[state] = now
+        old, new = ({mark.key: mark for mark in marks} for marks in (before, now))
+        moved = {key: mark for key, mark in new.items() if mark != old.get(key, mark)}
+        self.set = [
+            replace(mark, x=moved[mark.key].x, y=moved[mark.key].y) if mark.key in moved else mark
+            for mark in self.set
+            if mark.key in new or mark.key not in old
+        ] + [mark for key, mark in new.items() if key not in old]
 
     def resize(self) -> None:
         """Take the size that the browser reports."""

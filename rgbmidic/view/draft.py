@@ -32,7 +32,8 @@ from rgbmidic.settings import (
 from rgbmidic.view.address import KINDS, Mark
 
 __all__ = ["HOLES", "MASK", "OUTLINES", "Confirmation", "Draft", "arranged", "channel_section"]
-__all__ += ["marks_of", "mask_images", "masks_of", "probe_section", "region_of", "rings", "scale_section"]
+__all__ += ["check_complete", "marks_of", "mask_images", "masks_of", "probe_section", "region_of", "region_section"]
+__all__ += ["rings", "scale_section"]
 
 _FILES = (
     *("frames.path", "calibration.file", "region.mask", "mesh.file", "scale.camera", "channels.file"),
@@ -127,7 +128,7 @@ class Draft:
     @property
     def is_file(self) -> bool:
         """Whether the file has this content."""
-        return self.file.exists() and self.file.read_text(encoding="utf-8-sig") == self.text
+        return self.file.exists() and self.file.read_text(encoding="utf-8-sig", errors="replace") == self.text
 
     @property
     def document(self) -> dict[str, Any]:
@@ -286,7 +287,7 @@ class Confirmation:
 
     def question(self, files: Sequence[Path], what: str) -> str:
         """Return what to confirm; empty where no file exists, or where the same was asked just before."""
-        there = [str(file) for file in files if file.exists()]
+        there = {str(file): file.stat().st_mtime_ns for file in files if file.exists()}
         asked = (there, what) if there and self._asked != (there, what) else None
         self._asked = asked
         return f"{', '.join(there)} exists: press again to replace {what}." if asked else ""
@@ -315,6 +316,13 @@ def arranged(marks: Sequence[Mark], new: str) -> tuple[Mark, ...]:
     return tuple(kept)
 
 
+def region_section(draft: Draft, marks: Sequence[Mark]) -> dict[str, Any]:
+    """Return the keys of ``[region]`` for what is drawn; without an outline a mask that is stated stays."""
+    outline, stated = region_of(marks), draft.section("region")
+    keys = {"mask": None if outline else stated.get("mask"), "holes": _holes(marks) or None, **(outline or {})}
+    return {"rectangle": None, "polygon": None, **keys} if stated or any(keys.values()) else {}
+
+
 def region_of(marks: Sequence[Mark]) -> dict[str, Any] | None:
     """Return the keys of ``[region]`` for an outline and its holes; None where no outline is complete."""
     outline = next((kind for kind in OUTLINES if any(mark.kind == kind for mark in marks)), "")
@@ -327,6 +335,21 @@ def region_of(marks: Sequence[Mark]) -> dict[str, Any] | None:
     else:
         shape = {"polygon": corners}
     return {**shape, **({"holes": holes} if holes else {})}
+
+
+def check_complete(marks: Sequence[Mark]) -> None:
+    """Check that no outline, hole or mask lacks marks.
+
+    Raises
+    ------
+    ConfigurationError
+        One does: it would be left out.
+    """
+    for kind in dict.fromkeys(mark.kind for mark in marks):
+        shape = kind if kind in OUTLINES else MASK if kind.startswith(MASK) else kind.rpartition(" ")[0]
+        least, there = {**OUTLINES, **HOLES, MASK: HOLES["hole"]}[shape], sum(mark.kind == kind for mark in marks)
+        if there < least:
+            raise ConfigurationError(f"the {kind} needs {least} marks or more and has {there}: finish or remove it")
 
 
 def rings(marks: Sequence[Mark]) -> tuple[Ring, list[Ring]]:

@@ -254,7 +254,7 @@ class MarkLayer:
 
     def __init__(self, canvas: Canvas, elements: npt.NDArray[np.int32]) -> None:
         self.colours: dict[str, str] = {}
-        self._canvas, self._elements, self._shown = canvas, elements, dict[Mark, Mark]()
+        self._canvas, self._elements, self._shown = canvas, elements, dict[object, tuple[Mark, Mark]]()
         self._drawn: object = None
         self._joined = bk.ColumnDataSource(columns(_PROBE), name="probes")
         canvas.plot.multi_line("xs", "ys", source=self._joined, line_color="colour", line_width=3)
@@ -273,12 +273,12 @@ class MarkLayer:
         Each probe shows its value of `values`; strain gauges are circles of the length `gauge` (px).
         """
         at = [self._carried(mark, reference, nodes) for mark in marks]
-        shown = dict(zip(at, marks, strict=True))
-        drawn = (shown, dict(values), gauge)
+        self._shown = {mark.key: (mark, own) for mark, own in zip(at, marks, strict=True)}
+        self._canvas.place(at)
+        drawn = (at, dict(values), gauge)
         if drawn == self._drawn:
             return
-        self._shown, self._drawn = shown, drawn
-        self._canvas.place(at)
+        self._drawn = drawn
         ends = [mark for mark in at if mark.kind == SCALE]
         probes = {**probe_marks(at), **({SCALE: ends} if len(ends) > 1 else {})}
         self.colours = {name: _COLOURS[place % len(_COLOURS)] for place, name in enumerate(probes)}
@@ -292,9 +292,13 @@ class MarkLayer:
     def taken(self, nodes: FloatArray, reference: FloatArray) -> tuple[Mark, ...] | None:
         """Return the marks, set over nodes (N, 2), on the `reference` (N, 2); None where none has changed."""
         now = self._canvas.set
-        if now == list(self._shown):
+        if now == [mark for mark, _ in self._shown.values()]:
             return None
-        return tuple(self._shown.get(mark) or self._carried(mark, nodes, reference) for mark in now)
+        marks = []
+        for mark in now:
+            shown, own = self._shown.get(mark.key, (None, mark))
+            marks.append(own if mark == shown else self._carried(mark, nodes, reference))
+        return tuple(marks)
 
     def _carried(self, mark: Mark, before: FloatArray, after: FloatArray) -> Mark:
         """Carry a mark from the nodes `before` to those `after`; outside the mesh or without data it stays."""

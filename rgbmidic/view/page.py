@@ -92,6 +92,7 @@ class ResultPage:
         self.values: MapValues | None = None
         self._pointer: tuple[float, float] | None = None
         self._read = lru_cache(4)(lambda name, frame, changes, chosen: self.fields.read(name, frame))
+        self._moved = lru_cache(2)(lambda frame, changes, chosen: self.fields.displacement(frame))
         self._test_range = lru_cache(8)(lambda name, changes, chosen: range_of_test(self.fields, name))
         self._changes = self._size = 0
         self._scale_read: ScaleSettings | None = None
@@ -332,6 +333,12 @@ class ResultPage:
         return read
 
     @property
+    def _displacement(self) -> FloatArray:
+        """u, v and their uncertainties (4, N) in the frame in view, px."""
+        moved: FloatArray = self._moved(self.view.frame, self._changes, self._chosen)
+        return moved
+
+    @property
     def _others(self) -> list[str]:
         """Names of the fields beside the first."""
         asked = [getattr(self.view, entry) for entry in BESIDE]
@@ -408,10 +415,8 @@ class ResultPage:
         self.blank.show([(*self.result.nodes[node].tolist(), "", colours[values.status[node]]) for node in missing])
         probes = probe_marks(view.marks).items()
         gauge = self._gauge
-        texts = {
-            name: probe_text(self.fields, field, values, marks[0].kind, probe_place(marks, gauge))
-            for name, marks in probes
-        }
+        shown = self.fields, field, values, self._displacement, view.frame
+        texts = {name: probe_text(*shown, marks[0].kind, probe_place(marks, gauge)) for name, marks in probes}
         texts[SCALE] = f": {view.distance:g} mm" if view.distance else ""
         self.marks.place(view.marks, self.result.nodes, nodes, texts, gauge)
 
@@ -452,9 +457,9 @@ class ResultPage:
         """Show the value under the pointer, of the field and the frame in view."""
         text = ""
         if self.values is not None and self._pointer is not None:
-            nodes, elements = self._nodes(self.values), self.result.elements
+            place = self._displacement, self._nodes(self.values), *self._pointer
             text = " &nbsp; ".join(
-                pointer_text(self.fields.all[name], self._values(name), nodes, elements, *self._pointer)
+                pointer_text(self.fields, self.fields.all[name], self._values(name), *place)
                 for name in (self.view.field, *self._others)
             )
         self.parts.under.text = text

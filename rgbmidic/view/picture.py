@@ -302,6 +302,8 @@ _SPREAD = 24
 """Frames, evenly spread, whose values set the colour range of a whole test: they are read within a second."""
 _KEPT = 8
 """Raw frames that are kept as pictures: those around the one in view."""
+_WHOLE = 1 - 1e-9
+"""Part of the weights of a point's nodes that must be measured: all but what rounding leaves of a node beside it."""
 _REASON = 90
 """Letters of a frame's reason that are shown at once: two lines of the column."""
 _REASONS = ("measured", "no light sees enough texture here", "the images around it do not match", "carried over")
@@ -449,15 +451,16 @@ def extremes(field: MapField, values: MapValues) -> tuple[int, ...]:
 
 
 def pointer_text(
-    field: MapField, values: MapValues, nodes: FloatArray, elements: npt.NDArray[np.int32], x: float, y: float
+    maps: Maps, field: MapField, values: MapValues, moved: FloatArray, nodes: FloatArray, x: float, y: float
 ) -> str:
-    """Return the value at a place of the image, as HTML; where there is none, why."""
-    found = element_at(nodes, elements, x, y)
+    """Return the value at a place over nodes (N, 2), as HTML; where there is none, why. `moved` is as of `mean_of`."""
+    found = element_at(nodes, maps.result.elements, x, y)
     if found is None:
         return f"x {x:.1f}, y {y:.1f} px: outside the mesh"
     corners, weights = found
-    weights = np.eye(3)[weights.argmax()] if field.stepped else weights
-    value, std = (float(weights @ part[corners]) for part in (values.values, values.std))
+    there = corners.astype(np.int64)
+    mean = Mean(name="", nodes=there, weights=weights, correlation=maps.physical.covariance.part(there), least=_WHOLE)
+    value, std = mean_of(maps, field, values, moved, mean)
     text = f"{field.name} = {field.text(value, std)}"
     blank = values.status[corners].max()
     if not np.isfinite(value):
@@ -465,26 +468,47 @@ def pointer_text(
     return f"x {x:.1f}, y {y:.1f} px: <b>{html.escape(text)}</b>"
 
 
-def probe_text(maps: Maps, field: MapField, values: MapValues, kind: str, place: tuple[float, ...]) -> str:
-    """Return the value of a field at a point, or its mean along a line or over an area, with its uncertainty.
+def probe_text(
+    maps: Maps, field: MapField, values: MapValues, moved: FloatArray, frame: int, kind: str, place: tuple[float, ...]
+) -> str:
+    """Return what a probe of a kind measures of a field, with its uncertainty, as its history has it.
 
-    That of a mean of u or v, or of their rates, is exact; of others it is the most that it can be.
+    A probe whose history does not have the field shows its value at the centre, or its mean; see `mean_of`, which also
+    has `moved`.
     """
-    if kind == "gauge" or (field.stepped and kind != "point"):
+    name = field.name.removesuffix("_std")
+    if kind == "gauge" or (field.stepped and kind in ("line", "region", "circle")):
         return ""
     try:
+        if kind == "strain_gauge" and maps.field(name).group == "Strain":
+            strain = maps.strain_at(frame, *place)
+            value, std = float(strain[name][0]), float(strain[f"{name}_std"][0])
+            return f": {field.text(value, std) if name == field.name else field.text(std)}"
         kind, place = ("point", place[:2]) if kind == "strain_gauge" else (kind, place)
         probe = make_probe(maps.physical.covariance, kind, 1, place, rectified=maps.physical.rectified)
     except InputError:
         return ""
     assert isinstance(probe, Mean)
+    value, std = mean_of(maps, field, values, moved, probe)
+    most = " at most" if kind != "point" and name not in ("u", "v") and np.isfinite(std) else ""
+    return f"{' mean' if kind != 'point' else ''}: {field.text(value, std)}{most}"
+
+
+def mean_of(maps: Maps, field: MapField, values: MapValues, moved: FloatArray, mean: Mean) -> tuple[float, float]:
+    """Average a field over a place, as a history does, with its standard uncertainty; NaN where it has none.
+
+    That of u and v is exact, from their displacement `moved`, as `Maps.displacement` returns it; the errors of other
+    fields are taken as the same at all nodes, which is the most that they can add up to: gauges overlap.
+    """
+    name = field.name.removesuffix("_std")
     if field.stepped:
-        return f": {field.text(float(values.values[probe.nodes[probe.weights.argmax()]]))}"
-    read = np.stack([values.values, values.std])[:, None, probe.nodes]
-    stated = bool(np.isfinite(read[1]).any())
-    alike = field.name.partition("_")[0] not in ("u", "v") and len(probe.nodes) > 3
-    known = np.isfinite(read[0] + (read[1] if stated else 0))
-    (value,), (std,) = probe.average(read[0], read[1], known, alike=alike)
-    most = " at most" if stated and alike and np.isfinite(value) else ""
-    mean = " mean" if kind != "point" else ""
-    return f"{mean}: {field.text(float(value), float(std) if stated else float('nan'))}{most}"
+        return float(values.values[mean.nodes[mean.weights.argmax()]]), float("nan")
+    exact = name in ("u", "v")
+    read = moved["uv".index(name) :: 2] if exact else np.stack([values.values, values.std])
+    of_nodes, stds = read[:, None, mean.nodes]
+    stated = bool(np.isfinite(stds).any())
+    pair = mean.average(of_nodes, stds, np.isfinite(of_nodes + (stds if stated else 0)), alike=not exact)
+    (value,), (std,) = maps.physical.units.lengths(*pair) if exact else pair
+    if exact and name != field.name:
+        return float(std), float("nan")
+    return float(value), float(std) if stated else float("nan")

@@ -29,10 +29,12 @@ from rgbmidic.view.draft import (
     OUTLINES,
     Confirmation,
     Draft,
+    check_complete,
     marks_of,
     mask_images,
     masks_of,
     region_of,
+    region_section,
 )
 from rgbmidic.view.models import SharedState, script
 from rgbmidic.view.picture import AROUND, Background, Overlay, every, guarded, paint, palette, warning
@@ -74,7 +76,7 @@ class SetupPage:
         self.source = DraftFrames.of(draft)
         self.pictures: dict[str, Any] = {}
         self.inspection: Inspection | None = None
-        self._inspected, self._opened = 0, draft.file if draft.is_file else None
+        self._inspected, self._opened = 0, draft
         reference, out = draft.frames.reference[0], runs[-1].out if runs else draft.file.parent / "result"
         self.state = SharedState(name="state", asked=reference, shown=reference)
         self.parts = SetupControls(draft, len(self.source.series) - 1, out, dark=dark)
@@ -195,6 +197,7 @@ class SetupPage:
 
     def _inspect(self) -> None:
         """Inspect the frame in view as `rgbmidic inspect` does, in another thread."""
+        self.drawing.settle()  # else it drops the inspection
         content, size = region_of(self.drawing.marks), float(self.parts.size.value)
         if self.draft.section("mesh").get("file"):
             mesh, region = self._of_file()
@@ -226,7 +229,7 @@ class SetupPage:
 
     def _changed(self) -> Draft:
         """Return the draft with the values of all controls."""
-        p, content, end = self.parts, region_of(self.drawing.marks), len(self.source.series) - 1
+        p, end = self.parts, len(self.source.series) - 1
         frames: dict[str, Any] = {"first": int(p.first.value) or None}
         frames["last"] = None if int(p.last.value) == end else int(p.last.value)
         if int(p.reference.value) != self.draft.frames.reference[0]:
@@ -237,8 +240,8 @@ class SetupPage:
             changes["mesh"] = {"element_size": size}
         if p.calibration.value:
             changes["calibration"] = {"file": p.calibration.value}
-        if content is not None:
-            changes["region"] = {"mask": None, **{key: content.get(key) for key in ("rectangle", "polygon", "holes")}}
+        if region := region_section(self.draft, self.drawing.marks):
+            changes["region"] = region
         return self.draft.changed(changes)
 
     def _reopen(self) -> None:
@@ -263,26 +266,33 @@ class SetupPage:
         self.drawing.next_hole()
 
     def _write(self) -> bool:
-        """Write TEST.toml and the masks of the lights, unless other files than the one opened must be confirmed."""
+        """Write TEST.toml and the masks of the lights, unless files other than what was opened must be confirmed."""
+        self.drawing.settle()  # else it takes the place of what is reported here
+        check_complete(self.drawing.marks)
         self._reopen()
         draft, pictures = self.draft.at(Path(self.parts.file.value)), dict[Path, bytes]()
         if masks := masks_of(self.drawing.marks):
             lights, stem = self.source.lights, draft.file.stem
-            names = [f"{stem}_mask_{re.sub(r'[^A-Za-z0-9]+', '_', light)}.png" for light in lights]
+            names = [f"{stem}_mask_{at}_{re.sub(r'[^A-Za-z0-9]+', '_', one)}.png" for at, one in enumerate(lights, 1)]
             images = mask_images(masks, lights, self.source.shape)
             pictures = {draft.file.parent / name: image for name, image in zip(names, images, strict=True)}
             draft = draft.changed({"weights": {"method": "images", "images": names}})
         draft.check()
-        files = [*pictures, *([draft.file] if draft.file != self._opened else [])]
-        if asked := self.confirmation.question(files, "it" if len(files) == 1 else "them"):
+        same = draft.file == self._opened.file
+        files = [*pictures, *([] if same and self._opened.is_file else [draft.file])]
+        what = f"it{', which has another content than this page read' * same}" if files == [draft.file] else "them"
+        if asked := self.confirmation.question(files, what):
             self.parts.message.text = warning(asked)
             return False
         for file, content in pictures.items():
             write_complete(file, methodcaller("write", content))
         draft.write()
-        self.draft, self._opened = draft, draft.file
-        written = html.escape(", ".join(map(str, (draft.file, *pictures))))
-        self.parts.message.text = f"{written} {'are' if pictures else 'is'} written."
+        self.draft = self._opened = draft
+        written, region = html.escape(", ".join(map(str, (draft.file, *pictures)))), draft.section("region")
+        held = [f"a {key}" for key in ("rectangle", "polygon", "mask") if key in region]
+        held += [f"{len(region['holes'])} holes"] if "holes" in region else []
+        told = f", with {' and '.join(held)} as its region" if held else ""
+        self.parts.message.text = f"{written} {'are' if pictures else 'is'} written{told}."
         return True
 
     def _run(self) -> None:

@@ -165,6 +165,7 @@ class RegionDrawing:
         self._steps, self._hole, self._coming = Steps(marks), 1, False
         self._rings = ColumnDataSource(columns("xs ys colour"), name="rings")
         canvas.plot.multi_line("xs", "ys", source=self._rings, line_color="colour", line_width=2.5)
+        canvas.place(marks)
         canvas.marks.on_change("data", lambda attr, old, new: self._marked())
 
     @property
@@ -174,7 +175,7 @@ class RegionDrawing:
 
     def go(self, *, back: bool) -> None:
         """Return to the marks before the last step, or do it again."""
-        self._steps.go(back=back)
+        self._canvas.place(self._steps.go(back=back))
         self.draw()
 
     def clear(self) -> None:
@@ -186,10 +187,14 @@ class RegionDrawing:
         numbers = [mark.kind.split(" ")[1] for mark in self.marks if mark.kind.startswith(("hole ", MASK))]
         self._hole = max(map(int, numbers), default=0) + 1
 
+    def settle(self) -> None:
+        """Draw the lines of marks that were set just now."""
+        if self._coming:
+            self.draw()
+
     def draw(self) -> None:
-        """Draw the marks and the lines."""
+        """Draw the lines."""
         self._coming = False
-        self._canvas.place(self.marks)
         outline, holes = rings(self.marks)
         masks = [(ring, _COLOURS[(at + 2) % 7]) for at, own in enumerate(masks_of(self.marks).values()) for ring in own]
         closed = [[*ring, *ring[:1]] for ring in (outline, *holes, *(ring for ring, _ in masks))]
@@ -205,22 +210,22 @@ class RegionDrawing:
 
         A polygon's number is that of the present hole; a round hole is complete with two marks.
         """
-        before, now = self.marks, list[Mark]()
+        known, now = {mark.key for mark in self.marks}, list[Mark]()
         for mark in self._canvas.set:
             kind, number = mark.kind, self._hole
             if kind == "round hole":
                 number = 1 + sum(other.kind.startswith("round hole ") for other in now) // HOLES["round hole"]
             kind = f"{MASK} {number} {self.light}" if kind == MASK else f"{kind} {number}" if kind in HOLES else kind
-            now.append(Mark(kind, mark.x, mark.y))
-        if tuple(self._canvas.set) != before:
-            new = next((mark.kind for mark in self._canvas.set if mark not in before), "")
-            self._keep(arranged(now, new))
+            now.append(replace(mark, kind=kind))
+        if tuple(now) != self.marks:
+            self._keep(arranged(now, next((mark.kind for mark in now if mark.key not in known), "")))
 
     def _keep(self, marks: tuple[Mark, ...]) -> None:
         self._steps.keep(marks)
+        self._canvas.place(marks)
         if not self._coming:
             self._coming = True
-            self._document.add_timeout_callback(self.draw, _SOON)
+            self._document.add_timeout_callback(self.settle, _SOON)
 
 
 class SetupControls(Controls):

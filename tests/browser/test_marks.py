@@ -241,7 +241,7 @@ def test_masks_are_painted_undone_and_written_as_images_that_are_replaced_when_c
         driver.execute_script(*click("Write TEST.toml"))
         page.until("model('message').text.includes('are written')")
         weights = read_test(tmp_path / "TEST.toml").weights
-        assert [path.name for path in weights.images] == ["TEST_mask_light_1.png", "TEST_mask_light_2.png"]
+        assert [path.name for path in weights.images] == ["TEST_mask_1_light_1.png", "TEST_mask_2_light_2.png"]
         masks = np.asarray(MaskWeights.read(weights.images).masks)
         ring = [[round(x, 1), round(y, 1)] for x, y in placed]
         whole = Region.from_rectangle((0, 0, 149, 119), shape)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import tomllib
 
 import numpy as np
@@ -14,6 +15,7 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.plan import read_region
 from rgbmidic.results import Result
 from rgbmidic.settings import read_test
+from rgbmidic.view.setup import SetupPage
 
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
 
@@ -84,6 +86,33 @@ def test_a_region_with_a_hole_is_drawn_written_run_and_watched(test_file, tmp_pa
         again.until("model('ran').text.includes('ended: 3 of 3 frames measured')")
         again.driver.execute_script(*click("Run"))
         again.until("model('ran').text.includes('failed: error: ')", patience=60)
+
+
+def test_corners_that_are_drawn_while_the_server_makes_a_mesh_are_those_that_are_written(test_file, monkeypatch):
+    busy, idle, make = threading.Event(), threading.Event(), SetupPage._make_mesh
+
+    def slow(page):
+        busy.set()
+        idle.wait(30)
+        make(page)
+
+    with chromium() as driver, serving(test_file) as address:
+        page = Page(driver, address)
+        page.until("model('message').text.includes(' nodes, ')")
+        page.do("model('mode').active = 2")
+        monkeypatch.setattr(SetupPage, "_make_mesh", slow)
+        page.do("model('size').value = 15")
+        assert busy.wait(30)
+        corners = [(12, 10), (135, 12), (130, 105), (15, 100)]
+        for number, corner in enumerate(corners, start=3):
+            page.pointer(("click", *corner))
+            page.until(f"model('marks').data.kind.length === {number}")
+        page.driver.execute_script(*click("Write TEST.toml"))
+        idle.set()
+        page.until("model('message').text.includes('is written, with a polygon as its region')")
+        page.until("model('marks').data.kind.length === 4 && model('rings').data.xs[0].length === 5")
+        np.testing.assert_allclose(read_test(test_file).region.polygon, corners, atol=0.8)
+        assert read_test(test_file).element_size == 15
 
 
 def test_what_the_frame_tells_is_shown_and_bad_input_is_told(test_file):

@@ -81,7 +81,8 @@ def test_the_value_under_the_pointer_is_that_of_the_array(driver, address, resul
     x, y, u, std = (float(n) for n in re.findall(r"-?[\d.]+(?:e-?\d+)?", text))
     assert np.hypot(x - result.nodes[node, 0], y - result.nodes[node, 1]) < 0.5
     assert u == pytest.approx(0.002 * 5 * (x - 60), abs=1e-3)
-    assert std == pytest.approx(0.01)
+    read = read_histories(result, ProbeSettings(points=((x, y),)))
+    assert std == pytest.approx(read["point_1_u"].std[read.frames == 5][0], rel=0.03)  # two digits, of a place to .1 px
 
 
 def test_the_value_stays_that_of_what_is_shown(driver, address, result):
@@ -96,11 +97,10 @@ def test_the_value_stays_that_of_what_is_shown(driver, address, result):
 
     def check(frame, name):
         page.until(f"model('state').shown === {frame} && model('plot').title.text.startsWith({name + ' '!r})")
-        text = page.run("model('under').text")
+        text = page.until(f"model('under').text.includes('{name} = ') && model('under').text")
         x, y, value = (float(n) for n in re.findall(r"-?[\d.]+(?:e-?\d+)?", text)[:3])
         values = fields.read(name, frame)
         corners, weights = element_at(result.nodes, result.elements, x, y)
-        assert f"{name} = " in text
         assert value == pytest.approx(weights @ values.values[corners], rel=0.02, abs=1e-5)
 
     check(5, "u")
@@ -117,6 +117,7 @@ def test_the_value_stays_that_of_what_is_shown(driver, address, result):
     page.do("model('step').value = 2; model('play').active = true")
     page.until("model('state').shown === 6")
     page.do("model('play').active = false; model('step').value = 1")
+    page.until("model('state').shown === model('frame').value && model('state').shown === model('state').asked")
     check(page.run("model('state').shown"), "magnitude")
     page.keys(HOME, RIGHT, RIGHT, RIGHT)
     shown(page, 3)
@@ -173,9 +174,12 @@ def test_a_derived_field_and_its_uncertainty_are_those_of_the_library(driver, ad
     maps = Maps.of(result, gauge=80.0, measure="hencky", since=2, rigid_removed=True)
     read, speed = maps.read("exx", 5), maps.read("velocity", 5)
     node = int(np.argmin(np.hypot(*(result.nodes - [70, 45]).T)))
-    time.sleep(1)  # the plots take their new sizes
-    page.pointer(("move", *result.nodes[node]))
-    told = page.until("model('under').text.includes('exx = ') && model('under').text")
+    for _ in range(30):  # while the plots take their new sizes the pointer is elsewhere
+        page.pointer(("move", *result.nodes[node]))
+        told = page.until("model('under').text.includes('exx = ') && model('under').text")
+        if np.abs(numbers(told)[:2] - result.nodes[node]).max() < 1:
+            break
+        time.sleep(0.1)
     exx, std = numbers(told.partition("exx = ")[2])[:2]
     assert (exx, std) == pytest.approx((read.values[node], read.std[node]), rel=0.02)
     assert numbers(told.partition("velocity = ")[2])[0] == pytest.approx(speed.values[node], rel=0.05)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import signal
 from dataclasses import replace
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
+from typing import BinaryIO
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
 from results import NODES, make_result, smooth_record
 
+from rgbmidic import cli
+from rgbmidic.command import execute
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.report import movie
 from rgbmidic.report.movie import Curve, write_movie
@@ -89,6 +94,17 @@ def test_pages_are_the_same_for_any_number_of_processes(maps: Maps, monkeypatch:
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_a_process_whose_pages_nobody_takes_ends_in_silence(maps: Maps) -> None:
+    drawer = movie._Drawer.of(maps, ("u",), [0, 1], None, images=None, curve=None, colours=None)
+    receive, send = multiprocessing.Pipe(duplex=False)
+    receive.close()
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        movie._draw(drawer, [0, 1], send)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_over_raw_frames_the_field_lies_where_the_specimen_is(tmp_path: Path) -> None:
     def shifted(index: int) -> FrameRecord:
         both = {
@@ -124,6 +140,58 @@ def test_nothing_is_left_of_a_movie_that_is_interrupted(maps: Maps, tmp_path: Pa
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("does", "told"),
+    [
+        ("cat > /dev/null", "it ended with status 0 and 0 bytes"),
+        ("exec sleep 600", "did nothing for 0.2 s and was ended"),
+        ("cat > /dev/null; exec sleep 600", "did nothing for 0.2 s and was ended"),
+        ("cat > /dev/null; echo no codec >&2; exit 3", "no codec"),
+        ("exit 3", "it ended with status 3"),
+    ],
+)
+def test_an_ffmpeg_that_does_not_do_its_work_is_an_error_and_nothing_is_left(
+    maps: Maps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, alarm: None, does: str, told: str
+) -> None:
+    exe, out = tmp_path / "ffmpeg", tmp_path / "out"
+    exe.write_text(f"#!/bin/sh\n{does}\n")
+    exe.chmod(0o700)
+    out.mkdir()
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(exe))
+    if "sleep" in does:
+        monkeypatch.setattr(movie, "_PATIENCE", 0.2)
+    with pytest.raises(ResultError, match=told):
+        write_movie(maps, out / "m.mp4", ["u"], width=320)
+    assert not list(out.iterdir())
+
+
+@pytest.mark.parametrize("name", ["file:b.mp4", "-b.mp4", "a%03d.mp4", "http://b.mp4"])
+def test_a_movie_is_in_the_file_of_its_name_whatever_that_means_to_ffmpeg(
+    maps: Maps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(name).parent.mkdir(exist_ok=True)
+    write_movie(maps, name, ["u"], width=320, frames=[1, 3])
+    assert decoded(tmp_path / name).shape[0] == 2
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [tmp_path / name]
+
+
+def test_nothing_is_left_of_a_movie_whose_command_is_terminated(
+    maps: Maps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def terminated(file: BinaryIO, *_: object) -> None:
+        file.write(b"begun")
+        os.kill(os.getpid(), signal.SIGTERM)
+        raise AssertionError("still writing")
+
+    monkeypatch.setattr(movie, "_gif", terminated)
+    before = signal.getsignal(signal.SIGTERM)
+    out = tmp_path / "m.gif"
+    assert execute(cli.app, ["movie", str(maps.result.path), "--out", str(out), "--width", "320"]) == 130
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert not list(tmp_path.iterdir())
+
+
 def test_wrong_input_is_refused_and_nothing_is_overwritten(maps: Maps, tmp_path: Path) -> None:
     for message, name, fields, more in (
         ("name ends in .mp4, .webm, .gif", "m.avi", ["u"], {}),
@@ -133,6 +201,7 @@ def test_wrong_input_is_refused_and_nothing_is_overwritten(maps: Maps, tmp_path:
         ("from a smaller to a larger", "m.gif", ["u"], {"limits": (1.0, 1.0)}),
         (".1 to 240 frames", "m.gif", ["u"], {"fps": 0.0}),
         ("no colours", "m.gif", ["u"], {"colours": "none"}),
+        ("room for 7 panels of this shape, not for 30: show fewer", "m.gif", ["u"] * 30, {}),
     ):
         with pytest.raises(InputError, match=message):
             write_movie(maps, tmp_path / name, fields, **more)

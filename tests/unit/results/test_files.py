@@ -6,6 +6,8 @@ import errno
 import os
 import shutil
 import socket
+import subprocess
+import sys
 import tracemalloc
 import zipfile
 import zlib
@@ -19,7 +21,7 @@ from results import make_result
 
 from rgbmidic.errors import ResultError, RgbmidicError
 from rgbmidic.results import EXPORT_FORMATS, Result, export_result
-from rgbmidic.results.files import fingerprint
+from rgbmidic.results.files import check_file, fingerprint
 from rgbmidic.results.store import load_frames
 from rgbmidic.typing import AnyArray
 
@@ -240,3 +242,18 @@ def test_export_where_nobody_may_look_is_told(result: Result, tmp_path: Path, mo
     monkeypatch.setattr(Path, "stat", refuse)
     with pytest.raises(ResultError, match=r"fields cannot be written: Permission denied"):
         export_result(result, "npz", tmp_path / "fields")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a process cannot be asked for")
+def test_what_a_killed_process_left_of_a_file_goes_when_the_file_is_written_again(tmp_path: Path) -> None:
+    killed = subprocess.Popen([sys.executable, "-c", "pass"])
+    killed.wait()
+    host = socket.gethostname()
+    parts = {f"{name}.part": tmp_path / f"{name}.part" for name in (
+        f"a[1].mp4.{host}.{killed.pid}", f"a[1].mp4.{host}.{os.getpid()}", f"a[1].mp4.elsewhere.{killed.pid}",
+        f"b.mp4.{host}.{killed.pid}", f"a[1].mp4.{host}.x",
+    )}  # fmt: skip
+    for part in parts.values():
+        part.touch()
+    check_file(tmp_path / "a[1].mp4", overwrite=False)
+    assert [name for name, part in parts.items() if not part.exists()] == [f"a[1].mp4.{host}.{killed.pid}.part"]

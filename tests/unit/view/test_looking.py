@@ -185,11 +185,14 @@ def test_channels_off_the_frames_are_shown_where_they_are_and_told(tmp_path):
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
+    return make_result(tmp_path_factory.mktemp("view") / "result", frames=6, settings=in_mm())
+
+
+def in_mm():
     scale = {"mm_per_pixel": 0.5, "mm_per_pixel_std": 0.01}
-    settings = TestSettings.from_mapping(
+    return TestSettings.from_mapping(
         {"frames": {"path": "x.cine", "kind": "monochrome"}, "region": {"rectangle": [0, 0, 9, 9]}, "scale": scale}
     )
-    return make_result(tmp_path_factory.mktemp("view") / "result", frames=6, settings=settings)
 
 
 def test_fields_are_those_of_the_table_in_the_units_of_the_reader(result):
@@ -249,21 +252,71 @@ def test_what_is_hatched_lies_below_zero():
     assert (hatched[changed] == 0xFF000000).all()
 
 
-def test_the_value_of_a_probe_is_its_mean_with_the_uncertainty_of_one(tmp_path):
+def label(maps, name, kind, *place, frame=5):
+    return probe_text(maps, maps.all[name], maps.read(name, frame), maps.displacement(frame), frame, kind, place)
+
+
+def spread_of(text):
+    return float(text.split("±")[1].split()[0])
+
+
+PLACES = {"point": (52.0, 41.0), "region": (30.0, 20.0, 60.0, 60.0), "line": (20.0, 20.0, 90.0, 55.0)}
+PLACES |= {"circle": (60.0, 40.0, 17.0), "strain_gauge": (52.0, 41.0, 60.0)}
+
+
+@pytest.mark.parametrize("measure", MEASURES[:2])
+def test_the_label_of_a_probe_is_its_history_in_that_frame_and_the_pointer_states_the_same(tmp_path, measure):
+    result = make_result(tmp_path / "result", frames=6, record=smooth_record, settings=in_mm())
+    maps = Maps.of(result, gauge=60.0, measure=measure)
+    histories = read_histories(
+        result, ProbeSettings(**{f"{kind}s": (place,) for kind, place in PLACES.items()}, measure=measure)
+    )
+
+    def history(kind, name):
+        read = histories[f"{kind}_1_{name}"]
+        return float(read.values[5]), float(read.std[5])
+
+    for kind in ("point", "line", "region", "circle"):
+        mean = "" if kind == "point" else " mean"
+        for name in "uv":
+            value, std = history(kind, name)
+            assert label(maps, name, kind, *PLACES[kind]) == f"{mean}: {maps.all[name].text(value, std)}"
+            assert label(maps, f"{name}_std", kind, *PLACES[kind]) == f"{mean}: {maps.all[name].text(std)}"
+    for name in ("exx", "eyy", "exy", "e1", "e2", "direction", "equivalent"):
+        value, std = history("strain_gauge", name)
+        assert label(maps, name, "strain_gauge", *PLACES["strain_gauge"]) == f": {maps.all[name].text(value, std)}"
+        assert label(maps, f"{name}_std", "strain_gauge", *PLACES["strain_gauge"]) == f": {maps.all[name].text(std)}"
+    for name in ("u", "v", "u_std"):
+        field, values, moved = maps.all[name], maps.read(name, 5), maps.displacement(5)
+        told = pointer_text(maps, field, values, moved, result.nodes, *PLACES["point"])
+        assert told.endswith(f"<b>{name} = {label(maps, name, 'point', *PLACES['point'])[2:]}</b>")
+    assert label(maps, "u", "strain_gauge", *PLACES["strain_gauge"]) == label(maps, "u", "point", *PLACES["point"])
+
+
+def test_what_a_history_does_not_have_is_not_stated_too_exactly(tmp_path):
+    """Gauges overlap: their mean over three nodes is as uncertain as one, and so is that over an area at most."""
+    maps = Maps.of(make_result(tmp_path / "result", frames=6, record=smooth_record))
+    std, (around, _) = maps.read("exx", 5).std, element_at(MESH.nodes, MESH.elements, *PLACES["point"])
+    assert (
+        0.97 * std[around].min() < spread_of(label(maps, "exx", "point", *PLACES["point"])) < 1.03 * std[around].max()
+    )
+    told = label(maps, "exx", "region", *PLACES["region"])
+    assert told.endswith(" at most")
+    assert 0.97 * std.min() < spread_of(told) < 1.03 * std.max()
+    assert label(maps, "misfit", "point", 50.0, 40.0) == ": 1"
+    assert label(maps, "node_status", "point", 50.0, 40.0) == ": measured"
+    assert label(maps, "u", "region", 200.0, 200.0, 300.0, 300.0) == ""
+    assert label(maps, "exx", "strain_gauge", 200.0, 200.0, 40.0) == ""
+
+
+def test_a_strain_gauge_at_a_node_is_the_map_at_that_node_since_any_frame(tmp_path):
     result = make_result(tmp_path / "result", frames=6, record=smooth_record)
-    maps, box = Maps.of(result), (30.0, 20.0, 60.0, 60.0)
-    for name, most in (("u", ""), ("exx", " at most"), ("misfit", "")):
-        text = probe_text(maps, maps.all[name], maps.read(name, 5), "region", box)
-        assert text.endswith(most)
-        history = read_histories(result, ProbeSettings(regions=(box,)))["region_1_u"]
-        if name == "u":
-            assert text == f" mean: {maps.all[name].text(history.values[5], history.std[5])}"
-    assert probe_text(maps, maps.all["misfit"], maps.read("misfit", 5), "point", (50.0, 40.0)) == ": 1"
-    assert probe_text(maps, maps.all["node_status"], maps.read("node_status", 5), "point", (50.0, 40.0)) == ": measured"
-    assert probe_text(maps, maps.all["u"], maps.read("u", 5), "region", (200.0, 200.0, 300.0, 300.0)) == ""
-    exx = maps.read("exx", 5)
-    told = probe_text(maps, maps.all["exx"], exx, "region", box)
-    assert float(told.split("±")[1].split()[0]) <= exx.std.max() * 1.05
+    maps = Maps.of(result, gauge=60.0, since=2, rigid_removed=True)
+    node = int(np.argmin(np.hypot(*(result.nodes - [60, 40]).T)))
+    for name in ("exx", "equivalent"):
+        read = maps.read(name, 5)
+        stated = maps.all[name].text(read.values[node], read.std[node])
+        assert label(maps, name, "strain_gauge", *result.nodes[node], 60.0) == f": {stated}"
 
 
 def map_values(values, std):
@@ -472,7 +525,8 @@ class Walk:
         field, values = fields.all[view.field], fields.read(view.field, view.frame)
         nodes = values.moved if view.over == "deformed" else result.nodes
         pointer = page._pointer
-        told = "" if pointer is None else pointer_text(field, values, nodes, result.elements, *pointer)
+        moved = fields.displacement(view.frame)
+        told = "" if pointer is None else pointer_text(fields, field, values, moved, nodes, *pointer)
         assert page.parts.under.text == told
         remark = page.pictures.frame(view.frame)[1] if view.over == "deformed" else ""
         assert page.parts.description.text == frame_text(fields, view.frame, field, values, remark)
