@@ -8,9 +8,25 @@ from collections.abc import Iterator
 
 import pytest
 import real_files
+from draws import JITTER, SAMPLERS, other_draws
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # the processes share the cores already
     os.environ.setdefault("RGBMIDIC_THREADS", "1")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options under which nothing may fail: no verdict depends on a draw of the noise."""
+    group = parser.getgroup("other draws of the noise (see CONTRIBUTING.md)")
+    group.addoption("--draw", type=int, default=0, metavar="N", help="another noise of every virtual camera: 1, 2, ...")
+    group.addoption("--sampler", choices=SAMPLERS, default="poisson", help="of the photons: rounded normal numbers")
+    group.addoption("--jitter", type=float, nargs="?", const=JITTER, default=0.0, help="relative, of rendered pixels")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Exchange the noise where an option asks for it."""
+    asked = other_draws(config.option.draw, config.option.sampler, config.option.jitter)
+    asked.__enter__()
+    config.add_cleanup(lambda: asked.__exit__(None, None, None))
 
 
 @pytest.fixture(scope="session")
@@ -19,15 +35,22 @@ def real_data() -> real_files.RealData:
     return real_files.real_folder
 
 
-@pytest.fixture
+DEADLINE = 600
+"""Seconds after which a test hangs: the longest takes 15 on an idle machine."""
+
+
+@pytest.fixture(autouse=True)
 def alarm() -> Iterator[None]:
-    """What waits for ever fails after 20 s."""
+    """What waits for ever fails."""
+    if not hasattr(signal, "SIGALRM"):
+        yield
+        return
 
     def stop(*_: object) -> None:
-        raise TimeoutError("it hangs")
+        raise TimeoutError(f"it hangs: {DEADLINE} s")
 
     before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(20)
+    signal.alarm(DEADLINE)
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)

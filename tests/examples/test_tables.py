@@ -16,6 +16,7 @@ from benchmarks import __main__ as driver
 from benchmarks.tables import (
     FOLDER,
     README,
+    SCATTER_FOLDER,
     TABLES,
     Entry,
     MissingDataError,
@@ -88,6 +89,7 @@ def test_a_block_is_replaced_and_nothing_else():
 def test_each_file_is_of_a_table():
     assert {path.stem for path in FOLDER.glob("*.csv")} <= set(TABLES)
     assert {path.stem for path in FOLDER.glob("quick/*.csv")} == {n for n, e in TABLES.items() if e.own_quick}
+    assert {path.stem for path in SCATTER_FOLDER.glob("*.csv")} <= {n for n, e in TABLES.items() if not e.timing}
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -98,7 +100,9 @@ def test_quick_rows_are_those_of_the_page(name):
     except MissingDataError as error:
         pytest.skip(str(error))
     if not entry.timing:
-        assert not disagreements(entry, made, Table.read(entry.committed()))
+        scatter = SCATTER_FOLDER / f"{name}.csv"
+        known = Table.read(scatter) if scatter.exists() else None
+        assert not disagreements(entry, made, Table.read(entry.committed()), known)
 
 
 ROWS = [
@@ -175,7 +179,7 @@ def test_three_digits(value, text):
 def run(monkeypatch, *arguments: str) -> int:
     """Status of the driver, whose two tables are a good one and one that fails."""
 
-    def made(name: str, quick: bool, header: dict[str, str]) -> tuple[Table, float]:
+    def made(name: str, quick: bool, header: dict[str, str], scatter: bool) -> tuple[Table, float]:
         if name == "broken":
             raise RuntimeError("no camera")
         return Table.of(ENTRY, ROWS, header), 0.1
