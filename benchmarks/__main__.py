@@ -20,11 +20,11 @@ import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
-from tempfile import TemporaryDirectory
+
+from renders import kept_renders
 
 from . import ROOT
 from .tables import FOLDER, README, TABLES, Table, load, measured
-from .uncertainty_scenes import RENDERS
 
 ONE_THREAD = ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rgbmidic")
@@ -94,8 +94,7 @@ def main() -> int:
     os.environ |= dict.fromkeys(ONE_THREAD, "1")
     failed = {f"module {name}": reason for name, reason in broken.items()}
     start = time.perf_counter()
-    with TemporaryDirectory(prefix="rgbmidic-renders-") as renders:
-        os.environ[RENDERS] = renders
+    with kept_renders():
         # times come last, one at a time
         for timing, processes in ((False, options.processes), (True, 1)):
             some = [name for name in names if TABLES[name].timing == timing and not (timing and options.scatter)]

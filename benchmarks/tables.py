@@ -57,7 +57,7 @@ class Entry:
     own_quick: bool = False
     timing: bool = False
     scatter: dict[str, str] = field(default_factory=dict)
-    counts: dict[str, int] = field(default_factory=dict)
+    within: dict[str, float] = field(default_factory=dict)
 
     @property
     def caption(self) -> str:
@@ -83,7 +83,7 @@ def table(
     own_quick: bool = False,
     timing: bool = False,
     scatter: dict[str, str] | None = None,
-    counts: dict[str, int] | None = None,
+    within: dict[str, float] | None = None,
 ) -> Callable[[Callable[[bool], Iterator[Row]]], Callable[[bool], Iterator[Row]]]:
     """Register a generator of rows as a table of the pages.
 
@@ -106,14 +106,14 @@ def table(
         The figures depend on the machine: a test only sees that the table is made.
     scatter
         For figures that are noise around zero, such as a bias: the column that says how far they scatter.
-    counts
-        For figures that are fractions of a count: how many are counted in a quick row.
+    within
+        For figures that are fractions of a count n, 2/n; for others that may be 0, what is as good as 0.
     """
 
     def register(measure: Callable[[bool], Iterator[Row]]) -> Callable[[bool], Iterator[Row]]:
         if name in TABLES:
             raise ValueError(f"there are two tables named {name!r}: {TABLES[name].measure} and {measure}")
-        TABLES[name] = Entry(name, page, cost, measure, keys, seed, own_quick, timing, scatter or {}, counts or {})
+        TABLES[name] = Entry(name, page, cost, measure, keys, seed, own_quick, timing, scatter or {}, within or {})
         return measure
 
     return register
@@ -279,9 +279,9 @@ def disagreements(
 ) -> list[str]:
     """Figures of a quick measurement that are not those of the committed table.
 
-    A figure agrees within the factor, or within `TIMES` its `scatter` by the draws (`scatter_of`); one that is noise
-    around zero (`scatter` of the entry) within the factor times its scatter; a fraction of a count n (`counts`) within
-    2/n. A text agrees where it has one of its alternatives, "a or b", in common with the committed one or the draws.
+    A figure agrees within the factor, or within `TIMES` its `scatter` by the draws (`scatter_of`), or the `within` of
+    the entry; one that is noise around zero (`scatter` of the entry) within the factor times its scatter. A text agrees
+    where it has one of its alternatives, "a or b", in common with the committed one or the draws.
     """
     if quick.columns != committed.columns:
         return [f"columns {quick.columns}, committed {committed.columns}"]
@@ -296,13 +296,11 @@ def disagreements(
             except ValueError:
                 close = bool(set(new.split(" or ")) & set(f"{old} or {drawn}".split(" or ")))
             else:
-                allowed = TIMES * spread
+                allowed = max(TIMES * spread, entry.within.get(heading, 0))
                 if heading in entry.scatter:
                     allowed = max(allowed, factor * float(page[committed.column(entry.scatter[heading])]))
                 elif a * b > 0 and 1 / factor <= a / b <= factor:
                     allowed = np.inf
-                if heading in entry.counts:
-                    allowed = max(allowed, (200 if "[%]" in heading else 2) / entry.counts[heading])
                 unknown = np.isnan(a) or np.isnan(b)
                 close = (np.isnan(a) and np.isnan(b)) or np.isnan(spread) if unknown else abs(a - b) <= allowed
             if not close:
@@ -311,9 +309,10 @@ def disagreements(
 
 
 def scatter_of(entry: Entry, draws: list[Table]) -> Table | None:
-    """Standard deviation of every figure over draws of the camera's noise, and all that a text was; None without any.
+    """Standard deviation of every figure over draws of the camera's noise, the first as stated; None without any.
 
-    A figure that is not known in some of the draws alone has no scatter.
+    A figure that is known in some of the draws only scatters by NaN. Of a text, the alternatives in other draws that
+    share none with it.
     """
     first, rows = draws[0], []
     for cells in zip(*(table.rows for table in draws), strict=True):
@@ -322,7 +321,11 @@ def scatter_of(entry: Entry, draws: list[Table]) -> Table | None:
             try:
                 numbers = [float(value) for value in values]
             except ValueError:
-                row.append(" or ".join(sorted({one for value in values for one in value.split(" or ")})))
+                usual = set(values[0].split(" or "))
+                others = {
+                    one for value in values if not usual & set(value.split(" or ")) for one in value.split(" or ")
+                }
+                row.append(" or ".join(sorted(others)))
             else:
                 row.append(written(0.0 if np.isnan(numbers).all() else float(np.std(numbers, ddof=1))))
         rows.append(tuple(row))
@@ -338,13 +341,14 @@ def measured(
     processes included; for a process of its own."""
     import cv2
     from draws import other_draws
+    from renders import kept_renders
 
     cv2.setNumThreads(1)
     importlib.import_module(module)
     entry = TABLES[name]
     start = sum(os.times()[:4])
     made = []
-    for draw in range(1, DRAWS + 1) if scatter else [0]:
-        with other_draws(draw):
+    for draw in range(DRAWS if scatter else 1):
+        with kept_renders(), other_draws(draw):
             made.append(Table.of(entry, entry.measure(quick), header | {"seed": str(entry.seed)}))
     return scatter_of(entry, made) if scatter else made[0], sum(os.times()[:4]) - start

@@ -1,17 +1,20 @@
-"""What all tests share: the folders of real files, and an end to what hangs."""
+"""What all tests share: threads, kernels, renders, the draws of the noise, real files, and an end to what hangs."""
 
 from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import ExitStack, nullcontext
 
 import pytest
 import real_files
 from draws import JITTER, SAMPLERS, other_draws
+from renders import kept_renders, new_renders
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # the processes share the cores already
-    os.environ.setdefault("RGBMIDIC_THREADS", "1")
+from rgbmidic.lab.demo import kernels_compiled_meanwhile
+
+THREADS = ("RGBMIDIC_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -23,10 +26,26 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Exchange the noise where an option asks for it."""
-    asked = other_draws(config.option.draw, config.option.sampler, config.option.jitter)
-    asked.__enter__()
-    config.add_cleanup(lambda: asked.__exit__(None, None, None))
+    """Let the processes of the run share cores, kernels and renders; exchange the noise where an option asks for it."""
+    if getattr(config.option, "numprocesses", None):
+        os.environ |= {name: os.environ.get(name, "1") for name in THREADS}
+        with nullcontext() if config.option.collectonly else kernels_compiled_meanwhile():
+            pass
+    stack = ExitStack()
+    stack.enter_context(kept_renders())
+    stack.enter_context(other_draws(config.option.draw, config.option.sampler, config.option.jitter))
+    config.add_cleanup(stack.close)
+
+
+RENDERER = ("lab/virtual", "scene", "kernels")
+"""Rooms whose tests are about the renderer."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Render anew where the renderer is tested."""
+    with new_renders() if item.path.parent.as_posix().endswith(RENDERER) else nullcontext():
+        return (yield)
 
 
 @pytest.fixture(scope="session")
