@@ -329,7 +329,7 @@ def scatter_of(entry: Entry, draws: list[Table]) -> Table | None:
             else:
                 row.append(written(0.0 if np.isnan(numbers).all() else float(np.std(numbers, ddof=1))))
         rows.append(tuple(row))
-    if all(table.rows == first.rows for table in draws):
+    if all(cell in ("", "0") for row in rows for cell in row[first.keys :]):
         return None
     return Table(entry.name, first.header, first.columns, tuple(rows))
 

@@ -21,6 +21,7 @@ JITTER = 1e-6
 """Relative change of a pixel, single precision's 6e-8 after some operations."""
 current = "0_poisson_0"
 """Name of the draws that are in force."""
+_default_rng = np.random.default_rng
 
 
 @contextmanager
@@ -52,7 +53,7 @@ def other_draws(number: int = 0, sampler: str = "poisson", jitter: float = 0.0) 
             return np.maximum(drawn, 0).astype(np.int64)
 
     def generator(seed: Any = None) -> np.random.Generator:
-        made = default_rng(seed)
+        made = _default_rng(seed)
         return made if made is seed else Camera(made.bit_generator)
 
     def jittered(*arguments: Any) -> Any:
@@ -61,10 +62,9 @@ def other_draws(number: int = 0, sampler: str = "poisson", jitter: float = 0.0) 
         return images * noise
 
     global current
-    before = default_rng, trace, _ = np.random.default_rng, rendering._trace, current
+    before = _, trace, _ = np.random.default_rng, rendering._trace, current
     current = f"{number}_{sampler}_{jitter:g}"
-    if number or sampler != "poisson":
-        np.random.default_rng = generator
+    np.random.default_rng = generator if number or sampler != "poisson" else _default_rng
     if jitter:
         rendering._trace = jittered
     try:

@@ -23,6 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy.ndimage import map_coordinates
 from textures import Texture
 
@@ -203,6 +204,13 @@ def test_the_blocks_of_a_page_run_as_written(page, demo, tmp_path, monkeypatch, 
         scales = [camera.scale(camera.centre)[0] for camera in made]
         assert scales[:2] == pytest.approx([0.0939855] * 2, rel=3e-5)
         assert scales[2] == pytest.approx(0.0939855, rel=0.01)
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch):
+    """Pictures that nobody looks at, of a third of the resolution."""
+    savefig = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *to, **how: savefig(figure, *to, **how | {"dpi": 50}))
 
 
 def reachable(home, parts):
