@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from collections.abc import Generator, Iterator
@@ -35,6 +36,12 @@ def pytest_configure(config: pytest.Config) -> None:
     stack.enter_context(kept_renders())
     stack.enter_context(other_draws(config.option.draw, config.option.sampler, config.option.jitter))
     config.add_cleanup(stack.close)
+
+
+def pytest_collection_finish() -> None:
+    """Let no collection of garbage look through what the tests are made of."""
+    gc.collect()
+    gc.freeze()
 
 
 RENDERER = ("lab/virtual", "scene", "kernels")
