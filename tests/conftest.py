@@ -11,6 +11,7 @@ from contextlib import ExitStack, nullcontext
 import pytest
 import real_files
 from draws import JITTER, SAMPLERS, other_draws
+from matplotlib.figure import Figure
 from renders import kept_renders, new_renders
 
 from rgbmidic.lab.demo import kernels_compiled_meanwhile
@@ -23,7 +24,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("other draws of the noise (see CONTRIBUTING.md)")
     group.addoption("--draw", type=int, default=0, metavar="N", help="another noise of every virtual camera: 1, 2, ...")
     group.addoption("--sampler", choices=SAMPLERS, default="poisson", help="of the photons: rounded normal numbers")
-    group.addoption("--jitter", type=float, nargs="?", const=JITTER, default=0.0, help="relative, of rendered pixels")
+    group.addoption("--jitter", action="store_const", const=JITTER, default=0.0, help="of renders: 1e-6 of each pixel")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -80,6 +81,13 @@ def alarm() -> Iterator[None]:
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures that nobody looks at are drawn with a third of the resolution."""
+    savefig = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *to, **how: savefig(figure, *to, **how | {"dpi": 50}))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

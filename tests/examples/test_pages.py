@@ -23,7 +23,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from scipy.ndimage import map_coordinates
 from textures import Texture
 
@@ -33,6 +32,7 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.demo import run_demo, run_plate, write_plate
 from rgbmidic_calibration import cli as calibrate
 
+pytestmark = pytest.mark.usefixtures("small_pictures")
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT / "docs/_ext"))
 import reference  # noqa: E402 (it is no package)
@@ -204,13 +204,6 @@ def test_the_blocks_of_a_page_run_as_written(page, demo, tmp_path, monkeypatch, 
         scales = [camera.scale(camera.centre)[0] for camera in made]
         assert scales[:2] == pytest.approx([0.0939855] * 2, rel=3e-5)
         assert scales[2] == pytest.approx(0.0939855, rel=0.01)
-
-
-@pytest.fixture(autouse=True)
-def small_pictures(monkeypatch):
-    """Pictures that nobody looks at, of a third of the resolution."""
-    savefig = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *to, **how: savefig(figure, *to, **how | {"dpi": 50}))
 
 
 def reachable(home, parts):
