@@ -3,7 +3,8 @@
 Each table is measured in a process of its own with one thread and written as a whole to docs/tables/NAME.csv, with
 the commit, date, seed, machine and versions it was measured with, and into README.md where that shows it. `--quick`
 measures a few rows and writes nothing unless `--out` names a folder. A table that fails does not stop the others; the
-exit status is 1 then.
+exit status is 1 then. `--scatter` measures how far draws of the cameras' noise scatter the quick rows and writes
+docs/tables/scatter/NAME.csv, by which the tests compare them.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
-from tempfile import TemporaryDirectory
+
+from renders import kept_renders
 
 from . import ROOT
 from .tables import FOLDER, README, TABLES, Table, load, measured
-from .uncertainty_scenes import RENDERS
 
 ONE_THREAD = ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rgbmidic")
@@ -59,10 +60,10 @@ def _processor() -> str:
         return platform.processor() or platform.machine()
 
 
-def isolated(name: str, quick: bool, header: dict[str, str]) -> tuple[Table, float]:
+def isolated(name: str, quick: bool, header: dict[str, str], scatter: bool) -> tuple[Table | None, float]:
     """A table measured in a process that may die without taking another along."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-        return process.submit(measured, TABLES[name].measure.__module__, name, quick, header).result()
+        return process.submit(measured, TABLES[name].measure.__module__, name, quick, header, scatter).result()
 
 
 def main() -> int:
@@ -70,6 +71,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help="tables to measure; all if none is named")
     parser.add_argument("--quick", action="store_true", help="a few rows of each; written only where --out is given")
+    parser.add_argument("--scatter", action="store_true", help="how draws of the noise scatter the figures of --quick")
     parser.add_argument("--list", action="store_true", help="names, pages and CPU seconds of the tables")
     parser.add_argument("--processes", type=int, default=1, metavar="N", help="tables measured at once (default 1)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help=f"default: {FOLDER.relative_to(ROOT)}")
@@ -92,19 +94,18 @@ def main() -> int:
     os.environ |= dict.fromkeys(ONE_THREAD, "1")
     failed = {f"module {name}": reason for name, reason in broken.items()}
     start = time.perf_counter()
-    with TemporaryDirectory(prefix="rgbmidic-renders-") as renders:
-        os.environ[RENDERS] = renders
+    with kept_renders():
         # times come last, one at a time
         for timing, processes in ((False, options.processes), (True, 1)):
-            some = [name for name in names if TABLES[name].timing == timing]
-            failed |= measure(some, options.quick, options.out, processes)
+            some = [name for name in names if TABLES[name].timing == timing and not (timing and options.scatter)]
+            failed |= measure(some, options.quick, options.out, processes, options.scatter)
     print(f"{len(names)} tables in {time.perf_counter() - start:.0f} s")
     for name, reason in failed.items():
         print(f"failed: {name}, {reason}", file=sys.stderr)
     return 1 if failed else 0
 
 
-def measure(names: list[str], quick: bool, out: Path | None, processes: int) -> dict[str, str]:
+def measure(names: list[str], quick: bool, out: Path | None, processes: int, scatter: bool) -> dict[str, str]:
     """Measure tables, several at once, write them where they belong and return why those that failed did.
 
     Where the quick rows are a smaller case, they are measured with the full ones and written to `quick` beside them.
@@ -113,15 +114,23 @@ def measure(names: list[str], quick: bool, out: Path | None, processes: int) -> 
     place = out or (None if quick else FOLDER)
     with ThreadPoolExecutor(processes) as pool:
         for name in names:
+            if scatter:
+                full = header | {"command": f"python -m benchmarks {name} --scatter"}
+                work[pool.submit(isolated, name, True, full, True)] = name, (out or FOLDER) / "scatter"
+                continue
             full = header | {"command": f"python -m benchmarks {name}{' --quick' if quick else ''}"}
-            work[pool.submit(isolated, name, quick, full)] = name, place
+            work[pool.submit(isolated, name, quick, full, False)] = name, place
             if TABLES[name].own_quick and not quick:
                 small = header | {"command": f"python -m benchmarks {name} --quick"}
-                work[pool.submit(isolated, name, True, small)] = name, (out or FOLDER) / "quick"
+                work[pool.submit(isolated, name, True, small, False)] = name, (out or FOLDER) / "quick"
         for done in as_completed(work):
             name, folder = work[done]
             try:
                 made, seconds = done.result()
+                if made is None:
+                    (folder / f"{name}.csv").unlink(missing_ok=True)
+                    print(f"{name}: no figure scatters, {seconds:.1f} CPU s", flush=True)
+                    continue
                 if folder is not None:
                     made.write(folder / f"{name}.csv")
                 if folder == FOLDER:

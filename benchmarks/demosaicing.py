@@ -94,12 +94,10 @@ def painted(scene: Scene, wrinkles: float) -> Scene:
 
 def coloured(scene: Scene, state: State | None, fraction: float) -> FloatImage:
     """The lights' images; a `fraction` of each light's variance comes from a spray of its own."""
-    from .uncertainty_scenes import stored_render
-
-    images = stored_render(scene, state)
+    images = render(scene, state)
     for light in range(len(images) if fraction else 0):
         own = replace(scene, surface=replace(scene.surface, seed=scene.surface.seed + 1000 * (light + 1)))
-        other = stored_render(own, state)[light]
+        other = render(own, state)[light]
         mean = images[light].mean()
         images[light] = mean + (1 - fraction) ** 0.5 * (images[light] - mean) + fraction**0.5 * (other - mean)
     return np.maximum(images, 0)

@@ -18,7 +18,7 @@ from rgbmidic.illumination.crosstalk import unmix
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.lab.inspection import inspect_frame
-from rgbmidic.lab.virtual import Camera, State, record, truth, turned
+from rgbmidic.lab.virtual import Camera, State, record, render, truth, turned
 from rgbmidic.lab.virtual.rendering import sphere_scene
 from rgbmidic.mesh import Region
 from rgbmidic.scene.forecast import Instrument, trace_change
@@ -28,7 +28,6 @@ from rgbmidic.weights.geometry import GeometryWeights
 
 from .demosaicing import NAMED, Case, errors
 from .tables import table
-from .uncertainty_scenes import stored_render
 
 SIZE, INSET, PAINTS, PAIRS = 256, 14, 2, 2
 """Frames (px), margin of the region, paints, and pairs of shots of each."""
@@ -152,7 +151,7 @@ def geometry_weights(quick: bool) -> Iterator[dict[str, object]]:
             scene = replace(scene, surface=replace(scene.surface, dome=height))
             state, crosstalk, pair = turned(angle), scene.camera.true_crosstalk(scene.lights), []
             for number, one in enumerate((None, state)):
-                frame = record(stored_render(scene, one), scene.camera, scene.lights, seed=number)
+                frame = record(render(scene, one), scene.camera, scene.lights, seed=number)
                 linear = linearise(frame, scene.camera.noise)
                 assert isinstance(linear, LinearChannels)
                 pair.append(unmix(linear, crosstalk))

@@ -22,13 +22,12 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.illumination.calibration import Calibration, Crosstalk
 from rgbmidic.illumination.frame_check import mismatches
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.lab.virtual import plate_scene, sphere_scene
+from rgbmidic.lab.virtual import plate_scene, render, sphere_scene
 from rgbmidic.scene.camera import PIXEL
 from rgbmidic.typing import FloatArray, FloatImage
 
 from .demosaicing import MEASURED, TILT, painted
 from .tables import table
-from .uncertainty_scenes import stored_render
 
 BLACK, WHITE = 64, 4095
 RANGE = WHITE - BLACK
@@ -49,9 +48,9 @@ def scenes(quick: bool) -> Scenes:
         for gloss in (0.0, 1.5, 3.0):
             for size in (2.5, 8.0):
                 scene = make(size=256, seed=11, droplet=size * PIXEL, gloss=gloss)
-                found.append((f"{body}, gloss {gloss}, speckle {size}", stored_render(scene, None)))
+                found.append((f"{body}, gloss {gloss}, speckle {size}", render(scene, None)))
         scene = painted(make(size=256, seed=11, droplet=4.2 * PIXEL, gloss=1.5), 0.15)
-        found.append((f"{body}, coarse paint", stored_render(scene, None)))
+        found.append((f"{body}, coarse paint", render(scene, None)))
     return found
 
 

@@ -21,7 +21,9 @@ TREND = 1.3
 """An area is as good as A0 up to this multiple of its P (examples/paper/claims.py)."""
 
 
-@table("reflections", page="explanation/polarisers", cost=130, own_quick=True)
+@table(
+    "reflections", page="explanation/polarisers", cost=130, own_quick=True, within={"areas within 1.3 A0 [%]": 200 / 4}
+)
 def reflections(quick: bool) -> Iterator[Row]:
     """A sphere turning by 0.33 to 8 degrees under a reflection: the paper's perturbation P and the error."""
     angles = (1.0,) if quick else ANGLES

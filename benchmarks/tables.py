@@ -36,6 +36,10 @@ README = ROOT / "README.md"
 """Shows tables as markdown, which a repository's page renders: see `Table.shown_in`."""
 QUICK_FOLDER = FOLDER / "quick"
 """Committed files of the tables whose quick rows are a smaller case instead of some rows of the full table."""
+SCATTER_FOLDER = FOLDER / "scatter"
+"""How far the draws of the camera's noise scatter the figures of quick rows (see `scatter_of`); without: not at all."""
+DRAWS = 12
+"""Draws that it is measured from."""
 DIGITS = 3
 """Significant digits of a figure: the limits of the tests are 1.5 times the figures, draws scatter by more than 1 %."""
 
@@ -53,6 +57,7 @@ class Entry:
     own_quick: bool = False
     timing: bool = False
     scatter: dict[str, str] = field(default_factory=dict)
+    within: dict[str, float] = field(default_factory=dict)
 
     @property
     def caption(self) -> str:
@@ -78,6 +83,7 @@ def table(
     own_quick: bool = False,
     timing: bool = False,
     scatter: dict[str, str] | None = None,
+    within: dict[str, float] | None = None,
 ) -> Callable[[Callable[[bool], Iterator[Row]]], Callable[[bool], Iterator[Row]]]:
     """Register a generator of rows as a table of the pages.
 
@@ -100,12 +106,14 @@ def table(
         The figures depend on the machine: a test only sees that the table is made.
     scatter
         For figures that are noise around zero, such as a bias: the column that says how far they scatter.
+    within
+        For figures that are fractions of a count n, 2/n; for others that may be 0, what is as good as 0.
     """
 
     def register(measure: Callable[[bool], Iterator[Row]]) -> Callable[[bool], Iterator[Row]]:
         if name in TABLES:
             raise ValueError(f"there are two tables named {name!r}: {TABLES[name].measure} and {measure}")
-        TABLES[name] = Entry(name, page, cost, measure, keys, seed, own_quick, timing, scatter or {})
+        TABLES[name] = Entry(name, page, cost, measure, keys, seed, own_quick, timing, scatter or {}, within or {})
         return measure
 
     return register
@@ -262,38 +270,85 @@ def _same(wanted: str, cell: str) -> bool:
         return wanted == cell
 
 
-def disagreements(entry: Entry, quick: Table, committed: Table, factor: float = 1.5) -> list[str]:
-    """Figures of a quick measurement that are not those of the committed table, within a factor.
+TIMES = 6.0
+"""Standard deviations of draws by which two draws may differ: 4.2 of their difference."""
 
-    A figure that is noise around zero (`scatter` of the entry) may differ by the factor times its scatter.
+
+def disagreements(
+    entry: Entry, quick: Table, committed: Table, scatter: Table | None = None, factor: float = 1.5
+) -> list[str]:
+    """Figures of a quick measurement that are not those of the committed table.
+
+    A figure agrees within the factor, or within `TIMES` its `scatter` by the draws (`scatter_of`), or the `within` of
+    the entry; one that is noise around zero (`scatter` of the entry) within the factor times its scatter. A text agrees
+    where it has one of its alternatives, "a or b", in common with the committed one or the draws.
     """
     if quick.columns != committed.columns:
         return [f"columns {quick.columns}, committed {committed.columns}"]
     found = []
     for row in quick.rows:
         page = committed.matching(row[: quick.keys])[0]
-        for heading, new, old in list(zip(quick.columns, row, page, strict=True))[quick.keys :]:
+        draws = scatter.matching(row[: quick.keys])[0] if scatter else ("",) * len(row)
+        for heading, *cells in list(zip(quick.columns, row, page, draws, strict=True))[quick.keys :]:
+            new, old, drawn = cells
             try:
-                a, b = float(new), float(old)
+                a, b, spread = float(new), float(old), float(drawn or 0)
             except ValueError:
-                close = new == old
+                close = bool(set(new.split(" or ")) & set(f"{old} or {drawn}".split(" or ")))
             else:
+                allowed = max(TIMES * spread, entry.within.get(heading, 0))
                 if heading in entry.scatter:
-                    close = abs(a - b) <= factor * float(page[committed.column(entry.scatter[heading])])
-                else:
-                    close = a == b or (np.isnan(a) and np.isnan(b)) or (a * b > 0 and 1 / factor <= a / b <= factor)
+                    allowed = max(allowed, factor * float(page[committed.column(entry.scatter[heading])]))
+                elif a * b > 0 and 1 / factor <= a / b <= factor:
+                    allowed = np.inf
+                unknown = np.isnan(a) or np.isnan(b)
+                close = (np.isnan(a) and np.isnan(b)) or np.isnan(spread) if unknown else abs(a - b) <= allowed
             if not close:
                 found.append(f"{', '.join(row[: quick.keys])}: {heading} is {new}, committed {old}")
     return found
 
 
-def measured(module: str, name: str, quick: bool, header: dict[str, str]) -> tuple[Table, float]:
-    """One table and its CPU seconds, those of its own child processes included; for a process of its own."""
+def scatter_of(entry: Entry, draws: list[Table]) -> Table | None:
+    """Standard deviation of every figure over draws of the camera's noise, the first as stated; None without any.
+
+    A figure that is known in some of the draws only scatters by NaN. Of a text, the alternatives in other draws that
+    share none with it.
+    """
+    first, rows = draws[0], []
+    for cells in zip(*(table.rows for table in draws), strict=True):
+        row: list[str] = list(cells[0][: first.keys])
+        for values in list(zip(*cells, strict=True))[first.keys :]:
+            try:
+                numbers = [float(value) for value in values]
+            except ValueError:
+                usual = set(values[0].split(" or "))
+                others = {
+                    one for value in values if not usual & set(value.split(" or ")) for one in value.split(" or ")
+                }
+                row.append(" or ".join(sorted(others)))
+            else:
+                row.append(written(0.0 if np.isnan(numbers).all() else float(np.std(numbers, ddof=1))))
+        rows.append(tuple(row))
+    if all(cell in ("", "0") for row in rows for cell in row[first.keys :]):
+        return None
+    return Table(entry.name, first.header, first.columns, tuple(rows))
+
+
+def measured(
+    module: str, name: str, quick: bool, header: dict[str, str], scatter: bool = False
+) -> tuple[Table | None, float]:
+    """One table, or how its figures scatter by `DRAWS` draws of the noise, and the CPU seconds, those of its own child
+    processes included; for a process of its own."""
     import cv2
+    from draws import other_draws
+    from renders import kept_renders
 
     cv2.setNumThreads(1)
     importlib.import_module(module)
     entry = TABLES[name]
     start = sum(os.times()[:4])
-    made = Table.of(entry, entry.measure(quick), header | {"seed": str(entry.seed)})
-    return made, sum(os.times()[:4]) - start
+    made = []
+    for draw in range(DRAWS if scatter else 1):
+        with kept_renders(), other_draws(draw):
+            made.append(Table.of(entry, entry.measure(quick), header | {"seed": str(entry.seed)}))
+    return scatter_of(entry, made) if scatter else made[0], sum(os.times()[:4]) - start

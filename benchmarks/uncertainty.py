@@ -20,7 +20,7 @@ from rgbmidic.correlation import Solution
 from rgbmidic.fields import at_nodes, at_pixels, field_rms, high_pass
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.measures import area_stds
-from rgbmidic.lab.virtual import strained_plate, truth
+from rgbmidic.lab.virtual import render, strained_plate, truth
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.weights.threshold import threshold_weights
@@ -36,7 +36,6 @@ from .uncertainty_scenes import (
     frame,
     images_of,
     pair_of,
-    stored_render,
     turn,
 )
 
@@ -320,7 +319,7 @@ def areas(quick: bool) -> Iterator[Row]:
     cases = {"3-CCD": ("rgb", None), "Bayer": ("bayer", None), "Bayer without crosstalk": ("bayer", none)}
     for angle in (2.0,) if quick else (1.0, 2.0, 8.0):
         state = bench.state(angle)
-        exact, rendered = truth(bench.scene, state), [stored_render(bench.scene, one) for one in (None, state)]
+        exact, rendered = truth(bench.scene, state), [render(bench.scene, one) for one in (None, state)]
         for title, (kind, matrix) in list(cases.items())[: 2 if quick else 3]:
             camera = bench.scene.camera if matrix is None else replace(bench.scene.camera, crosstalk=matrix)
             scene = replace(bench.scene, camera=camera)

@@ -5,13 +5,9 @@ A scene is rendered light by light without the camera's colours, so cameras and 
 
 from __future__ import annotations
 
-import hashlib
-import os
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from pathlib import Path
 from typing import Any, Literal
 
 import cv2
@@ -42,14 +38,6 @@ PAINTS: dict[str, dict[str, float]] = {
     "coarse": {"wrinkles": 0.075},
 }
 """Options of `Setting`: wrinkles 25 um apart that reflect 1.5 times the full white; twice that; three times as wide."""
-RENDERS = "RGBMIDIC_RENDERS"
-"""Environment variable: folder of rendered scenes that several tables share; the driver sets it for its run."""
-_OWN_RENDERS = tempfile.TemporaryDirectory(prefix="rgbmidic-renders-")
-
-
-def renders() -> Path:
-    """Folder of what tables of one run share."""
-    return Path(os.environ.get(RENDERS, _OWN_RENDERS.name))
 
 
 def turn(angle: float) -> State:
@@ -105,25 +93,14 @@ class Pair:
         return int(self.exact.shape[1])
 
 
-def stored_render(scene: Scene, state: State | None) -> FloatImage:
-    """`render`, kept on disk while tables are measured: rendering is the slow part."""
-    key = hashlib.sha1(repr((scene, state)).encode()).hexdigest()[:20]
-    path = renders() / f"render_{key}.npy"
-    if not path.exists():
-        temporary = path.with_suffix(f".{os.getpid()}.npy")
-        np.save(temporary, render(scene, state))
-        temporary.replace(path)
-    return np.asarray(np.load(path))
-
-
 @lru_cache(maxsize=8)
 def pair_of(setting: Setting) -> Pair:
     """Render a setting, its mat twin and its truth."""
     scene, mat = setting.scene(), setting.scene(gloss=0.0)
     states = (None, setting.state)
-    lights = [stored_render(scene, state) for state in states]
+    lights = [render(scene, state) for state in states]
     glare = [
-        np.asarray(1 - blurred(stored_render(mat, one)) / np.maximum(blurred(full), 1), dtype=np.float32)
+        np.asarray(1 - blurred(render(mat, one)) / np.maximum(blurred(full), 1), dtype=np.float32)
         for one, full in zip(states, lights, strict=True)
     ]
     return Pair(scene, (lights[0], lights[1]), (glare[0], glare[1]), truth(scene, setting.state))
@@ -193,7 +170,7 @@ def overlapping_reflections() -> Pair:
     )
     surface = replace(scene.surface, white=white, black=black)
     scene = replace(scene, surface=surface, lights=tuple(replace(light, position=place) for light in scene.lights))
-    first, second = (stored_render(scene, state) for state in (None, turn(1.0)))
+    first, second = (render(scene, state) for state in (None, turn(1.0)))
     return Pair(scene, (first, second), (first * 0, second * 0), truth(scene, turn(1.0)))
 
 

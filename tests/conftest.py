@@ -1,16 +1,59 @@
-"""What all tests share: the folders of real files, and an end to what hangs."""
+"""What all tests share: threads, kernels, renders, the draws of the noise, real files, and an end to what hangs."""
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import ExitStack, nullcontext
 
 import pytest
 import real_files
+from draws import JITTER, SAMPLERS, other_draws
+from matplotlib.figure import Figure
+from renders import kept_renders, new_renders
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # the processes share the cores already
-    os.environ.setdefault("RGBMIDIC_THREADS", "1")
+from rgbmidic.lab.demo import kernels_compiled_meanwhile
+
+THREADS = ("RGBMIDIC_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options under which nothing may fail: no verdict depends on a draw of the noise."""
+    group = parser.getgroup("other draws of the noise (see CONTRIBUTING.md)")
+    group.addoption("--draw", type=int, default=0, metavar="N", help="another noise of every virtual camera: 1, 2, ...")
+    group.addoption("--sampler", choices=SAMPLERS, default="poisson", help="of the photons: rounded normal numbers")
+    group.addoption("--jitter", action="store_const", const=JITTER, default=0.0, help="of renders: 1e-6 of each pixel")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let the processes of the run share cores, kernels and renders; exchange the noise where an option asks for it."""
+    if getattr(config.option, "numprocesses", None):
+        os.environ |= {name: os.environ.get(name, "1") for name in THREADS}
+        with nullcontext() if config.option.collectonly else kernels_compiled_meanwhile():
+            pass
+    stack = ExitStack()
+    stack.enter_context(kept_renders())
+    stack.enter_context(other_draws(config.option.draw, config.option.sampler, config.option.jitter))
+    config.add_cleanup(stack.close)
+
+
+def pytest_collection_finish() -> None:
+    """Let no collection of garbage look through what the tests are made of."""
+    gc.collect()
+    gc.freeze()
+
+
+RENDERER = ("lab/virtual", "scene", "kernels")
+"""Rooms whose tests are about the renderer."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Render anew where the renderer is tested."""
+    with new_renders() if item.path.parent.as_posix().endswith(RENDERER) else nullcontext():
+        return (yield)
 
 
 @pytest.fixture(scope="session")
@@ -19,18 +62,32 @@ def real_data() -> real_files.RealData:
     return real_files.real_folder
 
 
-@pytest.fixture
+DEADLINE = 600
+"""Seconds after which a test hangs: the longest takes 15 on an idle machine."""
+
+
+@pytest.fixture(autouse=True)
 def alarm() -> Iterator[None]:
-    """What waits for ever fails after 20 s."""
+    """What waits for ever fails."""
+    if not hasattr(signal, "SIGALRM"):
+        yield
+        return
 
     def stop(*_: object) -> None:
-        raise TimeoutError("it hangs")
+        raise TimeoutError(f"it hangs: {DEADLINE} s")
 
     before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(20)
+    signal.alarm(DEADLINE)
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures that nobody looks at are drawn with a third of the resolution."""
+    savefig = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *to, **how: savefig(figure, *to, **how | {"dpi": 50}))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -461,9 +461,7 @@ def _common_gradient(gradient: FloatImage, values: FloatImage, weights: FloatIma
         return gradient
     out, mean = np.empty_like(gradient), np.empty((2, weights.shape[1]), dtype=np.float32)
     products = np.empty((4, weights.shape[1]), dtype=np.float32)
-    centred = [
-        v - spread(pixels, window_means(pixels, v[None], w[None]))[0] for v, w in zip(values, weights, strict=True)
-    ]
+    centred = values - spread(pixels, window_means(pixels, values, weights))
     texture = centred.sum(axis=0)
     for light, (own, weight) in enumerate(zip(centred, weights, strict=True)):
         others = texture - own

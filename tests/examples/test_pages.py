@@ -32,6 +32,7 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.demo import run_demo, run_plate, write_plate
 from rgbmidic_calibration import cli as calibrate
 
+pytestmark = pytest.mark.usefixtures("small_pictures")
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT / "docs/_ext"))
 import reference  # noqa: E402 (it is no package)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from table_laws import LAWS
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))
 
@@ -15,13 +16,16 @@ from benchmarks import ROOT
 from benchmarks import __main__ as driver
 from benchmarks.tables import (
     FOLDER,
+    QUICK_FOLDER,
     README,
+    SCATTER_FOLDER,
     TABLES,
     Entry,
     MissingDataError,
     Table,
     disagreements,
     load,
+    scatter_of,
     table,
     written,
 )
@@ -88,6 +92,17 @@ def test_a_block_is_replaced_and_nothing_else():
 def test_each_file_is_of_a_table():
     assert {path.stem for path in FOLDER.glob("*.csv")} <= set(TABLES)
     assert {path.stem for path in FOLDER.glob("quick/*.csv")} == {n for n, e in TABLES.items() if e.own_quick}
+    assert {path.stem for path in SCATTER_FOLDER.glob("*.csv")} <= {n for n, e in TABLES.items() if not e.timing}
+
+
+def test_each_table_of_smaller_cases_has_a_law():
+    assert set(LAWS) == {name for name, entry in TABLES.items() if entry.own_quick}
+
+
+@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("folder", [FOLDER, QUICK_FOLDER], ids=["full", "quick"])
+def test_committed_figures_obey_what_does_not_come_from_them(name, folder):
+    LAWS[name](Table.read(folder / f"{name}.csv"))
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -98,7 +113,11 @@ def test_quick_rows_are_those_of_the_page(name):
     except MissingDataError as error:
         pytest.skip(str(error))
     if not entry.timing:
-        assert not disagreements(entry, made, Table.read(entry.committed()))
+        scatter = SCATTER_FOLDER / f"{name}.csv"
+        known = Table.read(scatter) if scatter.exists() else None
+        assert not disagreements(entry, made, Table.read(entry.committed()), known)
+    if name in LAWS:
+        LAWS[name](made)
 
 
 ROWS = [
@@ -122,6 +141,23 @@ def test_a_figure_counts_as_the_same_within_a_factor_and_noise_within_its_scatte
     assert len(changed(bias=0.02)) == len(changed(lost=0)) == len(changed(rms=float("nan"))) == 1
     with pytest.raises(ValueError, match="no row 'Bayer, 4'; rows are: Bayer, 8; 3-CCD, 8"):
         changed(angle=4.0)
+
+
+def test_a_figure_agrees_within_the_scatter_of_draws_a_count_within_two_and_a_text_with_an_alternative():
+    entry = replace(ENTRY, within={"lost": 2.0})
+    rows = [row | {"by": "noise or levels"} for row in ROWS]
+    draws = [Table.of(entry, [rows[0] | {"rms error [px]": rms, "by": by}]) for rms, by in ((0.011, "–"), (0.013, "x"))]
+    scatter = scatter_of(entry, [Table.of(entry, rows[:1]), *draws])
+    assert scatter.rows == (("Bayer", "8", "0.00101", "0", "0", "x or –"),)
+    assert scatter_of(entry, [Table.of(entry, rows)] * 3) is None
+
+    def compared(**figures):
+        made = Table.of(entry, [rows[0] | {ROWS_NAMES.get(name, name): value for name, value in figures.items()}])
+        return len(disagreements(entry, made, Table.of(entry, rows), scatter))
+
+    assert not compared(rms=0.0061 + 1e-4, lost=1, by="levels or black level")
+    assert not compared(by="–")
+    assert [compared(rms=0.0060), compared(lost=0), compared(by="black level")] == [1, 1, 1]
 
 
 def test_what_is_written_is_read(tmp_path):
@@ -175,7 +211,7 @@ def test_three_digits(value, text):
 def run(monkeypatch, *arguments: str) -> int:
     """Status of the driver, whose two tables are a good one and one that fails."""
 
-    def made(name: str, quick: bool, header: dict[str, str]) -> tuple[Table, float]:
+    def made(name: str, quick: bool, header: dict[str, str], scatter: bool) -> tuple[Table, float]:
         if name == "broken":
             raise RuntimeError("no camera")
         return Table.of(ENTRY, ROWS, header), 0.1

@@ -140,7 +140,7 @@ def test_too_many_open_files_are_told_with_their_limit(
 )  # fmt: skip
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in folders")
 def test_a_pipe_is_refused_at_once_wherever_a_file_is_read(
-    command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, alarm: None, arguments: list[str]
+    command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("pipe.toml", "provenance.json"):

@@ -2,44 +2,62 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import pytest
 
+from rgbmidic import timing
 from rgbmidic.timing import STAGES, each, stage, timed
+
+Pass = Callable[[float], None]
+
+
+@pytest.fixture
+def wait(monkeypatch: pytest.MonkeyPatch) -> Pass:
+    """Lets seconds pass on the clock of the stages, which stands still otherwise."""
+    now = [1000.0]
+
+    def pass_by(seconds: float) -> None:
+        now[0] += seconds
+
+    monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    return pass_by
 
 
 @stage("weights")
-def weigh():
-    time.sleep(0.02)
+def weigh(wait: Pass) -> None:
+    wait(2)
     with stage("iteration"):
-        time.sleep(0.05)
+        wait(5)
 
 
-def starts():
-    time.sleep(0.03)
+def starts(wait: Pass) -> Iterator[int]:
+    wait(3)
     yield 1
+    wait(4)
 
 
-def test_a_stage_within_a_stage_counts_for_itself_and_all_adds_up():
-    begin = time.perf_counter()
+def test_a_stage_within_a_stage_counts_for_itself_and_all_adds_up(wait):
     with timed() as seconds:
-        for _ in each("search", starts()):
-            weigh()
-    whole = time.perf_counter() - begin
-    assert tuple(seconds) == STAGES
-    assert seconds["weights"] >= 0.02
-    assert seconds["iteration"] >= 0.05
-    assert 0.03 <= seconds["search"] <= whole - 0.07
-    assert sum(seconds.values()) == pytest.approx(whole, abs=0.005)
+        wait(1)
+        for _ in each("search", starts(wait)):
+            weigh(wait)
+    assert seconds == dict.fromkeys(STAGES, 0.0) | {"weights": 2, "iteration": 5, "search": 7, "rest": 1}
 
 
-def test_an_error_leaves_the_stage_and_nothing_is_measured_unasked():
+@stage("equations")
+def fail(wait: Pass) -> None:
+    wait(2)
+    raise ValueError("no")
+
+
+def test_an_error_leaves_the_stage_and_nothing_is_measured_unasked(wait):
     with timed() as seconds:
-        with pytest.raises(ValueError, match="no"), stage("equations"):
-            raise ValueError("no")
-        time.sleep(0.02)
-    assert seconds["rest"] >= 0.02
+        with pytest.raises(ValueError, match="no"):
+            fail(wait)
+        wait(3)
+    assert seconds == dict.fromkeys(STAGES, 0.0) | {"equations": 2, "rest": 3}
     with timed(False) as unasked:
-        weigh()
+        weigh(wait)
     assert unasked == {}

@@ -24,9 +24,9 @@ def test_a_damaged_file_gives_frames_of_its_shape_or_our_error(
     for number in range(CINE_COPIES if name.endswith(".cine") else COPIES):
         path.write_bytes(mutated(content, random))
         os.utime(path, ns=(number, number))  # copies written within one tick of the clock are different files
-        started = time.perf_counter()
+        started = time.process_time()
         frames, messages = read_all(path, stated)
-        assert time.perf_counter() - started < 5
+        assert time.process_time() - started < 5  # of the processor: .05 at most
         read += frames
         told.update(messages)
     assert told

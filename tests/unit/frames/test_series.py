@@ -232,7 +232,7 @@ def _device(path: Path) -> None:
 @pytest.mark.parametrize("make", [_pipe, _socket, _device])
 @pytest.mark.parametrize("ending", [".tif", ".dng"])
 def test_what_is_no_regular_file_is_refused_without_opening_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, alarm: None, make: Callable[[Path], None], ending: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Callable[[Path], None], ending: str
 ) -> None:
     monkeypatch.chdir(tmp_path)  # a socket's path is short
     write_dng(tmp_path / "f0.dng", noisy_mosaic())

@@ -257,7 +257,7 @@ def test_a_trigger_channel_and_a_correlation_find_the_recorder_s_clock(tmp_path:
     triggered = Channels.read(tmp_path / "c.csv", trigger="ttl")
     assert triggered.offset == pytest.approx(-7.29e-3, abs=1e-9)  # in the middle of the rise
     errors = []
-    times = np.arange(-2e-3, 10e-3, 50e-6)
+    times = np.arange(-2e-3, 10e-3, 100e-6)
     for seed in range(40):
         noise = np.random.default_rng(seed).normal(0, 0.02, len(times))
         history = -3e-4 * (np.exp(-(((times - 4.7e-3) / 1e-3) ** 2)) + noise)
