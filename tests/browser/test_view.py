@@ -513,6 +513,7 @@ def test_a_movie_of_what_is_in_view_is_written_beside_the_others(driver, wave, t
         page.do("model('quantity').value = 'node_status'")
         page.keys("m")
         page.until("model('said').text.includes('a movie shows fields of numbers, not node_status')", patience=60)
+        page.until("!model('movie').active")  # which is told after the text
         page.do("model('quantity').value = 'v'")
         page.keys("m")
         page.until("model('movie').active && model('said').text.startsWith('movie_v')")
