@@ -47,7 +47,8 @@ from rgbmidic.lab.virtual import (
 from rgbmidic.pipeline import Separation
 
 BENCHES = ("sequential", "bayer")
-"""Two white lamps in succession before a monochrome camera, as in the paper; three colours in one Bayer shot."""
+"""Two white lamps in succession before a monochrome camera, as in the paper; three colours in one Bayer shot. The lamps
+of the latter before a camera with three sensors, the ideal, are "3-CCD"."""
 SMALLEST = 448
 """Smallest frame (px) that holds the five areas with their margin."""
 PITCH = 100.0
@@ -66,6 +67,7 @@ LAMP = 700.0
 """Distance (mm) of the lamps from the surface."""
 DSLR: dict[str, object] = {"kind": "monochrome", "bits": 14, "black_level": 0, "gain": 1.6, "read_noise": 12.0}
 """A 14-bit camera of the class of the paper's: 26,000 electrons at full scale."""
+CAMERAS: dict[str, dict[str, object]] = {"sequential": DSLR, "bayer": {}, "3-CCD": {"kind": "rgb"}}
 TILT_DEG = 15.0
 """Tilt of the flat specimen's normal against the camera's axis (degrees): light from as far beyond it is reflected."""
 DISTANCE = 600.0
@@ -87,7 +89,7 @@ def study_paint(seed: int = 0) -> Surface:
 class Bench:
     """A scene with what is measured on it."""
 
-    name: str  # one of `BENCHES`
+    name: str  # one of `CAMERAS`
     scene: Scene
     areas: tuple[Area, ...]  # A0 to A4
     half: float  # half the side (px) of the measured square, about the middle of the frame
@@ -98,11 +100,11 @@ class Bench:
     @classmethod
     def build(cls, name: str, size: int = 1024, *, surface: Surface | None = None, seed: int = 0) -> Bench:
         """The bench before a camera of `size` x `size` px, painted as `study_paint` unless `surface` is given."""
-        if name not in BENCHES:
-            raise InputError(f"unknown scene {name!r}; allowed are {', '.join(BENCHES)}")
+        if name not in CAMERAS:
+            raise InputError(f"unknown scene {name!r}; allowed are {', '.join(CAMERAS)}")
         if size < SMALLEST:
             raise InputError(f"the frames must be at least {SMALLEST} px wide to hold the areas, not {size}")
-        camera = reference_camera((size, size), **(DSLR if name == "sequential" else {}))
+        camera = reference_camera((size, size), **CAMERAS[name])
         body, middle = Sphere(), camera.centre[0]
         half = min(REGION * body.radius * camera.focal_px / body.front[2], size / 2 - 8)
         pitch = min(PITCH, (half - MARGIN - 25) / 2)
@@ -169,7 +171,7 @@ class Bench:
         """
         camera, lights = self.scene.camera, self.scene.lights
         names = tuple(light.name for light in lights)
-        shots = [names] if self.name == "bayer" else [(name,) for name in names]
+        shots = [(name,) for name in names] if self.name == "sequential" else [names]
         frames = tuple(
             record(
                 images,
@@ -181,7 +183,7 @@ class Bench:
             for number, on in enumerate(shots)
         )
         calibration = None
-        if self.name == "bayer":
+        if self.name != "sequential":
             calibration = Calibration(crosstalk=camera.true_crosstalk(lights), noise=camera.noise)
         return replace(Separation(calibration=calibration, demosaic=demosaic)(frames), names=names)
 
