@@ -12,7 +12,6 @@ from bench import SMALLEST, Bench
 from rgbmidic.fields import at_nodes
 from rgbmidic.illumination import IlluminationImages
 from rgbmidic.pipeline import correlated
-from rgbmidic.settings import IlluminationSettings
 from rgbmidic.typing import AnyArray, FloatArray
 from run import run_scene
 
@@ -125,7 +124,7 @@ def with_peers(quick: bool) -> Iterator[Row]:
 
 def seen(images: IlluminationImages) -> FloatArray:
     """8-bit pictures (4, H, W) of the lights and of their mean, each divided by its local mean."""
-    lights = correlated(images, IlluminationSettings())
+    lights = correlated(images)
     every = np.concatenate([lights, lights.mean(axis=0, keepdims=True)])
     return np.asarray(np.nan_to_num(every * 110, nan=110.0).clip(0, 255).round(), dtype=np.float64)
 
