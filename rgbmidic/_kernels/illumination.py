@@ -19,7 +19,7 @@ __all__ = [
     "best_mean",
     "block_sums",
     "cell_moments",
-    "common_gradient",
+    "gradient_of_others",
     "lag_products",
     "malvar",
     "pad_mosaic",
@@ -135,37 +135,35 @@ _ONE = np.float32(1.0)
 
 @over_ranges("mean", axis=1, grain=BLOCK)
 @compiled(fastmath=_FAST)
-def common_gradient(start, stop, gradient, weights, light, kept, mean, products):
-    """Mean gradient of the lights other than `light` and of a part of its own, and its products with that light's own.
+def gradient_of_others(start, stop, gradient, weights, light, fewest, mean, products):
+    """Mean gradient of the lights other than `light`, and its products with that light's own.
 
-    For gradients (2, k, P) and weights (k, P): `mean` (2, P) receives the mean of the others that have weight and of
-    the part `kept` (P,), 0 to 1, of the light's own; where fewer than two others have weight, of all of it. `products`
-    (4, P) receives own times mean, mean times mean, own times own and 1, all 0 where the light has no weight.
+    For gradients (2, k, P) and weights (k, P): `mean` (2, P) receives the mean of the others that have weight; where
+    they are fewer than `fewest`, that of all that have. `products` (4, P) receives own times mean, mean times mean, own
+    times own and 1, all 0 where the light has no weight.
     """
-    count, part, total = np.empty((3, BLOCK), dtype=np.float32)
+    count, less, total = np.empty((3, BLOCK), dtype=np.float32)
     own, lights = np.uint64(light), np.uint64(len(weights))
     for block in range(start, stop, BLOCK):
         first, number = np.uint64(block), np.uint64(min(BLOCK, stop - block))
         for i in range(number):
             count[i] = _ZERO
         for j in range(lights):
-            if j != own:
-                for i in range(number):
-                    count[i] += _ONE if weights[j, first + i] > _ZERO else _ZERO
+            for i in range(number):
+                count[i] += _ONE if weights[j, first + i] > _ZERO else _ZERO
         for i in range(number):
             seen = _ONE if weights[own, first + i] > _ZERO else _ZERO
-            part[i] = seen * (kept[first + i] if count[i] > _ONE else _ONE)
+            less[i] = seen if count[i] - seen >= fewest else _ZERO
             products[3, first + i] = seen
         for axis in range(np.uint64(2)):
             for i in range(number):
-                total[i] = part[i] * gradient[axis, own, first + i]
+                total[i] = _ZERO
             for j in range(lights):
-                if j != own:
-                    for i in range(number):
-                        total[i] += gradient[axis, j, first + i] if weights[j, first + i] > _ZERO else _ZERO
+                for i in range(number):
+                    total[i] += gradient[axis, j, first + i] if weights[j, first + i] > _ZERO else _ZERO
             for i in range(number):
-                summed = count[i] + part[i]
-                mean[axis, first + i] = total[i] / summed if summed > _ZERO else _ZERO
+                slope = gradient[axis, own, first + i]
+                mean[axis, first + i] = (total[i] - less[i] * slope) / max(count[i] - less[i], _ONE)
         for i in range(number):
             seen, x, y = products[3, first + i], gradient[0, own, first + i], gradient[1, own, first + i]
             u, v = mean[0, first + i], mean[1, first + i]

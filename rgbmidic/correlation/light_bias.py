@@ -13,13 +13,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import gaussian_filter, map_coordinates
 
+from rgbmidic._kernels.illumination import scores
 from rgbmidic.correlation.assembly import BLOCK
-from rgbmidic.correlation.local_displacement import RANGE, LocalDisplacement
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.illumination.displacement import agreement
 from rgbmidic.typing import FloatArray, FloatImage
+
+RANGE = 24.0
+"""Standard deviation (px) of the window: a light's bias changes over some 50 px, and the mean of the lights that agree
+is known the better the wider it is. Half of it and 16 px give errors up to 5 % larger on raised droplets."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,11 +48,22 @@ class LightBias:
         mesh, pixels, count = reference.mesh, reference.pixels, len(weights)
         if count == 1:
             return cls(values=np.zeros_like(mesh.nodes), std=np.zeros_like(mesh.nodes))
-        lights = zip(residual.difference, weights, reference.gradient.swapaxes(0, 1), strict=True)
-        shown = [LocalDisplacement.of(pixels, *light) for light in lights]
-        displacement, variance = np.stack([one.values for one in shown]), np.stack([one.variance for one in shown])
-        information = np.stack([one.information for one in shown])
-        precision = information / information.sum(axis=0)
+        sums = np.empty((4, weights.shape[1]), dtype=np.float32)
+        moments = []
+        lights = zip(residual.difference, weights, *reference.gradient, strict=True)
+        for light in lights:
+            scores(*(field[None] for field in light), sums)
+            moments.append(pixels.block_sums(sums[:3], BLOCK).astype(np.float64))
+        blocks = np.stack(moments)  # (k, 3, h, w)
+        sigma = (0, 0, RANGE / BLOCK, RANGE / BLOCK)
+        around = gaussian_filter(blocks, sigma, mode="constant", truncate=3)
+        half = np.maximum(around[:, 2] / 2, 1e-30)
+        displacement = around[:, :2] / half[:, None]
+        # scatter of the blocks' scores about the window's displacement, a window holding so many blocks
+        scatter = ((blocks[:, :2] - displacement * blocks[:, 2:] / 2) ** 2).mean(axis=1)
+        held = 4 * np.pi * (RANGE / BLOCK) ** 2
+        variance = gaussian_filter(scatter, sigma[1:], mode="constant", truncate=3) / half**2 / held
+        precision = half / np.maximum(half.sum(axis=0), 1e-30)
         believed, agree = agreement(displacement, variance, precision)
         part = precision + agree * (believed - precision)
         mean = (part[:, None] * displacement).sum(axis=0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bits import assert_same_on_threads
 
-from rgbmidic._kernels.illumination import common_gradient, scores
+from rgbmidic._kernels.illumination import gradient_of_others, scores
 from rgbmidic._kernels.interpolation import product_sums
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
@@ -64,20 +64,20 @@ def test_scores_of_all_lights_together():
     np.testing.assert_array_equal(out[3], (weight > 0).any(axis=0))
 
 
+@pytest.mark.parametrize("fewest", [2, 3])
 @pytest.mark.parametrize("light", [0, 2])
-def test_common_gradient_holds_a_part_of_the_lights_own(light):
+def test_gradient_of_the_other_lights(light, fewest):
     random = np.random.default_rng(5)
     gradient, weights = random.normal(size=(2, 3, 5000)).astype(np.float32), random.uniform(-1, 1, size=(3, 5000))
-    kept = random.uniform(size=5000).astype(np.float32)
     mean, products = np.full((2, 5000), 7, dtype=np.float32), np.full((4, 5000), 7, dtype=np.float32)
-    common_gradient(gradient, weights.astype(np.float32), light, kept, mean, products)
+    gradient_of_others(gradient, weights.astype(np.float32), light, fewest, mean, products)
     for i in range(5000):
-        part = (weights[:, i] > 0).astype(float)
-        if part.sum() - part[light] >= 2:
-            part[light] *= kept[i]
-        wanted, own = gradient[:, :, i] @ part / max(part.sum(), 1e-9), gradient[:, light, i]
+        every = [j for j in range(3) if weights[j, i] > 0]
+        others = [j for j in every if j != light]
+        chosen = others if len(others) >= fewest else every
+        wanted, own = gradient[:, chosen, i].sum(axis=1) / max(len(chosen), 1), gradient[:, light, i]
         np.testing.assert_allclose(mean[:, i], wanted, atol=1e-5)
-        expected = np.array([own @ wanted, wanted @ wanted, own @ own, 1]) * (weights[light, i] > 0)
+        expected = np.array([own @ wanted, wanted @ wanted, own @ own, 1]) * (light in every)
         np.testing.assert_allclose(products[:, i], expected, atol=1e-5)
 
 
@@ -90,7 +90,7 @@ def test_the_same_bits_on_one_and_three_threads(pixels):
         many = np.resize(values, (2, 20000))
         scores(many, many, many, many, summed)
         mean, products = np.zeros((2, 20000), np.float32), np.zeros((4, 20000), np.float32)
-        common_gradient(np.stack([many, many**2]), many, 1, many[0], mean, products)
+        gradient_of_others(np.stack([many, many**2]), many, 1, 1, mean, products)
         blocks = pixels.block_sums(values, 5)
         return sums, summed, mean, products, blocks, pixels.from_blocks(blocks, 5), pixels.window(values)
 
