@@ -50,7 +50,9 @@ def rms(values):
 def test_p_is_error_and_not_the_motion_of_the_sphere(study):
     """The long waves that the filter takes off are all of the true field: what is left is error."""
     for one in study.scenes[0].measurements.values():
-        assert one.perturbation == pytest.approx(one.error, rel=0.05, nan_ok=True)
+        assert one.perturbation == pytest.approx(
+            one.error, rel=0.05, abs=2e-4, nan_ok=True
+        )  # noise has long waves, too
 
 
 def test_rms_is_of_both_components_with_all_their_waves(study):
