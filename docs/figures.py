@@ -170,10 +170,9 @@ class Demo:
 
 @cache
 def droplets() -> tuple[Any, Any, list[Any]]:
-    """The bench with raised droplets, turned by 8 degrees: the green light's image, truth, green alone and all three."""
+    """The bench with raised droplets, turned by 8 degrees: image of the green light, truth, green alone and all three."""
     sys.path.append(str(ROOT / "examples" / "paper"))
     from bench import Bench
-
     from rgbmidic import correlate
 
     bench = Bench.build("bayer", 640)

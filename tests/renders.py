@@ -34,11 +34,11 @@ def kept_renders() -> Iterator[None]:
     """Keep renders within the block, in the folder of the process that started this one or else in one that ends."""
     with tempfile.TemporaryDirectory(prefix="rgbmidic-renders-") as folder:
         first = os.environ.setdefault(_VARIABLE, folder) == folder
-        rendering._trace = _found
+        before, rendering._trace = rendering._trace, _found
         try:
             yield
         finally:
-            rendering._trace = _trace
+            rendering._trace = before
             if first:
                 del os.environ[_VARIABLE]
 

@@ -237,6 +237,8 @@ def test_a_table_that_fails_does_not_stop_the_others(monkeypatch, tmp_path, caps
     assert header["command"] == "python -m benchmarks sphere"
     assert Table.read(tmp_path / "quick" / "sphere.csv").header["command"] == "python -m benchmarks sphere --quick"
     assert run(monkeypatch, "sphere", "--quick") == 0
+    assert run(monkeypatch, "sphere", "--scatter", "--out", str(tmp_path / "new")) == 0
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("new/*/*")] == ["new/scatter/sphere.csv"]
 
 
 @pytest.mark.parametrize(

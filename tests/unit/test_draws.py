@@ -48,7 +48,7 @@ def test_renders_change_by_the_jitter_alone():
     assert 0.3e-6 < np.std(changed / usual - 1) < 3e-6
 
 
-def test_a_render_is_made_once_unless_it_is_to_be_made_anew(monkeypatch):
+def test_a_render_is_made_once_unless_it_is_to_be_made_anew(monkeypatch, tmp_path):
     made = []
 
     def trace(scene, state):
@@ -57,6 +57,7 @@ def test_a_render_is_made_once_unless_it_is_to_be_made_anew(monkeypatch):
 
     monkeypatch.setattr(renders, "_trace", trace)
     monkeypatch.setattr(renders, "_WORTH", -1.0)
+    monkeypatch.setenv("RGBMIDIC_RENDERS", str(tmp_path))
     scene = plate_scene(size=2)
     with renders.kept_renders():
         for angle in (1.25, 1.5, 1.25):

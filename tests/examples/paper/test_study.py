@@ -37,7 +37,7 @@ def test_reflection_disturbs_one_light_and_midic_follows_the_quiet_area(study):
     assert (p["dic"][:, 2:].max(axis=1) > np.array([1.5, 3]) * quiet).all()
     assert p["glc-dic"][1, 2:].max() < 0.8 * p["dic"][1, 2:].max()
     assert np.median(p["midic-unweighted"] / p["dic"]) > 0.6
-    # the P of an area is that of some ten nodes and scatters by a quarter: at 1 degree the quiet one is all noise
+    # the P of one area rests on some ten nodes and scatters by a quarter: at 1 degree the quiet one's is all noise
     assert rms(p["midic"][0, 3:]) < 0.7 * rms(p["dic"][0, 3:])
     assert (p["midic"][1, 3:] < 1.3 * quiet[1]).all()
     assert p["midic"][1, 2:].max() < 0.4 * p["dic"][1, 2:].max()
@@ -50,7 +50,9 @@ def rms(values):
 def test_p_is_error_and_not_the_motion_of_the_sphere(study):
     """The long waves that the filter takes off are all of the true field: what is left is error."""
     for one in study.scenes[0].measurements.values():
-        assert one.perturbation == pytest.approx(one.error, rel=0.05, nan_ok=True)
+        assert one.perturbation == pytest.approx(
+            one.error, rel=0.05, abs=2e-4, nan_ok=True
+        )  # noise has long waves, too
 
 
 def test_rms_is_of_both_components_with_all_their_waves(study):
@@ -83,7 +85,7 @@ def test_every_statement_has_a_verdict_and_a_reason_where_it_fails(study):
     assert {claim.figure.split(",")[0] for claim in claims} >= {"Fig. 4", "Fig. 7", "Fig. 8", "Fig. 9", "Fig. 17"}
     for claim in claims:
         assert claim.measured
-        if claim.verdict == "not reproduced":
+        if claim.possible == ("not reproduced",):
             assert claim.reason or claim.figure == "Fig. 6", claim
 
 

@@ -81,8 +81,8 @@ def test_fixed_pattern_is_separated_from_temporal_noise():
 
 def test_without_fixed_pattern_none_is_claimed():
     noise = measure(white_target, np.random.default_rng(4)).camera_noise
-    assert (noise.dsnu.value < 3 * noise.dsnu.std).all()
-    assert (noise.prnu.value < 3 * noise.prnu.std).all()
+    for pattern in (noise.dsnu, noise.prnu):  # the root of a variance within 4 standard errors (2 value std) of 0
+        assert (pattern.value < 8 * pattern.std).all()
     assert noise.defects == ()
 
 

@@ -25,8 +25,9 @@ from rgbmidic.scene.forecast import Instrument, node_constant, pixel_size, trace
 from rgbmidic.scene.speckle import SpecklePatch, SpeckleSpectrum, cover_covariance
 from rgbmidic.scene.zones import material_points, predict_zones
 
-OVERSTATED = 1.45
-"""Forecast over observed in reflections that move: 1.35 in this scene since the solve weights by covariance."""
+OVERSTATED = 1.6
+"""Forecast over observed in reflections that move: 1.39 in this scene since the solve weights by covariance; draws of
+the noise scatter it by .05."""
 RATIO = 0.25
 """The forecast is within this of what is observed."""
 DRAWS = 4

@@ -43,7 +43,7 @@ def test_saturation_clips_at_the_white_level():
 
 @pytest.mark.parametrize("cfa", BAYER_PATTERNS)
 def test_every_bayer_phase_samples_its_channel(cfa):
-    camera = Camera(shape=(6, 8), cfa=cfa, crosstalk=CROSSTALK, read_noise=0.0, gain=1e6)
+    camera = Camera(shape=(6, 8), cfa=cfa, crosstalk=CROSSTALK, read_noise=0.0, gain=1e8)
     images = np.random.default_rng(0).uniform(100, 2000, (3, 6, 8)).astype(np.float32)
     mosaic = record(images, camera, LIGHTS, seed=0)
     assert isinstance(mosaic, Mosaic)
@@ -54,7 +54,7 @@ def test_every_bayer_phase_samples_its_channel(cfa):
 
 
 def test_three_ccd_has_every_channel_and_lights_can_be_switched():
-    camera = Camera(shape=(4, 4), kind="rgb", crosstalk=CROSSTALK, read_noise=0.0, gain=1e6)
+    camera = Camera(shape=(4, 4), kind="rgb", crosstalk=CROSSTALK, read_noise=0.0, gain=1e8)
     images = np.ones((3, 4, 4), dtype=np.float32) * np.array([1000, 2000, 500], dtype=np.float32)[:, None, None]
     frame = record(images, camera, LIGHTS, seed=0)
     assert isinstance(frame, ChannelFrame)
@@ -128,7 +128,7 @@ def test_calibration_captures_show_one_light_each():
         means = [full[0::2, 0::2].mean(), full[0::2, 1::2].mean(), full[1::2, 1::2].mean()]
         ratio = np.array(means) / max(means)
         assert ratio == pytest.approx(CROSSTALK[:, index], abs=0.03)
-    dark = dark_frames(scene, count=4, seed=2)
+    dark = dark_frames(scene, count=16, seed=2)
     assert np.mean([frame.values for frame in dark]) == pytest.approx(64, abs=0.2)
     assert np.std([frame.values for frame in dark]) == pytest.approx(np.hypot(3, 12**-0.5), rel=0.03)
 
