@@ -170,7 +170,7 @@ class Demo:
 
 @cache
 def droplets() -> tuple[Any, Any, list[Any]]:
-    """The bench with raised droplets, turned by 8 degrees: image of the green light, truth, green alone and all three."""
+    """The bench with raised droplets turned by 8 degrees: green's image, truth, solutions by green alone and by all."""
     sys.path.append(str(ROOT / "examples" / "paper"))
     from bench import Bench
     from rgbmidic import correlate

@@ -36,7 +36,7 @@ OFFSET_PENALTY = 0.05
 INDISTINCT = 0.02
 """Channel-specific fraction of a colour's variance under which products do not show whether it is coarse."""
 SPARKLING = 0.5
-"""Coarse fraction up to which it is that of coarse wrinkles' sparkle: .27 on the independent scene, where errors are 5 %
+"""Coarse fraction up to which it is the sparkle of coarse wrinkles: .27 on the independent scene, where errors are 5 %
 smaller without it. A specimen of which a tenth is coloured has .75."""
 WIDTHS: FloatArray = np.asarray(NARROWEST * 1.3 ** np.arange(12), dtype=np.float64)
 COLOURED = 0.5
