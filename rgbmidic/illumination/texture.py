@@ -35,9 +35,6 @@ OFFSET_PENALTY = 0.05
 """Least-squares error (of products) that an offset of 1 costs; the true one is -0.02 to -0.15."""
 INDISTINCT = 0.02
 """Channel-specific fraction of a colour's variance under which products do not show whether it is coarse."""
-SPARKLING = 0.5
-"""Coarse fraction up to which it is the sparkle of coarse wrinkles: .27 on the independent scene, where errors are 5 %
-smaller without it. A specimen of which a tenth is coloured has .75."""
 WIDTHS: FloatArray = np.asarray(NARROWEST * 1.3 ** np.arange(12), dtype=np.float64)
 COLOURED = 0.5
 """Below this mean correlation of any two colours they do not show the same texture."""
@@ -247,8 +244,7 @@ def _coarse_fraction(model: TextureModel, sums: FloatArray, counts: FloatArray, 
     common = np.clip(correlations / (np.array([band.adjacent, band.diagonal, band.adjacent]) / band.own), 0, 1).mean()
     # what of the channel-specific fraction is still seen two pixels away, shrunk to 0 where that is nearly nothing
     coarse = measured / max(float(model(2.0)) / band.own, 1e-3) - common
-    fraction = float(np.clip(coarse * (1 - common) / ((1 - common) ** 2 + INDISTINCT**2), 0, 1))
-    return fraction if fraction > SPARKLING else 0.0
+    return float(np.clip(coarse * (1 - common) / ((1 - common) ** 2 + INDISTINCT**2), 0, 1))
 
 
 def speckle_diameter(picture: FloatArray) -> float | None:

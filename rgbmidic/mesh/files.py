@@ -79,7 +79,8 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
     except RgbmidicError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
     except _UNREADABLE as error:
-        raise InputError(f"{path} is not a readable mesh: {str(error)[:120] or 'it ends early'}") from None
+        told = str(error) if isinstance(error, OSError) else str(error)[:120]  # the latter may quote the file
+        raise InputError(f"{path} is not a readable mesh: {told or 'it ends early'}") from None
     faces, numbers = _faces(content, path, part)
     axes, chosen = _plane(content.points, faces, path)
     corners, numbers = _triangles(content.points[:, axes], faces[chosen], numbers[chosen], path)

@@ -26,8 +26,8 @@ from rgbmidic.scene.speckle import SpecklePatch, SpeckleSpectrum, cover_covarian
 from rgbmidic.scene.zones import material_points, predict_zones
 
 OVERSTATED = 1.6
-"""Forecast over observed in reflections that move: 1.39 in this scene since the solve weights by covariance; draws of
-the noise scatter it by .05."""
+"""Forecast over observed in reflections that move: 1.39 in this scene since the solve weights by covariance; the noise
+scatters it by .05 from draw to draw."""
 RATIO = 0.25
 """The forecast is within this of what is observed."""
 DRAWS = 4
