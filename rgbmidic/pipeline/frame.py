@@ -39,7 +39,7 @@ from rgbmidic.frames.data import Window
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.images import normalise as divide_by_local_mean
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.plan import SATURATED, Plan, check_exposed, exposure_fault, too_small
+from rgbmidic.pipeline.plan import SATURATED, Plan, exposure_fault, saturated_fraction, too_small
 from rgbmidic.pipeline.source import RawState, correlated
 from rgbmidic.results import FrameRecord
 from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, check_names, grey_levels
@@ -172,7 +172,7 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     there = state
     if not isinstance(state, IlluminationImages):
         there = tuple(replace(frame, values=frame.values[..., *here]) for frame in state)
-    if (share := check_exposed(there, plan.region.mask, name)) > plan.saturated + SATURATED:
+    if (share := saturated_fraction(there, plan.region.mask)) > plan.saturated + SATURATED:
         words = "%s: %.0f %% of the samples in the region are saturated, %.0f %% in the reference: look at the exposure"
         logger.warning(words, name, 100 * share, 100 * plan.saturated)
     with stage("separation"):

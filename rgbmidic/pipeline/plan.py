@@ -56,13 +56,13 @@ __all__ = [
     "Choice",
     "Plan",
     "UpdatedReferences",
-    "check_exposed",
     "check_texture",
     "exposure_fault",
     "finite_elements_of",
     "light_levels",
     "neighbour_correlation",
     "read_region",
+    "saturated_fraction",
     "too_small",
 ]
 
@@ -275,7 +275,7 @@ class Plan:
             images=rest.images,
             reference=reference,
             speckle=speckle,
-            saturated=check_exposed(rest.states[0], region.mask, rest.names),
+            saturated=saturated_fraction(rest.states[0], region.mask),
             window=window,
             element_size=size,
             finite_elements=finite_elements,
@@ -381,7 +381,10 @@ def _check_raw(
                 largest,
                 frame.white_level,
             )
-    if raw and (share := check_exposed(raw[0], region.mask, f"the reference ({names})")) > SATURATED:
+    share = saturated_fraction(raw[0], region.mask) if raw else 0.0
+    if share > _BLIND:
+        raise FrameError(f"no light sees the region in the reference ({names}): {exposure_fault(raw[0], region.mask)}")
+    if share > SATURATED:
         logger.warning("%.0f %% of the samples in the region of the reference (%s) are saturated", 100 * share, names)
     if calibration is None or not raw:
         return
@@ -666,20 +669,11 @@ _BLIND = 0.98
 from in two of three frames (measured)."""
 
 
-def check_exposed(state: RawState, inside: BoolArray, name: str) -> float:
-    """Fraction of the raw samples in a region (H, W) that are saturated; 0 for images of the lights.
-
-    Raises
-    ------
-    FrameError
-        Hardly any is not.
-    """
+def saturated_fraction(state: RawState, inside: BoolArray) -> float:
+    """Fraction of the raw samples in a region (H, W) that are saturated; 0 for images of the lights."""
     if isinstance(state, IlluminationImages):
         return 0.0
-    share = float(np.mean([(frame.values[..., inside] >= frame.white_level).mean() for frame in state]))
-    if share > _BLIND:
-        raise FrameError(f"no light sees the region in {name}: {exposure_fault(state, inside)}")
-    return share
+    return float(np.mean([(frame.values[..., inside] >= frame.white_level).mean() for frame in state]))
 
 
 def _shifted(samples: AnyArray, white: float) -> str | None:
