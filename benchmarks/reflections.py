@@ -23,7 +23,7 @@ METHODS = {"dic": "plain DIC with one lamp", "midic": "the paper's binary masks"
 LIGHTS = {
     "sequential": "two lamps in succession",
     "bayer": "three colours in one Bayer shot",
-    "3-CCD": "three colours, 3-CCD camera",
+    "3-CCD": "three colours with a 3-CCD camera",
 }
 SIZE, ANGLES, SEEDS = 640, (0.333, 1.0, 2.0, 8.0), (0, 1, 2)
 CROSSED = slice(3, 5)

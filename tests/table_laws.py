@@ -118,6 +118,12 @@ def _polarisers(table: Table) -> None:
                 assert ((crossed / plain > 0.125) & (crossed / plain < 0.25)).all()
 
 
+def _reflections_areas(table: Table) -> None:
+    """Every area is stated with its uncertainty, of some ten nodes and three paints or one."""
+    for area in range(5):
+        between(column(table, f"A{area}: error/stated"), 0.5, 1.7)
+
+
 def _reflections(table: Table) -> None:
     """What weights are for: at most half of plain DIC's P in the reflection."""
     plain, ours = (
@@ -212,6 +218,7 @@ LAWS: dict[str, Law] = {
     "polarisers": _polarisers,
     "probes": _probes,
     "reflections": _reflections,
+    "reflections_areas": _reflections_areas,
     "sphere": _sphere,
     "standing_glare": _standing_glare,
     "star": _star,
