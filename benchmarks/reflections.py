@@ -71,7 +71,7 @@ def reflections(quick: bool) -> Iterator[Row]:
             }
 
 
-@table("reflections_areas", page="explanation/polarisers", cost=90, own_quick=True)
+@table("reflections_areas", page="explanation/polarisers", cost=90, keys=2, own_quick=True)
 def areas(quick: bool) -> Iterator[Row]:
     """The same sphere: error of rgbmidic in each area, and error over stated uncertainty."""
     angles = (1.0,) if quick else (1.0, 8.0)

@@ -14,12 +14,14 @@ if TYPE_CHECKING:
     from rgbmidic.errors import RgbmidicError
     from rgbmidic.fields import CameraCalibration
     from rgbmidic.frames import read_frame
+    from rgbmidic.illumination import separate
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic.lab.inspection import Inspection, inspect_frame
     from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
     from rgbmidic.pipeline import correlate, measure, measure_sequence
     from rgbmidic.results import Result
-    from rgbmidic.settings import TestSettings, read_test
+    from rgbmidic.results.histories import read_histories
+    from rgbmidic.settings import SolverSettings, TestSettings, read_test
 
 from rgbmidic._version import __version__
 
@@ -34,6 +36,7 @@ __all__ = [
     "Result",
     "RgbmidicError",
     "Solution",
+    "SolverSettings",
     "Status",
     "TestSettings",
     "Tri3Mesh",
@@ -44,8 +47,10 @@ __all__ = [
     "measure",
     "measure_sequence",
     "read_frame",
+    "read_histories",
     "read_mesh",
     "read_test",
+    "separate",
 ]
 
 _HOMES = {
@@ -59,6 +64,7 @@ _HOMES = {
     "Result": "rgbmidic.results",
     "RgbmidicError": "rgbmidic.errors",
     "Solution": "rgbmidic.correlation",
+    "SolverSettings": "rgbmidic.settings",
     "Status": "rgbmidic.correlation",
     "TestSettings": "rgbmidic.settings",
     "Tri3Mesh": "rgbmidic.mesh",
@@ -68,8 +74,10 @@ _HOMES = {
     "measure": "rgbmidic.pipeline",
     "measure_sequence": "rgbmidic.pipeline",
     "read_frame": "rgbmidic.frames",
+    "read_histories": "rgbmidic.results.histories",
     "read_mesh": "rgbmidic.mesh",
     "read_test": "rgbmidic.settings",
+    "separate": "rgbmidic.illumination",
 }
 
 

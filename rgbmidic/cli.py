@@ -133,6 +133,7 @@ def batch(
         raise InputError(f"--elastic is a smaller and a larger strain, not {elastic}")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
+        series.check_summary(out, overwrite=overwrite)
 
     def conclude(result: Result, settings: TestSettings, measured: bool) -> None:
         if reports and (measured or not (result.path / REPORT).is_file()):

@@ -50,6 +50,7 @@ __all__ = [
     "read_test",
     "read_toml",
     "regular",
+    "unique_keys",
 ]
 
 _Section = TypeVar("_Section")
@@ -816,9 +817,25 @@ def regular(path: Path) -> Path:
     OSError
         It is not a regular file.
     """
+    if "\0" in str(path):
+        raise OSError("its name holds a NUL")
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise OSError("it is not a regular file but a pipe, a socket or a device")
     return path
+
+
+def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of a JSON file (`object_pairs_hook`), as TOML reads it: a key stated twice is an error.
+
+    Raises
+    ------
+    ValueError
+        A key is stated twice.
+    """
+    keys = [key for key, _ in pairs]
+    if len(found := dict(pairs)) < len(keys):
+        raise ValueError(f'the key "{next(key for key in found if keys.count(key) > 1)[:40]}" is stated twice')
+    return found
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from rgbmidic.frames.data import BAYER_PATTERNS, shift_cfa
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise, NoiseModel
-from rgbmidic.settings import FrameKind, plain, read_section, read_table, regular
+from rgbmidic.settings import FrameKind, plain, read_section, read_table, regular, unique_keys
 
 __all__ = ["SCHEMA_VERSION", "Calibration", "Crosstalk", "read_document", "write_document"]
 
@@ -267,7 +267,11 @@ def read_document(path: Path | str, what: str, schema: str, version: int) -> dic
     try:
         text = regular(Path(path)).read_text(encoding="utf-8")
         document = json.loads(
-            text, parse_constant=_number, parse_float=_number, parse_int=lambda text: int(text) if _number(text) else 0
+            text,
+            object_pairs_hook=unique_keys,
+            parse_constant=_number,
+            parse_float=_number,
+            parse_int=lambda text: int(text) if _number(text) else 0,
         )
     except FileNotFoundError:
         raise CalibrationError(f"{what} not found: {path}") from None

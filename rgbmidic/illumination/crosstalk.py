@@ -28,7 +28,7 @@ from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_wi
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.images import IlluminationImages, fill_holes
 from rgbmidic.illumination.linear import LinearChannels
-from rgbmidic.settings import regular
+from rgbmidic.settings import regular, unique_keys
 from rgbmidic.typing import BoolArray, FloatArray
 
 __all__ = [
@@ -325,7 +325,7 @@ class Sensitivities:
         path = Path(path)
         try:
             if path.suffix.lower() == ".json":
-                document: Any = json.loads(regular(path).read_text(encoding="utf-8"))
+                document: Any = json.loads(regular(path).read_text(encoding="utf-8"), object_pairs_hook=unique_keys)
                 spectra = document["spectral_data"]["data"]["main"]
                 rows = [[float(key), *values] for key, values in spectra.items()]
                 table = np.array(sorted(rows), dtype=float)

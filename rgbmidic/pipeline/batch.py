@@ -22,7 +22,7 @@ import numpy as np
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, RgbmidicError
 from rgbmidic.pipeline.run import measure
 from rgbmidic.results import Histories, Maps, Result, shared_part
-from rgbmidic.results.files import is_result, write_complete
+from rgbmidic.results.files import check_file, is_result, write_complete
 from rgbmidic.results.histories import read_histories
 from rgbmidic.settings import TestSettings, read_toml, regular
 from rgbmidic.typing import FloatArray
@@ -35,6 +35,7 @@ _NAME = re.compile(r"[\w][\w .+-]{0,79}")
 """What a test may be called: it names a folder."""
 SUMMARIES = ("summary.csv", "summary.html")
 """Table and page of a batch, beside the folders of its tests."""
+_HEADER = ("test", "state", "reason", "result")
 _QUANTILE = 99
 """Percentile of the nodes that stands for the largest value in a frame: single outliers do not count."""
 _FIELDS = ("magnitude", "e1", "equivalent")
@@ -256,7 +257,10 @@ def _outcome(
     if good < _LARGE_PART:
         raise ResultError(f"{int((ends != 0).sum())} of {len(ends)} deformed frames failed or did not converge")
     values = {"frames": float(len(ends)), "converged": good} | dict(_peaks(result, settings))
-    values |= dict(_probed(result, settings, elastic))
+    probed = dict(_probed(result, settings, elastic))
+    if both := sorted(values.keys() & probed.keys()):
+        raise InputError(f"channels of {settings.channels.file} have the names of measured columns: {', '.join(both)}")
+    values |= probed
     return Outcome(name=test.name, folder=folder, measured=moved, values=values)
 
 
@@ -353,11 +357,26 @@ def summary_rows(outcomes: Sequence[Outcome]) -> tuple[list[str], list[list[str]
     rows.append(["mean", "", "", "", *(_text(float(part.mean()) if len(part) else math.nan) for part in good)])
     rows.append(["standard deviation", "", "", "", *map(_text, map(float, deviations))])
     rows.append(["tests", "", "", "", *(str(len(part)) for part in good)])
-    return ["test", "state", "reason", "result", *names], rows
+    return [*_HEADER, *names], rows
 
 
 def _text(value: float) -> str:
     return "" if value != value else f"{value:.6g}"
+
+
+def check_summary(out: Path, *, overwrite: bool) -> None:
+    """Refuse a folder whose table or page has the name of a summary and is not of a batch.
+
+    Raises
+    ------
+    ResultError
+        There is one, and it may not be replaced.
+    """
+    table = out / SUMMARIES[0]
+    if table.is_file() and table.read_bytes().startswith(",".join(_HEADER).encode()):
+        return
+    for name in SUMMARIES:
+        check_file(out / name, overwrite=overwrite)
 
 
 def write_summary(outcomes: Sequence[Outcome], path: Path) -> None:

@@ -53,6 +53,8 @@ __all__ += ["frames_alone", "read_histories", "read_profile", "with_channels", "
 
 _BLURRED = 1.0
 """Motion (px) within the exposure from which a frame is reported to be blurred: the speckle is smeared over a pixel."""
+_COVERED = 0.01
+"""Fraction of a recording below which a warning doubts its unit of time: a factor of 1,000 is far below (chosen)."""
 _FAST = 95
 """Percentile of the nodes' speeds that stands for the fast ones: single outliers do not count."""
 
@@ -347,7 +349,22 @@ def with_channels(histories: Histories, stated: ChannelSettings) -> Histories:
         remarks.append(
             f"the times of the channels were shifted by {channels.offset:.6g} s: {stated.trigger} rises at 0"
         )
+    elif not stated.offset:
+        remarks.append(
+            "the clocks of channels and frames are taken as equal: channels.offset, .trigger or .align relates them"
+        )
+    first, last = channels.times[[0, -1]]
+    if (covered := float(np.nanmax(times) - np.nanmin(times)) / (last - first)) < _COVERED:
+        remarks.append(
+            f"the frames cover {covered:.2%} of the time of the channels: is the unit of {stated.file} right?"
+        )
     read = channels.at(times)
+    taken = {"frame", "number", "status", "time_s"} | ({"stress", "stress_MPa"} if stated.area is not None else set())
+    taken.update(*({one.name, one.column, f"{one.column}_std"} for one in histories.quantities))
+    if both := sorted(taken & read.keys()):
+        raise InputError(
+            f"channels of {stated.file} have the names of columns of the history, rename: {', '.join(both)}"
+        )
     beside = [HistoryColumn(name=name, unit="", values=values, std=None) for name, values in read.items()]
     for name, values in read.items():
         if missing := int(np.isnan(values).sum()):

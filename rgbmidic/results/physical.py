@@ -11,6 +11,7 @@ import csv
 import logging
 import math
 import re
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -59,6 +60,7 @@ logger = logging.getLogger(__name__)
 _TIME = re.compile(r"(?:time|t)(?:[\s_(\[]+(s|ms|us|µs)[)\]]?)?", re.IGNORECASE)
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 _NEWTONS = {"N": 1.0, "kN": 1e3}
+_DECIMAL = re.compile(r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:e[+-]?\d+)?|nan", re.IGNORECASE | re.ASCII)
 _UNIT = re.compile(r".*[\s_(\[](kN|N)[)\]]?")
 _DIFFERENT = 0.01
 """Relative difference of a stated frame rate from that of the time stamps above which a warning names both: stamps
@@ -243,7 +245,11 @@ class Channels:
             raise InputError(f"the channels {path} are not a text file") from None
         lines = [line for line in lines if line.strip()]
         separator = max(",;\t", key=(lines or [""])[0].count)
-        names = [name.strip() for name in next(csv.reader(lines[:1], delimiter=separator), [])]
+        try:
+            head, *rows = list(csv.reader(lines, delimiter=separator)) or [[]]
+        except csv.Error as error:
+            raise InputError(f"the channels {path} are not a table: {error}") from None
+        names = [name.strip() for name in head]
         unit = _TIME.fullmatch(names[0]) if len(names) > 1 else None
         if unit is None:
             raise InputError(
@@ -251,18 +257,28 @@ class Channels:
             )
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise InputError(f"the channels {path} have several columns of one name: {', '.join(twice)}")
-        table = _numbers(path, lines[1:], separator, len(names))
+        if "" in names:
+            raise InputError(f"column {names.index('') + 1} of the channels {path} has no name in the header line")
+        table = _numbers(path, rows, separator, len(names))
         times = table[:, 0] * _SECONDS[(unit[1] or "s").lower()]
         if len(times) < 2 or not (np.diff(times) > 0).all():
             raise InputError(f"the times of the channels {path} must rise from row to row, over two rows or more")
         values = dict(zip(names[1:], table[:, 1:].T, strict=True))
         channels = cls(path=path, times=times, values=values)
         if trigger is not None:
-            signal = channels.named(trigger)
-            middle = (np.nanmin(signal) + np.nanmax(signal)) / 2
-            crossed = np.flatnonzero(np.diff(np.sign(signal - middle)) != 0)
+            known = np.isfinite(channels.named(trigger))
+            signal, times = channels.named(trigger)[known], times[known]
+            middle = (signal.min() + signal.max()) / 2 if len(signal) else math.nan
+            crossed = np.flatnonzero(np.diff(signal > middle))
             if not len(crossed):
                 raise InputError(f"the trigger {trigger} of the channels {path} is constant: it marks no time")
+            if len(crossed) > 1:
+                logger.warning(
+                    "the trigger %s of %s crosses the middle of its range %d times: the first counts",
+                    trigger,
+                    path,
+                    len(crossed),
+                )
             i = int(crossed[0])
             offset = -float(times[i] + (middle - signal[i]) / (signal[i + 1] - signal[i]) * (times[i + 1] - times[i]))
         return channels.shifted(offset)
@@ -391,18 +407,28 @@ class Channels:
         return name, found[name]
 
 
-def _numbers(path: Path, lines: list[str], separator: str, count: int) -> FloatArray:
-    """Read rows of numbers (n, count); an empty field is NaN."""
-    rows = []
-    for number, row in enumerate(csv.reader(lines, delimiter=separator), 2):
-        fields = [part.strip().replace(",", ".") if separator == ";" else part.strip() for part in row]
-        try:
-            rows.append([float(part) if part else math.nan for part in fields])
-        except ValueError:
-            raise InputError(f"row {number} of the channels {path} is not numbers: {row}") from None
+def _numbers(path: Path, rows: list[list[str]], separator: str, count: int) -> FloatArray:
+    """Read rows of finite decimal numbers (n, count); an empty field, or nan, is NaN."""
+    table, marks = [], set[str]()
+    for number, row in enumerate(rows, 2):
+        fields = [part.strip() for part in row]
+        marks.update(mark for part in fields for mark in ".," if mark in part)
+        values = [
+            float(part.replace(",", ".") if separator == ";" else part) if part else math.nan
+            for part in fields
+            if not part or (_DECIMAL.fullmatch(part) and (separator == ";" or "," not in part))
+        ]
+        if len(values) != len(row) or np.isinf(values).any():
+            raise InputError(f"row {number} of the channels {path} is not numbers: {reprlib.repr(row)}")
         if len(row) != count:
             raise InputError(f"row {number} of the channels {path} has {len(row)} fields, the header {count}")
-    return np.array(rows, dtype=np.float64).reshape(-1, count)
+        if len(marks) > 1:
+            raise InputError(
+                f"row {number} of the channels {path}: the file has numbers with a comma and numbers with a point; "
+                f"one of them is the decimal mark, and thousands are not separated: {reprlib.repr(row)}"
+            )
+        table.append(values)
+    return np.array(table, dtype=np.float64).reshape(-1, count)
 
 
 _NODE, _ELEMENT = ("node",), ("element",)

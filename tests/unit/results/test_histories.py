@@ -16,6 +16,7 @@ from results import MESH, NODES, make_origin
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import ConfigurationError, InputError
+from rgbmidic.fields.history import Units
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.report import history_figure
 from rgbmidic.results import (
@@ -29,7 +30,7 @@ from rgbmidic.results import (
     probes_of,
     write_histories,
 )
-from rgbmidic.results.histories import history_csv, read_histories
+from rgbmidic.results.histories import HistoryColumn, history_csv, read_histories, with_channels
 from rgbmidic.settings import (
     ChannelSettings,
     FrameSettings,
@@ -241,12 +242,55 @@ def test_channels_are_brought_to_the_frames_and_make_a_stress(result: Result, tm
         ("time_s,a\n0,x\n1,2\n", r"row 2 of the channels .* is not numbers"),
         ("time_s,a\n0,1\n1,2,3\n", r"row 3 of the channels .* has 3 fields, the header 2"),
         ("", "need a header line"),
+        ("time_s;force_N\n0;1,234\n1;2.5\n", "numbers with a comma and numbers with a point"),
+        ("time_s,a\n0,1e999\n1,2\n", r"row 2 of the channels .* is not numbers"),
+        ("time_s,a\n0,inf\n1,2\n", r"row 2 of the channels .* is not numbers"),
+        ("time_s,a\n0,5_0\n1,2\n", r"row 2 of the channels .* is not numbers"),
+        ("time_s,a,\n0,1,\n1,2,\n", "column 3 of the channels .* has no name"),
+        ("time_s,a\n0," + "9" * 200_000 + "\n1,2\n", "c.csv (are not a table|is not numbers)"),
     ],
+    ids=range(13),
 )
 def test_a_channel_file_that_is_none_is_one_line(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "c.csv").write_text(text)
     with pytest.raises(InputError, match=words):
         Channels.read(tmp_path / "c.csv")
+
+
+def histories_of(times: np.ndarray, *quantities: HistoryColumn) -> Histories:
+    """Histories of frames that are all there."""
+    numbers = np.arange(len(times))
+    return Histories(
+        frames=numbers,
+        numbers=numbers,
+        status=0 * numbers,
+        times=times,
+        quantities=quantities,
+        stress_strain=None,
+        units=Units(),
+        remarks=(),
+    )
+
+
+def test_a_channel_does_not_take_the_place_of_a_measured_column(tmp_path: Path) -> None:
+    times = np.arange(4.0)
+    gauge = HistoryColumn(name="gauge_1_strain", unit="", values=np.full(4, 1e-3), std=np.full(4, 1e-5))
+    for name in ("gauge_1_strain", "frame", "status"):
+        (tmp_path / "c.csv").write_text(f"time_s,{name}\n" + "".join(f"{t},{t}\n" for t in times))
+        with pytest.raises(InputError, match=f"have the names of columns of the history, rename: {name}"):
+            with_channels(histories_of(times, gauge), ChannelSettings(file=tmp_path / "c.csv"))
+
+
+def test_doubts_about_the_clock_of_a_channel_file_are_stated(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    times = np.arange(4.0)
+    gauge = HistoryColumn(name="gauge_1_strain", unit="", values=np.zeros(4), std=np.zeros(4))
+    (tmp_path / "c.csv").write_text("time_s,a\n" + "".join(f"{1000 * t},{t}\n" for t in times))
+    found = with_channels(histories_of(times, gauge), ChannelSettings(file=tmp_path / "c.csv"))
+    assert any("the clocks of channels and frames are taken as equal" in remark for remark in found.remarks)
+    assert any("the frames cover 0.10% of the time of the channels" in remark for remark in found.remarks)
+    (tmp_path / "t.csv").write_text("time_s,ttl\n0,0\n1,1\n2,0\n3,1\n")
+    Channels.read(tmp_path / "t.csv", trigger="ttl")
+    assert "crosses the middle of its range 3 times: the first counts" in caplog.text
 
 
 def test_a_trigger_channel_and_a_correlation_find_the_recorder_s_clock(tmp_path: Path) -> None:
