@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from concurrent.futures import BrokenExecutor, CancelledError, Future, wait
 from dataclasses import replace
 from heapq import heappop, heappush
 from typing import Any
@@ -111,7 +111,7 @@ class Schedule:
             else:
                 while self._ready and len(self._running) < (workers.slots if most is None else 1):
                     self._submit(workers, *heappop(self._ready))
-            ended = wait(self._running, return_when=FIRST_COMPLETED).done
+            ended = workers.wait(self._running)
             if any(isinstance(_error(future), BrokenExecutor) for future in ended):
                 ended = wait(self._running).done  # with one of its processes all work of an executor ends
                 workers.restart()

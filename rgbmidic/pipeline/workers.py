@@ -9,9 +9,18 @@ import os
 import pickle
 import signal
 import threading
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
+from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
@@ -57,6 +66,10 @@ class Workers(ABC):
     def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
         """Have one frame measured."""
 
+    def wait(self, running: Collection[Future[Measured]]) -> set[Future[Measured]]:
+        """Wait for the first of some frames to end."""
+        return wait(running, return_when=FIRST_COMPLETED).done
+
     def restart(self) -> None:  # noqa: B027 most have nothing to do
         """Begin anew after a worker has died."""
 
@@ -95,14 +108,20 @@ class Processes(Workers):
         self._executor: Executor = self._begin()
 
     def _begin(self) -> ProcessPoolExecutor:
-        others = set(multiprocessing.active_children())
+        others, keepers = set(multiprocessing.active_children()), set(_keepers())
         with _environment(dict.fromkeys(_THREADS, str(self._threads))):
             spawn = multiprocessing.get_context("spawn")  # threads do not survive a fork
             pool = ProcessPoolExecutor(self.slots, spawn, initializer=_prepare, initargs=(self._plan, self._threads))
             # the processes must start while the environment says how many threads they have
             try:
-                for one in [pool.submit(os.getpid) for _ in range(self.slots)]:
-                    one.result(_START)
+                started = list[Future[int]]()
+                for _ in range(self.slots):
+                    with _uninterrupted():  # else half of what it needs is sent to a process
+                        started.append(pool.submit(os.getpid))
+                self._keeper = next(iter(set(_keepers()) - keepers))
+                for one in started:
+                    _first([one], self._keeper, _START)
+                    one.result(0)
             except BaseException as error:
                 _end(pool, set(multiprocessing.active_children()) - others)
                 if not isinstance(error, (BrokenExecutor, OSError, RuntimeError, TimeoutError)):
@@ -124,6 +143,10 @@ class Processes(Workers):
             broken.set_exception(error)
             return broken
 
+    def wait(self, running: Collection[Future[Measured]]) -> set[Future[Measured]]:
+        """Wait for the first of some frames to end, or for all to be lost."""
+        return _first(running, self._keeper)
+
     def restart(self) -> None:
         """Begin with new processes."""
         self.close()
@@ -132,6 +155,42 @@ class Processes(Workers):
     def close(self) -> None:
         """Stop, without waiting for what is not finished."""
         _end(self._executor, self._processes)
+
+
+_LOOK = 2.0
+"""Seconds between looks at whether the thread that keeps the processes lives. Chosen: nobody waits longer in vain."""
+
+
+def _keepers() -> Iterator[threading.Thread]:
+    """The threads that keep the processes of executors, one each."""
+    return (thread for thread in threading.enumerate() if type(thread).__module__ == "concurrent.futures.process")
+
+
+def _first(running: Collection[Future[Any]], keeper: threading.Thread, most: float = float("inf")) -> set[Future[Any]]:
+    """Wait for the first to end, for `most` seconds; where their `keeper` dies, as without memory, all of them do."""
+    end = time.monotonic() + most
+    while not (done := wait(running, _LOOK, FIRST_COMPLETED).done) and time.monotonic() < end:
+        if not keeper.is_alive():
+            for future in running:
+                if not future.done():
+                    future.set_exception(BrokenExecutor("the thread that keeps the worker processes ended"))
+    return done
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Have this thread, and the processes that it starts, get no Ctrl-C and no SIGTERM before the end of the block."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+_STOPS = (signal.SIGINT, signal.SIGTERM)
 
 
 def _pickled(plan: Plan) -> bytes:
@@ -169,9 +228,13 @@ class Cluster(Workers):
             raise ConfigurationError(
                 "a Dask cluster needs the packages dask and distributed: install rgbmidic[cluster]"
             ) from None
-        self._log = logging.getLogger("distributed")
-        self._level = self._log.level
-        self._log.setLevel(logging.CRITICAL)  # what becomes of the cluster is reported here, without its tracebacks
+        # what becomes of the cluster is reported here, without its tracebacks; some loggers have levels of their own
+        names = [
+            name for name in logging.root.manager.loggerDict if name.partition(".")[0] in ("distributed", "tornado")
+        ]
+        self._levels = {logging.getLogger(name): logging.getLogger(name).level for name in names}
+        for log in self._levels:
+            log.setLevel(logging.CRITICAL + 1)
         try:
             self._client = distributed.Client(address, timeout=30, set_as_default=False)
             self._client.wait_for_workers(1, timeout=120)
@@ -201,9 +264,12 @@ class Cluster(Workers):
     def close(self) -> None:
         """Leave the cluster to others, without waiting for what is not finished."""
         self._executor.shutdown(wait=False)
+        alive = self._client.status == "running"
         with suppress(OSError, RuntimeError, TimeoutError, CancelledError):  # a scheduler that is gone has let go of it
             self._client.close()
-        self._log.setLevel(self._level)
+        if alive:  # else its threads complain for some time yet
+            for log, level in self._levels.items():
+                log.setLevel(level)
 
 
 LOST_CLUSTER = "the Dask scheduler and its workers no longer answer; what was finished is kept: go on with --resume"
@@ -264,6 +330,8 @@ def _prepare(plan: bytes, threads: int) -> None:
     """Begin a worker process, with all the threads it will have: where one cannot be had, it is known at once."""
     global _prepared
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one decides
+    if hasattr(signal, "pthread_sigmask"):  # of `_uninterrupted`
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _use_threads(threads)
     start_threads()

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, ResultEr
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import read_frame, write_tiff
 from rgbmidic.frames.data import ChannelFrame
-from rgbmidic.pipeline import measure, run, schedule, workers
+from rgbmidic.pipeline import Plan, measure, run, schedule, workers
 from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import UpdatedReferences
 from rgbmidic.results import Maps, Result, finish_result, scale_of
@@ -132,20 +133,19 @@ def test_a_frame_that_kills_its_worker_takes_no_other_with_it(
             running.append((index, future, super().submit(index, start, updated)))
             return future
 
-    def ended_together(futures: Any, **_: Any) -> Any:
-        ended = running[:]
-        running.clear()
-        together.append({index for index, *_ in ended})
-        for _, future, done in ended:
-            if 5 in together[-1]:
-                future.set_exception(BrokenExecutor("killed"))
-            else:
-                future.set_result(done.result())
-        return wait(futures)
+        def wait(self, futures: Any) -> Any:
+            ended = running[:]
+            running.clear()
+            together.append({index for index, *_ in ended})
+            for _, future, done in ended:
+                if 5 in together[-1]:
+                    future.set_exception(BrokenExecutor("killed"))
+                else:
+                    future.set_result(done.result())
+            return wait(futures).done
 
     running: list[tuple[int, Future[workers.Measured], Future[workers.Measured]]] = []
     together: list[set[int]] = []
-    monkeypatch.setattr(schedule, "wait", ended_together)
     monkeypatch.setattr(run, "open_workers", lambda plan, *_: Pool(plan))
     # every frame starts from the first: all but it can be measured side by side
     monkeypatch.setattr(schedule, "parent", lambda position: 0 if position else None)
@@ -207,7 +207,9 @@ def test_a_worker_that_never_ends_is_ended_with_the_run(monkeypatch: pytest.Monk
     wait_for_end(process)
 
 
-def test_a_dask_scheduler_that_is_killed_ends_the_run_in_one_line(movie: Path, tmp_path: Path) -> None:
+def test_a_dask_scheduler_that_is_killed_ends_the_run_in_one_line(
+    movie: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     pytest.importorskip("distributed", reason="dask and distributed are not installed")
     command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--dashboard-address", ":0"]
     where = tmp_path / "scheduler.json"
@@ -220,9 +222,13 @@ def test_a_dask_scheduler_that_is_killed_ends_the_run_in_one_line(movie: Path, t
     def kill(done: int, total: int, line: str) -> None:
         if done == 3:
             scheduler.kill()
+            # what it logs when it looks for its scheduler again
+            logging.getLogger("distributed.client").error("Traceback (most recent call last):")
 
+    logging.getLogger("distributed.client").setLevel(logging.WARNING)  # as its configuration does
     try:
-        while not where.exists():
+        end = time.monotonic() + 60
+        while not where.exists() and time.monotonic() < end:
             assert scheduler.poll() is None
             time.sleep(0.1)
         address = json.loads(where.read_text())["address"]
@@ -233,6 +239,59 @@ def test_a_dask_scheduler_that_is_killed_ends_the_run_in_one_line(movie: Path, t
             process.kill()
             process.wait()
     assert 3 <= Result.open(tmp_path / "result", partial=True).finished.sum() < COUNT
+    assert not [record for record in caplog.records if record.name.startswith("distributed")]
+
+
+@pytest.fixture
+def two_workers(movie: Path) -> Iterator[workers.Workers]:
+    with workers.open_workers(Plan.from_settings(settings(movie)), 2) as found:
+        yield found
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_without_the_thread_that_keeps_the_workers_nobody_waits_for_ever(
+    two_workers: workers.Workers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_memory(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("concurrent.futures.process._ExecutorManagerThread.add_call_item_to_queue", no_memory)
+    future = two_workers.submit(0, Start(displacement=None))
+    assert two_workers.wait([future]) == {future}
+    assert isinstance(future.exception(), BrokenExecutor)
+    monkeypatch.undo()
+    two_workers.restart()
+    again = two_workers.submit(0, Start(displacement=None))
+    assert two_workers.wait([again]).pop().result().record.status == Status.CONVERGED
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="no signal masks")
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_a_worker_is_started_whole_or_not_at_all(
+    movie: Path, stop: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that is sent half of what it needs prints a traceback of its own."""
+    started = []
+
+    class Pool(ThreadPoolExecutor):
+        def __init__(self, count: int, *_: object, **__: object) -> None:
+            super().__init__(count)
+
+        def submit(self, *given: Any) -> Future[Any]:
+            signal.raise_signal(stop)
+            started.append(signal.pthread_sigmask(signal.SIG_BLOCK, []))
+            return super().submit(*given)
+
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", Pool)
+    before = signal.signal(stop, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            workers.open_workers(Plan.from_settings(settings(movie)), 2)
+    finally:
+        signal.signal(stop, before)
+    assert len(started) == 1
+    assert {signal.SIGINT, signal.SIGTERM} <= started[0]
+    assert not {signal.SIGINT, signal.SIGTERM} & signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 @pytest.mark.parametrize("stop", [1, 13, 35])
