@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
+import rgbmidic
 import rgbmidic.settings
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.settings import (
@@ -28,6 +30,8 @@ from rgbmidic.settings import (
     WeightSettings,
     grey_levels,
     read_test,
+    regular,
+    unique_keys,
 )
 
 LEAST = """
@@ -454,3 +458,15 @@ def test_a_mapping_may_hold_numbers_of_numpy_and_paths(tmp_path: Path) -> None:
     assert built.region.rectangle == (1.0, 2.0, 30.0, 40.0)
     assert built.calibration_file == tmp_path / "calibration.json"
     assert built.solver.tolerance == 1e-4
+
+
+def test_a_key_stated_twice_in_json_and_a_nul_in_a_name_are_errors() -> None:
+    assert json.loads('{"a": 1, "b": {"a": 2}}', object_pairs_hook=unique_keys) == {"a": 1, "b": {"a": 2}}
+    with pytest.raises(ValueError, match='the key "a" is stated twice'):
+        json.loads('{"b": {"a": 1, "a": 2}}', object_pairs_hook=unique_keys)
+    with pytest.raises(OSError, match="holds a NUL"):
+        regular(Path("a\0b"))
+
+
+def test_names_of_the_package_are_there() -> None:
+    assert all(hasattr(rgbmidic, name) for name in rgbmidic.__all__)

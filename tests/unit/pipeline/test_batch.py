@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from small_tests import SmallTest, colour_test
 
-from rgbmidic.errors import InputError
+from rgbmidic.errors import InputError, ResultError
 from rgbmidic.fields import Units
 from rgbmidic.pipeline.batch import (
     Outcome,
+    check_summary,
     modulus,
     read_table,
     read_tests,
@@ -53,6 +54,15 @@ def test_the_summary_has_mean_and_deviation_of_the_tests_that_did_not_fail(tmp_p
     assert (cells["mean"], cells["standard deviation"], cells["tests"], cells["bad"]) == ("2", "1", "3", "")
     write_summary(outcomes, tmp_path / "s.csv")
     assert [row[2] for row in csv.reader((tmp_path / "s.csv").open(newline=""))][4] == "no, not at all"
+
+
+def test_a_summary_that_is_of_no_batch_is_not_replaced(tmp_path: Path) -> None:
+    write_summary([Outcome(name="a", folder=tmp_path)], tmp_path / "summary.csv")
+    check_summary(tmp_path, overwrite=False)
+    (tmp_path / "summary.csv").write_text("my,own,table\n")
+    with pytest.raises(ResultError, match="already exists"):
+        check_summary(tmp_path, overwrite=False)
+    check_summary(tmp_path, overwrite=True)
 
 
 def test_a_modulus_is_the_slope_while_the_stress_rises() -> None:
