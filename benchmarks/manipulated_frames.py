@@ -19,7 +19,8 @@ import numpy as np
 from colour_scenes import NOISE, A, sparkle, speckle
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
-from rgbmidic.illumination.calibration import Calibration, Crosstalk
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.frame_check import mismatches
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.lab.virtual import plate_scene, render, sphere_scene

@@ -12,7 +12,8 @@ from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_wi
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.start import Start, track
 from rgbmidic.frames import Mosaic, Window, cfa_channels
-from rgbmidic.illumination.calibration import Calibration, Crosstalk
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.source import Separation, correlated, reference_images

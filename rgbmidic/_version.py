@@ -1,5 +1,3 @@
 """The version, where anything may read it."""
 
-__all__ = ["__version__"]
-
 __version__ = "0.1.0"

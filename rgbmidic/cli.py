@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from rgbmidic.results import Result
     from rgbmidic.settings import TestSettings
 
-__all__ = ["app", "main"]
-
 _CONVERGED, _UNCONVERGED, _FAILED = 0, 1, 2
 _TOO_MANY = 0.5
 """Fraction of the deformed frames beyond which those that failed or did not converge make a run a failure: a specimen

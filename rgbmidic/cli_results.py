@@ -18,20 +18,6 @@ if TYPE_CHECKING:
     from rgbmidic.results import Result
     from rgbmidic.settings import TestSettings
 
-__all__ = [
-    "Out",
-    "Overwrite",
-    "Partial",
-    "Reading",
-    "app",
-    "frame_indices",
-    "messages",
-    "note",
-    "print_table",
-    "progress_of",
-    "read_settings",
-]
-
 app = typer.Typer()
 
 _WIDE = 400

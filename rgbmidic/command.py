@@ -21,25 +21,6 @@ import typer
 
 from rgbmidic.errors import InputError, RgbmidicError, disk_reason
 
-__all__ = [
-    "FAILURE",
-    "FRAME_OPTIONS",
-    "REQUIRED",
-    "execute",
-    "fail",
-    "frame_options",
-    "gather",
-    "help_where_alone",
-    "main",
-    "optional",
-    "picture_beside",
-    "read_lengths",
-    "read_pair",
-    "read_place",
-    "read_shape",
-    "read_statement",
-]
-
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
 REQUIRED = inspect.Parameter.empty
 

@@ -14,8 +14,6 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 
-__all__ = ["STAGES", "each", "progress_bar", "stage", "timed"]
-
 T = TypeVar("T")
 
 STAGES = ("reading", "separation", "preparation", "search", "weights", "equations", "iteration", "conclusion", "rest")

@@ -5,8 +5,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["AnyArray", "BoolArray", "FloatArray", "FloatImage", "IntArray"]
-
 AnyArray = npt.NDArray[Any]
 FloatArray = npt.NDArray[np.float64]
 """Coordinates, sums, matrices: double precision."""

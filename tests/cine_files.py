@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["SETUP_LENGTH", "even_times", "write_cine"]
-
 SETUP_LENGTH = 10408
 _CODES = {None: 0, "GBRG": 3, "RGGB": 4}
 _PACKINGS = {8: (8, 0), 16: (16, 0), 10: (16, 256), 12: (16, 1024)}

@@ -20,8 +20,6 @@ from rgbmidic.errors import ResultError
 from rgbmidic.results import FrameRecord, Result, ResultStore, probes_of, scale_of
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, SolverSettings, TestSettings
 
-__all__ = ["FRAMES", "damage_results", "write_result"]
-
 FRAMES = 6
 _RETRIED = 3
 """The frame that was measured twice."""

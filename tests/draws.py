@@ -14,8 +14,6 @@ import numpy as np
 
 from rgbmidic.lab.virtual import rendering
 
-__all__ = ["JITTER", "SAMPLERS", "current", "other_draws"]
-
 SAMPLERS = ("poisson", "normal")
 JITTER = 1e-6
 """Relative change of a pixel, single precision's 6e-8 after some operations."""

@@ -10,10 +10,9 @@ import numpy.typing as npt
 import tifffile
 from hypothesis import strategies as st
 
-from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import _cfa_tags, _colour_tags
-
-__all__ = ["channel_frames", "colour_mosaic", "mosaics", "noisy_mosaic", "write_cropped_dng", "write_monochrome_dng"]
+from rgbmidic.settings import BAYER_PATTERNS
 
 _ACTIVE_AREA = 50829
 

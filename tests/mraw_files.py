@@ -9,8 +9,6 @@ import numpy as np
 
 from rgbmidic.typing import AnyArray
 
-__all__ = ["HEADER", "pack_bits", "write_mraw"]
-
 HEADER: dict[str, Any] = {
     "Record Rate(fps)": 30000,
     "Start Frame": 0,

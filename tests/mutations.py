@@ -38,8 +38,6 @@ from rgbmidic.errors import RgbmidicError
 from rgbmidic.frames import ChannelFrame, FrameSeries, Mosaic, Window, open_series, write_dng
 from rgbmidic.settings import FrameSettings
 
-__all__ = ["WRITERS", "mutated", "read_all"]
-
 SHAPE = (31, 45)
 GREY = noisy_mosaic(SHAPE)
 FRAMES = np.random.default_rng(3).integers(0, 4096, (5, 12, 16)).astype(np.uint16)

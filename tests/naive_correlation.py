@@ -7,22 +7,6 @@ from scipy import ndimage
 
 from rgbmidic._kernels.interpolation import PAD
 
-__all__ = [
-    "bspline_coefficients",
-    "curvature_deviation",
-    "element_block_products",
-    "element_hessian",
-    "element_moments",
-    "element_right_side",
-    "element_squares",
-    "element_sums",
-    "element_vector",
-    "interpolate_nodal",
-    "pull_back",
-    "sample_with_gradient",
-    "warp",
-]
-
 
 def bspline_coefficients(image):
     """Coefficients by scipy, with the image's mirror around them."""

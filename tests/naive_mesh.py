@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["contains", "owners"]
-
 
 def contains(corners: Any, x: int, y: int) -> bool:
     """Whether the closed triangle (3, 2), of any orientation, contains the point."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["paint_field"]
-
 
 def paint_field(out, grey, x, y, elements, values, low, high, colours, share, nearest):
     out[:] = grey * np.uint32(0x010101) | np.uint32(0xFF000000)

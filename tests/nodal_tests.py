@@ -13,8 +13,6 @@ from rgbmidic.fields import NodalCovariance
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["MESH", "NodalTest", "dense_correlation", "nodal_noise"]
-
 MESH = Tri3Mesh.from_region(Region.from_rectangle((10, 10, 210, 170), (200, 240)), 20)
 STD = 0.01
 """Standard uncertainty of a displacement against the reference, px."""

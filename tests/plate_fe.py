@@ -20,8 +20,6 @@ from rgbmidic.results import FrameRecord
 from rgbmidic.results.comparison import Comparison, FrameComparison, Simulation
 from rgbmidic.typing import FloatArray
 
-__all__ = ["MM_PER_PIXEL", "PLACEMENT", "SHAPE", "Plate", "compared_plates", "plane_stress"]
-
 SHAPE, MM_PER_PIXEL = (210, 190), 0.05
 RADIUS, CENTRE = 30.0, (95.0, 105.0)
 EDGES = (12.0, 12.0, 178.0, 198.0)

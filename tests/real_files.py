@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-__all__ = ["CROPS", "RealData", "corner", "count", "full_folder", "real_folder"]
-
 RealData = Callable[..., Path]
 """Type of the fixture `real_data`: from the name of a folder, and of a file it must hold, to the folder."""
 

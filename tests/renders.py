@@ -16,8 +16,6 @@ import numpy as np
 
 from rgbmidic.lab.virtual import rendering
 
-__all__ = ["kept_renders", "new_renders", "renders"]
-
 _VARIABLE = "RGBMIDIC_RENDERS"
 _WORTH = 0.1
 """Seconds of the processor from which a render is kept: to read it takes a hundredth."""

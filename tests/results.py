@@ -12,8 +12,6 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.results import QUANTITIES, FrameRecord, Origin, Result, ResultStore
 from rgbmidic.timing import STAGES
 
-__all__ = ["LIGHTS", "MESH", "NODES", "make_origin", "make_result", "random_record", "smooth_record"]
-
 LIGHTS = ("red", "green", "blue")
 MESH = Tri3Mesh.from_region(Region.from_rectangle((10, 5, 110, 75), (80, 120)), 20)
 NODES = len(MESH.nodes)

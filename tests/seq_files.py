@@ -8,8 +8,6 @@ from typing import Any
 
 from rgbmidic.typing import AnyArray
 
-__all__ = ["change_header", "write_seq"]
-
 _FIELDS = {
     "version": (28, "<i"),
     "header_size": (32, "<i"),

@@ -18,8 +18,6 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.virtual import Scene, plate_scene, record, render, strained_plate, truth
 from rgbmidic.settings import TestSettings, read_test
 
-__all__ = ["REGION", "SHAPE", "SmallTest", "colour_test", "grey_frame", "toml"]
-
 SHAPE = (144, 144)
 REGION = [16, 16, 128, 128]
 Motion = tuple[float, float]

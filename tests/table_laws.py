@@ -16,8 +16,6 @@ from rgbmidic.typing import FloatArray
 if TYPE_CHECKING:
     from benchmarks.tables import Table
 
-__all__ = ["LAWS", "Law"]
-
 Law = Callable[["Table"], object]
 AS_STATED = (0.75, 1.25)
 """Rms of error over stated uncertainty, where that is right, of 40 and more independent errors."""

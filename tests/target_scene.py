@@ -9,20 +9,6 @@ from scipy.special import erf
 from rgbmidic.fields.plane import distorted, undistorted
 from rgbmidic_calibration.target import Target, View
 
-__all__ = [
-    "DISTANCE",
-    "LENS",
-    "NOISE",
-    "SHAPE",
-    "TARGET",
-    "imaged",
-    "on_plane",
-    "photo",
-    "pose",
-    "random_views",
-    "view_of",
-]
-
 SHAPE = (480, 640)
 TARGET = Target.parse("chessboard:9x7:5mm")
 LENS = np.array([2400.0, 327.0, 232.0, -0.5, 0, 0, 0, 0])

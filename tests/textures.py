@@ -11,8 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Affine", "Texture", "noisy_pair", "rigid_pair"]
-
 Array = npt.NDArray[np.float64]
 Matrix = tuple[tuple[float, float], tuple[float, float]]
 _IDENTITY: Matrix = ((1.0, 0.0), (0.0, 1.0))

@@ -12,8 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from queue import Queue
 
-__all__ = ["MISSING", "Page", "chromium", "click", "serving"]
-
 _ABSENT = [name for name in ("chromium", "chromedriver") if not shutil.which(name)]
 if "RGBMIDIC_BROWSER" not in os.environ:
     MISSING = "two minutes in a browser: set RGBMIDIC_BROWSER=1 (needs the extra browser, chromium, chromium-driver)"

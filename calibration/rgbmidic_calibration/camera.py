@@ -21,8 +21,6 @@ from rgbmidic.fields.plane import CameraCalibration, distorted, undistorted
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.target import View
 
-__all__ = ["COVERED", "LARGEST_RESIDUAL", "LensEstimate", "PlaneEstimate", "estimate_lens", "estimate_plane"]
-
 LEAST_VIEWS = 5
 """Views of the target from which a lens is calibrated: each gives two equations for the focal length and principal
 point (Zhang), which leaves seven for the distortion and the check."""

@@ -23,19 +23,6 @@ from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic_calibration.ratio import Sampling, saturation_pile
 
-__all__ = [
-    "TILE",
-    "CaptureFiles",
-    "Captures",
-    "TemporalStack",
-    "check_output",
-    "named_patterns",
-    "provenance",
-    "same_camera",
-    "stack_frames",
-    "tile_means",
-]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaptureFiles:

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from rgbmidic.settings import FrameSettings
     from rgbmidic_calibration.captures import Captures
 
-__all__ = ["app", "main"]
-
 app = typer.Typer(
     name="rgbmidic-calibrate",
     add_completion=False,

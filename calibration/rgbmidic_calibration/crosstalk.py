@@ -28,8 +28,6 @@ from rgbmidic_calibration.ratio import (
     variation,
 )
 
-__all__ = ["CHANNELS", "CrosstalkEstimate", "LightFit", "check_matrix", "estimate_crosstalk"]
-
 CHANNELS = ("R", "G", "B")
 
 BLACK_LEVEL_STD = 0.3

@@ -30,18 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "Design",
-    "Lamp",
-    "MeasuredLamp",
-    "best_sets",
-    "design",
-    "draw_calibration",
-    "draw_design",
-    "read_camera",
-    "read_lamp",
-]
-
 COLOURS = ("#c0392b", "#27823b", "#2457a6", "#7d3c98")
 
 

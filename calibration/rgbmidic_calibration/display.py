@@ -23,8 +23,6 @@ from rgbmidic_calibration.noise import NoiseEstimate
 from rgbmidic_calibration.registration import RegistrationEstimate
 from rgbmidic_calibration.verify import Verdict
 
-__all__ = ["calibration", "camera", "crosstalk", "designs", "draw_camera", "merged", "noise", "registration", "verdict"]
-
 
 def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
     """Print the matrix with its uncertainties, what it means for the noise, and the warnings."""

@@ -35,16 +35,6 @@ from rgbmidic_calibration.ratio import BlockMeans, block_means
 from rgbmidic_calibration.registration import ELEMENT, RegistrationEstimate, estimate_registration
 from rgbmidic_calibration.target import Target, View, find_views
 
-__all__ = [
-    "CameraEstimate",
-    "calibrate_camera",
-    "calibrate_crosstalk",
-    "calibrate_noise",
-    "calibrate_registration",
-    "merge_files",
-    "read_corners",
-]
-
 LIT = 0.1
 """Mean above black, relative to the full scale, of a plane whose histogram is looked at: in the dark, noise is too
 little to smooth it. Some cameras apply gains of their own to red and blue, so all planes are."""

@@ -18,9 +18,6 @@ from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile_means
 from rgbmidic_calibration.plausibility import fixed_pattern
 
-__all__ = ["NoiseEstimate", "photon_transfer"]
-
-
 HIGHEST = 0.9
 """Blocks brighter than this fraction of the range are not used: the variance falls as samples reach white.
 From .7 to .95 the gain of the virtual camera changes by .7 of its standard uncertainty at most."""

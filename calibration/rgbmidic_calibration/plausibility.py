@@ -19,8 +19,6 @@ from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic_calibration.captures import TemporalStack
 from rgbmidic_calibration.ratio import BlockMeans
 
-__all__ = ["CHECKS", "FixedPattern", "check_captures", "fixed_pattern"]
-
 CHECKS = {
     "name": "a light named red, green or blue is seen best by the channel of that colour",
     "same-channel": "no two lights are seen best by the same channel",

@@ -28,20 +28,6 @@ from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels, planes_of
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = [
-    "BlockMeans",
-    "ColumnFit",
-    "Sampling",
-    "Variation",
-    "block_centres",
-    "block_means",
-    "capture_scatter",
-    "fit_column",
-    "offsets_left",
-    "saturation_pile",
-    "variation",
-]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BlockMeans:

@@ -22,9 +22,6 @@ from rgbmidic.pipeline import correlate
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic_calibration.captures import TemporalStack, same_camera
 
-__all__ = ["ELEMENT", "LightMatch", "RegistrationEstimate", "estimate_registration", "jitter", "light_picture"]
-
-
 LOCAL = 8.0
 """Standard deviation (px) of the neighbourhood whose mean a plane is divided by: several speckles."""
 

@@ -16,8 +16,6 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic_calibration.captures import CaptureFiles
 
-__all__ = ["Target", "View", "find_view", "find_views", "photograph", "refined_corners"]
-
 _KINDS = ("chessboard", "charuco", "circles", "acircles")
 _FORM = re.compile(rf"({'|'.join(_KINDS)}):(\d+)x(\d+):([\d.]+)mm(?::([\d.]+)mm)?(?::(DICT_\w+))?")
 CLIPPED = 0.05

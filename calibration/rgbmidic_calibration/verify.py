@@ -21,20 +21,6 @@ from rgbmidic_calibration.captures import TILE, Captures, TemporalStack, same_ca
 from rgbmidic_calibration.ratio import BlockMeans, block_centres, block_means
 from rgbmidic_calibration.registration import estimate_registration
 
-__all__ = [
-    "Additivity",
-    "CheckItem",
-    "Leakage",
-    "Limits",
-    "Verdict",
-    "additivity",
-    "check_calibration",
-    "leakage",
-    "noise_ratio",
-    "read_limits",
-    "registration_left",
-]
-
 SAME_EXPOSURE = 0.05
 """Drift of the captures (`TemporalStack.drift`) up to which they count as one exposure; more is a lamp that drifts or
 an exposure series (`rgbmidic_calibration.crosstalk.INTENSITY_WARNING`)."""

@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from sphinx.application import Sphinx
 
 MODULES = [
@@ -349,11 +351,25 @@ def expanded(text: str) -> str:
 # ---- public names
 
 
+def exported(module: ModuleType) -> list[str]:
+    """Names a package exports by its list; of a module, what it defines under a name without underscore."""
+    if hasattr(module, "__all__"):
+        return list(module.__all__)
+    names = []
+    for node in ast.parse(inspect.getsource(module)).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.append(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names += [target.id for target in targets if isinstance(target, ast.Name)]
+    return [name for name in names if not name.startswith("_") and name != "logger"]
+
+
 def public() -> Iterator[tuple[str, str, Any]]:
     """Module, name and object of every public name, once, aliases of classes left out."""
     seen: set[int] = set()
     for module in map(import_module, MODULES):
-        for name in module.__all__:
+        for name in exported(module):
             found = getattr(module, name)
             alone = inspect.isclass(found) or inspect.isroutine(found)
             alias = inspect.isclass(found) and found.__name__ != name
@@ -397,7 +413,7 @@ def write_api(folder: Path) -> None:
         functions = [name for name, found in names if inspect.isroutine(found)]
         constants = [name for name, _ in names if name not in (*classes, *functions)]
         elsewhere = [
-            name for name in import_module(module).__all__ if name not in dict(names) and name != "__version__"
+            name for name in exported(import_module(module)) if name not in dict(names) and name != "__version__"
         ]
         if classes or functions:
             lines += [".. autosummary::", "   :nosignatures:", ""]

@@ -13,20 +13,6 @@ import numpy as np
 from rgbmidic._kernels.interpolation import _FAST, PAD
 from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
-__all__ = [
-    "BLOCK",
-    "element_block_products",
-    "element_hessian",
-    "element_right_side",
-    "element_squares",
-    "element_sums",
-    "element_vector",
-    "interpolate_nodal",
-    "patch_correlations",
-    "subtract_quadratic",
-    "warp",
-]
-
 _SIXTH = np.float32(1.0 / 6.0)
 _HALF = np.float32(0.5)
 _TWO_THIRDS = np.float32(2.0 / 3.0)

@@ -10,9 +10,6 @@ import numpy as np
 from rgbmidic._kernels.interpolation import _FAST, between
 from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
-__all__ = ["TILE", "displacement_sums", "fill_unknown", "predict", "prediction_taps"]
-
-
 TILE = 32
 """Side in px of the squares within which the filters are the same."""
 _SIZE, _WIDE = 5, 7

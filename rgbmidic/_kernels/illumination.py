@@ -13,23 +13,6 @@ import numpy as np
 from rgbmidic._kernels.interpolation import _FAST, between
 from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
-__all__ = [
-    "PAD",
-    "PLANE_PAIRS",
-    "best_mean",
-    "block_sums",
-    "cell_moments",
-    "gradient_of_others",
-    "lag_products",
-    "malvar",
-    "pad_mosaic",
-    "robust_weights",
-    "scaled_contrast",
-    "scores",
-    "subtract_mean",
-    "unmix",
-]
-
 BLOCK = 4096
 """Pixels at a time: what a core's fastest cache holds."""
 

@@ -19,19 +19,6 @@ import numpy as np
 from rgbmidic._kernels.threads import compiled, helper, over_ranges
 from rgbmidic.typing import FloatImage
 
-__all__ = [
-    "PAD",
-    "block_sums",
-    "bspline_coefficients",
-    "from_grid",
-    "from_image",
-    "paint_field",
-    "pixel_gradient",
-    "product_sums",
-    "sample_with_gradient",
-    "to_image",
-]
-
 PAD = 2
 """Rows and columns by which the coefficient array exceeds the image on every side."""
 

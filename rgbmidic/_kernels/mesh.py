@@ -12,15 +12,6 @@ import numpy as np
 from rgbmidic._kernels.interpolation import _FAST
 from rgbmidic._kernels.threads import compiled, over_ranges
 
-__all__ = [
-    "claim_pixels",
-    "colour_nodes",
-    "factorise",
-    "interpolate_at_points",
-    "node_energies",
-    "solve_factors",
-]
-
 
 @compiled()
 def claim_pixels(nodes, elements, owner):

@@ -24,8 +24,6 @@ import numpy as np
 
 from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
-__all__ = ["CYLINDER", "PLATE", "SPHERE", "sample_paint", "trace_rows"]
-
 PLATE, CYLINDER, SPHERE = 0, 1, 2
 TILE = 4
 """Side (px) of the squares whose droplets `trace_rows` gathers together."""

@@ -21,19 +21,6 @@ from threadpoolctl import ThreadpoolController
 
 from rgbmidic.errors import InputError
 
-__all__ = [
-    "Kernel",
-    "aside",
-    "compiled",
-    "helper",
-    "machine",
-    "one_blas_thread",
-    "over_ranges",
-    "set_threads",
-    "start_threads",
-    "threads",
-]
-
 P = ParamSpec("P")
 T = TypeVar("T")
 

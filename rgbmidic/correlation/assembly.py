@@ -28,18 +28,6 @@ from rgbmidic.mesh import PixelMap, Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = [
-    "BLOCK",
-    "OF_ELEMENT",
-    "SCORE_RANGE",
-    "Assembly",
-    "Elimination",
-    "RigidMotions",
-    "block_side",
-    "rigid_functions",
-    "unfitted_fraction",
-]
-
 _SINGULAR = 1e11
 """Entries of a node's own block over what is left of it when the others are eliminated, from which that is rounding:
 1e13 to 1e20 in singular matrices of 60 to 4,800 nodes, 3e8 at most where the smoothness alone holds one direction

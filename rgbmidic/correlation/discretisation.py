@@ -35,9 +35,6 @@ from rgbmidic.mesh.pixel_map import quadratic_fit
 from rgbmidic.settings import SMALLEST_HALVED, SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["discretisation_error"]
-
-
 _DRAWS = 16
 """Random scores from which the variance of the difference is found: averaged over a window to 6 % (derived)."""
 _NOISES = 2

@@ -20,8 +20,6 @@ from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["SEEN", "Equations", "Estimate", "Problem", "UnsolvableError", "compare", "iterate", "stepped"]
-
 _SMOOTHNESS = 1e-4
 """Weight of the smoothness that carries nodes without data along, relative to the texture's median Hessian. Chosen;
 with a tenth or ten times of it three lights under a moving reflection differ by 4e-5 and 4e-4 px at most, beside a gap

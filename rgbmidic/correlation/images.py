@@ -12,20 +12,6 @@ from rgbmidic.illumination.images import fill_holes
 from rgbmidic.mesh import PixelMap
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = [
-    "PREFILTERS",
-    "apply_prefilter",
-    "as_light_stack",
-    "spline_coefficients",
-    "spline_values",
-    "spread",
-    "usable_pixels",
-    "usable_reach",
-    "window_covariance",
-    "window_means",
-    "window_ratios",
-]
-
 _GAUSSIAN = np.exp(-(np.arange(-3, 4) ** 2) / 2)
 PREFILTERS: dict[str, FloatArray] = {
     "none": np.ones(1),

@@ -20,19 +20,6 @@ from rgbmidic.correlation.solution import NodeStatus
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = [
-    "LOST",
-    "RULES",
-    "Evidence",
-    "correlation",
-    "correlation_around",
-    "judge",
-    "matching_elements",
-    "misfit",
-    "one_sided_texture",
-    "torn_elements",
-]
-
 LOST = 0.5
 """Uncertainty (px) from which a node is decorrelated: a position uncertain by half a pixel is no match."""
 _MISFIT = 4.0

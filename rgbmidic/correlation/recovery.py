@@ -28,16 +28,6 @@ from rgbmidic.mesh.pixel_map import quadratic_fit
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = [
-    "Functional",
-    "NodeColouring",
-    "Recovery",
-    "displacement_functionals",
-    "functional_std",
-    "linear_fit_offset",
-    "mass_matrix",
-]
-
 Functional = tuple[sp.csr_matrix | None, sp.csr_matrix | None]
 """A quantity linear in the displacements around each node: its matrices (N, N) for u and for v, None for 0."""
 

@@ -36,8 +36,6 @@ from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
-__all__ = ["Deformed", "Reference", "drawn"]
-
 _WARP = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 
 _SHARED = 0.85

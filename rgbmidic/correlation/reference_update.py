@@ -24,8 +24,6 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.settings import SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["ReferenceUpdate"]
-
 _POOR = 0.95
 """Correlation coefficient, over the best median, under which an element calls for another reference. Paint of speckles
 of 4 px that changes by 5 % leaves a node of 25 px elements uncertain by 0.3 px, by 10 % nearly by the 0.5 px from which

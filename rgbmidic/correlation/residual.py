@@ -25,17 +25,6 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = [
-    "Precision",
-    "PrecisionMethod",
-    "Residual",
-    "brightness_change",
-    "brought_nearer",
-    "corrected_values",
-    "curved_deviation",
-    "follow",
-]
-
 _LEAST_BEND = 0.1
 """Least bend of the loss around a node, over that of its weights. Chosen; with half or twice of it nothing changes
 (benchmarks/constants.py)."""

@@ -18,8 +18,6 @@ import scipy.sparse as sp
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["NO_MATCH", "NodeStatus", "Solution", "Status", "fill", "rank"]
-
 NO_MATCH = "the images do not match anywhere in the region"
 """Reason of a frame in which nothing was found."""
 

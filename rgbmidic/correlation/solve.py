@@ -41,16 +41,6 @@ from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = [
-    "FIRST_PASS",
-    "Weighting",
-    "first_weighting",
-    "next_weighting",
-    "refining",
-    "settled",
-    "solve",
-]
-
 FIRST_PASS = 0.01
 """Increment (px) at which the first pass hands over to the pass with weights warped anew. At .05 an iteration
 less is needed, but from another start the result differs by up to 2.3e-4 px."""

@@ -29,20 +29,6 @@ from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import each
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = [
-    "LARGEST_TURN",
-    "Box",
-    "FoundStart",
-    "Keypoints",
-    "Start",
-    "confidence",
-    "find_start",
-    "find_starts",
-    "pairs",
-    "search_reach",
-    "track",
-]
-
 _NORMALISE = 6.0
 """Standard deviation of the local mean and contrast, px of the reduced picture. Chosen; with half or twice of it
 results differ by 4e-5 px at most (benchmarks/constants.py)."""

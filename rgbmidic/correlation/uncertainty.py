@@ -23,8 +23,6 @@ from rgbmidic.correlation.residual import Precision, Residual
 from rgbmidic.mesh import PixelMap
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
-__all__ = ["displacing_fraction", "light_covariances", "nodal_std", "score_covariance", "standard_uncertainty"]
-
 _LEAST_RATIO = 1e-2
 """Least fraction of a residual's variance that is taken to displace. Chosen; with half or twice of it nothing changes
 (benchmarks/constants.py)."""

@@ -31,17 +31,6 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.region import edge_keys
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = [
-    "CrackTip",
-    "Jump",
-    "JumpAlong",
-    "StressIntensity",
-    "Williams",
-    "crack_jump",
-    "stress_intensity",
-    "williams_series",
-]
-
 _NEAR = 0.5
 """Distance in elements within which a stated point counts as on a crack or at its tip: where a path of `[mesh] cracks`
 is moved, it is by as much."""

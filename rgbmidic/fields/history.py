@@ -26,9 +26,6 @@ from rgbmidic._kernels.rates import LOWEST, mean_rates
 from rgbmidic.errors import InputError
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["SIGMA", "History", "Nodal", "Probe", "Rates", "Units", "column", "high_pass", "rates"]
-
-
 _WIDE = 1.01
 """Windows are as wide as stated and 1 % more: cameras round time stamps, to 1 us at 10,000 frames a second."""
 _KINK = 4.0

@@ -17,8 +17,6 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.typing import FloatArray
 
-__all__ = ["EQUIVALENT", "MEASURES", "RigidMotion", "Strain", "length_of", "strain_of_gradient"]
-
 _Function = Callable[[FloatArray], FloatArray]
 _OF_STRETCH: dict[str, tuple[_Function, _Function]] = {
     "green-lagrange": (lambda c: (c - 1) / 2, lambda c: np.full_like(c, 0.5)),

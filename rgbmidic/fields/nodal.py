@@ -27,17 +27,6 @@ from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.mesh.pixel_map import blended, quadratic_fit
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = [
-    "NodalCovariance",
-    "Places",
-    "at_nodes",
-    "at_pixels",
-    "difference_std",
-    "field_rms",
-    "frame_covariance",
-    "reference_fraction",
-]
-
 _CANDIDATES = 24
 """Elements nearest to a point among which its own is looked for: their sizes in one mesh differ by a factor of 2."""
 _EDGE = 1e-6

@@ -25,8 +25,6 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import FloatArray
 
-__all__ = ["LENS_PARAMETERS", "CameraCalibration", "Rectification", "distorted", "undistorted"]
-
 LENS_PARAMETERS = ("f", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """Focal length and principal point in px, then the distortion in OpenCV's order."""
 _PLANE_PARAMETERS = ("h11", "h12", "h13", "h21", "h22", "h23", "h31", "h32")

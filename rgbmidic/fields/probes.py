@@ -24,9 +24,6 @@ from rgbmidic.fields.strain import StrainGauges
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["PROBES", "Gauge", "Mean", "StrainGauge", "make_probe"]
-
-
 _LEAST = 0.5
 """Least part of an area that must be measured for its mean to be stated: the larger part represents the whole."""
 _STEP = 1.0

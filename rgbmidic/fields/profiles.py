@@ -29,8 +29,6 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.pixel_map import quadratic_fit
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["ARRIVALS", "Arrivals", "Front", "ProfileLine", "arrival_times", "fit_front", "rate_correlation"]
-
 ARRIVALS = ("front", "peak")
 """What arrives: the rise through a fraction of the peak, or the peak."""
 _LEAST = 0.5

@@ -20,8 +20,6 @@ from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
-__all__ = ["SHORTEST", "StrainGauges", "shortest_gauge", "strain_of"]
-
 SHORTEST = 3.0
 """Length of the shortest gauge in elements: a node and those around it."""
 _ROUND = 0.9

@@ -26,8 +26,6 @@ from rgbmidic.frames.stored import StoredFrame, check_size, damaged, unpack_bits
 from rgbmidic.settings import FrameKind
 from rgbmidic.typing import AnyArray, FloatArray
 
-__all__ = ["CINE_ENDINGS", "CineFile"]
-
 CINE_ENDINGS = (".cine", ".cin", ".cci")
 
 _FILE, _BITMAP = struct.Struct("<2s3HiIi4IQ"), struct.Struct("<I2i2H6I")

@@ -13,21 +13,6 @@ from rgbmidic.errors import InputError
 from rgbmidic.settings import BAYER_PATTERNS
 from rgbmidic.typing import FloatArray
 
-__all__ = [
-    "BAYER_PATTERNS",
-    "ChannelFrame",
-    "Mosaic",
-    "Recording",
-    "Window",
-    "cfa_channels",
-    "even_times",
-    "fraction",
-    "frame_numbers",
-    "planes_of",
-    "sampled_channels",
-    "shift_cfa",
-]
-
 _GRID = 32
 """Windows begin and, within the frame, end at whole multiples of this (px): a mosaic's pattern, packed samples of
 10 bit (4 rows) and the blocks of the separation (at most 16 px) then lie as in the whole frame."""

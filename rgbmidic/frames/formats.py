@@ -30,18 +30,6 @@ from rgbmidic.frames.stored import Camera
 from rgbmidic.frames.tiff_pages import is_dng
 from rgbmidic.settings import FrameKind, FrameSettings
 
-__all__ = [
-    "ENTRY_POINTS",
-    "FORMATS",
-    "FrameFormat",
-    "advice",
-    "frame_endings",
-    "known_formats",
-    "open_source",
-    "read_frame",
-    "reader_name",
-]
-
 logger = logging.getLogger(__name__)
 
 

@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import FrameError, InputError
-from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic, cfa_channels
+from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stored import CHECKED_FROM, StoredFrame, check_size, complaints, damaged
 from rgbmidic.frames.tiff_pages import (
@@ -39,31 +39,12 @@ from rgbmidic.frames.tiff_pages import (
     tag,
     tiff_pages,
 )
-from rgbmidic.settings import FrameSettings, regular
+from rgbmidic.settings import BAYER_PATTERNS, FrameSettings, regular
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
     import rawpy
     from tifffile import TiffPage
-
-__all__ = [
-    "CAMERA_RAW_ENDINGS",
-    "MAXIMUM_FLAT_ROWS",
-    "MINIMUM_DNG_SIZE",
-    "TIFF_ENDINGS",
-    "CameraRaw",
-    "HeaderlessFile",
-    "PngFile",
-    "TiffFile",
-    "checked_page",
-    "decode",
-    "has_camera_header",
-    "is_headerless",
-    "page_frame",
-    "page_rows",
-    "write_dng",
-    "write_tiff",
-]
 
 logger = logging.getLogger(__name__)
 

@@ -29,8 +29,6 @@ from rgbmidic.frames.data import Integers, Recording, even_times, fraction
 from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import Layout, StoredFrame, damaged, unpack_bits
 
-__all__ = ["MRAW_ENDINGS", "MrawFile", "SeqFile"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -28,8 +28,6 @@ from rgbmidic.frames.stacks import split_dataset
 from rgbmidic.frames.stored import Camera
 from rgbmidic.settings import FrameSettings
 
-__all__ = ["Description", "FrameSeries", "chosen_frames", "describe", "list_frames", "open_series", "save_frame"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -16,8 +16,6 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.stored import Camera, StoredFrame, damaged, raw_frame
 from rgbmidic.settings import FrameSettings, regular
 
-__all__ = ["FrameSource", "Movie", "MovieHeader", "file_fingerprint", "file_hash", "remembered"]
-
 _T = TypeVar("_T")
 _SAMPLES, _PIECE = 64, 4096
 """Number of the pieces of a file, and bytes of each (a page of memory), that its fingerprint is made of: 256 KiB are

@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     import h5py
     from tifffile import TiffPage
 
-__all__ = ["HDF5_ENDINGS", "Hdf5File", "NpyFile", "TiffStack", "is_tiff_stack", "split_dataset"]
-
 _MAXIMUM_HEADER = 2**16
 """Bytes: numpy refuses to parse more than 10,000, but reads as many as a damaged header announces, up to 4 GB."""
 

@@ -20,26 +20,9 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from rgbmidic.errors import FrameError, InputError, RgbmidicError, first_line
-from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic, shift_cfa
-from rgbmidic.settings import FrameKind, FrameSettings
+from rgbmidic.frames.data import ChannelFrame, Mosaic, shift_cfa
+from rgbmidic.settings import BAYER_PATTERNS, FrameKind, FrameSettings
 from rgbmidic.typing import AnyArray, FloatArray
-
-__all__ = [
-    "CHECKED_FROM",
-    "MAXIMUM_BYTES",
-    "MAXIMUM_FRAMES",
-    "Camera",
-    "Layout",
-    "StoredFrame",
-    "check_count",
-    "check_size",
-    "complaints",
-    "cut_short",
-    "damaged",
-    "faults_of",
-    "raw_frame",
-    "unpack_bits",
-]
 
 # What readers share
 

@@ -24,22 +24,6 @@ from rgbmidic.typing import FloatArray
 if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage
 
-__all__ = [
-    "COLUMNS",
-    "DESCRIPTION",
-    "ROWS",
-    "UNCOMPRESSED",
-    "PageList",
-    "RawStructure",
-    "cfa_pattern",
-    "is_dng",
-    "is_stored_as_is",
-    "missing_data",
-    "tag",
-    "tiff_page",
-    "tiff_pages",
-]
-
 # A file's faults come back as one FrameError; without a handler Python would print tifffile's log as well.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 

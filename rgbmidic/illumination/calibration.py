@@ -14,13 +14,11 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.frames.data import BAYER_PATTERNS, shift_cfa
+from rgbmidic.frames.data import shift_cfa
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise, NoiseModel
-from rgbmidic.settings import FrameKind, plain, read_section, read_table, regular, unique_keys
-
-__all__ = ["SCHEMA_VERSION", "Calibration", "Crosstalk", "read_document", "write_document"]
+from rgbmidic.settings import BAYER_PATTERNS, FrameKind, plain, read_section, read_table, regular, unique_keys
 
 _Section = TypeVar("_Section")
 

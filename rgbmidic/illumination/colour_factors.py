@@ -20,22 +20,6 @@ from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import LAGS, WHITE_ENERGY, BandEnergy, TextureModel, fit_texture
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = [
-    "BLOCK",
-    "MEAN_BLOCK",
-    "ColourFactors",
-    "Moments",
-    "colour_factors",
-    "enlarged",
-    "gather_moments",
-    "learn_texture",
-    "local_means",
-    "of_mosaic",
-    "scaled",
-    "widened",
-]
-
-
 MEAN_BLOCK, BLOCK = 4, 8
 """Side of the blocks (px) of the local means and of the moments."""
 MEAN_WIDTH, MOMENT_WIDTH = 8.0, 14.0

@@ -31,19 +31,6 @@ from rgbmidic.illumination.linear import LinearChannels
 from rgbmidic.settings import regular, unique_keys
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = [
-    "NEGLIGIBLE",
-    "Crosstalk",
-    "CrosstalkField",
-    "Led",
-    "Sensitivities",
-    "align",
-    "legendre_products",
-    "needed",
-    "spectral_response",
-    "unmix",
-]
-
 
 def legendre_products(points: npt.ArrayLike, shape: tuple[int, int], order: int) -> FloatArray:
     """Return products of Legendre polynomials in x and y up to a total degree, on the field scaled to [-1, 1].

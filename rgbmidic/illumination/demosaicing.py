@@ -51,21 +51,6 @@ from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = [
-    "SIZE",
-    "SMALLEST_FRAME",
-    "WIDE",
-    "Demosaicer",
-    "FilterTable",
-    "MalvarDemosaicer",
-    "NormalisedMosaic",
-    "Reconstruction",
-    "ReflectionAwareDemosaicer",
-    "check_mosaic",
-    "prediction_filters",
-    "red_position",
-]
-
 
 @runtime_checkable
 class Demosaicer(Protocol):

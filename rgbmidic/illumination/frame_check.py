@@ -24,8 +24,6 @@ from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.settings import FrameCheck
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["Mismatch", "check_state", "mismatches", "unevenness"]
-
 Frame = Mosaic | ChannelFrame
 
 SIGNIFICANCE = 6.0

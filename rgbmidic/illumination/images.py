@@ -28,19 +28,6 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 if TYPE_CHECKING:  # reading a result takes no kernels
     from rgbmidic.illumination.displacement import LightDisplacement
 
-__all__ = [
-    "DARK",
-    "PARAMETERS",
-    "REFLECTING",
-    "IlluminationImages",
-    "Registration",
-    "fill_holes",
-    "frame_geometry",
-    "local_mean",
-    "normalise",
-    "registration_basis",
-]
-
 PARAMETERS = ("shift_x", "shift_y", "rotation", "scale", "radial")
 """Parameters of a light: px, px, rad (x towards y), relative magnification, relative magnification more at radius R."""
 

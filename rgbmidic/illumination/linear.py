@@ -17,8 +17,6 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.settings import bounded
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["QUANTISATION", "CameraNoise", "LinearChannels", "LinearMosaic", "NoiseModel", "Quantity", "linearise"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoiseModel:

@@ -24,9 +24,6 @@ from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import FloatArray
 
-__all__ = ["DEFAULT_METHOD", "DEMOSAICERS", "demosaic", "reconstructed_lights", "separate"]
-
-
 DEFAULT_METHOD = "reflection-aware"
 _BY_CHANNEL: dict[str, Demosaicer] = {"malvar": MalvarDemosaicer(), "normalised": NormalisedMosaic()}
 """Methods that know nothing of lights: demosaic, then unmix."""

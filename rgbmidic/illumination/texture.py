@@ -18,9 +18,6 @@ from scipy.optimize import nnls
 from rgbmidic.errors import InputError
 from rgbmidic.typing import FloatArray
 
-__all__ = ["LAGS", "WHITE_ENERGY", "BandEnergy", "TextureModel", "fit_texture", "speckle_diameter"]
-
-
 FARTHEST = 4.3
 """Products farther apart (px) do not enter: they depend on the spacing of the speckles, not on their edges."""
 LAGS = np.array(

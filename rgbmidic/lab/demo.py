@@ -33,8 +33,6 @@ from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ScaleSettings, TestSettings, read_test
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["DemoRow", "PlateRow", "run_demo", "run_plate", "write_plate"]
-
 _SCENE = """\
 # The paper's sphere (82.5 mm) turning about its front point under a red, a green and a blue lamp, all at once.
 # Body, paint, lamps and camera are those that stand in where a scene states none (docs/how-to/planning.md).

@@ -28,8 +28,6 @@ from rgbmidic.scene.zones import REFLECTS, Zones, material_points, predict_zones
 from rgbmidic.settings import IlluminationSettings
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["Outlook", "Plan", "Proposal", "make_plan", "propose_colours", "propose_lamps"]
-
 AZIMUTH_STEP = 15.0
 """Degrees about the optical axis between the directions that are tried."""
 INCLINATIONS = (20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)

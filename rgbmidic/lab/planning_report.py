@@ -22,20 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "FILES",
-    "UNCERTAINTY_WORDS",
-    "ZONE_WORDS",
-    "lamp_rows",
-    "out_of_plane",
-    "plan_document",
-    "plan_figure",
-    "summary",
-    "uncertainty_rows",
-    "write_plan",
-    "zone_rows",
-]
-
 FILES = ("plan.json", "plan.png")
 """What `write_plan` writes."""
 

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["FILES", "GAUGE_WORDS", "SIZE_WORDS", "cut_offs", "gauge_rows", "size_rows", "write_study"]
-
 FILES = ("resolution.csv", "resolution.json", "resolution.png")
 """What `write_study` writes."""
 _KEPT = 0.9

@@ -19,8 +19,6 @@ from rgbmidic.command import optional
 from rgbmidic.errors import InputError
 from rgbmidic.results.files import writing
 
-__all__ = ["SAMPLES", "Sample", "SampleFile", "cache_folder", "write_sample"]
-
 ADDRESS = "https://raw.githubusercontent.com"
 """Where GitHub gives a file of a repository at a commit."""
 

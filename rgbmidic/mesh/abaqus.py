@@ -10,8 +10,6 @@ from pathlib import Path
 from rgbmidic.errors import InputError
 from rgbmidic.mesh.content import CORNERS, MeshContent, text_of
 
-__all__ = ["read_abaqus"]
-
 logger = logging.getLogger(__name__)
 
 _ELEMENT = re.compile(

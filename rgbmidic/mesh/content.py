@@ -18,8 +18,6 @@ from rgbmidic.errors import InputError
 from rgbmidic.settings import regular
 from rgbmidic.typing import FloatArray, IntArray
 
-__all__ = ["CORNERS", "MOST_BYTES", "MeshContent", "sized", "text_of", "unique"]
-
 CORNERS = {"triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
 """Shapes that are read, and their corners, in VTK's order."""
 MOST_BYTES = 2**28

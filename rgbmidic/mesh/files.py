@@ -20,8 +20,6 @@ from rgbmidic.mesh.vtu import read_vtu
 from rgbmidic.settings import LENGTH_UNITS, regular
 from rgbmidic.typing import FloatArray, IntArray
 
-__all__ = ["read_mesh"]
-
 logger = logging.getLogger(__name__)
 
 _PLANAR = {"triangle": ((0, 1, 2),), "quad": ((0, 1, 2, 3),)}

@@ -12,8 +12,6 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["ROUNDING", "FiniteElementMesh", "cross"]
-
 ROUNDING = 1e-4
 """What rounding leaves of a distance, as a fraction of the mesh's extent: single precision and the eight columns of
 Nastran 1e-6 to 1e-5 (derived)."""

@@ -9,8 +9,6 @@ from rgbmidic.errors import InputError
 from rgbmidic.mesh.content import MeshContent, text_of
 from rgbmidic.mesh.meshio_formats import read_with_meshio
 
-__all__ = ["read_gmsh"]
-
 _SHAPES = {
     **dict.fromkeys((2, 9, 20, 21), "triangle"),
     **dict.fromkeys((3, 10, 16, 36), "quad"),

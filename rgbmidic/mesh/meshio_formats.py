@@ -20,8 +20,6 @@ from rgbmidic.mesh.content import CORNERS, MOST_BYTES, MeshContent, sized, uniqu
 from rgbmidic.mesh.vtu import NUMBERS, labels_of
 from rgbmidic.typing import IntArray
 
-__all__ = ["FORMATS", "read_with_meshio"]
-
 logger = logging.getLogger(__name__)
 
 FORMATS = {".vtk": "vtk", ".xdmf": "xdmf", ".mesh": "medit", ".avs": "avsucd", ".vol": "netgen"}

@@ -12,8 +12,6 @@ from pathlib import Path
 from rgbmidic.errors import InputError
 from rgbmidic.mesh.content import CORNERS, MeshContent, text_of
 
-__all__ = ["read_nastran"]
-
 _SHAPES = {
     **dict.fromkeys(("CTRIA3", "CTRIAR", "CTRIA6", "CPLSTN3", "CPLSTN6", "CPLSTS3", "CPLSTS6"), "triangle"),
     **dict.fromkeys(("CQUAD4", "CQUADR", "CQUAD8", "CQUAD", "CSHEAR"), "quad"),

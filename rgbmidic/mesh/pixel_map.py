@@ -22,8 +22,6 @@ from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh, with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["TERMS", "PixelMap", "blended", "quadratic_fit"]
-
 _RIM = 3.0
 """Farthest (px) that a pixel of the region may lie from the element that owns it: the polygon of an outline is within
 0.06 elements of it (`outline_mesh`), 3 px for elements of 50 px."""

@@ -21,8 +21,6 @@ from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
 from rgbmidic.typing import FloatArray
 
-__all__ = ["Placement", "Plane", "on_image"]
-
 logger = logging.getLogger(__name__)
 
 

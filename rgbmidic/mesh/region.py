@@ -19,8 +19,6 @@ from scipy.spatial import cKDTree
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["Region", "edge_keys", "outline_mesh"]
-
 logger = logging.getLogger(__name__)
 
 

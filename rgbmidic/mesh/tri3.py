@@ -17,8 +17,6 @@ from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.region import Region, edge_keys, outline_mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["Tri3Mesh", "refined", "with_data"]
-
 logger = logging.getLogger(__name__)
 
 NARROW = 10

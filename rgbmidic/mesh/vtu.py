@@ -21,8 +21,6 @@ from rgbmidic.errors import InputError
 from rgbmidic.mesh.content import CORNERS, MOST_BYTES, MeshContent, sized
 from rgbmidic.typing import AnyArray, IntArray
 
-__all__ = ["NUMBERS", "labels_of", "read_vtu"]
-
 NUMBERS = ("GlobalNodeId", "node_number", "node_id", "NodeId", "GlobalElementId", "element_number", "element_id")
 """Names under which VTK files keep labels: ParaView's of both, this package's own, and those of converters."""
 _SHAPES = {

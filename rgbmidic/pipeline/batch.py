@@ -27,8 +27,6 @@ from rgbmidic.results.histories import read_histories
 from rgbmidic.settings import TestSettings, read_toml, regular
 from rgbmidic.typing import FloatArray
 
-__all__ = ["BatchTest", "Outcome", "modulus", "read_table", "read_tests", "run_batch", "summary_rows"]
-
 logger = logging.getLogger(__name__)
 
 _NAME = re.compile(r"[\w][\w .+-]{0,79}")

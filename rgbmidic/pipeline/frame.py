@@ -47,19 +47,6 @@ from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import Statistics, as_weights, precision_method
 
-__all__ = [
-    "STRIDE",
-    "as_weights",
-    "correlate",
-    "failed_frame",
-    "initial_displacement",
-    "measure_frame",
-    "next_reference",
-    "read_state",
-    "solve_frame",
-    "solver_settings",
-]
-
 logger = logging.getLogger(__name__)
 
 STRIDE = 16

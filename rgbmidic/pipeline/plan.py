@@ -49,23 +49,6 @@ from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, prepare_weights
 from rgbmidic.weights.threshold import ThresholdWeights, blurred
 
-__all__ = [
-    "HARDLY_ENOUGH",
-    "SATURATED",
-    "SPECKLES",
-    "Choice",
-    "Plan",
-    "UpdatedReferences",
-    "check_texture",
-    "exposure_fault",
-    "finite_elements_of",
-    "light_levels",
-    "neighbour_correlation",
-    "read_region",
-    "saturated_fraction",
-    "too_small",
-]
-
 logger = logging.getLogger(__name__)
 
 _LOOKED_AT = 256

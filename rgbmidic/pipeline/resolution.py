@@ -30,17 +30,6 @@ from rgbmidic.settings import ELEMENT_SIZE, TestSettings
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.weights import as_weights, precision_method
 
-__all__ = [
-    "SIZES",
-    "Choice",
-    "GaugeFigures",
-    "ResolutionStudy",
-    "SizeFigures",
-    "choose",
-    "refine",
-    "study_sizes",
-]
-
 logger = logging.getLogger(__name__)
 
 SIZES = (10.0, 16.0, 25.0, 40.0, 63.0)

@@ -24,10 +24,10 @@ from rgbmidic.correlation import Solution, Start, Status
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.errors import FrameError, InputError, ResultError, RgbmidicError
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.frame import next_reference, read_state, solve_frame, solver_settings
+from rgbmidic.pipeline.frame import STRIDE, next_reference, read_state, solve_frame, solver_settings
 from rgbmidic.pipeline.plan import Choice, Plan, light_levels
 from rgbmidic.pipeline.resolution import choose, on_mesh, refine
-from rgbmidic.pipeline.schedule import STRIDE, Schedule, dependants, following, is_key, loses, parent, rank_of
+from rgbmidic.pipeline.schedule import Schedule, dependants, following, is_key, loses, parent, rank_of
 from rgbmidic.pipeline.source import FrameSequence, LightSeparation, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
@@ -43,8 +43,6 @@ from rgbmidic.settings import (
     WeightSettings,
 )
 from rgbmidic.weights import LightWeights, MaskWeights
-
-__all__ = ["measure", "measure_sequence"]
 
 logger = logging.getLogger(__name__)
 

@@ -28,19 +28,6 @@ from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Workers
 from rgbmidic.results import QUANTITIES, FrameRecord, ResultStore
 from rgbmidic.typing import AnyArray
 
-__all__ = [
-    "STRIDE",
-    "Schedule",
-    "children",
-    "dependants",
-    "following",
-    "is_key",
-    "lineage",
-    "loses",
-    "parent",
-    "rank_of",
-]
-
 logger = logging.getLogger(__name__)
 
 _LOSS = 0.01

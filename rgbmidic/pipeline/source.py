@@ -21,28 +21,14 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, Rgbmidic
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.series import chosen_frames
 from rgbmidic.frames.stored import Camera, StoredFrame, raw_frame
-from rgbmidic.illumination.calibration import Calibration, Crosstalk
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import IlluminationImages, normalise
 from rgbmidic.illumination.linear import LinearChannels, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.settings import LOCAL_MEAN, FrameSettings
 from rgbmidic.typing import AnyArray, FloatImage
-
-__all__ = [
-    "FrameSequence",
-    "LightSeparation",
-    "RawState",
-    "Separation",
-    "Series",
-    "SourceSeries",
-    "WindowedSeparation",
-    "correlated",
-    "describe",
-    "light_images",
-    "open_sequence",
-    "reference_images",
-]
 
 _LONGEST_NAME = 120
 """Characters of a description that are kept as they are; a longer one is cut and gets its checksum. Chosen; not

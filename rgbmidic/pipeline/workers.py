@@ -35,8 +35,6 @@ from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.results import FrameRecord
 
-__all__ = ["LOST_CLUSTER", "Measured", "Workers", "available_cores", "open_workers"]
-
 logger = logging.getLogger(__name__)
 
 _START = 180.0

@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["comparison_files", "difference_figure", "histogram_figure", "scale_figure", "scale_text"]
-__all__ += ["write_comparison"]
-
 PAGE, TABLE, SCALE, INDEX = "comparison.html", "comparison.csv", "scale.csv", "comparison.pvd"
 _SHOWN = 2
 """Frames of which maps are shown at most."""

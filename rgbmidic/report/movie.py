@@ -35,8 +35,6 @@ from rgbmidic.typing import AnyArray, FloatArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["MOVIES", "Curve", "write_movie"]
-
 Page = npt.NDArray[np.uint8]
 """Red, green, blue and opacity of a page, (H, W, 4)."""
 

@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
-__all__ = ["LIGHT_COLOURS", "OKABE_ITO", "STYLE", "colour_range", "finish_picture", "finish_plot", "literal"]
-__all__ += ["ordinary_values", "save_figure", "time_axis", "time_text", "view_limits"]
-
 STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 9,

@@ -42,9 +42,6 @@ from rgbmidic.results.result import Result
 from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, regular
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["QUANTITIES", "WAYS", "Agreement", "Comparison", "Fit", "FrameComparison", "Levelling", "Simulation"]
-__all__ += ["measured_mesh", "place"]
-
 logger = logging.getLogger(__name__)
 
 QUANTITIES = ("u", "v", "exx", "eyy", "exy")

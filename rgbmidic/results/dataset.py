@@ -22,8 +22,6 @@ from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.timing import STAGES
 
-__all__ = ["to_dataset"]
-
 _COMPONENTS = ("exx", "eyy", "exy")
 """Quantities of the field table that are the components of one variable, `strain`; likewise of their uncertainties."""
 _PARTS = {"brightness": ("brightness_part", ("gain", "offset")), "seconds": ("stage", tuple(STAGES))}

@@ -35,8 +35,6 @@ from rgbmidic.typing import AnyArray
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["EXPORT_FORMATS", "export_result", "write_hdf5"]
-
 _VERSION = (2, 0)
 """Of VTKHDF: the first with time steps, which ParaView reads from 5.12 on."""
 _TRIANGLE = 5

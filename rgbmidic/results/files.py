@@ -41,29 +41,6 @@ from rgbmidic.results.quantities import FINITE_ELEMENTS, SHARED
 from rgbmidic.settings import TestSettings, regular
 from rgbmidic.typing import AnyArray
 
-__all__ = [
-    "ALL_FRAMES",
-    "PROVENANCE",
-    "PUT_BACK",
-    "SCHEMA_VERSION",
-    "Claim",
-    "Origin",
-    "check_file",
-    "check_same",
-    "digest",
-    "fingerprint",
-    "is_result",
-    "now",
-    "read_arrays",
-    "read_json",
-    "read_provenance",
-    "sealed",
-    "write_arrays",
-    "write_complete",
-    "write_json",
-    "writing",
-]
-
 ALL_FRAMES = range(sys.maxsize)
 """All frames that a folder has or will have."""
 _PAUSES = (0.02, 0.05, 0.1, 0.2)

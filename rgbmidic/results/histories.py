@@ -47,10 +47,6 @@ from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.typing import AnyArray, FloatArray
 
-__all__ = ["Histories", "HistoryColumn", "Profile", "Wave", "history_csv", "history_rows"]
-__all__ += ["frames_alone", "read_histories", "read_profile", "with_channels", "write_histories", "write_profile"]
-
-
 _BLURRED = 1.0
 """Motion (px) within the exposure from which a frame is reported to be blurred: the speckle is smeared over a pixel."""
 _COVERED = 0.01

@@ -34,8 +34,6 @@ from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = ["WINDOW", "MapField", "MapValues", "Maps"]
-
 WINDOW = 9
 """Frames that a parabola takes in for rates where none are stated. Chosen: the noise of a velocity is then .13 of that
 of a displacement per frame, and a change within 4 frames is still seen."""

@@ -40,21 +40,6 @@ from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings, read_section, regular
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = [
-    "Channels",
-    "Physical",
-    "channels_of",
-    "exposure",
-    "frame_times",
-    "placement_of",
-    "probes_of",
-    "rectification_of",
-    "reference_frames",
-    "scale_of",
-    "shared_part",
-    "units_of",
-]
-
 logger = logging.getLogger(__name__)
 
 _TIME = re.compile(r"(?:time|t)(?:[\s_(\[]+(s|ms|us|µs)[)\]]?)?", re.IGNORECASE)

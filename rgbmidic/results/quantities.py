@@ -18,8 +18,6 @@ from rgbmidic.typing import AnyArray
 if TYPE_CHECKING:
     from rgbmidic.correlation.solution import Solution
 
-__all__ = ["FINITE_ELEMENTS", "NO_CHECKSUM", "QUANTITIES", "SHARED", "UNKNOWN_TIME", "FrameRecord", "ResultQuantity"]
-
 
 @dataclass(frozen=True, slots=True)
 class ResultQuantity:

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
     from rgbmidic.settings import ScaleSettings
 
-__all__ = ["Result"]
-
 logger = logging.getLogger(__name__)
 
 

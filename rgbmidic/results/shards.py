@@ -36,8 +36,6 @@ from rgbmidic.results.files import PROVENANCE, PUT_BACK, writing
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.typing import BoolArray
 
-__all__ = ["FrameTable", "RecordLayout", "ShardWriter", "discard", "shard_files"]
-
 _SHARD_FRAMES = 500
 """Frames of a file: 100,000 frames are 200 files; 5,000 nodes each are 150 MB."""
 _BUFFER = 2**16

@@ -41,18 +41,6 @@ from rgbmidic.results.quantities import FINITE_ELEMENTS, SHARED, FrameRecord
 from rgbmidic.results.shards import FrameTable, RecordLayout, ShardWriter, discard, shard_files
 from rgbmidic.typing import AnyArray, BoolArray
 
-__all__ = [
-    "ResultStore",
-    "check_complete",
-    "finish_result",
-    "listed",
-    "load_frames",
-    "load_result",
-    "read_mesh",
-    "read_names",
-    "read_reference",
-]
-
 logger = logging.getLogger(__name__)
 
 _NAMES, _MESH, _REFERENCE, _FRAMES = "frames.json", "mesh.npz", "reference.npz", "solution"

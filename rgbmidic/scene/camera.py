@@ -15,26 +15,9 @@ import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
-from rgbmidic.illumination.calibration import Crosstalk
-from rgbmidic.illumination.crosstalk import Led, Sensitivities, spectral_response
+from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities, spectral_response
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.typing import FloatArray
-
-__all__ = [
-    "DISTANCE",
-    "MEASURED_CROSSTALK",
-    "NOMINAL_DISTANCE",
-    "PIXEL",
-    "REFERENCE_CROSSTALK",
-    "Camera",
-    "Light",
-    "Polarisers",
-    "Vector",
-    "mosaic_samples",
-    "reference_camera",
-    "rotation",
-    "three_lights",
-]
 
 NOMINAL_DISTANCE = 600.0
 """Distance (mm) at which a light of power 1 gives an ideal white the camera's `exposure`."""

@@ -43,9 +43,6 @@ from rgbmidic.scene.zones import Zones, facet_variance, slope_variance
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["Forecast", "Instrument", "expected_std", "light_pull", "node_constant", "pixel_size", "trace_change"]
-
-
 WRINKLE_AREA = 0.085
 """Area over which the erratic part of a reflection is correlated, in units of the wrinkles' spacing squared (measured,
 see the tests, at a lobe of 4 and slopes of 6 degrees; 0.06 at 3 and 8 degrees, 0.11 at 6 and 4)."""

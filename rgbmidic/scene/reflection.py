@@ -20,9 +20,6 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["LIMIT_DEG", "Reflectance", "Reflection", "angle_weights", "reflection", "surface_from_heights"]
-
-
 LIMIT_DEG = 15.0
 """Angle between the light and the mirror direction within which the reflection corrupts the image (paper, Fig. 9)."""
 

@@ -21,19 +21,6 @@ from rgbmidic.scene.surface import AffineField, InPlaneField, MeshField, Surface
 from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value, read_section, read_table, read_toml, regular
 from rgbmidic.typing import FloatArray
 
-__all__ = [
-    "Body",
-    "Cylinder",
-    "DatasetSettings",
-    "Experiment",
-    "Plate",
-    "Scene",
-    "Sphere",
-    "State",
-    "Target",
-    "read_scene",
-]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sphere:

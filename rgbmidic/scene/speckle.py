@@ -26,15 +26,6 @@ from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.surface import BOUND, Surface
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = [
-    "SpecklePatch",
-    "SpeckleSpectrum",
-    "cover_covariance",
-    "cross_spectra",
-    "separated_phases",
-    "separation_spectra",
-]
-
 _LEVEL = 0.25
 """Fraction of full scale of the mean of each light's image: no sample saturates."""
 _NOISE = 0.005

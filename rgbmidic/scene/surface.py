@@ -17,8 +17,6 @@ from rgbmidic._kernels.render import PLATE, sample_paint
 from rgbmidic.errors import InputError
 from rgbmidic.typing import FloatArray
 
-__all__ = ["AffineField", "Finish", "InPlaneField", "MeshField", "Surface", "height_map", "material_from_spatial"]
-
 WRINKLE_FREQUENCY = 0.525
 """Wrinkles per lattice cell: where the height spectrum of the gradient noise peaks (measured; see the tests)."""
 WRINKLE_SLOPE = 0.704

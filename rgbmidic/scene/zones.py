@@ -18,19 +18,6 @@ from rgbmidic.scene.scene import Cylinder, Plate, Scene, Sphere, State
 from rgbmidic.scene.surface import Finish, Surface, material_from_spatial
 from rgbmidic.typing import FloatArray
 
-__all__ = [
-    "REFLECTS",
-    "Zones",
-    "intersect",
-    "macroscopic",
-    "material_points",
-    "placed",
-    "predict_zones",
-    "region_in_view",
-    "truth",
-    "zones_on_surface",
-]
-
 REFLECTS = 0.2
 """Specular fraction from which a light counts as reflecting at a point (chosen; the forecast does not use it)."""
 _DOME_SLOPE = 4 / 3

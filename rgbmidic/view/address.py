@@ -13,9 +13,6 @@ from urllib.parse import urlencode
 from rgbmidic.fields import MEASURES, Units
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ScaleSettings
 
-__all__ = ["BESIDE", "CLOCKS", "KINDS", "MARKS", "OVER", "PALETTES", "SCALE", "UNCERTAINTY", "Mark", "Steps"]
-__all__ += ["ViewState", "probe_marks", "probe_place"]
-
 KINDS = {"point": 1, "gauge": 2, "line": 2, "strain_gauge": 1, "region": 2, "circle": 2}
 """Probes that can be set with the pointer, and how many places each takes."""
 SCALE = "scale"

@@ -20,9 +20,6 @@ from rgbmidic.typing import AnyArray, FloatArray
 from rgbmidic.view.address import Mark
 from rgbmidic.view.picture import Window
 
-__all__ = ["LETTERS", "Canvas", "LabelLayer", "LineLayer", "Tiles", "arrow_lines", "columns", "contour_lines"]
-__all__ += ["direction_lines", "plain_plot"]
-
 _IMAGE = "image x y dw dh"
 _BAR = 80
 """Px of the screen for the colour bar: seven digits of 12 px, which change with the frame."""

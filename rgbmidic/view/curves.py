@@ -26,9 +26,6 @@ from rgbmidic.view.address import KINDS, Mark, probe_marks, probe_place
 from rgbmidic.view.canvas import columns, plain_plot
 from rgbmidic.view.picture import Background, warning
 
-__all__ = ["CurvePanel", "LinePanel", "Progress", "TimeLine", "as_csv", "band", "groups", "marks_of"]
-__all__ += ["places", "probes", "read"]
-
 
 def probes(marks: Sequence[Mark], gauge: float, stated: ProbeSettings, measure: Any = None) -> ProbeSettings:
     """Return the probes that marks make, each kind in the order set; a last mark without its pair waits for it.

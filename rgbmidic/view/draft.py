@@ -31,10 +31,6 @@ from rgbmidic.settings import (
 )
 from rgbmidic.view.address import KINDS, Mark
 
-__all__ = ["HOLES", "MASK", "OUTLINES", "Confirmation", "Draft", "arranged", "channel_section"]
-__all__ += ["check_complete", "marks_of", "mask_images", "masks_of", "probe_section", "region_of", "region_section"]
-__all__ += ["rings", "scale_section"]
-
 _FILES = (
     *("frames.path", "calibration.file", "region.mask", "mesh.file", "scale.camera", "channels.file"),
     *("weights.geometry", "weights.height_map", "weights.images"),

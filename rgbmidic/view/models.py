@@ -21,8 +21,6 @@ from rgbmidic.view.address import PALETTES, SCALE, Mark, probe_marks
 from rgbmidic.view.canvas import LETTERS, Canvas, columns
 from rgbmidic.view.picture import element_at
 
-__all__ = ["CONTROLS", "WRITTEN", "Controls", "MarkLayer", "ResultControls", "SharedState", "page_file", "script"]
-
 _SHORT = 150
 """Smallest number of ms between two frames that are played: 6 to 7 a second, which the eye can follow."""
 

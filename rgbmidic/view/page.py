@@ -57,8 +57,6 @@ from rgbmidic.view.picture import (
 )
 from rgbmidic.view.setup_panel import Movie
 
-__all__ = ["ResultPage"]
-
 _TICK, _IDLE = 200, 1000
 """Ms between two parts of the time line; between two checks whether a result has grown, and pictures of that."""
 _CONTOURS = 10

@@ -29,32 +29,6 @@ from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, MapField, Maps, MapValues
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import AnyArray, FloatArray
 
-__all__ = [
-    "AROUND",
-    "Background",
-    "Overlay",
-    "Picture",
-    "Pictures",
-    "RawPictures",
-    "Window",
-    "element_at",
-    "every",
-    "extremes",
-    "frame_text",
-    "grey_picture",
-    "guarded",
-    "paint",
-    "palette",
-    "palette_name",
-    "pointer_text",
-    "probe_text",
-    "range_of_test",
-    "robust_range",
-    "stretched",
-    "warning",
-    "watched",
-]
-
 logger = logging.getLogger(__name__)
 
 Picture = npt.NDArray[np.uint8]

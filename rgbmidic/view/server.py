@@ -39,8 +39,6 @@ from rgbmidic.view.models import page_file
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.setup_panel import Run
 
-__all__ = ["serve", "start"]
-
 _HOST = "127.0.0.1"
 _FORGOTTEN = 15_000
 """Ms after which the data of a closed page are freed: a page that is loaded anew takes less."""

@@ -40,8 +40,6 @@ from rgbmidic.view.models import SharedState, script
 from rgbmidic.view.picture import AROUND, Background, Overlay, every, guarded, paint, palette, warning
 from rgbmidic.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, pictures, side_by_side
 
-__all__ = ["SetupPage"]
-
 _MOST_EDGES = 20_000
 """Elements whose edges are drawn: more are a grey surface on a screen of two million pixels."""
 _TICK = 500

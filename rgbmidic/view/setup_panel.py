@@ -38,8 +38,6 @@ from rgbmidic.view.draft import HOLES, MASK, Draft, arranged, masks_of, rings
 from rgbmidic.view.models import Controls
 from rgbmidic.view.picture import Picture, RawPictures, grey_picture, stretched
 
-__all__ = ["RAW", "DraftFrames", "Movie", "RegionDrawing", "Run", "SetupControls", "pictures", "side_by_side"]
-
 RAW = "raw frame"
 
 

@@ -19,9 +19,6 @@ from rgbmidic.scene.zones import Zones, material_points, predict_zones, zones_on
 from rgbmidic.settings import TestSettings, regular
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = ["GeometryWeights"]
-
-
 _STEP = 4
 """Pixels between the points of the prediction; in between it is interpolated."""
 

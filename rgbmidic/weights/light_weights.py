@@ -32,8 +32,6 @@ from rgbmidic.settings import TestSettings
 from rgbmidic.typing import FloatImage
 from rgbmidic.weights.threshold import ThresholdWeights, automatic_weights
 
-__all__ = ["LightWeights", "MaskWeights", "Statistics", "ValidPixels", "precision_method", "prepare_weights"]
-
 
 class LightWeights(Protocol):
     """Weights (k, H, W) float32 in [0, 1] of every state of a test; 0 where an image is not valid.

@@ -32,19 +32,6 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, TestSettings
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = [
-    "FALLBACK",
-    "DisturbedZone",
-    "SetUpThreshold",
-    "ThresholdWeights",
-    "automatic_threshold",
-    "automatic_weights",
-    "blurred",
-    "disturbed_zone",
-    "set_up_threshold",
-    "threshold_weights",
-]
-
 logger = logging.getLogger(__name__)
 
 

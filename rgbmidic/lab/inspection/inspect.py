@@ -12,8 +12,8 @@ import numpy as np
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames import open_series, open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
-from rgbmidic.illumination.calibration import Calibration, Crosstalk
-from rgbmidic.illumination.crosstalk import align, unmix
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.crosstalk import Crosstalk, align, unmix
 from rgbmidic.illumination.demosaicing import SMALLEST_FRAME, ReflectionAwareDemosaicer
 from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
@@ -37,8 +37,6 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import finite_elements_of, read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatImage
-
-__all__ = ["inspect_files", "inspect_frame", "state_frames"]
 
 Frame = Mosaic | ChannelFrame
 Linear = Sequence[LinearMosaic | LinearChannels]

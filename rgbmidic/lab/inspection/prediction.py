@@ -39,20 +39,6 @@ from rgbmidic.scene.forecast import expected_std, light_pull
 from rgbmidic.scene.speckle import SpeckleSpectrum, separated_phases
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = [
-    "CONTRAST_WIDTH",
-    "Channel",
-    "LocalContrast",
-    "Prediction",
-    "SeparationErrors",
-    "channels_of",
-    "gaussian_field",
-    "noise_estimate",
-    "predict",
-    "speckle_texture",
-    "surroundings",
-]
-
 MEAN_WIDTH = 20.0
 """Standard deviation (px) of the local mean that the contrast is taken against; wide, so as to keep coarse speckle."""
 FARTHEST = 24

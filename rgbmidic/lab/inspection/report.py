@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["FILES", "channel_rows", "inspection_document", "light_rows", "uncertainty_rows", "write_inspection"]
-
 FILES = ("inspection.json", "inspection.png")
 """What `write_inspection` writes."""
 _BOX: dict[str, Any] = {"frameon": True, "framealpha": 0.85, "edgecolor": "none", "borderpad": 0.3}

@@ -16,9 +16,6 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.plan import SPECKLES
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-__all__ = ["TOO_FINE", "ChannelSummary", "Finding", "Inspection", "LightSummary", "Spread", "findings"]
-
-
 TOO_FINE = 0.75
 """Agreement of neighbouring colours below which the speckle is too fine for the colour lattice (docs: inspect)."""
 SATURATED, DARK, HIDDEN, NEGATIVE, GREENS = 0.01, 0.1, 0.01, 0.01, 0.05

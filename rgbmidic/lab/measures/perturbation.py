@@ -15,9 +15,6 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields import SIGMA, high_pass
 from rgbmidic.typing import FloatArray
 
-__all__ = ["AREA_SIZE", "Area", "area_means", "area_stds", "areas_along_x", "perturbation", "residual_percent"]
-
-
 AREA_SIZE = (50.0, 100.0)
 """Width and height (px) of the paper's areas."""
 _MEASURED = 0.5

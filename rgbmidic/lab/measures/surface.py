@@ -19,20 +19,6 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.typing import BoolArray, FloatArray
 
-__all__ = [
-    "Goniometry",
-    "Lobe",
-    "detrend",
-    "fit_lobe",
-    "goniometry",
-    "local_slope",
-    "paint_classes",
-    "pixel_levels",
-    "rms_slope",
-    "slope_uncertainty",
-    "wrinkle_spacing",
-]
-
 VISIBLE = 0.05
 """The reflection is erratic where the pixels' spread exceeds this fraction of the white paint's diffuse level."""
 _GROUPS = 10

@@ -28,16 +28,6 @@ from rgbmidic.scene.surface import Finish, Surface
 from rgbmidic.scene.zones import region_in_view, truth
 from rgbmidic.typing import FloatImage
 
-__all__ = [
-    "dark_frames",
-    "flat_frames",
-    "record",
-    "single_light_frames",
-    "target_scene",
-    "true_calibration",
-    "write_dataset",
-]
-
 Frame = Mosaic | ChannelFrame
 Progress = Callable[[int, int, str], None]
 EXPOSURES = tuple(0.13 * time for time in (0.5, 1, 2, 4, 6, 10))

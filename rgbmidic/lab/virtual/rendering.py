@@ -20,18 +20,6 @@ from rgbmidic.scene.surface import AffineField, Finish, Surface, material_from_s
 from rgbmidic.scene.zones import intersect, truth
 from rgbmidic.typing import FloatArray, FloatImage
 
-__all__ = [
-    "expose",
-    "paint",
-    "paper_scene",
-    "plate_scene",
-    "render",
-    "samples_needed",
-    "sphere_scene",
-    "strained_plate",
-    "turned",
-]
-
 BAND = 64
 """Pixel rows traced at a time: bounds the memory; the images do not depend on it."""
 LONGEST_STEP = 0.25

@@ -7,8 +7,9 @@ import pytest
 from calibration_scene import BLACK, MATRICES, WHITE, captures, expose, speckle_target, white_target
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.settings import BAYER_PATTERNS
 from rgbmidic_calibration.crosstalk import estimate_crosstalk
 from rgbmidic_calibration.ratio import block_centres, block_means
 

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 
 from rgbmidic.errors import InputError
 from rgbmidic.frames import read_frame
-from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import MINIMUM_DNG_SIZE, write_dng, write_tiff
+from rgbmidic.settings import BAYER_PATTERNS
 
 
 @pytest.fixture(scope="module")

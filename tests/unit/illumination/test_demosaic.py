@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import InputError
-from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.illumination.demosaicing import Demosaicer, MalvarDemosaicer, NormalisedMosaic
 from rgbmidic.illumination.linear import LinearMosaic
+from rgbmidic.settings import BAYER_PATTERNS
 
 MALVAR = MalvarDemosaicer()
 

@@ -6,7 +6,6 @@ import pytest
 from naive_demosaic import site_channels
 
 from rgbmidic.errors import InputError
-from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.illumination.colour_factors import colour_factors, gather_moments, learn_texture
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaicing import (
@@ -20,6 +19,7 @@ from rgbmidic.illumination.demosaicing import (
 from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.scene.camera import MEASURED_CROSSTALK
+from rgbmidic.settings import BAYER_PATTERNS
 
 SHAPE = (160, 176)
 

@@ -6,9 +6,9 @@ import pytest
 
 from rgbmidic._kernels import demosaicing as kriging
 from rgbmidic._kernels import illumination as texture
-from rgbmidic.frames.data import BAYER_PATTERNS
 from rgbmidic.illumination.colour_factors import colour_moments, of_mosaic, widened
 from rgbmidic.illumination.demosaicing import red_position
+from rgbmidic.settings import BAYER_PATTERNS
 
 SHAPES = [(16, 24), (19, 21), (33, 18), (9, 531)]
 

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from rgbmidic import illumination
 from rgbmidic.errors import InputError
 from rgbmidic.frames import ChannelFrame, Mosaic
-from rgbmidic.illumination.calibration import Calibration, Crosstalk
-from rgbmidic.illumination.crosstalk import NEGLIGIBLE, unmix
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.crosstalk import NEGLIGIBLE, Crosstalk, unmix
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
 from rgbmidic.illumination.separation import DEMOSAICERS, separate
 

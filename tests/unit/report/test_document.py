@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.illumination.calibration import Calibration, Crosstalk
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.report import curves, document, remove_report, setup, style, write_report
 from rgbmidic.results import FrameRecord, Maps, Result, ResultStore, read_profile

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import InputError
-from rgbmidic.frames.data import BAYER_PATTERNS, ChannelFrame, Mosaic, cfa_channels
+from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.illumination.crosstalk import HALF_MAXIMUM, spectral_response
 from rgbmidic.lab.virtual import Camera, Led, Light, Sensitivities, expose, paper_scene, record, render, sphere_scene
 from rgbmidic.lab.virtual.dataset import dark_frames, single_light_frames
+from rgbmidic.settings import BAYER_PATTERNS
 
 LIGHTS = tuple(Light(name=name, position=(0.0, 0.0, 0.0)) for name in ("red", "green", "blue"))
 CROSSTALK = np.array([[1, 0.10, 0.02], [0.14, 1, 0.16], [0.03, 0.12, 1]])
