@@ -14,9 +14,10 @@ from rgbmidic.correlation.start import Start, track
 from rgbmidic.frames import Mosaic, Window, cfa_channels
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.images import correlated
 from rgbmidic.illumination.linear import NoiseModel
+from rgbmidic.illumination.separation import Separation, reference_images
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.source import Separation, correlated, reference_images
 from rgbmidic.scene.camera import REFERENCE_CROSSTALK
 from rgbmidic.settings import ELEMENT_SIZE, SolverSettings
 from rgbmidic.typing import FloatArray, FloatImage

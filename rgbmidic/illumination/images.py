@@ -23,6 +23,7 @@ from rgbmidic._kernels.illumination import divide_by_mean
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.linear import LinearChannels
 from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.settings import LOCAL_MEAN
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:  # reading a result takes no kernels
@@ -367,3 +368,8 @@ def _half_blur(image: FloatImage, sigma: float) -> FloatImage:
 
 def _gaussian(image: FloatImage, sigma: float) -> FloatImage:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
+
+
+def correlated(images: IlluminationImages, sigma: float = LOCAL_MEAN) -> FloatImage:
+    """What the solve correlates (k, H, W): the lights' images, over their local mean of width `sigma` (0: as is)."""
+    return normalise(images.values, sigma, images.full_scale) if sigma else images.values

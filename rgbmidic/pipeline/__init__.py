@@ -1,9 +1,13 @@
 """The main job: raw frames in, displacement fields out."""
 
-from rgbmidic.pipeline.frame import correlate, measure_frame
+from rgbmidic.illumination.images import correlated
+from rgbmidic.illumination.separation import LightSeparation, Separation
+from rgbmidic.pipeline.correlate import correlate
+from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import Plan, read_region
-from rgbmidic.pipeline.run import measure, measure_sequence
-from rgbmidic.pipeline.source import FrameSequence, LightSeparation, Separation, correlated
+from rgbmidic.pipeline.run import measure
+from rgbmidic.pipeline.sequence import measure_sequence
+from rgbmidic.pipeline.source import FrameSequence
 
 __all__ = [
     "FrameSequence",

@@ -1,7 +1,7 @@
 """One frame of a test to one record, whatever the frame is like.
 
 read -> one image per light -> weights -> images of the solve -> displacement and its uncertainty -> gaps filled ->
-brightness of the lights -> record. `correlate` is the same for one pair of states, arrays in and out.
+brightness of the lights -> record.
 """
 
 from __future__ import annotations
@@ -11,46 +11,37 @@ import logging
 import zlib
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.threads import aside, machine
+from rgbmidic._kernels.threads import machine
 from rgbmidic.correlation import (
     Deformed,
-    PrecisionMethod,
-    Reference,
     Solution,
     Start,
     Status,
     discretisation_error,
     fill,
-    solve,
-    track,
 )
-from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import brightness_change
-from rgbmidic.errors import ConfigurationError, FrameError, InputError, RgbmidicError
+from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.data import Window
-from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.images import normalise as divide_by_local_mean
-from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.illumination.images import IlluminationImages, correlated
+from rgbmidic.illumination.separation import RawState
+from rgbmidic.pipeline.order import STRIDE, is_key
 from rgbmidic.pipeline.plan import SATURATED, Plan, exposure_fault, saturated_fraction, too_small
-from rgbmidic.pipeline.source import RawState, correlated
 from rgbmidic.results import FrameRecord
-from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, check_names, grey_levels
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
-from rgbmidic.weights import Statistics, as_weights, precision_method
+from rgbmidic.weights import precision_method
 
 logger = logging.getLogger(__name__)
 
-STRIDE = 16
-"""Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
 _THUMBNAIL = 256
 """Longest side in px of the picture of the weights that is kept of every frame."""
 _DARK = 0.3
@@ -150,6 +141,9 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         The frame cannot be read or is not what the settings say.
     """
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
+    place = plan.series.chosen.index(index)
+    if is_key(place):  # it looks for what has been lost; frames between key frames follow what there is
+        start = replace(start, unmeasured=0.0)
     if index in settings.frames.reference:
         start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
     window = plan.window_of(start.displacement, reference_update.displacement)
@@ -179,7 +173,8 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         solution = replace(solution, reason="; ".join([solution.reason, *causes]))
         end = "cannot be measured" if solution.status is Status.FAILED else "did not converge"
         logger.warning("frame %d (%s) %s: %s", index, name, end, solution.reason)
-    if _asks_for_error(plan, index) and solution.measured.any():
+    key = place % STRIDE == 0 or place == len(plan.series.chosen) - 1
+    if (settings.mesh_error is True or (settings.mesh_error == "key" and key)) and solution.measured.any():
         with stage("conclusion"):
             solution = discretisation_error(reference, deformed, solution, plan.solver, method)
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
@@ -203,12 +198,6 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         "machine": machine(),
         "checksum": zlib.crc32(b"".join(one.values.tobytes() for one in samples)),
     }
-
-
-def _asks_for_error(plan: Plan, index: int) -> bool:
-    """Whether the settings ask for the discretisation error of a frame."""
-    asked, place = plan.settings.mesh_error, plan.series.chosen.index(index)
-    return asked is True or (asked == "key" and (place % STRIDE == 0 or place == len(plan.series.chosen) - 1))
 
 
 def _causes(
@@ -284,139 +273,3 @@ def _tell_dark(name: str, lights: tuple[str, ...], brightness: FloatArray) -> No
 
 def _in_bytes(shares: FloatImage) -> npt.NDArray[np.uint8]:
     return np.round(shares * 255).astype(np.uint8)
-
-
-def correlate(
-    reference: npt.ArrayLike,
-    deformed: npt.ArrayLike,
-    *,
-    region: Sequence[float] | Region | None = None,
-    element_size: float = ELEMENT_SIZE,
-    cracks: Sequence[npt.ArrayLike] = (),
-    weights: npt.ArrayLike | None = None,
-    initial: npt.ArrayLike | None = None,
-    deformed_weights: npt.ArrayLike | None = None,
-    normalise: float | Literal["auto"] | None = None,
-    statistics: bool | PrecisionMethod = True,
-    mesh_error: bool = False,
-    **options: Any,
-) -> Solution:
-    """Measure the displacement between two states seen under k lights (k = 1: plain DIC).
-
-    Parameters
-    ----------
-    reference, deformed : array_like, shape (H, W) or (k, H, W)
-        Grey levels; NaN marks an invalid pixel.
-    region
-        Rectangle (x0, y0, x1, y1) in px, or a `rgbmidic.mesh.Region`; None: the whole image.
-    element_size
-        Side of the triangles in px.
-    cracks
-        Paths, each of corners (x, y) in px, along which the mesh is split, see `Tri3Mesh.from_region`.
-    weights : array_like, shape (H, W) or (k, H, W), optional
-        Weight of each light at each pixel of the reference, finite and not negative; 0 excludes the pixel.
-    initial : array_like, shape (2,) or (N, 2), optional
-        Initial guess of the displacement (u, v) in px; None: it is found by a search.
-    deformed_weights
-        Like `weights`, on the deformed images.
-    normalise
-        Standard deviation in px of the Gaussian of the local mean by which every image is first divided; ``"auto"``: 10
-        px, 30 px if there are cracks. None: grey levels are not changed.
-    statistics
-        True: weight the lights by the statistics of the residual around each pixel (`rgbmidic.weights.Statistics`).
-        False: only by `weights`. Or an object with a method of your own.
-    mesh_error
-        Estimate the discretisation error, too (`rgbmidic.discretisation_error`).
-    **options
-        Fields of `rgbmidic.settings.SolverSettings` and their defaults: prefilter, rigid, brightness, fill,
-        tolerance, max_iterations.
-
-    Returns
-    -------
-    Solution
-        With `nodes` (N, 2), `elements` (E, 3), `displacement` (N, 2) in px, `displacement_std` (N, 2) in px,
-        `status`, and more.
-
-    Raises
-    ------
-    InputError
-        The images have different shapes, a weight or initial guess does not fit them, or a setting is unknown.
-    RegionError
-        The region is empty, too small or outside the image.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from scipy.ndimage import gaussian_filter
-    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(120, 160)), 1.5)
-    >>> solution = correlate(speckle, np.roll(speckle, 2, axis=1), region=(20, 20, 140, 100))
-    >>> solution.status.name
-    'CONVERGED'
-    >>> np.allclose(solution.displacement, (2, 0), atol=0.01)
-    True
-    """
-    f, g = as_light_stack(reference, "reference"), as_light_stack(deformed, "deformed")
-    if f.shape != g.shape:
-        raise InputError(f"reference and deformed images must have one shape; given are {f.shape} and {g.shape}")
-    height, width = f.shape[1:]
-    if not isinstance(region, Region):
-        region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
-    mesh = Tri3Mesh.from_region(region, element_size, cracks)
-    cracked = len(mesh.crack_edges) > 0
-    sigma, solver = grey_levels(0.0 if normalise is None else normalise, solver_settings(options), cracked=cracked)
-    if sigma:
-        f, g = (divide_by_local_mean(stack, sigma, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
-    given = as_weights(weights, f.shape, "weights"), as_weights(deformed_weights, f.shape, "deformed_weights")
-    second = aside(Deformed.prepare, g, given[1], prefilter=solver.prefilter)
-    first = Reference.prepare(f, region, given[0], mesh=mesh, prefilter=solver.prefilter)
-    method = (Statistics() if statistics else None) if isinstance(statistics, bool) else statistics
-    start = initial_displacement(initial, len(mesh.nodes))
-    if start is None:
-        solution = track(first, second.result(), Start(displacement=None), solver, method)
-    else:
-        solution = solve(first, second.result(), start, solver, method)
-    if mesh_error:
-        solution = discretisation_error(first, second.result(), solution, solver, method)
-    return fill(mesh, solution, solver.fill) if solver.fill else solution
-
-
-def solver_settings(options: dict[str, Any]) -> SolverSettings:
-    """The settings of the solve that options of a function state.
-
-    Raises
-    ------
-    InputError
-        An option is unknown or out of range.
-    """
-    try:
-        check_names(options, (entry.name for entry in fields(SolverSettings)), "option", "correlate")
-        return SolverSettings(**options)
-    except ConfigurationError as error:
-        raise InputError(str(error)) from None
-
-
-def initial_displacement(initial: npt.ArrayLike | None, nodes: int) -> FloatArray | None:
-    """Return an initial guess as an array, or None where none is given.
-
-    Parameters
-    ----------
-    initial : array_like, shape (2,) or (N, 2), optional
-        Displacement (u, v) in px.
-    nodes
-        Number N of nodes of the mesh.
-
-    Returns
-    -------
-    ndarray, shape (N, 2), or None
-
-    Raises
-    ------
-    InputError
-        Not (2,) or (N, 2), or not finite.
-    """
-    if initial is None:
-        return None
-    values = np.asarray(initial, dtype=np.float64)
-    if values.shape not in ((2,), (nodes, 2)) or not np.isfinite(values).all():
-        raise InputError(f"initial must be finite with shape (2,) or ({nodes}, 2); given is shape {values.shape}")
-    return np.broadcast_to(values, (nodes, 2)).copy()

@@ -27,23 +27,20 @@ from rgbmidic.frames import Window, open_series, read_frame
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import check_state
-from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
+from rgbmidic.illumination.images import DARK, IlluminationImages, correlated, local_mean
 from rgbmidic.illumination.linear import QUANTISATION
-from rgbmidic.illumination.texture import speckle_diameter
-from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
-from rgbmidic.mesh.placement import on_image
-from rgbmidic.pipeline.source import (
-    FrameSequence,
+from rgbmidic.illumination.separation import (
     LightSeparation,
     RawState,
     Separation,
-    Series,
     WindowedSeparation,
-    correlated,
     light_images,
-    open_sequence,
     reference_images,
 )
+from rgbmidic.illumination.texture import speckle_diameter
+from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
+from rgbmidic.mesh.placement import on_image
+from rgbmidic.pipeline.source import FrameSequence, Series, open_sequence
 from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings, grey_levels
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, prepare_weights

@@ -20,12 +20,12 @@ from rgbmidic.correlation.discretisation import discretisation_error
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionError, RgbmidicError
 from rgbmidic.fields import NodalCovariance, Places, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
+from rgbmidic.illumination.images import correlated
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.pixel_map import quadratic_fit
 from rgbmidic.mesh.tri3 import refined
 from rgbmidic.pipeline.frame import read_state
 from rgbmidic.pipeline.plan import SPECKLES, Choice, Plan
-from rgbmidic.pipeline.source import correlated
 from rgbmidic.settings import ELEMENT_SIZE, TestSettings
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.weights import as_weights, precision_method

@@ -1,48 +1,36 @@
-"""The main job: a test's raw frames in, displacement fields with their uncertainty out.
-
-`measure` keeps each frame's result in a folder as it finishes; `measure_sequence` takes one state after the other, as a
-camera gives them, and yields each solution before it asks for the next, in constant memory. Initial guesses, tracking
-and reference updates are the same, frame for frame.
-"""
+"""The main job: a test's raw frames in, displacement fields with their uncertainty out."""
 
 from __future__ import annotations
 
 import logging
-import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
-from itertools import chain
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic._kernels import are_compiled
-from rgbmidic.correlation import Solution, Start, Status
-from rgbmidic.correlation.reference_update import ReferenceUpdate
-from rgbmidic.errors import FrameError, InputError, ResultError, RgbmidicError
-from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.frame import STRIDE, next_reference, read_state, solve_frame, solver_settings
+from rgbmidic.correlation import Status
+from rgbmidic.errors import FrameError, InputError, ResultError
+from rgbmidic.illumination.separation import LightSeparation
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.pipeline.frame import read_state
+from rgbmidic.pipeline.order import dependants
 from rgbmidic.pipeline.plan import Choice, Plan, light_levels
 from rgbmidic.pipeline.resolution import choose, on_mesh, refine
-from rgbmidic.pipeline.schedule import Schedule, dependants, following, is_key, loses, parent, rank_of
-from rgbmidic.pipeline.source import FrameSequence, LightSeparation, describe
+from rgbmidic.pipeline.schedule import Schedule
+from rgbmidic.pipeline.source import FrameSequence, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
-from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
+from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.results.files import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.results.store import listed, read_mesh
 from rgbmidic.settings import (
-    ELEMENT_SIZE,
-    FrameSettings,
-    IlluminationSettings,
-    RegionSettings,
     TestSettings,
-    WeightSettings,
 )
-from rgbmidic.weights import LightWeights, MaskWeights
+from rgbmidic.weights import LightWeights
 
 logger = logging.getLogger(__name__)
 
@@ -285,164 +273,3 @@ def _exposure(plan: Plan) -> Iterator[dict[str, Any]]:
     levels, inside = light_levels(plan.images, plan.region), plan.images.values[:, plan.region.mask]
     for (light, level), part in zip(levels.items(), inside, strict=True):
         yield {"light": light, "median": level, "excluded": float(1 - np.isfinite(part).mean())}
-
-
-def measure_sequence(
-    states: Iterable[Any],
-    settings: TestSettings | None = None,
-    *,
-    reference: Any = None,
-    region: Sequence[float] | Region | None = None,
-    element_size: float = ELEMENT_SIZE,
-    normalise: float | Literal["auto"] = "auto",
-    statistics: bool = True,
-    update_reference: bool = False,
-    separation: LightSeparation | None = None,
-    weights: LightWeights | npt.ArrayLike | None = None,
-    mesh: Tri3Mesh | None = None,
-    **options: Any,
-) -> Iterator[Solution]:
-    """Measure states one by one, each as soon as it is available: from a list, a generator, a camera.
-
-    Every solution is identical, bit for bit, to that of `rgbmidic.measure` for the same frames. Only the reference and
-    a few initial guesses are kept between states, whatever their number. To write a result folder, pass the frames to
-    `rgbmidic.measure` as `source`.
-
-    Parameters
-    ----------
-    states
-        Without `settings` arrays (H, W) or (k, H, W), one image per light, NaN where not valid, or
-        `IlluminationImages`.
-        With `settings` anything that a frame source may return (`rgbmidic.pipeline.FrameSequence`), such as raw frames.
-    settings
-        Settings of a test, with ``frames.path = []``; they replace `region`, `element_size`, `normalise`,
-        `statistics`, `update_reference` and the `options`.
-    reference
-        The reference state; None: the first of the `states`, which is measured like the others.
-    region
-        Rectangle (x0, y0, x1, y1) in px, or a `rgbmidic.mesh.Region`; None: the whole image.
-    element_size
-        Side of the triangles in px.
-    normalise
-        Standard deviation in px of the Gaussian of the local mean by which every image is first divided; 0: grey levels
-        are not changed; ``"auto"``: 10 px, 30 px if the mesh has cracks.
-    statistics
-        Weight every light by the inverse variance of its own residual around each pixel, robustly.
-    update_reference
-        Whether a later state becomes the reference when the correlation with the present one is low.
-    separation, mesh
-        As in `rgbmidic.measure`.
-    weights
-        As in `rgbmidic.measure`; or an array (k, H, W) from 0 to 1 that applies to every state.
-    **options
-        Fields of `rgbmidic.settings.SolverSettings` and their defaults.
-
-    Yields
-    ------
-    Solution
-        One for each state, relative to the reference. A state that cannot be measured is `Status.FAILED` with its
-        reason; the next states are measured.
-
-    Raises
-    ------
-    RgbmidicError
-        The settings contradict themselves or the objects, or the reference is not usable.
-    """
-    remaining = iter(states)
-    own = reference is None
-    if own:
-        try:
-            reference = next(remaining)
-        except StopIteration:
-            raise InputError("there is no state to measure: the sequence is empty") from None
-    latest = _Latest(reference=reference, light_images=settings is None)
-    mask = region if isinstance(region, Region) else None
-    if settings is None:
-        height, width = np.shape(getattr(reference, "values", reference))[-2:]
-        corners: Any = (0, 0, width - 1, height - 1)
-        if region is not None and not isinstance(region, Region):
-            corners = tuple(region)
-        settings = TestSettings(
-            frames=FrameSettings(path=(), update_reference=update_reference),
-            region=RegionSettings(rectangle=corners),
-            element_size=element_size,
-            illumination=IlluminationSettings(normalise=normalise),
-            weights=WeightSettings(method="statistics" if statistics else "none"),
-            solver=solver_settings(options),
-        )
-    elif options or region is not None:
-        told = ", ".join([*options, *(["region"] if region is not None else [])])
-        raise InputError(f"settings are given: state in them what {told} says")
-    if settings.weights.threshold == "auto":
-        raise InputError('weights.threshold = "auto" looks at the first deformed frame, which a sequence has not yet')
-    counted: Any = weights if weights is None or hasattr(weights, "deformed") else MaskWeights(cast(Any, weights))
-    frames = replace(settings.frames, reference=(0,), first=0 if own else 1, last=None, step=1)
-    plan = Plan.from_settings(
-        replace(settings, frames=frames), source=latest, separation=separation, weights=counted, mesh=mesh, region=mask
-    )
-    return _solutions(plan, latest, chain([reference], remaining) if own else remaining)
-
-
-@dataclass(slots=True)
-class _Latest:
-    """A frame source of the reference, frame 0, and of the latest state, whatever its number."""
-
-    reference: Any
-    light_images: bool
-    state: Any = None
-
-    def __len__(self) -> int:
-        return sys.maxsize
-
-    def __getitem__(self, index: int) -> Any:
-        state = self.state if index else self.reference
-        if self.light_images and not hasattr(state, "values"):
-            return np.asarray(state, dtype=np.float32)
-        return state
-
-
-def _solutions(plan: Plan, latest: _Latest, states: Iterable[Any]) -> Iterator[Solution]:
-    """The solution of each state, from the starts and with the second tries of `Schedule`."""
-    starts: dict[int, Start] = {}
-    updates: dict[tuple[int, ...], ReferenceUpdate] = {(): ReferenceUpdate.none(plan.reference)}
-    last = NO_CHECKSUM
-    for position, latest.state in enumerate(states):
-        index, before = plan.series.chosen[position], parent(position)
-        start = Start(displacement=None) if before is None else starts[before]
-        found, after, checksum = _solved(plan, index, start, updates, key=is_key(position))
-        if checksum == last != NO_CHECKSUM:
-            logger.warning("state %d repeats the one before, bit for bit", position)
-        last = checksum
-        if is_key(position) and loses(found, start):
-            closer = starts[position - 1]
-            again, after_again, _ = _solved(plan, index, closer, updates, key=True)
-            if rank_of(again) < rank_of(found):
-                found, after, start = again, after_again, closer
-            elif not found.measured.any():
-                after = closer
-        if (frames := after.reference_updates[-2:]) not in updates:
-            updates[frames] = next_reference(plan, updates[start.reference_updates[-2:]], index, found)
-        starts[position] = after
-        # a later state starts from this one, from the first, or from the last at a multiple of a power of STRIDE
-        needed, step = {0, position}, STRIDE
-        while step <= position:
-            needed.add(position // step * step)
-            step *= STRIDE
-        starts = {place: one for place, one in starts.items() if place in needed}
-        kept = {(), *(one.reference_updates[-2:] for one in starts.values())}
-        updates = {frames: one for frames, one in updates.items() if frames in kept}
-        yield found
-
-
-def _solved(
-    plan: Plan, index: int, start: Start, updates: dict[tuple[int, ...], ReferenceUpdate], *, key: bool
-) -> tuple[Solution, Start, int]:
-    """The solution of the latest state from a start, where the one after it starts, and the state's checksum."""
-    try:
-        given = replace(start, unmeasured=0.0) if key else start
-        values = solve_frame(plan, index, given, updates[start.reference_updates[-2:]])
-    except RgbmidicError as error:
-        logger.warning("%s failed: %s", plan.series.name(index), error)
-        mesh, lights = plan.reference.mesh, len(plan.images.names)
-        return Solution.failed(mesh, lights, str(error), np.zeros(0)), start, NO_CHECKSUM
-    return values["solution"], following(plan, FrameRecord.from_solution(**values).values, start), values["checksum"]

@@ -1,16 +1,9 @@
-"""Which frame is measured next, from where it starts, and what becomes of a frame whose worker dies.
-
-In which order frames can be measured: each starts from an earlier one, whatever the number of workers.
-
-The frames are the leaves of a tree of base `STRIDE`: a frame starts from the one before it, every 16th from the 16th
-before, every 256th from the 256th before, and so on, so that chunks of consecutive frames can be measured side by side
-once their key frame is, and any range of frames needs only some key frames of those before it.
-"""
+"""Which frame is measured next, from where it starts, and what becomes of a frame whose worker dies."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, CancelledError, Future, wait
 from dataclasses import replace
 from heapq import heappop, heappush
@@ -19,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.correlation import NodeStatus, Solution, Start, Status
-from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.frame import STRIDE, failed_frame
+from rgbmidic.pipeline.frame import failed_frame
+from rgbmidic.pipeline.order import better, children, lineage, loses, parent, rank_of
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Workers
 from rgbmidic.results import QUANTITIES, FrameRecord, ResultStore
@@ -30,9 +23,6 @@ from rgbmidic.typing import AnyArray
 
 logger = logging.getLogger(__name__)
 
-_LOSS = 0.01
-"""Share of the nodes that a key frame may lose against the one it starts from before it is measured again from the
-frame just before it."""
 _TRIES = 3
 """Times that a worker may die over a frame, all but the first with that frame alone, before the frame is what kills
 them: two may be chance (memory that another program took)."""
@@ -48,7 +38,7 @@ Progress = Callable[[int, int, str], None]
 class Schedule:
     """The frames of a test that are still to be measured.
 
-    A frame starts from its parent in the tree of `rgbmidic.pipeline.schedule`, or, where that one failed, from where it
+    A frame starts from its parent in the tree of `rgbmidic.pipeline.order`, or, where that one failed, from where it
     started. A key frame that is not measured well from there is measured once more from the frame just before it, and
     the better of both is kept.
     """
@@ -109,12 +99,10 @@ class Schedule:
                     count += 1
 
     def _submit(self, workers: Workers, position: int, start: Start) -> None:
-        # a key frame looks for what has been lost; those between follow what there is
-        given = replace(start, unmeasured=0.0) if is_key(position) else start
         last = start.reference_updates[-2:]  # all that the reference which they make depends on
         mesh, lights = self._plan.reference.mesh, len(self._plan.images.names)
         found = [_solution(mesh, lights, kept) for kept in self._store.table().each(_MEASURED, last)] if last else []
-        future = workers.submit(self._index(position), given, list(zip(map(self._index, last), found, strict=True)))
+        future = workers.submit(self._index(position), start, list(zip(map(self._index, last), found, strict=True)))
         self._running[future] = position, start
 
     def _index(self, position: int) -> int:
@@ -141,7 +129,7 @@ class Schedule:
         if record.unread and (gone := self._plan.series.gone()):
             raise FrameError(f"the frames are gone: {gone}; go on with --resume when they are there again")
         first = self._first_tries.pop(position, None)
-        if first is None and is_key(position) and loses(record, start):
+        if first is None and loses(position, record, start):
             self._first_tries[position] = record
             before = position - 1  # it may have to be measured first
             if self._finished[before]:
@@ -151,8 +139,8 @@ class Schedule:
                 self._want(before)
             return
         if first is not None:
-            better = first if rank_of(first) <= rank_of(record) else record
-            record = replace(better, values={**better.values, "tries": 2})
+            record = better(first, record)
+            record = replace(record, values={**record.values, "tries": 2})
         self._store.write_frame(position, record)
         self._finished[position] = True
         next_start = following(self._plan, record.values, start)
@@ -221,65 +209,3 @@ def _error(future: Future[Measured]) -> BaseException | None:
         return future.exception()
     except CancelledError:
         raise RgbmidicError(LOST_CLUSTER) from None
-
-
-def rank_of(record: FrameRecord | Solution) -> tuple[bool, float]:
-    """The smaller, the better a frame is measured (`rgbmidic.correlation.solution.rank`)."""
-    return rank(int(record.status), record.node_status)
-
-
-def loses(record: FrameRecord | Solution, start: Start) -> bool:
-    """Whether a key frame is measured worse than the one it starts from."""
-    return record.status != Status.CONVERGED or rank_of(record)[1] > start.unmeasured + _LOSS
-
-
-def parent(position: int) -> int | None:
-    """The frame that a frame starts from; None for the first."""
-    return position - _step(position) if position else None
-
-
-def is_key(position: int) -> bool:
-    """Whether a frame starts from one that is not just before it."""
-    return position > 0 and _step(position) > 1
-
-
-def children(position: int, count: int) -> Iterator[int]:
-    """The frames among `count` that start from a frame."""
-    step = 1
-    while position + step < count:
-        if parent(position + step) == position:
-            yield position + step
-        step *= STRIDE
-
-
-def lineage(position: int) -> Iterator[int]:
-    """A frame, its parent, the parent of that, and so on to the first."""
-    yield position
-    while position:
-        position -= _step(position)
-        yield position
-
-
-def dependants(places: Iterable[int], tries: Sequence[int]) -> set[int]:
-    """The frames that depend on some, directly or through others, of a test with as many frames as `tries`.
-
-    A frame depends on the one that it starts from; a key frame of 2 `tries` also on the one just before it.
-    """
-    found: set[int] = set()
-    ahead = list(places)
-    while ahead:
-        place = ahead.pop()
-        after = set(children(place, len(tries)))
-        if place + 1 < len(tries) and tries[place + 1] > 1:
-            after.add(place + 1)
-        ahead += after - found
-        found |= after
-    return found
-
-
-def _step(position: int) -> int:
-    """The largest power of `STRIDE` that divides the position of a frame after the first."""
-    step = 1
-    while position % (step * STRIDE) == 0:
-        step *= STRIDE
-    return step

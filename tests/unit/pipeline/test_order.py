@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rgbmidic.pipeline.frame import STRIDE
-from rgbmidic.pipeline.schedule import children, dependants, is_key, lineage, parent
+from rgbmidic.pipeline.order import STRIDE, children, dependants, is_key, lineage, parent
 
 
 def test_a_frame_starts_from_the_one_before_it_and_a_key_frame_from_the_key_frame_before() -> None:

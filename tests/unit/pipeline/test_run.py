@@ -151,7 +151,7 @@ def test_a_frame_that_kills_its_worker_takes_no_other_with_it(
     monkeypatch.setattr(schedule, "parent", lambda position: 0 if position else None)
     monkeypatch.setattr(schedule, "lineage", lambda position: iter((position, 0) if position else (0,)))
     monkeypatch.setattr(schedule, "children", lambda position, count: iter(range(1, count) if not position else ()))
-    monkeypatch.setattr(schedule, "is_key", lambda position: False)
+    monkeypatch.setattr(schedule, "loses", lambda position, record, start: False)
     result = measure(settings(movie, last=9), tmp_path / "result")
     assert result.frame(5).reason == "its worker process died 3 times"
     assert np.flatnonzero(result.status != Status.CONVERGED).tolist() == [5]
