@@ -220,7 +220,7 @@ def refined_mesh(quick: bool) -> Iterator[Row]:
             sizes = np.sqrt(mesh.areas.sum() / count) * np.linspace(0.8, 1.25, 19)
             meshes = (Tri3Mesh.from_region(plan.region, size) for size in sizes)
             even = min(meshes, key=lambda one: abs(len(one.nodes) - count))
-            pair = (finer, resolution.on_mesh(plan, even))
+            pair = (finer, plan.on_mesh(even))
             draws.append([(len(one.reference.mesh.nodes), *errors(one, states, field)) for one in pair])
         for kind, (nodes, moved, strain, largest) in zip(("refined", "uniform"), np.mean(draws, axis=0), strict=True):
             yield {

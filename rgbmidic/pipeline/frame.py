@@ -31,14 +31,13 @@ from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import brightness_change
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.data import Window
-from rgbmidic.illumination.images import IlluminationImages, correlated
+from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.pipeline.order import STRIDE, is_key
 from rgbmidic.pipeline.plan import SATURATED, Plan, exposure_fault, saturated_fraction, too_small
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
-from rgbmidic.weights import precision_method
 
 logger = logging.getLogger(__name__)
 
@@ -161,13 +160,12 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     with stage("preparation"):
-        weights, ready = plan.frame_weights(images, index), correlated(images, plan.normalise)
+        ready, weights = plan.prepared(images, index)
         deformed = Deformed.prepare(ready, weights, prefilter=plan.solver.prefilter, origin=window.origin)
         step = -(-max(plan.window.shape) // _THUMBNAIL)
         thumbnail = _in_bytes(weights[:, *here][:, ::step, ::step])
-        del weights, ready  # a tenth of what a frame needs
-    method = precision_method(plan.weights, settings.weights.method)
-    solution = reference_update.track(deformed, start, plan.solver, method)
+        del ready, weights  # a tenth of what a frame needs
+    solution = reference_update.track(deformed, start, plan.solver, plan.method)
     if solution.status is not Status.CONVERGED:
         causes = _causes(plan, there, images, reference.offset(deformed), solution)
         solution = replace(solution, reason="; ".join([solution.reason, *causes]))
@@ -176,7 +174,7 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     key = place % STRIDE == 0 or place == len(plan.series.chosen) - 1
     if (settings.mesh_error is True or (settings.mesh_error == "key" and key)) and solution.measured.any():
         with stage("conclusion"):
-            solution = discretisation_error(reference, deformed, solution, plan.solver, method)
+            solution = discretisation_error(reference, deformed, solution, plan.solver, plan.method)
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
     moved = solution.displacement - reference.offset(deformed)
     brightness = brightness_change(plan.images.values, images.values, reference, moved)
@@ -234,8 +232,7 @@ def next_reference(plan: Plan, before: ReferenceUpdate, index: int, solution: So
     """
     window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
     images = plan.lights(read_state(plan, index, window)[0], window)
-    ready = correlated(images, plan.normalise)
-    return before.updated(solution, ready, plan.frame_weights(images, index), window.origin)
+    return before.updated(solution, *plan.prepared(images, index), window.origin)
 
 
 def _updated_reference(plan: Plan, updated: Sequence[tuple[int, Solution]]) -> ReferenceUpdate:

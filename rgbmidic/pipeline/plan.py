@@ -11,14 +11,14 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, combinations
 from threading import Lock
 from typing import Any
 
 import numpy as np
 
-from rgbmidic.correlation import Reference
+from rgbmidic.correlation import PrecisionMethod, Reference
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError
@@ -43,7 +43,7 @@ from rgbmidic.mesh.placement import on_image
 from rgbmidic.pipeline.source import FrameSequence, Series, open_sequence
 from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings, grey_levels
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
-from rgbmidic.weights import LightWeights, as_weights, prepare_weights
+from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights
 from rgbmidic.weights.threshold import ThresholdWeights, blurred
 
 logger = logging.getLogger(__name__)
@@ -225,19 +225,9 @@ class Plan:
             frames=len(series),
             images_of=lambda index: light_images(rest.separation, series.read(index, window), window),
         )
-        counted = as_weights(weights.reference(rest.images), rest.images.values.shape, "weights of the reference")
-        assert counted is not None
-        if settings.weights.method == "threshold":
-            _tell_no_effect(weights, counted, rest.images, region, settings.weights.blur)
-        reference = Reference.prepare(
-            correlated(rest.images, sigma),
-            region,
-            counted,
-            mesh=mesh,
-            prefilter=solver.prefilter,
-            origin=window.origin,
-            registration=rest.images.registration,
-        )
+        reference = _reference(rest.images, weights, region, mesh, sigma, solver, window)
+        if isinstance(weights, ThresholdWeights):
+            _tell_no_effect(weights, rest.images, region)
         speckle = _speckle(rest.images, region)
         if finite_elements is not None:
             _tell_small(mesh, speckle, finite_elements)
@@ -263,21 +253,31 @@ class Plan:
             calibration=whole_calibration.figures() if whole_calibration else {},
         )
 
+    @property
+    def method(self) -> PrecisionMethod | None:
+        """How the lights are weighted by their residuals; None: by `weights` only."""
+        return precision_method(self.weights, self.settings.weights.method)
+
+    def on_mesh(self, mesh: Tri3Mesh) -> Plan:
+        """The same test on another mesh of its region, in px of the window."""
+        reference = _reference(self.images, self.weights, self.region, mesh, self.normalise, self.solver, self.window)
+        return replace(self, reference=reference)
+
     def lights(self, state: RawState, window: Window) -> IlluminationImages:
         """One image per light of a state, or of a `window` of it."""
         return light_images(self.separation, state, window)
 
-    def frame_weights(self, images: IlluminationImages, index: int) -> FloatImage:
-        """Weights (k, H, W) of the images of frame `index`.
+    def prepared(self, images: IlluminationImages, index: int) -> tuple[FloatImage, FloatImage]:
+        """What the solve takes of the images of frame `index`: grey levels and weights, (k, H, W) each.
 
         Raises
         ------
         InputError
             Weights of the user's have another shape, or are negative or not finite.
         """
-        given = as_weights(self.weights.deformed(images, index), images.values.shape, f"weights of frame {index}")
-        assert given is not None
-        return given
+        weights = as_weights(self.weights.deformed(images, index), images.values.shape, f"weights of frame {index}")
+        assert weights is not None
+        return correlated(images, self.normalise), weights
 
     def window_of(self, *displacements: FloatArray | None) -> Window:
         """Part of a frame that is read to find its displacement from rest and from nodal `displacements` (N, 2).
@@ -289,6 +289,27 @@ class Plan:
         nodes = self.reference.mesh.nodes + self.window.origin
         places = [nodes, *(nodes + moved for moved in displacements if moved is not None)]
         return _window(np.concatenate(places), search_reach(nodes), self.settings, self.window.frame)
+
+
+def _reference(
+    images: IlluminationImages,
+    weights: LightWeights,
+    region: Region,
+    mesh: Tri3Mesh,
+    sigma: float,
+    solver: SolverSettings,
+    window: Window,
+) -> Reference:
+    """The reference state as the solve needs it."""
+    return Reference.prepare(
+        correlated(images, sigma),
+        region,
+        as_weights(weights.reference(images), images.values.shape, "weights of the reference"),
+        mesh=mesh,
+        prefilter=solver.prefilter,
+        origin=window.origin,
+        registration=images.registration,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -482,18 +503,16 @@ def _tell_small(mesh: Tri3Mesh, speckle: float | None, finite_elements: FiniteEl
     )
 
 
-def _tell_no_effect(
-    weights: LightWeights, counted: FloatImage, images: IlluminationImages, region: Region, blur: float
-) -> None:
+def _tell_no_effect(weights: ThresholdWeights, images: IlluminationImages, region: Region) -> None:
     """Warn of a threshold that excludes nothing in the region of the reference."""
     inside = region.mask
-    if isinstance(weights, ThresholdWeights) and (counted > 0)[:, inside].sum() == images.valid[:, inside].sum():
+    if (weights.reference(images) > 0)[:, inside].sum() == images.valid[:, inside].sum():
         logger.warning(
             "weights.threshold = %.3g excludes nothing in the reference: no light, blurred over %g px, exceeds %.2g of "
             'the dynamic range in the region. State a lower one, or weights.method = "statistics"',
             weights.threshold,
-            blur,
-            blurred(images, blur)[:, inside].max() / images.full_scale,
+            weights.blur,
+            blurred(images, weights.blur)[:, inside].max() / images.full_scale,
         )
 
 

@@ -15,12 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from rgbmidic.correlation import Deformed, PrecisionMethod, Reference, Solution, Start, Status, track
+from rgbmidic.correlation import Deformed, Solution, Start, Status, track
 from rgbmidic.correlation.discretisation import discretisation_error
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionError, RgbmidicError
 from rgbmidic.fields import NodalCovariance, Places, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
-from rgbmidic.illumination.images import correlated
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.pixel_map import quadratic_fit
 from rgbmidic.mesh.tri3 import refined
@@ -28,7 +27,6 @@ from rgbmidic.pipeline.frame import read_state
 from rgbmidic.pipeline.plan import SPECKLES, Choice, Plan
 from rgbmidic.settings import ELEMENT_SIZE, TestSettings
 from rgbmidic.typing import BoolArray, FloatArray
-from rgbmidic.weights import as_weights, precision_method
 
 logger = logging.getLogger(__name__)
 
@@ -371,12 +369,12 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
     while len(counts) <= _PASSES:
         mesh = plan.reference.mesh
         solution = _solve(plan, key.deformed, key.start(mesh))
-        known = discretisation_error(plan.reference, key.deformed, solution, plan.solver, _method(plan))
+        known = discretisation_error(plan.reference, key.deformed, solution, plan.solver, plan.method)
         finer = refined(mesh, _worth(mesh, known), least)
         if finer is mesh:
             break
         nodes = np.round(finer.nodes / _EXACT) * _EXACT
-        plan = on_mesh(plan, Tri3Mesh(nodes=nodes, elements=finer.elements))
+        plan = plan.on_mesh(Tri3Mesh(nodes=nodes, elements=finer.elements))
         counts.append(len(nodes))
     name = plan.series.name(key.index)
     worth = f"the discretisation error of strain in {name} is more than {_WORTH:g} times its noise"
@@ -450,39 +448,18 @@ class _KeyFrame:
 def _deformed(plan: Plan, index: int) -> Deformed:
     """The images of a frame, ready to be interpolated."""
     window = plan.window_of()
-    images = plan.lights(read_state(plan, index, window)[0], window)
-    weights = plan.frame_weights(images, index)
-    ready = correlated(images, plan.normalise)
-    return Deformed.prepare(ready, weights, prefilter=plan.solver.prefilter, origin=window.origin)
+    ready = plan.prepared(plan.lights(read_state(plan, index, window)[0], window), index)
+    return Deformed.prepare(*ready, prefilter=plan.solver.prefilter, origin=window.origin)
 
 
 def _resized(plan: Plan, size: float) -> Plan:
     """The same test on elements of another size; the weights are those prepared for this one's."""
     cracks = [np.subtract(path, plan.window.origin) for path in plan.settings.cracks]
-    return replace(on_mesh(plan, Tri3Mesh.from_region(plan.region, size, cracks)), element_size=size)
-
-
-def on_mesh(plan: Plan, mesh: Tri3Mesh) -> Plan:
-    """The same test on another mesh of its region, in px of the window."""
-    images, origin = plan.images, plan.window.origin
-    reference = Reference.prepare(
-        correlated(images, plan.normalise),
-        plan.region,
-        as_weights(plan.weights.reference(images), images.values.shape, "weights of the reference"),
-        mesh=mesh,
-        prefilter=plan.solver.prefilter,
-        origin=origin,
-        registration=images.registration,
-    )
-    return replace(plan, reference=reference)
+    return replace(plan.on_mesh(Tri3Mesh.from_region(plan.region, size, cracks)), element_size=size)
 
 
 def _solve(plan: Plan, deformed: Deformed, start: FloatArray | None) -> Solution:
-    return track(plan.reference, deformed, Start(displacement=start), plan.solver, _method(plan))
-
-
-def _method(plan: Plan) -> PrecisionMethod | None:
-    return precision_method(plan.weights, plan.settings.weights.method)
+    return track(plan.reference, deformed, Start(displacement=start), plan.solver, plan.method)
 
 
 def _beyond_affine(solution: Solution) -> float:
@@ -556,7 +533,7 @@ def _figures(
     still = [_solve(plan, deformed, np.zeros_like(mesh.nodes)) for deformed in rest]
     single = np.sqrt(1 + 1 / len(plan.settings.frames.reference))
     moved, strain = (_floor([getattr(one, name) for one in still], single) for name in ("displacement", "strain"))
-    known = discretisation_error(plan.reference, key.deformed, solution, plan.solver, _method(plan))
+    known = discretisation_error(plan.reference, key.deformed, solution, plan.solver, plan.method)
     field = _Field.of(mesh, known)
     errors = [_rms(known.displacement_error), _rms(known.strain_error)]
     errors = [float(np.fmax.reduce([error, *apart])) for error, apart in zip(errors, field.apart(finer), strict=True)]

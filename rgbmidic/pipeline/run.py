@@ -19,7 +19,7 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import read_state
 from rgbmidic.pipeline.order import dependants
 from rgbmidic.pipeline.plan import Choice, Plan, light_levels
-from rgbmidic.pipeline.resolution import choose, on_mesh, refine
+from rgbmidic.pipeline.resolution import choose, refine
 from rgbmidic.pipeline.schedule import Schedule
 from rgbmidic.pipeline.source import FrameSequence, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
@@ -158,7 +158,7 @@ def _refined(plan: Plan, frame: int | bool, out: Path, kept: Mapping[str, Any]) 
         return refine(plan, frame)
     stored = read_mesh(out, kept)
     mesh = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
-    return replace(on_mesh(plan, mesh), refinement=kept["refinement"])
+    return replace(plan.on_mesh(mesh), refinement=kept["refinement"])
 
 
 def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
