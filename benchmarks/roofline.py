@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rgbmidic._kernels.illumination import unmix
-from rgbmidic._kernels.interpolation import PAD, bspline_coefficients
+from rgbmidic._kernels.splines import PAD, bspline_coefficients
 from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.typing import FloatArray

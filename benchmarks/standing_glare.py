@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_with_gradient
+from rgbmidic._kernels.splines import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.start import Start, track
 from rgbmidic.frames import Mosaic, Window, cfa_channels

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from rgbmidic._kernels.interpolation import PAD
+from rgbmidic._kernels.splines import PAD
 
 
 def bspline_coefficients(image):

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rgbmidic._kernels.interpolation import _FAST, between
-from rgbmidic._kernels.threads import compiled, helper, over_ranges
+from rgbmidic._kernels.grids import between
+from rgbmidic._kernels.threads import FAST, compiled, helper, over_ranges
 
 TILE = 32
 """Side in px of the squares within which the filters are the same."""
@@ -160,7 +160,7 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
 
 
 @over_ranges("out", least=0)
-@compiled(fastmath=_FAST)
+@compiled(fastmath=FAST)
 def prediction_taps(
     start, stop, common, own, together, seen, alike, displacement, noise, texture, step, fine, offset, channels, out
 ):

@@ -24,6 +24,8 @@ from rgbmidic.errors import InputError
 P = ParamSpec("P")
 T = TypeVar("T")
 
+FAST = {"reassoc", "contract", "arcp", "nsz"}
+"""Freedom of a kernel's floating-point arithmetic: it keeps the meaning of NaN and inf."""
 _VARIABLE = "RGBMIDIC_THREADS"
 _chosen: list[int] = []
 _limits: list[Any] = []

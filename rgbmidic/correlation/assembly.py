@@ -23,7 +23,7 @@ from scipy.linalg import eigh
 from scipy.sparse.linalg import splu
 
 from rgbmidic._kernels.correlation import element_block_products, element_hessian
-from rgbmidic._kernels.mesh import factorise, solve_factors
+from rgbmidic._kernels.factors import factorise, solve_factors
 from rgbmidic.mesh import PixelMap, Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage

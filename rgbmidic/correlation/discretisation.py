@@ -20,9 +20,9 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from rgbmidic._kernels.correlation import interpolate_nodal
-from rgbmidic._kernels.illumination import scores
+from rgbmidic._kernels.patches import interpolate_nodal
 from rgbmidic._kernels.threads import one_blas_thread
+from rgbmidic._kernels.weights import scores
 from rgbmidic.correlation.assembly import SCORE_RANGE, block_side, rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
 from rgbmidic.correlation.images import apply_prefilter

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, product_sums
+from rgbmidic._kernels.owned_pixels import product_sums
+from rgbmidic._kernels.splines import PAD, bspline_coefficients
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import fill_holes
 from rgbmidic.mesh import PixelMap

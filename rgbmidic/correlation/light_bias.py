@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from rgbmidic._kernels.illumination import scores
+from rgbmidic._kernels.weights import scores
 from rgbmidic.correlation.assembly import BLOCK
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.illumination.displacement import agreement

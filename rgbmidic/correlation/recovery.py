@@ -22,7 +22,8 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from rgbmidic._kernels.mesh import colour_nodes, node_energies
+from rgbmidic._kernels.factors import node_energies
+from rgbmidic._kernels.mesh import colour_nodes
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.pixel_map import quadratic_fit
 from rgbmidic.mesh.tri3 import with_data

@@ -9,18 +9,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.correlation import (
-    BLOCK,
-    element_hessian,
-    element_right_side,
-    element_sums,
-    element_vector,
-    interpolate_nodal,
-    warp,
-)
-from rgbmidic._kernels.illumination import gradient_of_others
-from rgbmidic._kernels.interpolation import pixel_gradient, sample_with_gradient
+from rgbmidic._kernels.correlation import BLOCK, element_hessian, element_right_side, element_sums, element_vector, warp
+from rgbmidic._kernels.patches import interpolate_nodal
+from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
+from rgbmidic._kernels.weights import gradient_of_others
 from rgbmidic.correlation.assembly import Assembly, block_side, unfitted_fraction
 from rgbmidic.correlation.images import (
     spline_coefficients,

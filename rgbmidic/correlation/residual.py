@@ -14,12 +14,8 @@ from typing import Literal, Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rgbmidic._kernels.correlation import (
-    element_squares,
-    interpolate_nodal,
-    patch_correlations,
-    subtract_quadratic,
-)
+from rgbmidic._kernels.correlation import element_squares
+from rgbmidic._kernels.patches import interpolate_nodal, patch_correlations, subtract_quadratic
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data

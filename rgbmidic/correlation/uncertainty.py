@@ -13,7 +13,7 @@ from itertools import combinations_with_replacement
 import cv2
 import numpy as np
 
-from rgbmidic._kernels.illumination import scores
+from rgbmidic._kernels.weights import scores
 from rgbmidic.correlation.assembly import BLOCK, RigidMotions, block_side
 from rgbmidic.correlation.assembly import SCORE_RANGE as _SCORE_RANGE
 from rgbmidic.correlation.equations import Equations

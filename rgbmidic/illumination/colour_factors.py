@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels import illumination as kernels
+from rgbmidic._kernels import texture as kernels
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import LAGS, WHITE_ENERGY, BandEnergy, TextureModel, fit_texture
 from rgbmidic.typing import FloatArray, FloatImage

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.illumination import unmix as unmix_kernel
-from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, sample_with_gradient
+from rgbmidic._kernels.splines import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.images import IlluminationImages, fill_holes
 from rgbmidic.illumination.linear import LinearChannels

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.illumination import divide_by_mean
+from rgbmidic._kernels.texture import divide_by_mean
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.linear import LinearChannels
 from rgbmidic.illumination.texture import TextureModel

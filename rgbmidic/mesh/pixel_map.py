@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from rgbmidic._kernels.interpolation import block_sums, from_grid, from_image, to_image
 from rgbmidic._kernels.mesh import claim_pixels
+from rgbmidic._kernels.owned_pixels import block_sums, from_grid, from_image, to_image
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh, with_data

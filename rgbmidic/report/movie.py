@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.interpolation import paint_field
+from rgbmidic._kernels.picture import paint_field
 from rgbmidic.command import optional
 from rgbmidic.errors import InputError, ResultError, RgbmidicError
 from rgbmidic.report import style

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from bokeh.document import Document
 
-from rgbmidic._kernels.interpolation import paint_field
+from rgbmidic._kernels.picture import paint_field
 from rgbmidic.errors import FrameError, InputError, RgbmidicError
 from rgbmidic.fields import Mean, make_probe
 from rgbmidic.frames.data import ChannelFrame, Mosaic

@@ -19,7 +19,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.illumination import best_mean, robust_weights
+from rgbmidic._kernels.weights import best_mean, robust_weights
 from rgbmidic.correlation import PrecisionMethod
 from rgbmidic.correlation.images import spread, window_covariance, window_means
 from rgbmidic.correlation.residual import Precision, Residual

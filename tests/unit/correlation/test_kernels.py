@@ -11,7 +11,8 @@ import pytest
 from bits import assert_same_on_threads
 
 from rgbmidic._kernels import correlation as kernels
-from rgbmidic._kernels.interpolation import PAD, bspline_coefficients, pixel_gradient, sample_with_gradient
+from rgbmidic._kernels import patches
+from rgbmidic._kernels.splines import PAD, bspline_coefficients, pixel_gradient, sample_with_gradient
 from rgbmidic.correlation.reference import _partial_blocks
 from rgbmidic.correlation.residual import curved_deviation
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -215,7 +216,7 @@ def test_projection_and_interpolation_of_pixel_fields_equal_their_naive_twins():
     kernels.element_vector(case.weight, case.reference, *case.gradient, *case.on_map, case.pixels.barycentric, out)
     close(out, naive.element_vector(case.weight, case.reference, *case.gradient, case.pixels), scale=1e3)
     fields = np.full((2, case.reference.size), 7, dtype=np.float32)
-    kernels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
+    patches.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
     np.testing.assert_allclose(fields, naive.interpolate_nodal(case.displacement, case.pixels, case.mesh), atol=1e-5)
 
 
@@ -233,7 +234,7 @@ def less_curved(case, carried, bend):
     out = np.full((1, case.reference.size), 7, dtype=np.float32)
     images = case.reference[None], case.gradient[:1], case.gradient[1:]
     deviation = curved_deviation(case.mesh, case.pixels.barycentric, carried, bend)
-    kernels.subtract_quadratic(*images, deviation, *case.on_map, out)
+    patches.subtract_quadratic(*images, deviation, *case.on_map, out)
     return out
 
 
@@ -243,7 +244,7 @@ def correlated_patches(random):
     first[:14, :14] = 5
     centres = np.concatenate([[[8, 8]], random.integers(8, 51, (99, 2))])
     out = np.full((100, 7, 7), 7, dtype=np.float32)
-    kernels.patch_correlations(first, second, centres, 5, out)
+    patches.patch_correlations(first, second, centres, 5, out)
     return first, second, centres, out
 
 
@@ -268,7 +269,7 @@ def all_outputs():
     kernels.element_squares(case.gradient, case.gradient**2, case.pixels.offsets, squares)
     kernels.element_sums(case.gradient, case.weight, case.pixels.offsets, sums)
     kernels.element_vector(case.weight, case.reference, *case.gradient, *case.on_map, case.pixels.barycentric, vector)
-    kernels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
+    patches.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
     curved = less_curved(case, case.displacement, case.random.normal(size=(len(case.mesh.nodes), 2, 3)))
     blocks = block_products(case, np.ones(case.pixels.grid(7), dtype=np.float32), 7, 2)
     found = right, hessian, difference, weights, moments, squares, sums, vector, fields, curved, blocks

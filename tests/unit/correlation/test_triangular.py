@@ -7,7 +7,7 @@ import pytest
 from bits import assert_same_on_threads
 
 from rgbmidic import Region, Tri3Mesh
-from rgbmidic._kernels.mesh import node_energies
+from rgbmidic._kernels.factors import node_energies
 from rgbmidic.correlation.assembly import Assembly
 
 RANDOM = np.random.default_rng(0)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rgbmidic._kernels import demosaicing as kriging
-from rgbmidic._kernels import illumination as texture
+from rgbmidic._kernels import texture
 from rgbmidic.illumination.colour_factors import colour_moments, of_mosaic, widened
 from rgbmidic.illumination.demosaicing import red_position
 from rgbmidic.settings import BAYER_PATTERNS

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from bits import assert_same_on_threads
 
-from rgbmidic._kernels.illumination import gradient_of_others, scores
-from rgbmidic._kernels.interpolation import product_sums
+from rgbmidic._kernels.owned_pixels import product_sums
+from rgbmidic._kernels.weights import gradient_of_others, scores
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 
