@@ -4,7 +4,8 @@ from rgbmidic.illumination.images import correlated
 from rgbmidic.illumination.separation import LightSeparation, Separation
 from rgbmidic.pipeline.correlate import correlate
 from rgbmidic.pipeline.frame import measure_frame
-from rgbmidic.pipeline.plan import Plan, read_region
+from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.region import read_region
 from rgbmidic.pipeline.run import measure
 from rgbmidic.pipeline.sequence import measure_sequence
 from rgbmidic.pipeline.source import FrameSequence

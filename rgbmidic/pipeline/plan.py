@@ -21,9 +21,9 @@ import numpy as np
 from rgbmidic.correlation import PrecisionMethod, Reference
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
-from rgbmidic.errors import ConfigurationError, FrameError, RegionError
+from rgbmidic.errors import ConfigurationError, FrameError
 from rgbmidic.fields import CameraCalibration
-from rgbmidic.frames import Window, open_series, read_frame
+from rgbmidic.frames import Window, open_series
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import check_state
@@ -38,10 +38,10 @@ from rgbmidic.illumination.separation import (
     reference_images,
 )
 from rgbmidic.illumination.texture import speckle_diameter
-from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
-from rgbmidic.mesh.placement import on_image
+from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh
+from rgbmidic.pipeline.region import finite_elements_of, read_region, region_and_window, window_around
 from rgbmidic.pipeline.source import FrameSequence, Series, open_sequence
-from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings, grey_levels
+from rgbmidic.settings import SolverSettings, TestSettings, grey_levels
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights
 from rgbmidic.weights.threshold import ThresholdWeights, blurred
@@ -79,11 +79,6 @@ class UpdatedReferences:
 
 SPECKLES = 3.0
 """Least number of speckles on the side of an element (iDICs Good Practices Guide, for subsets)."""
-_REACH = 96.0
-"""px around what is looked at that the separation's local statistics use: three standard deviations of their windows
-with all that is between (`rgbmidic.lab.inspection.prediction.MARGIN`)."""
-_WORTH = 0.5
-"""Share of the frame from which all of it is read: what a window saves would be less than half."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,7 +201,7 @@ class Plan:
         if whole or not isinstance(separate, WindowedSeparation):
             region, window = region or read_region(settings.region, series.shape), Window.whole(series.shape)
         else:
-            region, window = _region_and_window(settings, region, series.shape)
+            region, window = region_and_window(settings, region, series.shape)
             if mesh is not None:
                 mesh = Tri3Mesh(nodes=mesh.nodes - window.origin, elements=mesh.elements)
         rest = _Rest.read(settings, series, separate, window, region, calibration)
@@ -288,7 +283,7 @@ class Plan:
             return self.window
         nodes = self.reference.mesh.nodes + self.window.origin
         places = [nodes, *(nodes + moved for moved in displacements if moved is not None)]
-        return _window(np.concatenate(places), search_reach(nodes), self.settings, self.window.frame)
+        return window_around(np.concatenate(places), search_reach(nodes), self.settings, self.window.frame)
 
 
 def _reference(
@@ -459,21 +454,6 @@ def _series_and_calibration(
     return series, calibration and calibration.cropped(settings.frames.crop_origin, series.shape)
 
 
-def finite_elements_of(
-    settings: TestSettings, frame: tuple[int, int]
-) -> tuple[FiniteElementMesh, Placement, Tri3Mesh, Region]:
-    """The part of ``mesh.file`` that is measured, where it lies on frames of this shape, and its pixels."""
-    assert settings.mesh_file is not None
-    camera = None if settings.scale.camera is None else CameraCalibration.read(settings.scale.camera)
-    placement = Placement.fit(settings.mesh_points or (), camera)
-    logger.info("mesh.points: %s", placement.summary())
-    limits = settings.region
-    allowed = read_region(limits, frame) if limits.is_stated else Region.from_mask(np.ones(frame, dtype=bool))
-    every = read_mesh(settings.mesh_file, unit=settings.mesh_unit or "mm", part=settings.mesh_part)
-    part, mesh, region = on_image(every, placement, frame, allowed.without(limits.holes))
-    return part, placement, mesh, region
-
-
 def _tell_small(mesh: Tri3Mesh, speckle: float | None, finite_elements: FiniteElementMesh) -> None:
     """Warn of finite elements that are small for the speckle, with the uncertainty to expect.
 
@@ -516,24 +496,6 @@ def _tell_no_effect(weights: ThresholdWeights, images: IlluminationImages, regio
         )
 
 
-def _region_and_window(settings: TestSettings, region: Region | None, frame: tuple[int, int]) -> tuple[Region, Window]:
-    """The region, counted from where the window begins, and the part of the reference frames that is read."""
-    region = region or read_region(settings.region, frame)
-    spans = [np.flatnonzero(region.mask.any(axis=axis)) for axis in (0, 1)]
-    corners = np.array([[span[0], span[-1]] for span in spans], dtype=np.float64).T
-    window = _window(corners, search_reach(corners), settings, frame)
-    if np.prod(window.shape) > _WORTH * np.prod(frame):
-        return region, Window.whole(frame)
-    return region.part(*window.part_of(Window.whole(frame))), window
-
-
-def _window(points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int]) -> Window:
-    """What lies within `reach` of points (N, 2), and what its images depend on."""
-    may_crack = bool(settings.cracks) or settings.mesh_file is not None
-    sigma, _ = grey_levels(settings.illumination.normalise, settings.solver, cracked=may_crack)
-    return Window.around(points, reach + max(_REACH, 3 * max(sigma, settings.weights.blur)), frame)
-
-
 def _speckle(images: IlluminationImages, region: Region) -> float | None:
     """Size of the speckle (px), the median over the lights that are on, in the middle of the region; None: unknown."""
     part = [
@@ -546,31 +508,6 @@ def _speckle(images: IlluminationImages, region: Region) -> float | None:
     known = [np.where(np.isfinite(one), one, np.nanmean(one)) for one in pictures if np.isfinite(one).any()]
     sizes = [size for one in known if (size := speckle_diameter(one.astype(np.float64))) is not None]
     return float(np.median(sizes)) if sizes else None
-
-
-def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
-    """The region of interest of the settings on images of `shape` (H, W).
-
-    Raises
-    ------
-    RegionError
-        The region is empty, outside the image, or the mask image has another size.
-    """
-    return _outlined(settings, shape).without(settings.holes)
-
-
-def _outlined(settings: RegionSettings, shape: tuple[int, int]) -> Region:
-    """The region, its holes included."""
-    if settings.rectangle is not None:
-        return Region.from_rectangle(settings.rectangle, shape)
-    if settings.polygon is not None:
-        return Region.from_polygon(settings.polygon, shape)
-    assert settings.mask is not None
-    mask = read_frame(settings.mask, kind="monochrome").values[0]
-    try:
-        return Region.from_mask(mask, shape)
-    except RegionError as error:
-        raise RegionError(f"region.mask {settings.mask}: {error}") from None
 
 
 NO_TEXTURE = 0.05
