@@ -64,7 +64,7 @@ def run(
     frames: Annotated[
         str, typer.Option("--frames", help="Only these, such as 1000:2000; end with `rgbmidic finish`.")
     ] = "",
-    workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Frames at a time; 0: as many as cores.")] = 0,
     scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
     timings: Annotated[bool, typer.Option("--timings", help="Store and print the time of each stage.")] = False,
     draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
@@ -110,7 +110,7 @@ def batch(
     elastic: Annotated[
         str, typer.Option("--elastic", metavar="LOW:HIGH", help="Strains between which a modulus is fitted.")
     ] = "0.0005:0.0025",
-    workers: Annotated[int, typer.Option("--workers", min=0, help="Processes; 0: as many as cores.")] = 0,
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Frames at a time; 0: as many as cores.")] = 0,
     reports: Annotated[bool, typer.Option("--reports/--no-reports", help="Write a report of each test.")] = True,
     overwrite: Overwrite = False,
 ) -> None:

@@ -6,19 +6,17 @@ brightness of the lights -> record.
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.threads import machine
+from rgbmidic._kernels.threads import keep_memory, machine
 from rgbmidic.correlation import (
     Deformed,
     Solution,
@@ -64,7 +62,7 @@ def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[
     updated
         Index and solution of the last two of ``start.reference_updates``: all that the reference they make depends on.
     """
-    _keep_memory()
+    keep_memory()
     try:
         with timed(plan.timings) as seconds:
             values = solve_frame(plan, index, start, _updated_reference(plan, updated))
@@ -76,19 +74,6 @@ def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[
         reason, unread = f"unexpected error: {type(error).__name__}: {error}", False
         logger.exception("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
     return failed_frame(plan, index, reason, unread=unread)
-
-
-@cache
-def _keep_memory() -> None:
-    """Have glibc keep what a frame gives back for the next one: arrays of up to 1 GiB are no longer mapped anew.
-
-    Pages that the system fills with zeros first took 3 to 8 % of the CPU time of a raw frame of 1 Mpx, and 26 % of one
-    of 4 Mpx, whose arrays exceed the 32 MB up to which glibc learns to keep them (measured).
-    """
-    with suppress(OSError, AttributeError, TypeError):  # another C library
-        mallopt = ctypes.CDLL(None).mallopt
-        for parameter in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD (malloc.h)
-            mallopt(parameter, 2**30)
 
 
 def failed_frame(plan: Plan, index: int, reason: str, *, unread: bool = False) -> FrameRecord:
@@ -119,7 +104,8 @@ def read_state(plan: Plan, index: int, window: Window | None = None) -> tuple[Ra
         They cannot be read.
     """
     try:
-        return plan.series.read(index, window), plan.series.inputs(index, window)
+        with plan.reading:
+            return plan.series.read(index, window), plan.series.inputs(index, window)
     except (FrameError, OSError) as error:
         raise _UnreadError(str(error)) from error
 

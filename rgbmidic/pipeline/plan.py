@@ -54,22 +54,35 @@ _KEPT_UPDATES = 2
 """Updated references that a process keeps: frames measured side by side follow this one or the last."""
 
 
-class UpdatedReferences:
+class Turns:
+    """A lock that lets one thread in at a time; a copy sent to another process has one of its own."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+
+    def __reduce__(self) -> tuple[type[Turns], tuple[()]]:
+        return type(self), ()
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+
+class UpdatedReferences(Turns):
     """The references that frames of one test have become lately, made once for all threads of a process.
 
     A copy sent to another process begins empty.
     """
 
     def __init__(self) -> None:
+        super().__init__()
         self._kept: deque[tuple[tuple[int, ...], ReferenceUpdate]] = deque(maxlen=_KEPT_UPDATES)
-        self._lock = Lock()
-
-    def __reduce__(self) -> tuple[type[UpdatedReferences], tuple[()]]:
-        return UpdatedReferences, ()
 
     def get(self, frames: tuple[int, ...], make: Callable[[], ReferenceUpdate]) -> ReferenceUpdate:
         """The reference that the `frames` make in turn: a kept one, else what `make` gives."""
-        with self._lock:
+        with self:
             for known, reference_update in self._kept:
                 if known == frames:
                     return reference_update
@@ -131,6 +144,8 @@ class Plan:
         Whether to tell the time that each stage of a frame takes.
     updates
         References that later frames have become.
+    reading
+        Frames are read by one thread at a time: a movie has one place at which it is read.
     """
 
     settings: TestSettings
@@ -153,6 +168,7 @@ class Plan:
     calibration: dict[str, Any] = field(default_factory=dict)
     timings: bool = False
     updates: UpdatedReferences = field(default_factory=UpdatedReferences, repr=False, compare=False)
+    reading: Turns = field(default_factory=Turns, repr=False, compare=False)
 
     @classmethod
     def from_settings(

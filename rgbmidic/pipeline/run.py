@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from rgbmidic._kernels import are_compiled
 from rgbmidic.correlation import Status
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.illumination.separation import LightSeparation
@@ -34,9 +33,6 @@ from rgbmidic.weights import LightWeights
 
 logger = logging.getLogger(__name__)
 
-FRAMES_A_WORKER = 8
-"""Fewer frames are not worth a process, which takes some 5 s to start."""
-
 Progress = Callable[[int, int, str], None]
 
 
@@ -52,7 +48,7 @@ def measure(
     resume: bool = False,
     retry_failed: bool = False,
     frames: range | None = None,
-    workers: int | None = 1,
+    workers: int | None = None,
     scheduler: str | None = None,
     timings: bool = False,
     progress: Progress | None = None,
@@ -90,11 +86,11 @@ def measure(
         Only these of the frames that the settings choose, with the same numbers; other processes may write to the
         folder at the same time. When all are measured, `rgbmidic.results.finish_result` finishes the result. None: all.
     workers
-        Number of processes on this machine. 1: the frames are measured in the present process; None: one for each core,
-        but none for fewer than `FRAMES_A_WORKER` frames. A script with more than 1 must be guarded by
-        ``if __name__ == "__main__"``.
+        Number of frames that are measured at a time, each by a thread of this process. None: one for each core, but 1
+        with a `separation` or `weights`, which more than one thread would call at a time. A `source` is read by one
+        thread at a time.
     scheduler
-        Address of the scheduler of a Dask cluster, instead of processes of this machine.
+        Address of the scheduler of a Dask cluster, instead of threads of this process.
     timings
         Store the time of each stage of a frame in seconds (`seconds` of a result); it differs from run to run.
     progress
@@ -131,7 +127,7 @@ def measure(
         objects["weights"] = describe(plan.weights)
     places = _places(plan.series.chosen, frames)
     if workers is None:
-        workers = max(min(available_cores(), len(places) // FRAMES_A_WORKER), 1)
+        workers = available_cores() if separation is None and weights is None else 1
     with _store(plan, Path(out), places if frames else None, objects, overwrite=overwrite, resume=resume) as store:
         if resume and frames is None:
             _take_back(plan, store, retry_failed=retry_failed)
@@ -140,9 +136,6 @@ def measure(
             logger.warning("%s is finished and whole: nothing is left to be measured", out)
             return Result.open(out)
         store.reopen()
-        if workers > 1 and not are_compiled():  # the other processes then find all compiled
-            with open_workers(plan, 1) as here:
-                schedule.run(here, progress, most=1)
         if not schedule.done:
             with open_workers(plan, min(workers, len(places)), scheduler) as others:
                 schedule.run(others, progress)

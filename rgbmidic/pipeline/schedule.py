@@ -1,12 +1,12 @@
-"""Which frame is measured next, from where it starts, and what becomes of a frame whose worker dies."""
+"""Which frame is measured next, and from where it starts."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from concurrent.futures import BrokenExecutor, CancelledError, Future, wait
+from concurrent.futures import CancelledError, Future
 from dataclasses import replace
-from heapq import heappop, heappush
+from heapq import nsmallest
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from rgbmidic.correlation import NodeStatus, Solution, Start, Status
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import failed_frame
-from rgbmidic.pipeline.order import better, children, lineage, loses, parent, rank_of
+from rgbmidic.pipeline.order import STRIDE, better, children, lineage, loses, parent, rank_of
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Workers
 from rgbmidic.results import QUANTITIES, FrameRecord, ResultStore
@@ -23,9 +23,6 @@ from rgbmidic.typing import AnyArray
 
 logger = logging.getLogger(__name__)
 
-_TRIES = 3
-"""Times that a worker may die over a frame, all but the first with that frame alone, before the frame is what kills
-them: two may be chance (memory that another program took)."""
 
 _KEPT = ("u", "v", "node_status", "reference_updates", "best_match")
 _STRAIN = ("exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std")
@@ -50,8 +47,6 @@ class Schedule:
         self._ready: list[tuple[int, Start]] = []
         self._waiting: dict[int, list[int]] = {}
         self._first_tries: dict[int, FrameRecord] = {}
-        self._deaths: dict[int, int] = {}
-        self._suspects: list[tuple[int, Start]] = []
         self._running: dict[Future[Measured], tuple[int, Start]] = {}
         for position in places:
             self._want(position)
@@ -59,9 +54,9 @@ class Schedule:
     @property
     def done(self) -> bool:
         """Whether nothing is left to be measured."""
-        return not (self._ready or self._suspects or self._running)
+        return not (self._ready or self._running)
 
-    def run(self, workers: Workers, progress: Progress | None = None, *, most: int | None = None) -> None:
+    def run(self, workers: Workers, progress: Progress | None = None) -> None:
         """Have frames measured, and keep each in the store as it finishes.
 
         Parameters
@@ -70,8 +65,6 @@ class Schedule:
             Who measures.
         progress
             Called after every frame with the number of frames done, their total and a line about the last one.
-        most
-            Stop after so many; None: when all are measured.
 
         Raises
         ------
@@ -80,23 +73,23 @@ class Schedule:
         FrameError
             All files of the frames are gone.
         """
-        count = 0
-        while not self.done and count != most:
-            if self._suspects:  # each alone, so that a further death is its own
-                if not self._running:
-                    self._submit(workers, *self._suspects.pop())
-            else:
-                while self._ready and len(self._running) < (workers.slots if most is None else 1):
-                    self._submit(workers, *heappop(self._ready))
-            ended = workers.wait(self._running)
-            if any(isinstance(_error(future), BrokenExecutor) for future in ended):
-                ended = wait(self._running).done  # with one of its processes all work of an executor ends
-                workers.restart()
-            for future in ended:
+        while not self.done:
+            while self._ready and len(self._running) < workers.slots:
+                self._submit(workers, *self._next(workers.slots))
+            for future in workers.wait(self._running):
                 position, start = self._running.pop(future)
-                if (record := self._outcome(future, position, start)) is not None:
-                    self._take(position, start, record, progress)
-                    count += 1
+                self._take(position, start, self._outcome(future, position), progress)
+
+    def _next(self, slots: int) -> tuple[int, Start]:
+        """Take the frame that is to be measured next out of those that can be.
+
+        Of the earliest chains, one more than several frames are measured at a time, it is that of the chain which is
+        behind: at the end of a test none is left alone.
+        """
+        chains = nsmallest(slots + (slots > 1), self._ready, key=lambda one: one[0])
+        found = min(chains, key=lambda one: one[0] % STRIDE)
+        self._ready.remove(found)
+        return found
 
     def _submit(self, workers: Workers, position: int, start: Start) -> None:
         last = start.reference_updates[-2:]  # all that the reference which they make depends on
@@ -109,20 +102,19 @@ class Schedule:
         """Place in the series of a frame of the result."""
         return self._plan.series.chosen[position]
 
-    def _outcome(self, future: Future[Measured], position: int, start: Start) -> FrameRecord | None:
-        """What a worker found; None where it died and the frame, as all that ran with it, is to be measured alone."""
-        error = _error(future)
-        if error is None:
-            for level, text in future.result().messages:
-                logger.log(level, "%s", text)
-            return future.result().record
-        deaths = self._deaths[position] = self._deaths.get(position, 0) + 1
-        name = self._plan.series.name(self._index(position))
-        logger.warning("a worker died while %s was measured (%s)", name, str(error) or type(error).__name__)
-        if deaths < _TRIES:
-            self._suspects.append((position, start))
-            return None
-        return failed_frame(self._plan, self._index(position), f"its worker process died {deaths} times")
+    def _outcome(self, future: Future[Measured], position: int) -> FrameRecord:
+        """What a worker found, or why it found nothing."""
+        try:
+            measured = future.result()
+        except CancelledError:
+            raise RgbmidicError(LOST_CLUSTER) from None
+        except Exception as error:  # a worker of a cluster that died over the frame more often than the cluster allows
+            name = self._plan.series.name(self._index(position))
+            logger.warning("a worker died while %s was measured (%s)", name, str(error) or type(error).__name__)
+            return failed_frame(self._plan, self._index(position), f"its worker died: {type(error).__name__}")
+        for level, text in measured.messages:
+            logger.log(level, "%s", text)
+        return measured.record
 
     def _take(self, position: int, start: Start, record: FrameRecord, progress: Progress | None) -> None:
         """Keep a record, or have the frame measured again, and release what waits for it."""
@@ -133,7 +125,7 @@ class Schedule:
             self._first_tries[position] = record
             before = position - 1  # it may have to be measured first
             if self._finished[before]:
-                heappush(self._ready, (position, self._start_after(before)))
+                self._ready.append((position, self._start_after(before)))
             else:
                 self._waiting.setdefault(before, []).append(position)
                 self._want(before)
@@ -146,7 +138,7 @@ class Schedule:
         next_start = following(self._plan, record.values, start)
         released = [child for child in children(position, len(self._finished)) if self._wanted[child]]
         for after in (*released, *self._waiting.pop(position, ())):
-            heappush(self._ready, (after, next_start))
+            self._ready.append((after, next_start))
         if progress is not None:
             places = self._places
             done, status = int(self._finished[places.start : places.stop].sum()), Status(record.status)
@@ -167,7 +159,7 @@ class Schedule:
             self._wanted[place], first = True, place
         if first is not None:
             before = parent(first)
-            heappush(self._ready, (first, Start(displacement=None) if before is None else self._start_after(before)))
+            self._ready.append((first, Start(displacement=None) if before is None else self._start_after(before)))
 
     def _start_after(self, position: int) -> Start:
         """Where a frame starts that follows a finished one: from the last that is measured up to there.

@@ -41,8 +41,8 @@ class FrameSequence(Protocol):
     - ``describe()``: a text that says what is measured; another text is another test, which `resume` refuses. Without
       it the class, the number of frames and the content of the first and the last frame say it.
 
-    More than one worker sends it to other processes: it must then be picklable, and one that holds an open file opens
-    it where it is used.
+    It is read by one thread at a time. A Dask cluster sends it to other processes: it must then be picklable, and one
+    that holds an open file opens it where it is used.
     """
 
     def __len__(self) -> int:

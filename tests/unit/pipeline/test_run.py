@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import json
 import logging
-import multiprocessing
 import pickle
 import shutil
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
+from threading import Barrier, Lock
 from typing import Any
 
 import numpy as np
 import pytest
 from textures import Affine, Texture
 
+from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.correlation import Start, Status
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, ResultError, RgbmidicError
 from rgbmidic.fields import CameraCalibration
@@ -33,6 +33,7 @@ from rgbmidic.results.physical import Physical
 from rgbmidic.settings import TestSettings
 
 COUNT, SHAPE = 36, (72, 80)
+in_order = partial(measure, workers=1)
 
 
 @pytest.fixture(scope="module")
@@ -87,99 +88,88 @@ def test_every_frame_is_measured_or_says_why_not(whole: Result) -> None:
 def test_two_workers_give_the_same_bits(movie: Path, whole: Result, tmp_path: Path, caplog: Any) -> None:
     with caplog.at_level(logging.WARNING):
         same(measure(settings(movie), tmp_path / "result", workers=2), whole)
-    assert "f020.tif" in caplog.text  # what the other processes say is heard
+    assert "f020.tif" in caplog.text
 
 
-def test_a_worker_that_is_killed_costs_no_frame(movie: Path, whole: Result, tmp_path: Path) -> None:
-    others, killed = set(multiprocessing.active_children()), list[Any]()
-
-    def kill_one(done: int, total: int, line: str) -> None:
-        if done == 12:
-            killed.append(min(set(multiprocessing.active_children()) - others, key=lambda worker: worker.pid))
-            killed[0].kill()
-
-    same(measure(settings(movie), tmp_path / "result", workers=2, progress=kill_one), whole)
-    wait_for_end(killed[0])
-    assert killed[0].exitcode == -signal.SIGKILL
-
-
-def test_a_frame_that_kills_every_worker_fails_and_the_rest_goes_on(
-    movie: Path, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_frame_that_kills_every_worker_of_a_cluster_fails_and_the_rest_goes_on(
+    movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Dying(workers.Here):
+    class Dying(workers.Threads):
         def submit(self, index: int, start: Start, updated: Any = ()) -> Future[workers.Measured]:
             if index != 5:
                 return super().submit(index, start, updated)
             dead: Future[workers.Measured] = Future()
-            dead.set_exception(BrokenExecutor("killed"))
+            dead.set_exception(RuntimeError("the cluster gave up"))  # as distributed's KilledWorker
             return dead
 
-    monkeypatch.setattr(run, "open_workers", lambda plan, *_: Dying(plan))
+    monkeypatch.setattr(run, "open_workers", lambda plan, *_: Dying(plan, 1))
     result = measure(settings(movie, last=9), tmp_path / "result")
-    assert result.frame(5).reason == "its worker process died 3 times"
+    assert result.frame(5).reason == "its worker died: RuntimeError"
     assert (result.status[[4, 6, 9]] == Status.CONVERGED).all()
 
 
-def test_a_frame_that_kills_its_worker_takes_no_other_with_it(
+def test_frames_share_the_threads_that_share_a_kernel(movie: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, both = list[int](), Barrier(2)
+
+    def watched(plan: Plan, index: int, *_: Any) -> Any:
+        both.wait(60)  # two frames are being measured
+        seen.append(threads())
+        both.wait(60)
+        return measured
+
+    plan = Plan.from_settings(settings(movie))
+    measured = measure_frame(plan, 0, Start(displacement=None))
+    before = threads()
+    set_threads(4)
+    monkeypatch.setattr(workers, "measure_frame", watched)
+    try:
+        with workers.Threads(plan, 2) as pool:
+            running = [pool.submit(index, Start(displacement=None)) for index in range(2)]
+            assert all(one.result(60).record is measured for one in running)
+        assert seen == [2, 2]
+        assert threads() == 4
+    finally:
+        set_threads(before)
+
+
+def test_frames_are_read_by_one_thread_at_a_time(movie: Path, whole: Result, tmp_path: Path) -> None:
+    names, reading, most = sorted(movie.glob("*.tif")), Lock(), list[bool]()
+
+    class Source:
+        def __len__(self) -> int:
+            return len(names)
+
+        def __getitem__(self, index: int) -> Any:
+            most.append(reading.acquire(blocking=False))
+            time.sleep(0.002)
+            reading.release()
+            return read_frame(names[index], kind="monochrome").values[0]
+
+    stated = settings(movie, path=[], white_level=255)
+    measure(stated, tmp_path / "result", source=Source(), workers=3)
+    assert all(most)
+
+
+def test_the_frames_of_chains_are_measured_in_step(
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Pool(workers.Here):
-        """Three frames at a time; with the worker of one the work of all is lost, as in a pool of processes."""
+    """At the end of a test no chain is left alone, which one worker would measure while the others wait."""
+    order = list[int]()
 
-        slots = 3
-
+    class Watching(workers.Threads):
         def submit(self, index: int, start: Start, updated: Any = ()) -> Future[workers.Measured]:
-            future: Future[workers.Measured] = Future()
-            running.append((index, future, super().submit(index, start, updated)))
-            return future
+            order.append(index)
+            return super().submit(index, start, updated)
 
-        def wait(self, futures: Any) -> Any:
-            ended = running[:]
-            running.clear()
-            together.append({index for index, *_ in ended})
-            for _, future, done in ended:
-                if 5 in together[-1]:
-                    future.set_exception(BrokenExecutor("killed"))
-                else:
-                    future.set_result(done.result())
-            return wait(futures).done
+    def two(plan: Plan, *_: Any) -> workers.Workers:
+        found = Watching(plan, 1)
+        found.slots = 2
+        return found
 
-    running: list[tuple[int, Future[workers.Measured], Future[workers.Measured]]] = []
-    together: list[set[int]] = []
-    monkeypatch.setattr(run, "open_workers", lambda plan, *_: Pool(plan))
-    # every frame starts from the first: all but it can be measured side by side
-    monkeypatch.setattr(schedule, "parent", lambda position: 0 if position else None)
-    monkeypatch.setattr(schedule, "lineage", lambda position: iter((position, 0) if position else (0,)))
-    monkeypatch.setattr(schedule, "children", lambda position, count: iter(range(1, count) if not position else ()))
-    monkeypatch.setattr(schedule, "loses", lambda position, record, start: False)
-    result = measure(settings(movie, last=9), tmp_path / "result")
-    assert result.frame(5).reason == "its worker process died 3 times"
-    assert np.flatnonzero(result.status != Status.CONVERGED).tolist() == [5]
-    deadly = [batch for batch in together if 5 in batch]
-    assert len(deadly[0]) == 3
-    assert deadly[1:] == [{5}, {5}]
-
-
-def wait_for_end(process: Any) -> None:
-    """An executor's own thread may be the one that hears of the end: look more than once."""
-    while process.exitcode is None:
-        time.sleep(0.05)
-
-
-class NeverAnswers:
-    """A plan that a worker process never finishes reading, as one that waits for a thread which cannot start."""
-
-    def __reduce__(self) -> tuple[Any, tuple[int]]:
-        return time.sleep, (1000,)
-
-
-def test_workers_that_do_not_start_are_ended_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "_START", 2.0)
-    others = set(multiprocessing.active_children())  # an earlier test's may not have ended yet
-    with pytest.raises(ConfigurationError, match=r"cannot be started: no answer in 2 s.*--workers 1"):
-        workers.Processes(NeverAnswers(), 1)  # type: ignore[arg-type]
-    for process in set(multiprocessing.active_children()) - others:
-        wait_for_end(process)
+    monkeypatch.setattr(run, "open_workers", two)
+    measure(settings(movie), tmp_path / "result")
+    assert set(order) == set(range(COUNT))
+    assert max(order.index(16), order.index(32)) < order.index(5)  # three chains for two workers
 
 
 def test_threads_of_a_process_make_an_updated_reference_once() -> None:
@@ -195,16 +185,6 @@ def test_threads_of_a_process_make_an_updated_reference_once() -> None:
     assert got == made * 8
     assert pickle.loads(pickle.dumps(updates)).get((1, 2), make) is not got[0]
     assert len(made) == 2
-
-
-def test_a_worker_that_never_ends_is_ended_with_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    others = set(multiprocessing.active_children())
-    with workers.Processes({}, 1) as pool:  # type: ignore[arg-type]
-        busy = pool._executor.submit(time.sleep, 1000)
-        while not busy.running():
-            time.sleep(0.01)
-        (process,) = set(multiprocessing.active_children()) - others
-    wait_for_end(process)
 
 
 def test_a_dask_scheduler_that_is_killed_ends_the_run_in_one_line(
@@ -240,58 +220,6 @@ def test_a_dask_scheduler_that_is_killed_ends_the_run_in_one_line(
             process.wait()
     assert 3 <= Result.open(tmp_path / "result", partial=True).finished.sum() < COUNT
     assert not [record for record in caplog.records if record.name.startswith("distributed")]
-
-
-@pytest.fixture
-def two_workers(movie: Path) -> Iterator[workers.Workers]:
-    with workers.open_workers(Plan.from_settings(settings(movie)), 2) as found:
-        yield found
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_without_the_thread_that_keeps_the_workers_nobody_waits_for_ever(
-    two_workers: workers.Workers, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def no_memory(*_: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr("concurrent.futures.process._ExecutorManagerThread.add_call_item_to_queue", no_memory)
-    future = two_workers.submit(0, Start(displacement=None))
-    assert two_workers.wait([future]) == {future}
-    assert isinstance(future.exception(), BrokenExecutor)
-    monkeypatch.undo()
-    two_workers.restart()
-    again = two_workers.submit(0, Start(displacement=None))
-    assert two_workers.wait([again]).pop().result().record.status == Status.CONVERGED
-
-
-@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="no signal masks")
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_a_worker_is_started_whole_or_not_at_all(
-    movie: Path, stop: signal.Signals, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A process that is sent half of what it needs prints a traceback of its own."""
-    started = []
-
-    class Pool(ThreadPoolExecutor):
-        def __init__(self, count: int, *_: object, **__: object) -> None:
-            super().__init__(count)
-
-        def submit(self, *given: Any) -> Future[Any]:
-            signal.raise_signal(stop)
-            started.append(signal.pthread_sigmask(signal.SIG_BLOCK, []))
-            return super().submit(*given)
-
-    monkeypatch.setattr(workers, "ProcessPoolExecutor", Pool)
-    before = signal.signal(stop, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            workers.open_workers(Plan.from_settings(settings(movie)), 2)
-    finally:
-        signal.signal(stop, before)
-    assert len(started) == 1
-    assert {signal.SIGINT, signal.SIGTERM} <= started[0]
-    assert not {signal.SIGINT, signal.SIGTERM} & signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 @pytest.mark.parametrize("stop", [1, 13, 35])
@@ -338,7 +266,7 @@ def test_frames_that_were_away_for_a_moment_are_measured_when_they_are_back(
         for file in files if done in (4, 30) else ():
             file.rename(file.with_suffix(".away")) if done == 4 else file.with_suffix(".away").rename(file)
 
-    result = measure(settings(folder), out, progress=outage)
+    result = in_order(settings(folder), out, progress=outage)
     assert np.flatnonzero(result.unread).tolist() == sorted((*away, 20))
     assert np.flatnonzero(result.status == Status.FAILED).tolist() == sorted((*away, 20, 31, 32))
     measured: list[str] = []
@@ -349,9 +277,9 @@ def test_frames_that_were_away_for_a_moment_are_measured_when_they_are_back(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        measure(settings(folder), out, resume=True, progress=interrupt)
+        in_order(settings(folder), out, resume=True, progress=interrupt)
     assert f"since it can be read now: {away[0]} " in caplog.text
-    again = measure(settings(folder), out, resume=True, progress=counted(measured))
+    again = in_order(settings(folder), out, resume=True, progress=counted(measured))
     assert len(measured) == COUNT - away[0]  # what lies before does not depend on them
     for index in range(COUNT):  # f020.tif is named with its folder
         expected = {**whole.frame(index).values, "inputs": None, "reason": None}
@@ -397,12 +325,12 @@ def test_a_source_that_vanishes_stops_the_run_and_fails_no_frame(
             folder.rename(tmp_path / "elsewhere")
 
     with pytest.raises(FrameError, match=told):
-        measure(chosen, out, progress=vanish)
+        in_order(chosen, out, progress=vanish)
     partial = Result.open(out, partial=True)
     assert partial.finished.sum() == 10
     assert (partial.status[:10] == Status.CONVERGED).all()
     (tmp_path / "elsewhere").rename(folder)
-    resumed = measure(chosen, out, resume=True)
+    resumed = in_order(chosen, out, resume=True)
     np.testing.assert_array_equal(resumed.u, whole.u[: len(resumed)])
 
 
@@ -413,7 +341,7 @@ def test_a_finished_result_is_gone_on_with_only_where_it_is_damaged(
     kept, file = (out / "provenance.json").read_bytes(), out / "solution" / "000000.frames"
     monkeypatch.setattr("rgbmidic.results.store.now", lambda: "later")
     measured: list[str] = []
-    same(measure(settings(movie), out, resume=True, progress=counted(measured)), whole)
+    same(in_order(settings(movie), out, resume=True, progress=counted(measured)), whole)
     assert "is finished and whole: nothing is left to be measured" in caplog.text
     assert ((out / "provenance.json").read_bytes(), measured) == (kept, [])
     content = bytearray(file.read_bytes())
@@ -426,7 +354,7 @@ def test_a_finished_result_is_gone_on_with_only_where_it_is_damaged(
         ResultError, match=r"damaged \(000000\.frames\): of 36 frames are lost 25 \(f025\.tif\); .*--res"
     ):
         Result.open(out)
-    same(measure(settings(movie), out, resume=True, progress=counted(measured)), whole)
+    same(in_order(settings(movie), out, resume=True, progress=counted(measured)), whole)
     assert "lost to damage and measured again: 12 (f012.tif), 25 (f025.tif)" in caplog.text
     assert measured == ["f012", *(f"f{index:03d}" for index in range(25, COUNT))]  # nobody knows that 25 had not failed
     assert Result.open(out).provenance["finished"] == "later"
@@ -503,7 +431,7 @@ def test_a_key_frame_that_is_lost_is_measured_from_the_frame_before_it(
         return schedule.failed_frame(plan, index, "lost") if index == 16 and len(starts) == 17 else record
 
     monkeypatch.setattr("rgbmidic.pipeline.workers.measure_frame", watched)
-    result = measure(settings(movie, last=18), tmp_path / "result")
+    result = in_order(settings(movie, last=18), tmp_path / "result")
     tries = [moved for index, moved in starts if index == 16]
     assert tries == pytest.approx([0.0, 1.5], abs=0.1)
     assert (result.status == Status.CONVERGED).all()
