@@ -55,6 +55,9 @@ _LARGEST = 0.99
 """Quantile over the nodes and components that stands for the largest strain: the very largest is one node's noise."""
 _EQUAL = 0.1
 """How much shorter than three elements a gauge may be, as `StrainGauges` has it."""
+_FINER = 1.4
+"""Ratio of element sizes from which their fields are compared: mesh errors of nearer ones are too much alike. Chosen:
+those of neighbours among `SIZES` are compared."""
 _PASSES = 3
 """Bisections in a row at most: legs of 25 px become 9 px."""
 _WORTH = 2.0
@@ -308,8 +311,30 @@ def study_sizes(
         static=len(rest),
         speckle=plan.speckle or float("nan"),
         preparation=key.seconds,
-        sizes=tuple(figures),
+        sizes=_mesh_errors(figures),
     )
+
+
+def _mesh_errors(sizes: Sequence[SizeFigures]) -> tuple[SizeFigures, ...]:
+    """Figures of sizes in rising order, with discretisation errors that do not fall.
+
+    A coarser mesh follows no more than a finer one: what falls as elements grow is none of the mesh's. It is, for
+    instance, that of reflections, which each element averages.
+    """
+    out, least, fallen = list[SizeFigures](), np.array([np.inf, np.inf]), 0.0
+    for one in reversed(sizes):
+        stated = np.array([one.discretisation, one.strain_discretisation])
+        least = np.fmin(least, stated)
+        mesh = np.where(np.isfinite(stated), least, np.nan)
+        fallen = float(np.fmax(fallen, np.sqrt(np.maximum(stated[0] ** 2 - mesh[0] ** 2, 0.0))))
+        out.append(replace(one, discretisation=float(mesh[0]), strain_discretisation=float(mesh[1])))
+    if fallen > max((one.noise for one in sizes if one.noise > 0), default=np.inf):
+        logger.warning(
+            "differences of %.2g px between element sizes fall as the elements grow, as those of reflections: they are "
+            "not counted as the mesh's",
+            fallen,
+        )
+    return tuple(reversed(out))
 
 
 def choose(settings: TestSettings, **given: Any) -> Choice:
@@ -536,7 +561,11 @@ def _figures(
     known = discretisation_error(plan.reference, key.deformed, solution, plan.solver, plan.method)
     field = _Field.of(mesh, known)
     errors = [_rms(known.displacement_error), _rms(known.strain_error)]
-    errors = [float(np.fmax.reduce([error, *apart])) for error, apart in zip(errors, field.apart(finer), strict=True)]
+    other = [one for one in finer if _FINER * one.mesh.size <= mesh.size]
+    # beyond noise it differs from all of them, as reflections, which each size averages in its own way, do not
+    errors = [
+        float(np.fmax(error, min(apart, default=0.0))) for error, apart in zip(errors, field.apart(other), strict=True)
+    ]
     finer.append(field)
     return SizeFigures(
         element_size=plan.element_size,

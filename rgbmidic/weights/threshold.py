@@ -23,6 +23,7 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
+from scipy.special import chdtri
 
 from rgbmidic.correlation import Deformed, Reference, Start, Status, track
 from rgbmidic.errors import InputError, RgbmidicError
@@ -98,6 +99,11 @@ _FAR = 0.6
 """The unaffected zone, where none is given: rings farther from the reflection than this share of the farthest."""
 _NEAR = 0.5
 """The disturbance is looked for nearer than this share of the farthest pixel."""
+_ACCIDENT = 1e-3
+"""Probability of a disturbed zone where there is none. Chosen."""
+_INDEPENDENT = 0.5
+"""Independent values in an element, whose neighbours are correlated: with twice as many, 1 of 40 shots of a mat sphere
+showed a zone (measured)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,8 +121,9 @@ class DisturbedZone:
     radii, profile : ndarray, shape (n,)
         Mean radius (px) and P (px) of rings about the centre.
     contrast
-        Largest P of the rings near the centre over that on the unaffected zone. The paper's zone stands out 4 times;
-        the contour of one that hardly reaches 1.5 is an accident of noise.
+        Largest P of the rings near the centre over that on the unaffected zone. The paper's zone stands out 4 times.
+    chance
+        The contrast that noise alone reaches in that ring in one of a thousand measurements.
     """
 
     centre: tuple[float, float]
@@ -125,6 +132,7 @@ class DisturbedZone:
     radii: FloatArray
     profile: FloatArray
     contrast: float
+    chance: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,7 +154,9 @@ class SetUpThreshold:
     value: float
 
 
-def disturbed_zone(high_passed: FloatArray, centre: tuple[float, float]) -> DisturbedZone:
+def disturbed_zone(
+    high_passed: FloatArray, centre: tuple[float, float], element_size: float = ELEMENT_SIZE
+) -> DisturbedZone:
     """Find how far from a reflection the displacement is disturbed.
 
     Parameters
@@ -155,6 +165,8 @@ def disturbed_zone(high_passed: FloatArray, centre: tuple[float, float]) -> Dist
         `rgbmidic.fields.high_pass` of a displacement measured without weights, shape (H, W); NaN where not measured.
     centre
         Middle of the reflection, (x, y) in px.
+    element_size
+        Of the measurement, px: its P² has the distribution of chi square.
 
     Raises
     ------
@@ -173,6 +185,7 @@ def disturbed_zone(high_passed: FloatArray, centre: tuple[float, float]) -> Dist
     unaffected = float(np.median(profile[radii > _FAR * distance.max()]))
     near = max(1, int((radii < _NEAR * distance.max()).sum()))
     peak = int(profile[:near].argmax())
+    independent = _INDEPENDENT * count[full][peak] / element_size**2
     return DisturbedZone(
         centre=centre,
         radius=_first_crossing(radii, profile, DISTURBED * unaffected, peak),
@@ -180,11 +193,17 @@ def disturbed_zone(high_passed: FloatArray, centre: tuple[float, float]) -> Dist
         radii=radii,
         profile=profile,
         contrast=float(profile[peak] / unaffected),
+        chance=float(np.sqrt(chdtri(independent, _ACCIDENT / near) / independent)),
     )
 
 
 def set_up_threshold(
-    high_passed: FloatArray, images: IlluminationImages, *, light: int = 0, blur: float = 10.0
+    high_passed: FloatArray,
+    images: IlluminationImages,
+    *,
+    light: int = 0,
+    blur: float = 10.0,
+    element_size: float = ELEMENT_SIZE,
 ) -> SetUpThreshold:
     """The weighting threshold of a set-up, from a measurement with one light and without weights.
 
@@ -201,22 +220,25 @@ def set_up_threshold(
         Index of the light that was used.
     blur
         Standard deviation (px) of the blur that the weights will use.
+    element_size
+        Of the measurement, px.
 
     Raises
     ------
     InputError
-        The displacement is nowhere disturbed: the set-up needs no weights, or the motion is too small to show it.
+        The displacement is nowhere disturbed beyond chance: the set-up needs no weights, or the motion is too small to
+        show it.
     """
     from scipy.ndimage import map_coordinates
 
     image = blurred(images, blur)[light].astype(np.float64) / images.full_scale
     smooth = np.where(np.isfinite(high_passed), blurred(images, 2 * blur)[light], -np.inf)
     row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
-    zone = disturbed_zone(high_passed, (float(column), float(row)))
-    if not zone.radius > 0:
+    zone = disturbed_zone(high_passed, (float(column), float(row)), element_size)
+    if zone.contrast <= (least := max(DISTURBED, zone.chance)):
         raise InputError(
             f"no disturbed zone around {zone.centre}: P is {zone.contrast * zone.unaffected:.2g} px there and "
-            f"{zone.unaffected:.2g} px away from it, less than {DISTURBED:g} times as much"
+            f"{zone.unaffected:.2g} px away from it, less than {least:.2g} times as much"
         )
     # the mean over the part of the zone's perimeter that lies inside the image
     angle = np.linspace(0, 2 * np.pi, max(16, int(2 * np.pi * zone.radius)), endpoint=False)
@@ -305,7 +327,8 @@ def automatic_threshold(
     for light, name in enumerate(reference.names):
         for component, shown in _displacement(reference, deformed, region, light, element_size, prefilter):
             try:
-                threshold = set_up_threshold(high_pass(shown), reference, light=light, blur=blur)
+                ripple = high_pass(shown)
+                threshold = set_up_threshold(ripple, reference, light=light, blur=blur, element_size=element_size)
             except InputError as error:
                 logger.info("%s alone, without weights, %s: %s", name, component, error)
                 continue

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
+from textures import Affine, Texture
 
 sys.path.append(str(Path(__file__).resolve().parents[3]))
 
@@ -305,3 +307,19 @@ def test_settings_that_contradict_refining_are_refused(mesh, text):
 def test_a_live_sequence_cannot_be_refined():
     with pytest.raises(ConfigurationError, match=r"mesh\.refine is done on the frames of a test"):
         list(measure_sequence(BUMPS, refining()))
+
+
+def test_the_error_of_reflections_is_not_that_of_the_mesh(caplog):
+    """An affine field, which every mesh follows, under sparkle that moves: its error falls as the elements grow."""
+    side, rng = 260, np.random.default_rng(0)
+    texture, row, column = Texture.random(0, contrast=600), *np.indices((side, side))
+    states = [texture.image((side, side), Affine.strain_and_rotation(strain, 500 * strain)) for strain in (0.0, 2e-3)]
+    spot = 150 * np.exp(-((row - side / 2) ** 2 + (column - side / 2) ** 2) / (2 * 60**2))
+    sparkle = gaussian_filter(rng.normal(size=(2, side, side)), (0, 3, 3))
+    frames = [4000 + one + spot * two / two.std() for one, two in zip(states, sparkle, strict=True)]
+    stated = settings(region={"rectangle": [40, 40, side - 41, side - 41]})
+    found = study_sizes(stated, (12, 20, 40), gauges=(), source=np.float32(frames))
+    assert max(one.discretisation for one in found.sizes) < found.sizes[0].noise
+    assert found.choice is not None
+    assert found.choice.element_size == 40
+    assert "they are not counted as the mesh's" in caplog.text
