@@ -309,7 +309,13 @@ def test_a_live_sequence_cannot_be_refined():
         list(measure_sequence(BUMPS, refining()))
 
 
-def test_the_error_of_reflections_is_not_that_of_the_mesh(caplog):
+def test_what_falls_as_elements_grow_is_not_the_mesh_s(caplog):
+    sizes = resolution._mesh_errors([one(12, 0.09, 0.13), one(20, 0.06, 0.01), one(40, 0.04, 0.02)])
+    assert [figures.discretisation for figures in sizes] == [0.01, 0.01, 0.02]
+    assert "they are not counted as the mesh's" in caplog.text
+
+
+def test_the_error_of_reflections_is_not_that_of_the_mesh():
     """An affine field, which every mesh follows, under sparkle that moves: its error falls as the elements grow."""
     side, rng = 260, np.random.default_rng(0)
     texture, row, column = Texture.random(0, contrast=600), *np.indices((side, side))
@@ -322,4 +328,3 @@ def test_the_error_of_reflections_is_not_that_of_the_mesh(caplog):
     assert max(one.discretisation for one in found.sizes) < found.sizes[0].noise
     assert found.choice is not None
     assert found.choice.element_size == 40
-    assert "they are not counted as the mesh's" in caplog.text
