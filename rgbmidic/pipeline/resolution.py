@@ -562,10 +562,11 @@ def _figures(
     field = _Field.of(mesh, known)
     errors = [_rms(known.displacement_error), _rms(known.strain_error)]
     other = [one for one in finer if _FINER * one.mesh.size <= mesh.size]
-    # beyond noise it differs from all of them, as reflections, which each size averages in its own way, do not
-    errors = [
-        float(np.fmax(error, min(apart, default=0.0))) for error, apart in zip(errors, field.apart(other), strict=True)
-    ]
+    # it differs from all of them, each of which has an error of its own (in proportion to the size's third power);
+    # reflections, which every size averages in its own way, hardly differ from the next
+    part = [1 - (one.mesh.size / mesh.size) ** 3 for one in other]
+    apart = [min(np.divide(found, part), default=0.0) for found in field.apart(other)]
+    errors = [float(np.fmax(error, far)) for error, far in zip(errors, apart, strict=True)]
     finer.append(field)
     return SizeFigures(
         element_size=plan.element_size,
