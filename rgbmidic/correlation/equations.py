@@ -41,9 +41,9 @@ _LONGEST_STEP = 4.0
 """Longest motion of a node in one iteration, px: a speckle (3 to 5 px), beyond which the gradient is another's."""
 _PASS_ITERATIONS = 12
 """Most iterations of a pass: from within half a speckle 4 to 5 do (measured on the truth tests)."""
-_PATIENCE = 1
-"""Iterations of a pass after which a tenth of the nodes may still move: with the weights of the next pass they do so
-faster. Chosen; with twice of it results do not change (benchmarks/constants.py)."""
+_PATIENCE = 3
+"""Iterations of a pass after which a tenth of the nodes may still move: they wander where nothing matches, or faster
+with the weights of the next pass. Chosen; 1 to 3 give the same, with 5 a fragment that has turned takes one more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -280,7 +280,6 @@ def iterate(
     residual: Residual,
     estimate: Estimate,
     tolerance: float,
-    patience: int = _PATIENCE,
 ) -> Estimate:
     """Iterate with one Hessian until no textured node moves by more than `tolerance`.
 
@@ -296,8 +295,6 @@ def iterate(
         From which the pass begins.
     tolerance
         px.
-    patience
-        Iterations after which a tenth of the nodes may still move.
 
     Raises
     ------
@@ -311,7 +308,7 @@ def iterate(
         if not np.isfinite(estimate.displacement).all():
             raise UnsolvableError("the iteration diverged", estimate)
         # a few nodes that wander where nothing matches must not keep the others waiting
-        most = turn >= patience and np.quantile(estimate.increments[-1][equations.textured], 0.9) <= tolerance
+        most = turn >= _PATIENCE and np.quantile(estimate.increments[-1][equations.textured], 0.9) <= tolerance
         if estimate.longest <= tolerance or most:
             break
     return estimate

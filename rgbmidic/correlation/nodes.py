@@ -22,12 +22,9 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 LOST = 0.5
 """Uncertainty (px) from which a node is decorrelated: a position uncertain by half a pixel is no match."""
-_MISFIT = 4.0
-"""Residual around a node, over the median, from which it is decorrelated where elements near it do not match. Chosen;
-with half or twice of it no node of the scenes in benchmarks/constants.py changes."""
 _ONE_SIDED = 0.3
 """Texture in the worse direction over that in the better one under which the former may be noise...
-Chosen; with half or twice of it no node of the scenes in benchmarks/constants.py changes."""
+Chosen; half or twice of it matters in a deep shadow only (benchmarks/constants.py)."""
 _NOISY = 0.3
 """...and is, if noise alone would give this fraction of it: displacements along it are 30 % too small (derived)."""
 
@@ -42,20 +39,16 @@ class Evidence:
         Enough texture is seen around the node, by what precision there is (`Equations`).
     one_sided : ndarray, shape (N,), bool
         The texture runs in one direction only (`one_sided_texture`).
-    mismatched, near_mismatch : ndarray, shape (N,), bool
-        An element around the node does not match; one around the node or its neighbours.
+    mismatched : ndarray, shape (N,), bool
+        An element around the node does not match.
     std : ndarray, shape (N, 2)
         Standard uncertainty of u and v, px.
-    misfit : ndarray, shape (N,)
-        Residual around the node over its median.
     """
 
     textured: BoolArray
     one_sided: BoolArray
     mismatched: BoolArray
-    near_mismatch: BoolArray
     std: FloatArray
-    misfit: FloatArray
 
 
 RULES: tuple[tuple[NodeStatus, Callable[[Evidence], BoolArray]], ...] = (
@@ -67,8 +60,6 @@ RULES: tuple[tuple[NodeStatus, Callable[[Evidence], BoolArray]], ...] = (
     (NodeStatus.NOT_SEEN, lambda nodes: nodes.one_sided),
     # its displacement is uncertain by half a pixel or more
     (NodeStatus.DECORRELATED, lambda nodes: nodes.std.max(axis=1) > LOST),
-    # elements near it do not match, and the residual around it is several times the usual one
-    (NodeStatus.DECORRELATED, lambda nodes: nodes.near_mismatch & (nodes.misfit > _MISFIT)),
 )
 """Status of a node to which a rule applies, in this order; one to which none does is measured."""
 

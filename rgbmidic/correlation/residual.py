@@ -22,8 +22,8 @@ from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 _LEAST_BEND = 0.1
-"""Least bend of the loss around a node, over that of its weights. Chosen; with half or twice of it nothing changes
-(benchmarks/constants.py)."""
+"""Least bend of the loss around a node, over that of its weights: the quotient exists. Any value up to twice of it
+gives the same."""
 _ROUNDING = 2e-7
 """Fraction of the sum of squares below which that beyond the mean is rounding: three units of single precision."""
 

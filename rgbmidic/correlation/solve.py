@@ -48,7 +48,7 @@ _REFINED = {"none": 1, "auto": 1, "global": 1, "local": 4, "mean": 2}
 """Passes whose residual still changes weights and grey levels, for each grey-level correction."""
 _STARTED = 0.25
 """Correlation coefficient at the initial guess under which an element waits until its neighbours have brought it
-nearer. Chosen; with half or twice of it results do not change (benchmarks/constants.py)."""
+nearer. Chosen; half or twice of it matters beside a hole and in a deep shadow (benchmarks/constants.py)."""
 _RETURNS = 2
 """Passes after which elements may take part again. Chosen: at a fragment's edge some come and go with every pass, which
 costs iterations; after a single pass what a crack or another body pulls at first is left out for good."""
@@ -61,14 +61,11 @@ _ELSEWHERE = 0.05
 of several lights are learnt once more: what all lights alike show of the motion hides which of them is the precise one.
 Chosen: a hundredth of a speckle, which a residual still shows."""
 _SETTLED = 1e-3
-"""Fraction of the weight that may still change for the passes to end. Chosen; with half or twice of it lights do not
-change (benchmarks/constants.py)."""
+"""Fraction of the weight that may still change for the passes to end. Chosen; a hundredth or a hundred times of it
+change the displacement by .02 of its uncertainty at most (benchmarks/constants.py)."""
 _LOOKED_AT = 10_000
 """That change is the sum over about so many pixels: a change of all weights by that fraction is known to 1 % of it
 (derived)."""
-_PATIENCE = 5
-"""Iterations of the end after which a tenth of the nodes may still move: they wander where nothing matches, for from
-within half a speckle 4 to 5 iterations do (measured on the truth tests)."""
 _SWINGING = 0.02
 """Fraction of the nodes that may be left out at the end because they still move: a few at the rim of a fragment, half
 of whose pixels match nothing, swing for good; where more do the frame has not converged. Chosen."""
@@ -274,7 +271,7 @@ def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, 
         weighting = next_weighting(problem, weighting, equations, estimate, number)
     assert equations is not None
     if estimate.longest > tolerance:
-        estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance, _PATIENCE)
+        estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance)
         swinging = equations.textured & (estimate.increments[-1] > tolerance)
         matched = weighting.matched & ~swinging[problem.reference.mesh.elements].any(axis=1)
         few = 0 < swinging.mean() < _SWINGING and matched.any()
@@ -282,7 +279,7 @@ def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, 
             residual = compare(problem, weighting.values, estimate)
             weighting = replace(weighting, residual=residual, matched=matched)
             equations = _equations(problem, weighting, estimate)
-            estimate = iterate(problem, equations, weighting.values, residual, estimate, tolerance, _PATIENCE)
+            estimate = iterate(problem, equations, weighting.values, residual, estimate, tolerance)
         weighting = replace(weighting, residual=compare(problem, weighting.values, estimate))
     return estimate, equations, weighting
 
@@ -354,8 +351,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         fitted = fitted + bias.values
         std = np.hypot(std, bias.of_recovered())
     squares = weighting.residual.squares(equations.weights)
-    misfits = misfit(mesh, squares, equations.textured)
-    node_status = _judged(estimate, equations, weighting, mismatched, std, misfits)
+    node_status = _judged(estimate, equations, weighting, mismatched, std)
     if equations.rigid is not None and equations.rigid.hidden.any():
         numbers = [str(number) for number in np.flatnonzero(equations.rigid.hidden)]
         named = f"lights {', '.join(numbers)} share" if len(numbers) > 1 else f"light {numbers[0]} shares"
@@ -381,7 +377,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         strain_error=np.full((len(inner), 3), np.nan),
         node_status=node_status,
         light_fraction=equations.light_fraction,
-        misfit=np.where(measured, misfits, np.nan),
+        misfit=np.where(measured, misfit(mesh, squares, equations.textured), np.nan),
         status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
         reason="" if converged else _unsettled(problem, estimate, measured),
         rigid=np.where(np.any(equations.weights, axis=1, keepdims=True), estimate.rigid, np.nan),
@@ -397,7 +393,6 @@ def _judged(
     weighting: Weighting,
     mismatched: BoolArray,
     std: FloatArray,
-    misfits: FloatArray,
 ) -> npt.NDArray[np.uint8]:
     """Status of every node (N,).
 
@@ -410,9 +405,7 @@ def _judged(
         textured=equations.textured,
         one_sided=one_sided_texture(equations, weighting.residual),
         mismatched=mismatched,
-        near_mismatch=weighting.residual.reference.mesh.beside(mismatched),
         std=std[:, :2],
-        misfit=misfits,
     )
     node_status = judge(evidence)
     if not (node_status == NodeStatus.MEASURED).any():

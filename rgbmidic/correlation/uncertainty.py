@@ -24,8 +24,8 @@ from rgbmidic.mesh import PixelMap
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 _LEAST_RATIO = 1e-2
-"""Least fraction of a residual's variance that is taken to displace. Chosen; with half or twice of it nothing changes
-(benchmarks/constants.py)."""
+"""Least fraction of a residual's variance that is taken to displace: that of images without noise is not 0. Any value
+up to twice of it gives the same."""
 _LEAST_FRACTION = 0.05
 """Least fraction of a direction in the texture: nodes with less of the median are not measured (`SEEN`)."""
 _EVEN = 0.6

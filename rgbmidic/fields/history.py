@@ -219,6 +219,32 @@ _POWERS = {"value": 0, "velocity": 1, "acceleration": 2} | {
 """Quantities in the order of the kernel, each with the power of the time in its denominator."""
 
 
+FEWEST = LOWEST + 2
+"""Frames that a parabola with an uncertainty needs."""
+
+
+def rate_frames(window: int, measured: int) -> int:
+    """Return the frames that a parabola takes in for rates: the `window`, or all `measured` if these are fewer.
+
+    Raises
+    ------
+    InputError
+        Either is too few.
+    """
+    if window < FEWEST:
+        raise InputError(f"rates are taken over a window of {FEWEST} frames or more, not {window}")
+    if measured < FEWEST:
+        raise InputError(f"rates need {FEWEST} measured frames or more; there are {measured}")
+    return min(window, measured)
+
+
+def rate_words(window: int, measured: int) -> str:
+    """Return over how many frames the polynomials of rates are fitted."""
+    taken = rate_frames(window, measured)
+    fewer = "" if taken == window else f" (a window of {window} was stated)"
+    return f"parabolas over {taken} frames{fewer}, polynomials of degree 4 over {min(measured, round(5 * taken / 3))}"
+
+
 def rates(
     times: npt.ArrayLike,
     values: npt.ArrayLike,
@@ -268,10 +294,10 @@ def rates(
         raise InputError("rates need the times of the frames to rise from each to the next")
     reach = window * _WIDE
     most = int((np.searchsorted(when, when + reach, side="right") - np.arange(len(when))).max())
-    if most <= LOWEST + 1:
+    if most < FEWEST:
         raise InputError(
             f"a window of {window:g} holds no more than {most} frames; a polynomial of degree {LOWEST} needs "
-            f"{LOWEST + 2} or more"
+            f"{FEWEST} or more"
         )
     flat, spread = (np.ascontiguousarray(part.reshape(len(when), -1).T) for part in (what, error))
     scaled = (when - when[0]) / reach

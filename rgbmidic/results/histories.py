@@ -31,6 +31,7 @@ from rgbmidic.fields import (
     make_probe,
     rates,
 )
+from rgbmidic.fields.history import rate_frames, rate_words
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.maps import MapField, Maps
@@ -179,7 +180,7 @@ def read_histories(
     Raises
     ------
     InputError
-        A probe is outside the region, or measured in no frame; the window is longer than the test; the times of the
+        A probe is outside the region, or measured in no frame; too few frames for rates; the times of the
         frames are not known, or have none in common with those of the channels; the channels are not usable.
     """
     if not probes.places and probes.rigid_motion == "none":
@@ -189,8 +190,7 @@ def read_histories(
     there = np.flatnonzero(result.finished)
     if not len(there):
         raise InputError(f"no frame of {result.path} is measured yet")
-    if probes.window > len(there):
-        raise InputError(f"rates over a window of {probes.window} frames need as many; {len(there)} are measured")
+    window = probes.window and rate_frames(probes.window, len(there))
     times = None if times is None else times[there]
     covariance = NodalCovariance.from_mesh(rectified.mesh)
     counts: dict[str, int] = {}
@@ -213,7 +213,7 @@ def read_histories(
     quantities = [
         quantity
         for history in read
-        for quantity in _in_units(history, units, clock, probes.window, shared_part(result), references)
+        for quantity in _in_units(history, units, clock, window, shared_part(result), references)
     ]
     read_off = Histories(
         frames=there,
@@ -223,7 +223,10 @@ def read_histories(
         quantities=tuple(quantities),
         stress_strain=None,
         units=units,
-        remarks=(*_remarks(rectified, speed, exposure(result), there, by_probe),),
+        remarks=(
+            *_remarks(rectified, speed, exposure(result), there, by_probe),
+            *([f"rates: {rate_words(probes.window, len(there))}"] if window else ()),
+        ),
     )
     return with_channels(read_off, channels or ChannelSettings())
 

@@ -27,6 +27,7 @@ from rgbmidic.fields import (
     rates,
     strain_of_gradient,
 )
+from rgbmidic.fields.history import FEWEST, rate_frames, rate_words
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.physical import Physical, frame_times, reference_frames, scale_of, shared_part
 from rgbmidic.results.quantities import UNKNOWN_TIME
@@ -37,8 +38,6 @@ from rgbmidic.typing import BoolArray, FloatArray
 WINDOW = 9
 """Frames that a parabola takes in for rates where none are stated. Chosen: the noise of a velocity is then .13 of that
 of a displacement per frame, and a change within 4 frames is still seen."""
-_FEWEST = 4
-"""Frames that a parabola with an uncertainty needs, as in `rgbmidic.fields.rates`."""
 _AROUND = 2
 """Windows of frames that are read at once, and on either side of these: the widest fit takes in 5/3 of a window."""
 _AT_ONCE = 4096
@@ -265,8 +264,7 @@ class Maps:
             reason = self.result.frame(since).reason or "no node"
             raise InputError(f"nothing is known since frame {since}, in which nothing is measured: {reason}")
         window = window or int(self.result.setting("probes", "window", 0)) or WINDOW
-        if window < _FEWEST:
-            raise InputError(f"rates are taken over a window of {_FEWEST} frames or more, not {window}")
+        rate_frames(window, FEWEST)
         physical, measure = self.physical, measure or MEASURES[0]
         if (gauge, measure) != (physical.gauge, physical.measure):
             physical = replace(physical, gauge=gauge, measure=measure)
@@ -317,13 +315,14 @@ class Maps:
     @property
     def how(self) -> dict[str, str]:
         """Describe how derived fields are made, for the texts beside them: strain, reference, rates."""
+        enough = len(self._there) >= FEWEST
         since = "" if self.since is None else f"since frame {self.since}"
         moved = [*filter(None, [since, "rigid motion removed" if self.rigid_removed else ""])]
         gauge = f"virtual strain gauge of {self.physical.in_units(self.physical.gauges.length)}"
         return {
             "Displacement": ", ".join(moved),
             "Strain": ", ".join([self.physical.measure_name, gauge, *moved[: bool(since)]]),
-            "Rates": f"over {self.window} frames",
+            "Rates": rate_words(self.window, len(self._there)) if enough else "",
         }
 
     def read(self, name: str, frame: int) -> MapValues:
@@ -533,8 +532,7 @@ class Maps:
 
     def _rates_of(self, name: str, block: int) -> FloatArray:
         """Compute rates of a field from the frames of a block and those around: the same whichever is asked for."""
-        if len(self._there) < _FEWEST:
-            raise InputError(f"rates need {_FEWEST} measured frames or more; there are {len(self._there)}")
+        taken = rate_frames(self.window, len(self._there))
         size = _AROUND * self.window
         inner = slice(block * size, min((block + 1) * size, len(self._there)))
         outer = slice(max(inner.start - size, 0), inner.stop + size)
@@ -544,7 +542,7 @@ class Maps:
             series = np.stack([self._measured(frame)[_UV.index(name) :: 2] for frame in frames.tolist()], axis=1)
         else:
             series = np.stack([np.stack(plain._derived(name, frame)) for frame in frames.tolist()], axis=1)
-        span = (min(self.window, len(self._there)) - 1) * float(np.median(np.diff(self._clock)))
+        span = (taken - 1) * float(np.median(np.diff(self._clock)))
         common, references = shared_part(self.result), reference_frames(self.result)[frames]
         mine = slice(inner.start - outer.start, inner.stop - outer.start)
         found = np.empty((2, 2, inner.stop - inner.start, series.shape[2]))

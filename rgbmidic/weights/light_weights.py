@@ -246,8 +246,7 @@ _LEAST_VARIANCE = 0.1
 lights under a reflection do not change, those beside a gap by half their uncertainty, that by 59 %
 (benchmarks/constants.py)."""
 _ROUNDING = 1e-6
-"""Least variance of a residual, over that of the grey levels, where two images are the same. Chosen; with half or twice
-of it nothing changes (benchmarks/constants.py)."""
+"""Least variance of a residual, over that of the grey levels, where two images are the same: none is 0."""
 _OWN = 0.1
 """Fraction of its variance that each light's residual is taken to have for itself: .03 to .3 measure the same."""
 

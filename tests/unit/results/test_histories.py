@@ -16,7 +16,7 @@ from results import MESH, NODES, make_origin
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import ConfigurationError, InputError
-from rgbmidic.fields.history import Units
+from rgbmidic.fields.history import Units, rate_words
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.report import history_figure
 from rgbmidic.results import (
@@ -24,6 +24,7 @@ from rgbmidic.results import (
     Channels,
     FrameRecord,
     Histories,
+    Maps,
     Origin,
     Result,
     ResultStore,
@@ -334,7 +335,7 @@ def command(*arguments: object) -> int:
             "half or more of circle_1 is outside the region that was measured, which lies within x 10 to 110",
         ),
         (["--window", "3"], "probes.window must be 0 or at least 4 frames, not 3"),
-        (["--window", "30"], "rates over a window of 30 frames need as many; 8 are measured"),
+        (["--window", "2"], "probes.window must be 0 or at least 4 frames, not 2"),
         (["--measure", "euler"], "probes.measure must be one of"),
         (["--youngs-modulus", "2"], "--youngs-modulus is of a crack's tip, and none is stated"),
         (["--area", "20"], "channels.area is of channels, whose file (channels.file) is not stated"),
@@ -502,3 +503,17 @@ def test_names_of_probes_are_those_of_columns_and_figures(result: Result, tmp_pa
 def test_names_that_make_no_column_are_refused(names: list[list[str]], told: str) -> None:
     with pytest.raises(ConfigurationError, match=told):
         ProbeSettings(points=((1, 2), (3, 4)), names=names)
+
+
+def test_a_window_longer_than_the_test_is_one_rule_for_maps_and_histories(result: Result) -> None:
+    """Rates are those of all frames that are measured, and say so, in both alike."""
+    maps = Maps.of(result, window=30)
+    said = "parabolas over 8 frames (a window of 30 was stated), polynomials of degree 4 over 8"
+    assert maps.how["Rates"] == said
+    found = read_histories(result, ProbeSettings(points=(PLACE,), window=30))
+    assert f"rates: {said}" in found.remarks
+    alike = read_histories(result, ProbeSettings(points=(PLACE,), window=8))
+    for one, other in zip(found.quantities, alike.quantities, strict=True):
+        np.testing.assert_array_equal(one.values, other.values)
+    with pytest.raises(InputError, match="rates need 4 measured frames or more; there are 3"):
+        rate_words(9, 3)
