@@ -62,7 +62,7 @@ of several lights are learnt once more: what all lights alike show of the motion
 Chosen: a hundredth of a speckle, which a residual still shows."""
 _SETTLED = 1e-3
 """Fraction of the weight that may still change for the passes to end. Chosen; a hundredth or a hundred times of it
-change the displacement by .02 of its uncertainty at most (benchmarks/constants.py)."""
+matter in a deep shadow only (benchmarks/constants.py)."""
 _LOOKED_AT = 10_000
 """That change is the sum over about so many pixels: a change of all weights by that fraction is known to 1 % of it
 (derived)."""
