@@ -1,10 +1,9 @@
 """How much the chosen constants of the solve matter: each is halved and doubled.
 
 Seven scenes with exact speckle and noise of 3 grey levels. Three have a motion with strain and rotation, and
-reflections of up to 60 grey levels in the deformed state: three lights with a reflection in each, the same with a part left out and
-rigid motions, and one light whose reflection decorrelates nodes. One light sees the others: a part shows another
-texture, two bodies move apart, a shadow takes nearly all contrast, with
-both ways to correct it.
+reflections of up to 60 grey levels in the deformed state: three lights with a reflection in each, the same with a
+part left out and rigid motions, and one light whose reflection decorrelates nodes. One light sees the others: a part
+shows another texture, two bodies move apart, a shadow takes nearly all contrast, with both ways to correct it.
 """
 
 from __future__ import annotations
