@@ -11,7 +11,7 @@ from rgbmidic._kernels.splines import PAD, bspline_coefficients
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import fill_holes
 from rgbmidic.mesh import PixelMap
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage, plain
 
 _GAUSSIAN = np.exp(-(np.arange(-3, 4) ** 2) / 2)
 PREFILTERS: dict[str, FloatArray] = {
@@ -31,7 +31,7 @@ def as_light_stack(images: npt.ArrayLike, name: str) -> FloatImage:
     InputError
         Another number of axes, not real numbers, or under 8 px in height or width.
     """
-    stack = np.asarray(images)
+    stack = plain(images)
     if stack.ndim not in (2, 3) or stack.dtype.kind not in "buif":
         raise InputError(f"{name} must be a real image (H, W) or (k, H, W), not {stack.dtype} of shape {stack.shape}")
     stack = np.atleast_3d(stack) if stack.ndim == 3 else stack[None]

@@ -26,6 +26,8 @@ from rgbmidic.typing import BoolArray, FloatArray
 
 _LEAST = 0.5
 """Least part of an area that must be measured for its mean to be stated: the larger part represents the whole."""
+_WHOLE = 0.995
+"""Part of a place from which nothing is said of the rest, which is rounding of its points. Chosen."""
 _STEP = 1.0
 """Distance in px of the points that stand for a line or an area: an element of 10 px holds some 40."""
 
@@ -44,6 +46,8 @@ class Mean:
         Of the nodes' errors.
     least
         Part of the weights that must be measured; the mean is that of the measured part.
+    inside
+        Part of the place that lies in the region.
     """
 
     name: str
@@ -51,6 +55,7 @@ class Mean:
     weights: FloatArray
     correlation: FloatArray
     least: float = 1.0
+    inside: float = 1.0
 
     @classmethod
     def over(
@@ -70,17 +75,28 @@ class Mean:
             raise InputError(f"half or more of {name} is outside {places.where}")
         weights = places.mean()
         nodes = np.flatnonzero(weights).astype(np.int64)
-        correlation, least = covariance.part(nodes), least - 1e-9
-        return cls(name=name, nodes=nodes, weights=weights[nodes], correlation=correlation, least=least)
+        return cls(
+            name=name,
+            nodes=nodes,
+            weights=weights[nodes],
+            correlation=covariance.part(nodes),
+            least=least - 1e-9,
+            inside=float(places.inside.mean()),
+        )
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px."""
-        uv = zip("uv", self.read(nodal), strict=True)
-        return [History(name=f"{self.name}_{name}", unit="px", values=values, std=std) for name, (values, std) in uv]
+        uv = [*zip("uv", self.read(nodal), strict=True)]
+        used = np.where(np.isfinite(uv[0][1][0]), _known(nodal) @ self.weights, 1.0)
+        note = _cut(self.name, "mean", self.inside * used)
+        return [
+            History(name=f"{self.name}_{name}", unit="px", values=values, std=std, note=note)
+            for name, (values, std) in uv
+        ]
 
     def read(self, nodal: Nodal) -> list[tuple[FloatArray, FloatArray]]:
         """Average u and v, each (T,), with their standard uncertainty."""
-        known = np.isfinite(nodal.u + nodal.v + nodal.u_std + nodal.v_std)
+        known = _known(nodal)
         return [self.average(*pair, known) for pair in ((nodal.u, nodal.u_std), (nodal.v, nodal.v_std))]
 
     def average(
@@ -99,6 +115,18 @@ class Mean:
         square = parts.sum(axis=1) ** 2 if alike else np.einsum("tm,tm->t", parts @ self.correlation, parts)
         spread = np.sqrt(np.maximum(square, 0))
         return np.where(enough, mean, np.nan), np.where(enough, spread, np.nan)
+
+
+def _known(nodal: Nodal) -> BoolArray:
+    return np.isfinite(nodal.u + nodal.v + nodal.u_std + nodal.v_std)
+
+
+def _cut(name: str, what: str, used: FloatArray) -> str:
+    """What is said of a probe of which only a part (T,) is `used`, where it reaches beyond what is measured."""
+    least = float(used.min(initial=1.0))
+    if least > _WHOLE:
+        return ""
+    return f"{name} is the {what} of {least:.0%} of its place at least: the rest lies outside the region or has no data"
 
 
 def _line(x0: float, y0: float, x1: float, y1: float) -> FloatArray:
@@ -199,12 +227,15 @@ class StrainGauge:
         One gauge, whose nodes count as in `nodes`.
     measure
         One of `rgbmidic.fields.MEASURES`.
+    inside
+        Part of the gauge that lies in the region.
     """
 
     name: str
     nodes: npt.NDArray[np.int64]
     gauges: StrainGauges
     measure: str
+    inside: float
 
     @classmethod
     def around(
@@ -219,7 +250,8 @@ class StrainGauge:
             nodes=np.searchsorted(nodes, gauges.nodes),
             needed=gauges.needed[:, nodes],
         )
-        return cls(name=name, nodes=nodes, gauges=reduced, measure=measure)
+        inside = float(Places.of(covariance.mesh, _circle(x, y, reduced.length / 2)).inside.mean())
+        return cls(name=name, nodes=nodes, gauges=reduced, measure=measure, inside=inside)
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute exx, eyy, exy, e1, e2, the direction of e1 and the von Mises equivalent."""
@@ -229,8 +261,11 @@ class StrainGauge:
         values = [*s.components.T, *s.principal.T, s.direction_deg, s.equivalent]
         stds = [*s.components_std.T, *s.principal_std.T, s.direction_std_deg, s.equivalent_std]
         units = {"exx": "", "eyy": "", "exy": "", "e1": "", "e2": "", "direction": "deg", "equivalent": ""}
+        weights = self.gauges.fractions / self.gauges.fractions.sum()
+        used = np.where(np.isfinite(values[0]), _known(nodal)[:, self.gauges.nodes] @ weights, 1.0)
+        note = _cut(self.name, "strain", self.inside * used)
         return [
-            History(name=f"{self.name}_{name}", unit=unit, values=value, std=std)
+            History(name=f"{self.name}_{name}", unit=unit, values=value, std=std, note=note)
             for (name, unit), value, std in zip(units.items(), values, stds, strict=True)
         ]
 

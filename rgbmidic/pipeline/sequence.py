@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from rgbmidic.correlation import Solution, Start
 from rgbmidic.correlation.reference_update import ReferenceUpdate
-from rgbmidic.errors import InputError, RgbmidicError
+from rgbmidic.errors import FrameError, InputError, RgbmidicError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.correlate import solver_settings
@@ -35,6 +35,7 @@ from rgbmidic.settings import (
     TestSettings,
     WeightSettings,
 )
+from rgbmidic.typing import plain
 from rgbmidic.weights import LightWeights, MaskWeights
 
 logger = logging.getLogger(__name__)
@@ -64,7 +65,7 @@ def measure_sequence(
     Parameters
     ----------
     states
-        Without `settings` arrays (H, W) or (k, H, W), one image per light, NaN where not valid, or
+        Without `settings` arrays (H, W) or (k, H, W), one image per light, NaN or masked where not valid, or
         `IlluminationImages`.
         With `settings` anything that a frame source may return (`rgbmidic.pipeline.FrameSequence`), such as raw frames.
     settings
@@ -149,9 +150,12 @@ class _Latest:
 
     def __getitem__(self, index: int) -> Any:
         state = self.state if index else self.reference
-        if self.light_images and not hasattr(state, "values"):
-            return np.asarray(state, dtype=np.float32)
-        return state
+        if not self.light_images or hasattr(state, "values"):
+            return state
+        images = plain(state)
+        if images.dtype.kind not in "buif":
+            raise FrameError(f"a state must be an array of real numbers or IlluminationImages, not {images.dtype}")
+        return images.astype(np.float32)
 
 
 def _solutions(plan: Plan, latest: _Latest, states: Iterable[Any]) -> Iterator[Solution]:

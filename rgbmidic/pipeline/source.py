@@ -23,7 +23,7 @@ from rgbmidic.frames.stored import Camera, StoredFrame, raw_frame
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.settings import FrameSettings
-from rgbmidic.typing import AnyArray
+from rgbmidic.typing import AnyArray, plain
 
 _LONGEST_NAME = 120
 """Characters of a description that are kept as they are; a longer one is cut and gets its checksum. Chosen; not
@@ -222,7 +222,12 @@ class SourceSeries:
         states = tuple(state) if isinstance(state, tuple | list) else (state,)
         if states and all(isinstance(one, Mosaic | ChannelFrame) for one in states):
             return states
-        values = np.asarray(state)
+        values = plain(state)
+        if values.dtype.kind == "f" and np.asarray(state).dtype.kind in "ui":
+            raise FrameError(
+                f"{name} of {_class(self.source)} has masked samples, which a raw frame cannot have: give it saturated "
+                "there, or images of the lights as floats"
+            )
         if values.dtype.kind != "f" or values.ndim not in (2, 3):
             return (self._raw(values, name),)
         stated = {"frames.kind": self.stated.kind, "frames.cfa": self.stated.cfa, "calibration.file": self.camera}

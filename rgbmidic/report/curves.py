@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 
     from rgbmidic.results.physical import Physical
 
+logger = logging.getLogger(__name__)
+
 _COLOURS = [OKABE_ITO[name] for name in ("blue", "vermillion", "green")]
 _STATUS = QUANTITIES["node_status"].codes
 _STATUS_COLOURS = (OKABE_ITO["sky blue"], "#333333", OKABE_ITO["vermillion"], OKABE_ITO["yellow"])
@@ -40,6 +44,8 @@ _MARKED, _MARKED_OF_PROBE = 40, 60
 """Points up to which each gets a marker, in a panel of half the width and of the whole width: more would touch."""
 _PANEL = 2.4
 """Height of a panel of `history_figure` in inches, its numbers included: four fill a page."""
+_PANELS = 24
+"""Most panels of a picture of histories: two screens high. Chosen."""
 _NAMED = 14
 """Most quantities of a panel that its legend names: more lines of 7 pt are higher than it; a crack has one a node."""
 _KINDS = (
@@ -119,7 +125,7 @@ def history_figure(histories: Histories) -> Figure:
     """Draw what probes read, over the time, or over the frames where no time is known.
 
     Quantities of one kind and unit share a panel; two standard uncertainties on both sides are shaded. Where a stress
-    is known, a last panel shows it over the strain.
+    is known, a last panel shows it over the strain. Of many kinds the first 24 are shown, and a warning says so.
 
     Parameters
     ----------
@@ -134,6 +140,10 @@ def history_figure(histories: Histories) -> Figure:
     panels: dict[tuple[str, str], list[HistoryColumn]] = {}
     for quantity in histories.quantities:
         panels.setdefault((_kind(quantity), quantity.unit), []).append(quantity)
+    if len(panels) > _PANELS:
+        words = "the picture shows %d of %d kinds of quantities, in their order; the table has them all"
+        logger.warning(words, _PANELS, len(panels))
+        panels = dict(islice(panels.items(), _PANELS))
     times, label_of_times = time_axis(histories.times, histories.frames)
 
     def draw(axes: list[Axes]) -> None:

@@ -29,7 +29,7 @@ from rgbmidic.frames import read_frame
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region
 from rgbmidic.settings import TestSettings
-from rgbmidic.typing import FloatImage
+from rgbmidic.typing import FloatImage, plain
 from rgbmidic.weights.threshold import ThresholdWeights, automatic_weights
 
 
@@ -174,7 +174,7 @@ def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str)
     """
     if weights is None:
         return None
-    values = np.asarray(weights)
+    values = plain(weights)
     if values.shape not in (shape, shape[1:]) or values.dtype.kind not in "buif":
         raise InputError(f"{name} must have shape {shape[1:]} or {shape}; given is {values.dtype} {values.shape}")
     if not (values.min() >= 0 and values.max() < np.inf):  # NaN spreads to both

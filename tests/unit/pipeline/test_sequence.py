@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift
 
-from rgbmidic import measure, measure_sequence
+from rgbmidic import correlate, measure, measure_sequence
 from rgbmidic.correlation import Status
-from rgbmidic.errors import InputError
+from rgbmidic.errors import FrameError, InputError
 from rgbmidic.settings import TestSettings
 
 SIDE, COUNT = 72, 20
@@ -102,3 +102,28 @@ def test_what_contradicts_is_refused():
         measure_sequence(states()[:2], settings(), region=(0, 0, 1, 1))
     with pytest.raises(InputError, match="unknown option"):
         measure_sequence(states()[:2], tolerence=1)
+
+
+def test_masked_samples_are_unknown_and_complex_ones_refused():
+    frames, region = states()[:2], (10, 10, 61, 61)
+    hidden = np.zeros(frames[1].shape, dtype=bool)
+    hidden[:, :34] = True
+    masked = np.ma.masked_array(frames[1], hidden)
+    (found,) = measure_sequence([masked], reference=frames[0], region=region, element_size=17)
+    (expected,) = measure_sequence(
+        [np.where(hidden, np.float32(np.nan), frames[1])], reference=frames[0], region=region, element_size=17
+    )
+    np.testing.assert_array_equal(found.displacement, expected.displacement)
+    assert np.isnan(found.displacement[found.nodes[:, 0] < 25]).all()
+    alone = correlate(frames[0], masked, region=region, element_size=17)
+    assert np.isnan(alone.displacement[alone.nodes[:, 0] < 25]).all()
+    (failed,) = measure_sequence([frames[1] * (1 + 0j)], reference=frames[0], region=region, element_size=17)
+    assert "must be an array of real numbers" in failed.reason
+    with pytest.raises(FrameError, match="must be an array of real numbers"):
+        list(measure_sequence([frames[1]], reference=frames[0] * (1 + 0j), region=region, element_size=17))
+
+
+def test_masked_samples_of_a_raw_frame_are_refused(tmp_path):
+    raw = [np.ma.masked_greater(np.round(one).astype(np.uint16), 2500) for one in states()[:2]]
+    with pytest.raises(FrameError, match="has masked samples, which a raw frame cannot have"):
+        measure(settings(), tmp_path / "out", source=raw)

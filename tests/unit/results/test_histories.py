@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -101,7 +102,11 @@ def result(tmp_path: Path) -> Result:
 
 
 def read(result: Result, **options: Any) -> Histories:
-    chosen = {key: options.pop(key) for key in list(options) if key in ("points", "gauges", "strain_gauges", "window")}
+    chosen = {
+        key: options.pop(key)
+        for key in list(options)
+        if key in ("points", "gauges", "strain_gauges", "regions", "window")
+    }
     return read_histories(result, ProbeSettings(**chosen), **options)
 
 
@@ -517,3 +522,20 @@ def test_a_window_longer_than_the_test_is_one_rule_for_maps_and_histories(result
         np.testing.assert_array_equal(one.values, other.values)
     with pytest.raises(InputError, match="rates need 4 measured frames or more; there are 3"):
         rate_words(9, 3)
+
+
+def test_what_is_cut_off_a_probe_is_stated(result: Result) -> None:
+    """The region reaches to 110 px; a node lacks data in one frame."""
+    regions = ((80.0, 20.0, 130.0, 60.0), (15.0, 12.0, 30.0, 30.0))
+    read_off = read(result, regions=regions, strain_gauges=((100, 40, 60),))
+    (area, gauge) = (remark for remark in read_off.remarks if "of its place at least" in remark)
+    assert area.startswith("region_1 is the mean of 60% of its place at least")
+    part = float(re.search(r"strain of (\d+)%", gauge)[1])
+    assert gauge.startswith("strain_gauge_1")
+    assert 60 < part < 80
+
+
+def test_of_many_channels_the_first_are_drawn(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    columns = [HistoryColumn(name=f"c{i}", unit=f"u{i}", values=np.arange(4.0), std=None) for i in range(40)]
+    assert len(history_figure(histories_of(np.arange(4.0), *columns)).axes) == 24
+    assert "the picture shows 24 of 40 kinds" in caplog.text
