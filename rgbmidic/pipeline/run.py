@@ -31,7 +31,7 @@ from rgbmidic.pipeline.schedule import Schedule, dependants, following, is_key, 
 from rgbmidic.pipeline.source import FrameSequence, LightSeparation, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
-from rgbmidic.results.files import PROVENANCE, read_provenance
+from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.results.store import listed, read_mesh
 from rgbmidic.settings import (
