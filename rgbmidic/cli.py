@@ -199,7 +199,7 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
 @contextmanager
 def _continuation_hint(test: Path, out: Path, frames: str, *, resume: bool) -> Iterator[None]:
     """Print how to continue when the run is interrupted, by Ctrl-C or by SIGTERM, if it wrote anything."""
-    from rgbmidic.results.files import PROVENANCE
+    from rgbmidic.results.provenance import PROVENANCE
 
     def begun() -> bytes:
         return file.read_bytes() if (file := out / PROVENANCE).is_file() else b""

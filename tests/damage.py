@@ -27,7 +27,7 @@ _KINDS = ("bit", "bits", "digit", "cut", "lost piece", "doubled piece", "zeros",
 
 
 def write_result(path: Path, *, tolerance: float = 1e-3, seed: int = 0) -> Path:
-    """A finished result in two files of frames, one frame of which was taken back and measured again."""
+    """A finished result, one frame of which was taken back and measured again."""
     settings = TestSettings(
         frames=FrameSettings(path=("*.dng",)),
         region=RegionSettings(rectangle=(0, 0, 9, 9)),
@@ -104,7 +104,7 @@ def _damage(copy: Path, other: Path, kind: str, random: np.random.Generator) -> 
     elif kind == "swapped":
         content[:] = (other / file.relative_to(copy)).read_bytes()
     elif kind == "renamed":
-        one, two = (copy / "solution" / f"00000{number}.frames" for number in (0, 1))
+        one, two = (copy / "solution" / f"00000{number}.npz" for number in (0, 1))
         spare = one.rename(one.with_suffix(".spare"))
         two.rename(one)
         spare.rename(two)

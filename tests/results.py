@@ -75,6 +75,15 @@ def random_record(seed: int) -> FrameRecord:
     return FrameRecord.of(nodes=NODES, lights=len(LIGHTS), **values)
 
 
+def corrupt(result: Result, frame: int) -> Path:
+    """Turn a bit in the file of a frame, in the displacement."""
+    file = result.path / "solution" / f"{frame:06d}.npz"
+    content = bytearray(file.read_bytes())
+    content[content.find(b"u.npy") + 200] ^= 4
+    file.write_bytes(content)
+    return file
+
+
 def make_result(
     path: Path,
     *,

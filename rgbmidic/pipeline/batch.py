@@ -22,8 +22,9 @@ import numpy as np
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, RgbmidicError
 from rgbmidic.pipeline.run import measure
 from rgbmidic.results import Histories, Maps, Result, shared_part
-from rgbmidic.results.files import check_file, is_result, write_complete
+from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.histories import read_histories
+from rgbmidic.results.provenance import is_result
 from rgbmidic.settings import TestSettings, read_toml, regular
 from rgbmidic.typing import FloatArray
 

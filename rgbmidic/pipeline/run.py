@@ -23,7 +23,7 @@ from rgbmidic.pipeline.schedule import Schedule
 from rgbmidic.pipeline.source import FrameSequence, describe
 from rgbmidic.pipeline.workers import available_cores, open_workers
 from rgbmidic.results import Origin, Result, ResultStore
-from rgbmidic.results.files import PROVENANCE, read_provenance
+from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.results.store import listed, read_mesh
 from rgbmidic.settings import (

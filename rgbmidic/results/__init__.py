@@ -3,7 +3,6 @@
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
-from rgbmidic.results.files import Origin
 from rgbmidic.results.histories import (
     Histories,
     HistoryColumn,
@@ -27,6 +26,7 @@ from rgbmidic.results.physical import (
     shared_part,
     units_of,
 )
+from rgbmidic.results.provenance import Origin
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, ResultQuantity
 from rgbmidic.results.result import Result
 from rgbmidic.results.store import ResultStore, finish_result

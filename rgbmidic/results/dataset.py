@@ -43,7 +43,7 @@ class _Frames(BackendArray):
 
     def __init__(self, result: Result, names: tuple[str, ...], physical: Physical | None = None) -> None:
         self.result, self.names, self.physical = result, names, physical
-        blank = QUANTITIES[names[0]].unmeasured(result.table.layout.sizes)
+        blank = QUANTITIES[names[0]].unmeasured(result.table.sizes)
         self.dtype = blank.dtype
         self.shape = (len(result), *blank.shape, *([len(names)] if len(names) > 1 else []))
 
@@ -61,7 +61,7 @@ class _Frames(BackendArray):
                 array = array[(slice(None),) * axis + (index,)]
             return array
 
-        blank = QUANTITIES[self.names[0]].unmeasured(self.result.table.layout.sizes)
+        blank = QUANTITIES[self.names[0]].unmeasured(self.result.table.sizes)
         read = np.empty((frames.size, *part(dict.fromkeys(self.names, blank)).shape), dtype=self.dtype)
         for row, values in enumerate(self._each(frames.reshape(-1).tolist(), blank)):
             read[row] = part(values)

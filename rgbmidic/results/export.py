@@ -304,7 +304,7 @@ def _write_npz(physical: Physical, file: BinaryIO) -> None:
         for quantity in QUANTITIES.values():
             if not quantity.stackable:
                 continue
-            blank = quantity.unmeasured(result.table.layout.sizes)
+            blank = quantity.unmeasured(result.table.sizes)
             head = {"descr": blank.dtype.str, "fortran_order": False, "shape": (len(result), *blank.shape)}
             with archive.open(f"{quantity.name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array_header_1_0(member, head)

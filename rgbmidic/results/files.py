@@ -1,51 +1,25 @@
-"""Files of a result, and claims on its folder.
-
-A file appears under its name only when it is complete; a damaged one is an error that names it. A claim is a file that
-names a process that writes into the folder, and the frames that it writes.
-
-Provenance of a result: what all its frames share, kept so that a later run can check that it is the same.
-"""
+"""Files that appear under their names only when they are complete; a damaged one is an error that names it."""
 
 from __future__ import annotations
 
 import glob
-import hashlib
-import importlib.metadata
 import io
 import json
 import os
-import platform
-import random
-import secrets
 import socket
-import sys
-import time
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.threads import machine
-from rgbmidic._version import __version__
-from rgbmidic.errors import AnotherTestError, ResultError, disk_faults
-from rgbmidic.fields import CameraCalibration
-from rgbmidic.frames import file_hash
-from rgbmidic.mesh import FiniteElementMesh, Placement
-from rgbmidic.results.quantities import FINITE_ELEMENTS, SHARED
-from rgbmidic.settings import TestSettings, regular
+from rgbmidic.errors import ResultError, disk_faults
+from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray
-
-ALL_FRAMES = range(sys.maxsize)
-"""All frames that a folder has or will have."""
-_PAUSES = (0.02, 0.05, 0.1, 0.2)
-"""Seconds, at most, between tries. Two that start at once see each other and both step back; a pause drawn by chance
-lets one be first. A process of an array looks at a folder in some ms."""
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
@@ -75,12 +49,34 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> AnyArray:
     entry = archive.getinfo(f"{name}.npy")
     if entry.compress_type != zipfile.ZIP_STORED:
         raise ValueError(f"{name} is compressed")
-    content = archive.read(entry)
-    file = io.BytesIO(content)
+    return npy_array(archive.read(entry))
+
+
+def npy_bytes(array: npt.ArrayLike) -> bytes:
+    """Return an array as the content of an npy file."""
+    values = np.asarray(array)
+    return _npy_header(values.dtype, values.shape) + values.tobytes()
+
+
+def npy_array(content: bytes) -> AnyArray:
+    """Undo `npy_bytes`; content that its header does not fit is an error before memory is taken."""
+    end = 10 + int.from_bytes(content[8:10], "little")
+    shape, fortran, dtype = _npy_parsed(content[:end])
+    return np.frombuffer(content, dtype, offset=end).reshape(shape, order="F" if fortran else "C").copy()
+
+
+@lru_cache(maxsize=256)
+def _npy_header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
+    file, about = io.BytesIO(), {"descr": dtype.str, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, about)
+    return file.getvalue()
+
+
+@lru_cache(maxsize=256)
+def _npy_parsed(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    file = io.BytesIO(header)
     np.lib.format.read_magic(file)
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    array = np.frombuffer(content, dtype, offset=file.tell())  # one that the header's shape does not fit is an error
-    return array.reshape(shape, order="F" if fortran else "C").copy()
+    return np.lib.format.read_array_header_1_0(file)
 
 
 def write_json(path: Path, document: Any, *, new: bool = False) -> None:
@@ -107,8 +103,8 @@ def read_json(path: Path) -> Any:
         raise ResultError(f"{path} is damaged: {error}") from None
 
 
-def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool = False) -> None:
-    """Write a file under another name and rename it when all of it is on the disk; else nothing is left of it.
+def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool = False, lasting: bool = True) -> None:
+    """Write a file under another name and rename it when all of it is written; else nothing is left of it.
 
     Parameters
     ----------
@@ -119,13 +115,16 @@ def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool
     new
         Whether a file of this name stays as it is, also one that another process writes at the same time; else it is
         replaced.
+    lasting
+        Whether it is on the disk before it gets its name; else a machine without power may lose it.
     """
     temporary = path.with_name(f"{path.name}.{socket.gethostname()}.{os.getpid()}.part")
     try:
         with writing(path), temporary.open("wb") as file:
             write(file)
             file.flush()
-            os.fsync(file.fileno())
+            if lasting:
+                os.fsync(file.fileno())
             if new:
                 try:
                     path.hardlink_to(temporary)
@@ -158,10 +157,16 @@ def check_file(out: Path, *, overwrite: bool) -> None:
             )
         if not out.parent.is_dir():
             raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
-        for part in out.parent.glob(f"{glob.escape(out.name)}.*.*.part"):
-            host, _, process = part.name.removeprefix(f"{out.name}.").removesuffix(".part").rpartition(".")
-            if process.isdecimal() and not _may_live({"host": host, "process": int(process)}):
-                part.unlink(missing_ok=True)
+        remove_parts(out.parent, glob.escape(out.name))
+
+
+def remove_parts(folder: Path, names: str) -> None:
+    """Remove what processes of this host that were killed left of files whose `names` match a pattern."""
+    host = socket.gethostname()
+    for part in folder.glob(f"{names}.{glob.escape(host)}.*.part"):
+        process = part.name.split(".")[-2]
+        if process.isdecimal() and not may_live({"host": host, "process": int(process)}):
+            part.unlink(missing_ok=True)
 
 
 def writing(path: Path | str) -> AbstractContextManager[None]:
@@ -169,79 +174,8 @@ def writing(path: Path | str) -> AbstractContextManager[None]:
     return disk_faults(ResultError, f"{path} cannot be written")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Claim:
-    """A claim that this process holds; other processes of copies cannot release it.
-
-    Attributes
-    ----------
-    file
-        The file of the claim.
-    process
-        Who holds it.
-    """
-
-    file: Path
-    process: int
-
-    @classmethod
-    def take(cls, folder: Path, frames: range) -> Self:
-        """Claim frames (consecutive) of a folder; claims that dead processes of this host left are removed.
-
-        Raises
-        ------
-        ResultError
-            Another run holds some of them, or the claim cannot be written.
-        """
-        for pause in _PAUSES:
-            file = folder / f"in_use.{secrets.token_hex(8)}.json"
-            if not (other := next(_others(file, frames), None)):
-                holder = {"process": os.getpid(), "host": socket.gethostname()}
-                part = file.with_suffix(".part")
-                with writing(file):  # whole at once; it need not outlive the machine
-                    part.write_text(json.dumps(holder | {"first": frames.start, "stop": frames.stop}), encoding="utf-8")
-                    part.replace(file)
-                if not (other := next(_others(file, frames), None)):
-                    return cls(file=file, process=os.getpid())
-                file.unlink(missing_ok=True)
-            time.sleep(random.uniform(0, pause))
-        assert other
-        name, holder = other
-        raise ResultError(
-            f"{folder} is in use by process {holder.get('process', '?')} on {holder.get('host', '?')}; "
-            f"give another folder, or delete {name} if that run is dead"
-        )
-
-    def release(self) -> None:
-        """Remove the claim, so that other processes can write the frames."""
-        if self.process == os.getpid():
-            with writing(self.file):
-                self.file.unlink(missing_ok=True)
-
-
-def _others(mine: Path, frames: range) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Yield the claims of other processes on any of these frames; one that cannot be read is on all of them."""
-    for file in mine.parent.glob("in_use.*.json"):
-        if file == mine:
-            continue
-        try:
-            document = read_json(file)
-        except FileNotFoundError:
-            continue
-        except ResultError:
-            document = {}
-        holder = document if isinstance(document, dict) else {}
-        first, stop = holder.get("first"), holder.get("stop")
-        if not _may_live(holder):
-            file.unlink(missing_ok=True)
-        elif not (isinstance(first, int) and isinstance(stop, int)) or (
-            max(first, frames.start) < min(stop, frames.stop)
-        ):
-            yield file, holder
-
-
-def _may_live(holder: dict[str, Any]) -> bool:
-    """Report whether the process of a claim may live: False only for one of this host that is found dead."""
+def may_live(holder: dict[str, Any]) -> bool:
+    """Report whether the process of a claim or a file may live: False only for one of this host that is found dead."""
     if holder.get("host") != socket.gethostname() or os.name == "nt":  # where signal 0 would end a process
         return True
     try:
@@ -251,221 +185,3 @@ def _may_live(holder: dict[str, Any]) -> bool:
     except (KeyError, TypeError, OverflowError, OSError):
         pass
     return True
-
-
-SCHEMA_NAME = "rgbmidic-result"
-SCHEMA_VERSION = 10
-"""Goes up with every change of the quantities or files: a result of another version is refused, not guessed at."""
-
-PROVENANCE = "provenance.json"
-PUT_BACK = "put back the file that was there, or delete it and go on with --resume"
-"""What to do about a file of another run."""
-_SEAL = "sha256"
-_PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tifffile", "h5py")
-_ALWAYS = ("rgbmidic", *_PACKAGES[:4])
-"""Packages whose version decides on the bits of any result; the others read formats of frames."""
-READING = ("scale", "probes", "setup", "channels")
-"""Sections of the settings that state how a result is read, and not what is measured."""
-_NAMED = 3
-"""Differences that an error names: more do not fit a line of a terminal."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Origin:
-    """What all frames of a result share.
-
-    Attributes
-    ----------
-    nodes, elements
-        The mesh: (N, 2) positions in px and (E, 3) node indices.
-    readers
-        Names of the packages, beside those that every result needs, by which the frames are read.
-    finite_elements, placement
-        The same mesh in mm with the numbers of its nodes and elements, and where it lies; None: it is of no file.
-    names, lights
-        Name of each frame and of each light.
-    settings
-        Kept in the provenance, with the hash of the calibration file that they name.
-    inputs
-        A text for each input by its name, such as a file's fingerprint: when it differs, so does the input.
-    references
-        Positions of the reference frames among the result's frames; may be empty.
-    reference : array, shape (k, H, W), optional
-        Reference image of each light, NaN where unknown; kept in 8 bit, for figures.
-    notes
-        Further plain values to keep in the provenance, such as ``frame_rate`` and ``exposure_ns``.
-    """
-
-    nodes: npt.ArrayLike
-    elements: npt.ArrayLike
-    names: Sequence[str]
-    lights: Sequence[str]
-    settings: TestSettings | None = None
-    inputs: Mapping[str, str] = field(default_factory=dict)
-    readers: Sequence[str] = ()
-    finite_elements: FiniteElementMesh | None = None
-    placement: Placement | None = None
-    references: Sequence[int] = (0,)
-    reference: npt.ArrayLike | None = None
-    notes: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def mesh(self) -> dict[str, AnyArray]:
-        """`nodes` and `elements`, and what is known of finite elements, in the types of the table."""
-        arrays: dict[str, npt.ArrayLike] = {"nodes": self.nodes, "elements": self.elements}
-        if (stated := self.finite_elements) is not None:
-            numbers = stated.node_numbers, stated.element_numbers, stated.points
-            arrays |= zip(FINITE_ELEMENTS, numbers, strict=True)
-        return {name: SHARED[name].convert(array, {}) for name, array in arrays.items()}
-
-    def provenance(self) -> dict[str, Any]:
-        """Return the content of ``provenance.json`` at the start of a run, in plain values."""
-        document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION, "created": now()}
-        versions = {"rgbmidic": __version__, "python": platform.python_version()}
-        for name in _PACKAGES:
-            with suppress(importlib.metadata.PackageNotFoundError):
-                versions[name] = importlib.metadata.version(name)
-        document |= {"versions": versions, "readers": list(self.readers)}
-        document |= {"platform": platform.platform(), "machine": machine()}
-        if self.settings is not None:
-            document |= {"settings": self.settings.to_mapping(), "base": str(self.settings.base)}
-            if (file := self.settings.calibration_file) is not None:
-                document["calibration"] = {"file": str(file), "sha256": file_hash(file)}
-            if (file := self.settings.scale.camera) is not None:
-                document["camera"] = CameraCalibration.read(file).to_document()
-        if self.finite_elements is not None and self.placement is not None:
-            document["finite_elements"] = {
-                **{key: getattr(self.finite_elements, key) for key in ("name", "axes", "unit_mm", "numbering")},
-                "sha256": file_hash(Path(self.finite_elements.name)),
-                "placement": self.placement.to_document(),
-            }
-        document |= {**self.notes, "lights": list(self.lights), "references": list(self.references)}
-        document["frames"] = {"count": len(self.names), "sha256": digest(list(self.names))}
-        document |= {"mesh": digest(self.mesh), "inputs": dict(self.inputs)}
-        plain: dict[str, Any] = json.loads(json.dumps(document))
-        return plain
-
-
-def digest(content: Mapping[str, AnyArray] | list[str]) -> str:
-    """Return the SHA-256 of arrays or of texts in hexadecimal digits."""
-    if isinstance(content, list):
-        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
-    sums = hashlib.sha256()
-    for name, array in content.items():
-        sums.update(f"{name} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())
-    return sums.hexdigest()
-
-
-def check_same(path: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuse to go on with a result whose provenance `was` when frames to come would have the provenance `now`.
-
-    Raises
-    ------
-    AnotherTestError
-        Settings, calibration, inputs, frames, mesh, lights, references, or a version differ; the message says which.
-    """
-    before, after = dict(_compared(was)), dict(_compared(now))
-    # 25 and 25.0 are one number; 1 is a frame, true is not
-    names = [name for name in {**before, **after} if _typed(before.get(name)) != _typed(after.get(name))]
-    if names:
-        differences = "; ".join(
-            f"{name} was {_short(before.get(name))}, now {_short(after.get(name))}" for name in names[:_NAMED]
-        )
-        more = f"; and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-        raise AnotherTestError(
-            f"{path} is of another test and is not gone on with: {differences}{more}; give another folder"
-        )
-
-
-def _compared(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield what decides on the bits of a result, each under a name for messages."""
-    for section, keys in document.get("settings", {}).items():
-        if section in READING:
-            continue
-        yield from ((f"{section}.{key}", value) for key, value in keys.items())
-    yield "the calibration", document.get("calibration", {}).get("sha256")
-    yield from ((f"the input {name}", text) for name, text in document["inputs"].items())
-    yield "the mesh", document["mesh"]
-    yield "the mesh's file", document.get("finite_elements", {}).get("sha256")
-    yield "the number of frames", document["frames"]["count"]
-    yield "the list of frames", document["frames"]["sha256"]
-    yield from ((name, document[name]) for name in ("lights", "references"))
-    for name in (*_ALWAYS, *document["readers"]):
-        yield f"the version of {name}", document["versions"].get(name)
-
-
-def _typed(value: Any) -> tuple[bool, Any]:
-    return isinstance(value, bool), value
-
-
-def _short(value: Any) -> str:
-    text = "nothing" if value is None else json.dumps(value)
-    return text if len(text) <= 60 else f"{text[:56]} ..."
-
-
-def fingerprint(document: Mapping[str, Any]) -> bytes:
-    """Return the digest (16 bytes) of what `check_same` compares: every record of a run has it in its header."""
-    return hashlib.sha256(_canonical(dict(_compared(document)))).digest()[:16]
-
-
-def sealed(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Add the checksum of the content to a provenance, as it is written."""
-    return {**document, _SEAL: hashlib.sha256(_canonical(document)).hexdigest()}
-
-
-def _canonical(document: Mapping[str, Any]) -> bytes:
-    return json.dumps(document, sort_keys=True).encode()
-
-
-def is_result(path: Path) -> bool:
-    """Report whether a folder has the provenance of a result, of whatever version and state.
-
-    Raises
-    ------
-    ResultError
-        It has a foreign file of that name, or one that is no JSON.
-    """
-    try:
-        _document(path)
-    except FileNotFoundError:
-        return False
-    return True
-
-
-def _document(path: Path) -> dict[str, Any]:
-    document = read_json(path / PROVENANCE)
-    if not isinstance(document, dict) or document.get("schema") != SCHEMA_NAME:
-        raise ResultError(f'{path / PROVENANCE} does not belong to a result: its "schema" is not "{SCHEMA_NAME}"')
-    return document
-
-
-def read_provenance(path: Path) -> dict[str, Any]:
-    """Read the provenance of the result in a folder: lights, settings, fingerprints, versions, dates.
-
-    Raises
-    ------
-    ResultError
-        The folder is no result, has another schema version, or the file was changed.
-    """
-    try:
-        document = _document(path)
-    except FileNotFoundError:
-        raise ResultError(f"{path} is not a result folder: it has no {PROVENANCE}") from None
-    if (version := document.get("schema_version")) != SCHEMA_VERSION:
-        raise ResultError(
-            f"{path} has schema version {version!r}, this version of rgbmidic reads {SCHEMA_VERSION}; measure the test "
-            "again, or read it with the version of rgbmidic that wrote it"
-        )
-    seal = document.pop(_SEAL, None)
-    if sealed(document)[_SEAL] != seal:
-        raise ResultError(
-            f"{path / PROVENANCE} was changed after it was written: put it back as it was. Another [scale], [setup] or "
-            "other [probes] or [channels] are stated in TEST.toml: `rgbmidic run TEST.toml --out DIR --resume` keeps "
-            "them, --test TEST.toml of history, export and report reads with them"
-        )
-    return document
-
-
-def now() -> str:
-    """Return the present date and time."""
-    return datetime.now(UTC).isoformat(timespec="seconds")

@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from rgbmidic.command import optional
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.files import fingerprint, read_provenance
+from rgbmidic.results.provenance import fingerprint, read_provenance
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord
-from rgbmidic.results.shards import FrameTable
+from rgbmidic.results.records import FrameTable
 from rgbmidic.results.store import check_complete, listed, load_frames, load_result, read_reference
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 class Result:
     """The result of a test, for post-processing.
 
-    `Result.open` opens a result folder, also during a run, and reads only the mesh and the table of the frames. The
+    `Result.open` opens a result folder, also during a run, and reads only the mesh and which frames there are. The
     quantities are those of `rgbmidic.results.QUANTITIES` (table in docs: conventions). There are four ways to read
     them:
 
@@ -52,7 +52,7 @@ class Result:
     path
         The folder.
     table
-        Position of each frame in the files.
+        Which frames there are.
     nodes : ndarray, shape (N, 2), float64
         Positions (x, y) in px on the reference image.
     elements : ndarray, shape (E, 3), int32
@@ -111,10 +111,8 @@ class Result:
             check_complete(path, made.names, made.table, ended=ended)
         elif check:
             made = replace(made, table=made.table.without_damaged(ended=ended))
-            lost, gaps = np.flatnonzero(made.table.damaged).tolist(), made.table.gaps
-            if lost or gaps:
-                files = "".join(f"; {file} is damaged between its records" for file in gaps)
-                logger.warning("%s is damaged: frames lost: %s%s", path, listed(lost, made.names) or "unknown", files)
+            if lost := np.flatnonzero(made.table.damaged).tolist():
+                logger.warning("%s is damaged: frames lost: %s", path, listed(lost, made.names))
         return made
 
     def refresh(self) -> Self:
@@ -128,7 +126,7 @@ class Result:
         provenance = read_provenance(self.path)
         if {**provenance, "finished": ""} != {**self.provenance, "finished": ""}:
             raise ResultError(f"{self.path} now holds another result; open it again")
-        table = load_frames(self.path, self.table.layout.sizes, len(self), fingerprint(provenance))
+        table = load_frames(self.path, self.table.sizes, len(self), fingerprint(provenance))
         if self.table.damaged.any():
             table = table.without_damaged(ended="finished" in provenance)
         return replace(self, table=table, provenance=provenance)
@@ -172,7 +170,7 @@ class Result:
     def stack(self, name: str) -> AnyArray:
         """Read one quantity of all frames into one array, the frames as first axis."""
         entry = QUANTITIES[name]
-        shape = (len(self.nodes),) if entry.estimated else entry.unmeasured(self.table.layout.sizes).shape
+        shape = (len(self.nodes),) if entry.estimated else entry.unmeasured(self.table.sizes).shape
         stacked = np.full((len(self), *shape), entry.blank, dtype=entry.dtype)
         for index, value in enumerate(self.each(name)):
             if np.size(value) or not entry.estimated:
@@ -259,7 +257,7 @@ class Result:
 
         Of a frame of which only a part is read it shows that part, which begins at `reference_origin`.
         """
-        return read_reference(self.path, self.table.layout.sizes, fingerprint(self.provenance))
+        return read_reference(self.path, self.table.sizes, fingerprint(self.provenance))
 
     @property
     def reference_origin(self) -> tuple[int, int]:

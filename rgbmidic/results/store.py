@@ -1,13 +1,15 @@
 """The writing side of a result: one folder that grows frame by frame and can be read at any time.
 
 ``provenance.json`` (settings, fingerprints, versions, dates), ``frames.json`` (names), ``mesh.npz``, ``reference.npz``
-(the reference images as pictures) and the frames under ``solution/``. The provenance appears first and at once, whoever
-starts first; all else follows from what it has fingerprints of, so that whoever comes later can complete it.
+(the reference images as pictures) and a file for each frame under ``solution/``. The provenance appears first and at
+once, whoever starts first; all else follows from what it has fingerprints of, so that whoever comes later can complete
+it.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,27 +20,22 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.files import (
-    ALL_FRAMES,
+from rgbmidic.results.claim import ALL_FRAMES, Claim
+from rgbmidic.results.files import read_arrays, read_json, remove_parts, write_arrays, write_json, writing
+from rgbmidic.results.provenance import (
     PROVENANCE,
     PUT_BACK,
-    Claim,
     Origin,
     check_same,
     digest,
     fingerprint,
     is_result,
     now,
-    read_arrays,
-    read_json,
     read_provenance,
     sealed,
-    write_arrays,
-    write_json,
-    writing,
 )
 from rgbmidic.results.quantities import FINITE_ELEMENTS, SHARED, FrameRecord
-from rgbmidic.results.shards import FrameTable, RecordLayout, ShardWriter, discard, shard_files
+from rgbmidic.results.records import FrameTable, discard, record_files, write_record
 from rgbmidic.typing import AnyArray, BoolArray
 
 logger = logging.getLogger(__name__)
@@ -69,7 +66,7 @@ class ResultStore:
     frame_count: int
     sizes: Mapping[str, int]
     _claim: Claim
-    _writer: ShardWriter
+    _run: bytes
 
     @classmethod
     def create(cls, path: Path | str, origin: Origin, *, overwrite: bool = False) -> Self:
@@ -141,8 +138,7 @@ class ResultStore:
             if overwrite is not None:
                 _make_room(path, overwrite=overwrite)
             run = _start(path, origin)
-            writer = ShardWriter(path / _FRAMES, RecordLayout.of(sizes), run)
-            return cls(path=path, frame_count=count, sizes=sizes, _claim=claim, _writer=writer)
+            return cls(path=path, frame_count=count, sizes=sizes, _claim=claim, _run=run)
 
     def __enter__(self) -> Self:
         """Return the store."""
@@ -153,11 +149,10 @@ class ResultStore:
         self.release()
 
     def release(self) -> None:
-        """Close the file that is written and remove the claim, so that other runs can write these frames."""
-        try:
-            self._writer.close()
-        finally:
-            self._claim.release()
+        """Have all that was written put on the disk and remove the claim, so that other runs can write these frames."""
+        if hasattr(os, "sync"):  # once: for each frame by itself it takes as long as three of them take to be written
+            os.sync()
+        self._claim.release()
 
     def write_frame(self, index: int, record: FrameRecord) -> None:
         """Keep the result of frame `index`; in any order, and again, where the last one counts.
@@ -175,13 +170,13 @@ class ResultStore:
             raise InputError(f"there is no frame {index} in a result of {self.frame_count} frames")
         if record.sizes != self.sizes:
             raise InputError(f"frame {index} has the sizes {record.sizes}, the result {self.sizes}")
-        self._writer.append(index, record)
+        write_record(self.path / _FRAMES, index, record, self._run)
 
     def discard(self, frames: Collection[int]) -> None:
         """Discard frames that are to be measured again; a `ResultError` where the disk refuses."""
         if frames:
             self.reopen()
-            discard(self.path / _FRAMES, self._writer.run, frames)
+            discard(self.path / _FRAMES, frames)
 
     def finished(self) -> BoolArray:
         """Read which frames of the test are in the folder, whoever wrote them, shape (T,)."""
@@ -189,7 +184,7 @@ class ResultStore:
 
     def table(self) -> FrameTable:
         """Read the table of the frames that are in the folder now, whoever wrote them."""
-        return load_frames(self.path, self.sizes, self.frame_count, self._writer.run)
+        return load_frames(self.path, self.sizes, self.frame_count, self._run)
 
     def reopen(self) -> None:
         """Take the date of its end out of the provenance, before frames are written."""
@@ -235,10 +230,9 @@ def check_complete(path: Path, names: tuple[str, ...], table: FrameTable, *, end
     if not missing:
         return
     frames = listed(missing, names)
-    if ended or table.gaps or table.damaged.any():
-        where = f" ({', '.join(file.name for file in table.gaps)})" if table.gaps else ""
+    if ended or table.damaged.any():
         raise ResultError(
-            f"{path} is damaged{where}: of {len(names)} frames are lost {frames}; `rgbmidic run TEST.toml --out {path} "
+            f"{path} is damaged: of {len(names)} frames are lost {frames}; `rgbmidic run TEST.toml --out {path} "
             "--resume` measures them again, --partial (partial=True) reads the rest"
         )
     raise ResultError(
@@ -263,7 +257,7 @@ def load_result(path: Path) -> dict[str, Any]:
 
 def load_frames(path: Path, sizes: Mapping[str, int], count: int, run: bytes) -> FrameTable:
     """Read the table of the frames that a result of `count` frames holds now; `run` is the digest of the run."""
-    return FrameTable.load(path / _FRAMES, RecordLayout.of(sizes), count, run)
+    return FrameTable.load(path / _FRAMES, sizes, count, run)
 
 
 def read_names(path: Path, provenance: Mapping[str, Any]) -> tuple[str, ...]:
@@ -328,7 +322,9 @@ def _make_room(path: Path, *, overwrite: bool) -> None:
             "on with it (--resume)"
         )
     with writing(path):
-        for file in (*shard_files(path / _FRAMES), *(path / name for name in (_REFERENCE, _MESH, _NAMES, PROVENANCE))):
+        old = (path / _FRAMES).glob("[0-9]*.frames")  # of schema versions to 10
+        frames = (Path(entry) for entry in record_files(path / _FRAMES).values())
+        for file in (*old, *frames, *(path / name for name in (_REFERENCE, _MESH, _NAMES, PROVENANCE))):
             file.unlink(missing_ok=True)
 
 
@@ -338,7 +334,7 @@ def _start(path: Path, origin: Origin) -> bytes:
     Returns the digest of the run from the provenance that is there, which may write the same number in another way.
     """
     foreign = [file for name in (_MESH, _REFERENCE, _NAMES) if (file := path / name).exists()]
-    foreign += shard_files(path / _FRAMES)
+    foreign += map(Path, record_files(path / _FRAMES).values())
     stated = origin.provenance()
     if not (path / PROVENANCE).exists():  # looked at after the others: it is the first to appear
         if foreign:
@@ -355,6 +351,8 @@ def _start(path: Path, origin: Origin) -> bytes:
         )
     with writing(path):
         (path / _FRAMES).mkdir(exist_ok=True)
+        remove_parts(path, "*")
+        remove_parts(path / _FRAMES, "*")
     run, sizes = fingerprint(kept), {"light": len(origin.lights)}
     if not _readable(lambda: read_names(path, kept)):
         write_json(path / _NAMES, list(origin.names))

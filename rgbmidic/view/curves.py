@@ -117,11 +117,6 @@ NOW = {"dimension": "height", "level": "overlay", "line_color": "#8e5bd0", "line
 """Mark of the frame in view: over all else, which is not painted again when it moves."""
 
 
-def places(result: Result) -> npt.NDArray[np.int64]:
-    """Return the places of the frames' records, shape (T, 2): a frame that is measured again has another place."""
-    return np.stack([result.table.places[name] for name in ("shard", "start")], axis=1)
-
-
 class Progress:
     """Status of the frames of a result that may still grow; pages of one result share it.
 
@@ -146,7 +141,7 @@ class Progress:
         self.status: npt.NDArray[np.int8] = np.full(frames, _NOT_YET, dtype=np.int8)
         self.fraction: FloatArray = np.full(frames, np.nan)
         self.changes = 0
-        self._places = np.zeros((frames, 2), dtype=np.int64)
+        self._written = np.zeros(frames, dtype=np.int64)
 
     @property
     def known(self) -> int:
@@ -155,11 +150,11 @@ class Progress:
 
     def advance(self, result: Result) -> None:
         """Read some frames more, and again those that were measured again."""
-        now = places(result)
-        stale = (self.status != _NOT_YET) & (now != self._places).any(axis=1)
+        now = result.table.written
+        stale = (self.status != _NOT_YET) & (now != self._written)
         self.status[stale], self.fraction[stale] = _NOT_YET, np.nan
         frames = np.flatnonzero(result.finished & (self.status == _NOT_YET))[:_AT_ONCE]
-        self._places[frames] = now[frames]
+        self._written[frames] = now[frames]
         self.changes += bool(stale.any() or len(frames))
         for frame in frames.tolist():
             try:
@@ -438,25 +433,25 @@ class _Reading:
     ----------
     maps, profile
         The result, and a row of each of its frames.
-    places : ndarray, shape (T, 2)
-        Of the records.
+    written : ndarray, shape (T,), int64
+        When each frame was written: one that is measured again is read again.
     read : ndarray, shape (T,), bool
         Frames that are read, or cannot be.
     """
 
     maps: Maps
     profile: Profile
-    places: npt.NDArray[np.int64]
+    written: npt.NDArray[np.int64]
     read: BoolArray
 
     @classmethod
     def begin(cls, maps: Maps, field: str, place: Sequence[float], before: _Reading | None) -> _Reading:
         """Lay the line; what was read `before`, of the result when it was shorter, is kept unless it may differ."""
         profile = Profile.along(maps, field, place, range(len(maps.result)))
-        now, read = places(maps.result), np.zeros(len(maps.result), dtype=np.bool_)
-        if before is not None and not profile.rate_window and (now == before.places)[before.read].all():
+        now, read = maps.result.table.written, np.zeros(len(maps.result), dtype=np.bool_)
+        if before is not None and not profile.rate_window and (now == before.written)[before.read].all():
             profile.values[:], profile.std[:], read = before.profile.values, before.profile.std, before.read.copy()
-        return cls(maps=maps, profile=profile, places=now, read=read).further()
+        return cls(maps=maps, profile=profile, written=now, read=read).further()
 
     @property
     def missing(self) -> npt.NDArray[np.int64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -34,7 +35,7 @@ from rgbmidic.view.address import (
     probe_place,
 )
 from rgbmidic.view.canvas import Canvas, LabelLayer, LineLayer, arrow_lines, contour_lines, direction_lines
-from rgbmidic.view.curves import CurvePanel, LinePanel, Progress, TimeLine, as_csv, marks_of, places, probes
+from rgbmidic.view.curves import CurvePanel, LinePanel, Progress, TimeLine, as_csv, marks_of, probes
 from rgbmidic.view.draft import Confirmation, Draft, channel_section, probe_section, scale_section
 from rgbmidic.view.models import CONTROLS, WRITTEN, MarkLayer, ResultControls, SharedState, script
 from rgbmidic.view.picture import (
@@ -59,6 +60,8 @@ from rgbmidic.view.setup_panel import Movie
 
 _TICK, _IDLE = 200, 1000
 """Ms between two parts of the time line; between two checks whether a result has grown, and pictures of that."""
+_SETTLED = 2_000_000_000
+"""Ns after which a folder that is changed has another date, whatever the disk's clock ticks in."""
 _CONTOURS = 10
 """Steps between contour lines at most. Chosen; more cover the field."""
 _CURVES = {entry for entry, section, *_ in CONTROLS if section == "Channels"} | {"along"}
@@ -92,7 +95,7 @@ class ResultPage:
         self._read = lru_cache(4)(lambda name, frame, changes, chosen: self.fields.read(name, frame))
         self._moved = lru_cache(2)(lambda frame, changes, chosen: self.fields.displacement(frame))
         self._test_range = lru_cache(8)(lambda name, changes, chosen: range_of_test(self.fields, name))
-        self._changes = self._size = 0
+        self._changes = self._grown = 0
         self._scale_read: ScaleSettings | None = None
         self._chosen: tuple[Any, ...] = ()
         self.state, self.dark = SharedState(name="state", asked=view.frame, shown=view.frame), view.theme == "dark"
@@ -643,11 +646,11 @@ class ResultPage:
 
     def _grow(self) -> None:
         """Take in frames that a run has added or measured again; a view of the last frame follows it."""
-        size = sum(file.stat().st_size for file in self.result.path.glob("solution/*"))
-        if size == self._size:
+        grown = (self.result.path / "solution").stat().st_mtime_ns
+        if grown == self._grown and time.time_ns() > grown + _SETTLED:
             return
-        self._size, new = size, self.result.refresh()
-        if np.array_equal(places(new), places(self.result)):
+        self._grown, new = grown, self.result.refresh()
+        if np.array_equal(new.table.written, self.result.table.written):
             return
         before, after = np.flatnonzero(self.result.finished), np.flatnonzero(new.finished)
         self.result, self.fields, self._changes = new, replace(self.fields, result=new), self._changes + 1

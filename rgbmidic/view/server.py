@@ -31,7 +31,7 @@ from tornado.web import ErrorHandler
 
 from rgbmidic.errors import ConfigurationError, InputError, ResultError, RgbmidicError
 from rgbmidic.results import Maps, Result
-from rgbmidic.results.files import PROVENANCE
+from rgbmidic.results.provenance import PROVENANCE
 from rgbmidic.settings import read_table, read_toml
 from rgbmidic.view.address import ViewState
 from rgbmidic.view.curves import Progress

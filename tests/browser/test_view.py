@@ -9,7 +9,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
-from results import NODES, make_origin, make_result, smooth_record
+from results import NODES, corrupt, make_origin, make_result, smooth_record
 from viewer import MISSING, Page, chromium, click, serving
 
 from rgbmidic.report import write_movie
@@ -345,10 +345,7 @@ def test_nothing_is_asked_of_the_network(driver, address):
 
 def test_a_damaged_frame_is_told_and_the_page_goes_on(driver, tmp_path):
     made = make_result(tmp_path / "result", frames=3)
-    file = next((made.path / "solution").glob("*.frames"))
-    content = bytearray(file.read_bytes())
-    content[int(made.table.places["start"][1]) + 3] ^= 255
-    file.write_bytes(content)
+    corrupt(made, 1)
     with serving(made.path) as told:
         page = Page(driver, told)
         page.do("model('frame').value = 1")

@@ -19,7 +19,7 @@ import pytest
 import tifffile
 import typer
 from cine_files import write_cine
-from results import make_origin, make_result, random_record, smooth_record
+from results import corrupt, make_origin, make_result, random_record, smooth_record
 from small_tests import colour_test
 
 from rgbmidic import __version__, cli, report
@@ -349,19 +349,17 @@ def test_export_of_an_interrupted_run(command: Run, tmp_path: Path) -> None:
 
 def test_export_of_a_damaged_result(command: Run, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     result = make_result(tmp_path / "out", frames=3)
-    file = result.path / "solution" / "000000.frames"
-    content = bytearray(file.read_bytes())
-    content[int(result.table.places["start"][1] + result.table.places["length"][1] // 2)] ^= 16
-    file.write_bytes(content)
+    last = result.frame(2).u
+    corrupt(result, 1)
     status, _, error = command("export", result.path, "--out", tmp_path / "a.npz")
     assert status == 2
-    assert "000000.frames is damaged in frame 1: " in error
+    assert "000001.npz is damaged in frame 1: " in error
     assert "--partial" in error
     assert command("export", result.path, "--out", tmp_path / "a.npz", "--partial")[0] == 0
     assert f"{result.path} is damaged: frames lost: 1 (frame 1)" in caplog.text
     with np.load(tmp_path / "a.npz") as archive:
         assert np.isnan(archive["u"]).all(axis=1).tolist() == [False, True, False]
-        np.testing.assert_array_equal(archive["u"][2], result.u[2])
+        np.testing.assert_array_equal(archive["u"][2], last)
     assert command("finish", result.path, "--no-figures")[0] == 2
 
 

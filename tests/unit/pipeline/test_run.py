@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from results import corrupt
 from textures import Affine, Texture
 
 from rgbmidic._kernels.threads import set_threads, threads
@@ -338,21 +339,15 @@ def test_a_finished_result_is_gone_on_with_only_where_it_is_damaged(
     movie: Path, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any
 ) -> None:
     out = Path(shutil.copytree(whole.path, tmp_path / "result"))
-    kept, file = (out / "provenance.json").read_bytes(), out / "solution" / "000000.frames"
+    kept = (out / "provenance.json").read_bytes()
     monkeypatch.setattr("rgbmidic.results.store.now", lambda: "later")
     measured: list[str] = []
     same(in_order(settings(movie), out, resume=True, progress=counted(measured)), whole)
     assert "is finished and whole: nothing is left to be measured" in caplog.text
     assert ((out / "provenance.json").read_bytes(), measured) == (kept, [])
-    content = bytearray(file.read_bytes())
-    content[int(whole.table.places["start"][12] + whole.table.places["length"][12] // 2)] ^= (
-        4  # in the record of one frame, in the header of another
-    )
-    content[int(whole.table.places["start"][25]) - 20] ^= 4
-    file.write_bytes(content)
-    with pytest.raises(
-        ResultError, match=r"damaged \(000000\.frames\): of 36 frames are lost 25 \(f025\.tif\); .*--res"
-    ):
+    corrupt(Result.open(out), 12)
+    (out / "solution" / "000025.npz").unlink()
+    with pytest.raises(ResultError, match=r"damaged: of 36 frames are lost 25 \(f025\.tif\); .*--res"):
         Result.open(out)
     same(in_order(settings(movie), out, resume=True, progress=counted(measured)), whole)
     assert "lost to damage and measured again: 12 (f012.tif), 25 (f025.tif)" in caplog.text

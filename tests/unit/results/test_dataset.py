@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
+from results import LIGHTS, MESH, NODES, corrupt, make_origin, make_result, random_record
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results import QUANTITIES, FrameRecord, Result, ResultStore
@@ -82,11 +82,7 @@ def test_pairs_of_frame_and_node_are_read_point_by_point(result: Result) -> None
 
 def test_only_the_frames_asked_for_are_read(result: Result) -> None:
     data = result.to_xarray()
-    file = result.path / "solution" / "000000.frames"
-    start, size = int(result.table.places["start"][2]), int(result.table.places["length"][2])
-    content = bytearray(file.read_bytes())
-    content[start : start + size] = bytes(size)
-    file.write_bytes(content)
+    corrupt(result, 2)
     np.testing.assert_array_equal(data.u.isel(frame=[0, 1, 3, 4]).values, [result.frame(i).u for i in (0, 1, 3, 4)])
     with pytest.raises(ResultError, match="frame 2"):
         data.u.load()

@@ -120,7 +120,7 @@ def test_what_cannot_be_exported_leaves_nothing(result: Result, tmp_path: Path) 
         export_result(result, "npz", tmp_path / "none" / "a")
     with pytest.raises(ResultError, match="already exists"):
         export_result(result, "npz", tmp_path, overwrite=True)
-    file = result.path / "solution" / "000000.frames"
+    file = result.path / "solution" / "000000.npz"
     file.write_bytes(bytes(file.stat().st_size))
     for to in EXPORT_FORMATS:
         with pytest.raises(ResultError, match="damaged"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import shutil
 import socket
@@ -12,23 +13,26 @@ import tracemalloc
 import zipfile
 import zlib
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from damage import damage_results, write_result
-from results import make_result
+from results import corrupt, make_result, random_record
 
 from rgbmidic.errors import ResultError, RgbmidicError
-from rgbmidic.results import EXPORT_FORMATS, Result, export_result
-from rgbmidic.results.files import check_file, fingerprint
+from rgbmidic.results import EXPORT_FORMATS, Result, export_result, finish_result, records
+from rgbmidic.results.files import check_file, npy_bytes
+from rgbmidic.results.provenance import fingerprint
 from rgbmidic.results.store import load_frames
 from rgbmidic.typing import AnyArray
 
 COPIES = 120
 """Mutated copies of each small file of a result."""
-SHARD_COPIES = 1000
-"""Mutated copies of each file that holds frames."""
+RECORD_COPIES = 1000
+"""Mutated copies of the file of a frame."""
 
 
 @pytest.fixture(scope="module")
@@ -84,22 +88,20 @@ def test_a_mutated_file_is_read_or_told(copy: Path, name: str) -> None:
 
 def test_mutated_frames_are_read_told_or_not_there(copy: Path) -> None:
     """Also quantity by quantity, and opened as a run that goes on: never anything else than what was written."""
-    file, whole = copy / "solution" / "000000.frames", Result.open(copy)
-    content, records = file.read_bytes(), [whole.frame(index).values for index in range(2)]
-    told, absent, run = list[str](), 0, fingerprint(whole.provenance)
-    for mutated in _mutations(content, 6, SHARD_COPIES):
+    file, whole = copy / "solution" / "000001.npz", Result.open(copy)
+    content, kept = file.read_bytes(), [whole.frame(index).values for index in range(2)]
+    told, run = list[str](), fingerprint(whole.provenance)
+    for mutated in _mutations(content, 6, RECORD_COPIES):
         file.write_bytes(mutated)
+        table = load_frames(copy, whole.table.sizes, 2, run)
         try:
-            table = load_frames(copy, whole.table.layout.sizes, 2, run)
-            there = np.flatnonzero(table.finished)
-            absent += 2 - len(there)
-            for index, values in zip(there, table.each(["u", "status", "reason"], there), strict=True):
-                np.testing.assert_equal(values, {name: records[index][name] for name in values})
-                np.testing.assert_equal(dict(table.read(index).values), dict(records[index]))
+            for index, values in enumerate(table.each(["u", "status", "reason"], range(2))):
+                np.testing.assert_equal(values, {name: kept[index][name] for name in values})
+                np.testing.assert_equal(dict(table.read(index).values), dict(kept[index]))
         except RgbmidicError as error:
             told.append(str(error))
-    assert all("000000." in message for message in told)
-    assert len(told) + absent > SHARD_COPIES / 2
+    assert all("000001.npz is damaged in frame 1: " in message for message in told)
+    assert len(told) > RECORD_COPIES / 2
 
 
 def test_results_damaged_at_random_are_right_or_told(tmp_path: Path) -> None:
@@ -110,60 +112,81 @@ def test_results_damaged_at_random_are_right_or_told(tmp_path: Path) -> None:
     assert any(end == "told, the rest read, healed by --resume" for _, end in ends)
 
 
-@pytest.mark.parametrize("name", ["solution/000001.frames", "reference.npz", "mesh.npz", "provenance.json"])
+@pytest.mark.parametrize("name", ["solution/000001.npz", "reference.npz", "mesh.npz", "provenance.json"])
 def test_a_file_of_another_run_is_refused_by_name(tmp_path: Path, name: str) -> None:
     """The same mesh, frames and lights, another tolerance of the solver: its numbers are not this run's."""
     mine, other = write_result(tmp_path / "mine"), write_result(tmp_path / "other", tolerance=2e-3, seed=1)
     if name == "mesh.npz":
         np.savez(other / name, nodes=Result.open(other).nodes + 1e-9, elements=Result.open(other).elements)
     shutil.copy(other / name, mine / name)
-    shown = "000000.frames is of another run" if name == "provenance.json" else f"{name} is .*another"
+    shown = "000000.npz is of another run" if name == "provenance.json" else f"{name} is .*another"
     with pytest.raises(ResultError, match=shown):
         _ = Result.open(mine, partial=True).reference
 
 
-def test_a_damaged_header_or_record_loses_its_frame_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Records of one file of four frames: a bit in a header, a bit in a record; the rest is as it was written."""
+def test_a_damaged_record_loses_its_frame_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A bit in an array of one, a bit in the directory of another; the rest is as it was written."""
     whole = Result.open(write_result(tmp_path / "out"))
-    file, table = whole.path / "solution" / "000000.frames", whole.table
+    expected = whole.u
+    corrupt(whole, 2)
+    file = whole.path / "solution" / "000001.npz"
     content = bytearray(file.read_bytes())
-    content[int(table.places["start"][1]) - 3] ^= 1
-    content[int(table.places["start"][2] + table.places["length"][2]) - 1] ^= 128
+    content[-100] ^= 1
     file.write_bytes(content)
-    with pytest.raises(
-        ResultError, match=r"\(000000\.frames\): of 6 frames are lost 1 \(frame 1\); .*--resume.*partial"
-    ):
-        Result.open(whole.path)
+    with pytest.raises(ResultError, match=r"000001\.npz is damaged in frame 1: its directory .*--resume.*--partial"):
+        _ = Result.open(whole.path).u
+    with pytest.raises(ResultError, match=r"000002\.npz is damaged in frame 2: the checksum of u is wrong"):
+        Result.open(whole.path).frame(2)
     rest = Result.open(whole.path, partial=True)
     assert rest.finished.tolist() == [True, False, False, True, True, True]
     assert rest.reasons[1:3] == ("damaged", "damaged")
-    assert "frames lost: 1 (frame 1), 2 (frame 2); " in caplog.text
+    assert "frames lost: 1 (frame 1), 2 (frame 2)" in caplog.text
     assert np.isnan(rest.u[1:3]).all()
-    np.testing.assert_array_equal(rest.u[[0, 3, 4, 5]], whole.u[[0, 3, 4, 5]])
+    np.testing.assert_array_equal(rest.u[[0, 3, 4, 5]], expected[[0, 3, 4, 5]])
     assert rest.refresh().finished.tolist() == rest.finished.tolist()
-    content[int(table.places["start"][1]) - 3] ^= 1  # then only the record is damaged, which shows when it is read
-    file.write_bytes(content)
-    with pytest.raises(ResultError, match=r"000000\.frames is damaged in frame 2: .*--resume"):
-        list(Result.open(whole.path).each("reflection_thumbnail"))
+    with pytest.raises(ResultError, match=r"of 6 frames are lost 1 \(frame 1\), 2 \(frame 2\); .*--resume.*partial"):
+        finish_result(whole.path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes")
+def test_a_pipe_in_the_place_of_a_record_is_not_waited_for(copy: Path) -> None:
+    (copy / "solution" / "000001.npz").unlink()
+    os.mkfifo(copy / "solution" / "000001.npz")
+    with pytest.raises(ResultError, match=r"000001\.npz cannot be read: it is not a regular file but a pipe"):
+        Result.open(copy).frame(1)
+    assert Result.open(copy, partial=True).reasons[1] == "damaged"
 
 
 @pytest.mark.parametrize("size", [0, 7, 2**31, 2**32 - 1])
-@pytest.mark.parametrize("name", ["history", "inputs", "rigid", "weights_thumbnail"])
-def test_a_forged_head_is_told(copy: Path, name: str, size: int) -> None:
+@pytest.mark.parametrize(
+    ("part", "name"), [("shape", "weights_thumbnail"), *product(["shape", "length"], ["history", "inputs", "rigid"])]
+)
+def test_a_forged_record_is_told(copy: Path, part: str, name: str, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sizes that no record has, their checksums right: no memory is taken for what is not there."""
-    table = Result.open(copy).table
-    file = table.files[0]
-    content, first = bytearray(file.read_bytes()), int(table.places["start"][0])
-    shape = table.layout.places[name].shape
-    assert isinstance(shape, slice)
-    for number in range(shape.start, shape.stop):
-        content[first + 4 * number : first + 4 * number + 4] = size.to_bytes(4, "little")
-    file.write_bytes(content)
-    table.places["head"][0] = zlib.crc32(content[first : first + table.layout.head])
+    result, record = Result.open(copy), random_record(2)
+
+    def forged(values: Any) -> bytes:
+        content = npy_bytes(values)
+        if values is not record.values[name] or part == "length":
+            return content
+        about = {"descr": values.dtype.str, "fortran_order": False, "shape": (size, *values.shape[1:], 3)}
+        file = io.BytesIO()
+        np.lib.format.write_array_header_1_0(file, about)
+        return file.getvalue() + values.tobytes()
+
+    monkeypatch.setattr(records, "npy_bytes", forged)
+    records.write_record(copy / "solution", 0, record, result.table.run)
+    if part == "length":
+        file = copy / "solution" / "000000.npz"
+        content = bytearray(file.read_bytes())
+        place = content.rindex(f"{name}.npy".encode()) - 26
+        content[place : place + 4] = size.to_bytes(4, "little")
+        content[-4:] = zlib.crc32(content[content.index(b"PK\x01\x02") : -4]).to_bytes(4, "little")
+        file.write_bytes(content)
     tracemalloc.start()
     try:
         with pytest.raises(ResultError, match="damaged in frame 0"):
-            table.read(0)
+            result.frame(0)
         assert tracemalloc.get_traced_memory()[1] < 2_000_000
     finally:
         tracemalloc.stop()

@@ -17,8 +17,7 @@ import pytest
 from results import MESH, make_origin, make_result, random_record
 
 from rgbmidic.errors import ResultError
-from rgbmidic.results import Result, ResultStore, finish_result
-from rgbmidic.results import files as provenance
+from rgbmidic.results import Result, ResultStore, finish_result, provenance
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, SolverSettings, TestSettings
 
 FRAMES = 600
@@ -58,8 +57,10 @@ def test_killed_at_any_moment_it_goes_on_to_the_same_bits(tmp_path: Path) -> Non
             finished.append(Result.open(out, partial=True).finished)
             assert finished[-1][finished[-2]].all()
     assert len({int(there.sum()) for there in finished} - {0, FRAMES}) >= KILLS // 2
+    assert len(list(out.rglob("*.part"))) <= 1
     _write(out)
     finish_result(out)
+    assert not list(out.rglob("*.part"))
     result = Result.open(out)
     for index, record in enumerate(RECORDS):
         np.testing.assert_equal(dict(result.frame(index).values), dict(record.values))
@@ -195,28 +196,23 @@ def test_a_start_that_was_killed_is_completed(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.name == "nt", reason="no limits")
 def test_a_full_disk_is_told_and_the_frames_before_are_kept(tmp_path: Path) -> None:
-    """A file that may not grow, as the system says it in the middle of a write."""
+    """A file that may not grow, as the system says it in the middle of a write: nothing is left of the frame."""
     sizes = resource.getrlimit(resource.RLIMIT_FSIZE)
     with ResultStore.create(tmp_path / "out", make_origin(40)) as store:
-        file, told = tmp_path / "out" / "solution" / "000000.frames", list[str]()
+        folder = tmp_path / "out" / "solution"
+        for index in range(20):
+            store.write_frame(index, random_record(1))
         try:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, sizes[1]))
-            index = next(index for index in range(40) if not _written(store, index, told))
+            resource.setrlimit(resource.RLIMIT_FSIZE, (3000, sizes[1]))
+            for frame in (20, 3):  # a new one, and one that is there
+                with pytest.raises(ResultError) as told:
+                    store.write_frame(frame, random_record(2))
+                assert str(told.value) == f"{folder / f'{frame:06d}.npz'} cannot be written: File too large"
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, sizes)
-        assert told == [f"{file} cannot be written: File too large"]
-        result = Result.open(tmp_path / "out", partial=True)
-        assert 0 < result.finished.sum() == index < 40
-        assert file.stat().st_size == result.table.places["length"].sum() + 40 * index
-        for later in range(index, 40):  # when there is room again
+        assert sorted(file.name for file in folder.iterdir()) == [f"{index:06d}.npz" for index in range(20)]
+        assert Result.open(tmp_path / "out", partial=True).finished.tolist() == [True] * 20 + [False] * 20
+        for later in range(20, 40):  # when there is room again
             store.write_frame(later, random_record(1))
         store.finish()
     np.testing.assert_array_equal(Result.open(tmp_path / "out").u, [random_record(1).u] * 40)
-
-
-def _written(store: ResultStore, index: int, told: list[str]) -> bool:
-    try:
-        store.write_frame(index, random_record(1))
-    except ResultError as error:
-        told.append(str(error))
-    return not told

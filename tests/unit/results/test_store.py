@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import zipfile
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record
 
+from rgbmidic._version import __version__
 from rgbmidic.correlation import NodeStatus, Solution, Status
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, FrameRecord, Origin, Result, ResultStore
+from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, FrameRecord, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 
 
@@ -102,7 +104,7 @@ def test_existing_result_is_kept_unless_overwriting_is_allowed(tmp_path: Path) -
         "mesh.npz",
         "notes.txt",
         "provenance.json",
-        "solution/000000.frames",
+        "solution/000000.npz",
         "solution/notes.txt",
     ]
 
@@ -117,10 +119,10 @@ def test_foreign_files_are_never_replaced(tmp_path: Path) -> None:
         assert (out / name).read_text() == content
         with pytest.raises(ResultError, match=name):
             ResultStore.join(out, make_origin(1))
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "000000.frames").touch()
-    make_result(tmp_path / "photos", frames=1)
-    assert (tmp_path / "photos" / "000000.frames").exists()
+    (tmp_path / "photos" / "solution").mkdir(parents=True)
+    (tmp_path / "photos" / "solution" / "000000.npz").touch()
+    with pytest.raises(ResultError, match=r"holds a 000000\.npz that is not of a result"):
+        make_result(tmp_path / "photos", frames=1)
 
 
 def test_interrupted_run_keeps_what_was_finished(tmp_path: Path) -> None:
@@ -158,47 +160,57 @@ def test_a_growing_result_is_seen_to_grow(tmp_path: Path) -> None:
 
 @given(share=st.floats(0, 1, exclude_max=True))
 @settings(max_examples=40, deadline=None)
-def test_truncated_files_hold_the_frames_that_are_whole(truncated: tuple[Path, int], share: float) -> None:
-    """A torn record, as a kill leaves it, is passed over and no damage; every frame before it is there."""
-    path, frames = truncated
-    file = path / "solution" / "000000.frames"
+def test_a_truncated_file_loses_its_frame_only(five: Path, share: float) -> None:
+    file = five / "solution" / "000003.npz"
     content = file.read_bytes()
     file.write_bytes(content[: int(share * len(content))])
-    result = Result.open(path, partial=True)
-    read = [result.frame(index).u for index in range(frames)]
+    result = Result.open(five, partial=True)
+    read = [result.frame(index).u for index in range(5)]
     file.write_bytes(content)
-    there = int(result.finished.sum())
-    assert result.finished.tolist() == [True] * there + [False] * (frames - there)
-    assert abs(there - share * frames) <= 1
-    assert not result.table.gaps
-    assert not result.table.damaged.any()
-    for index in range(there):
+    assert result.finished.tolist() == [True, True, True, False, True]
+    assert result.reasons[3] == "damaged"
+    for index in (0, 1, 2, 4):
         np.testing.assert_array_equal(read[index], random_record(2 * index).u)
 
 
 @pytest.fixture(scope="module")
-def truncated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
-    path, frames = tmp_path_factory.mktemp("truncated") / "out", 5
-    with _create(path, frames) as store:
-        for index in range(frames):
+def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("truncated") / "out"
+    with _create(path, 5) as store:
+        for index in range(5):
             store.write_frame(index, random_record(2 * index))
-    return path, frames
+    return path
 
 
-def test_many_frames_lie_in_few_files(tmp_path: Path) -> None:
-    count = 1201
-    names = [f"frame {index}" for index in range(count)]
-    origin = Origin(nodes=np.zeros((3, 2)), elements=[[0, 1, 2]], names=names, lights=["one"])
-    random = np.random.default_rng(0)
-    order, u = random.permutation(count), random.normal(size=(count, 3))
-    with ResultStore.create(tmp_path / "out", origin) as store:
-        for index in order:
-            store.write_frame(index, FrameRecord.of(nodes=3, lights=1, u=u[index], reason=str(index)))
-        store.finish()
-    assert len(list((tmp_path / "out" / "solution").iterdir())) == 3
-    result = Result.open(tmp_path / "out")
-    np.testing.assert_array_equal(result.u, u)
-    assert result.reasons == tuple(map(str, range(count)))
+def test_a_record_is_an_npz_file(tmp_path: Path) -> None:
+    """As numpy and every zip program read it: no array is missing, all checksums are right."""
+    record = random_record(2)
+    make_result(tmp_path / "out", frames=3)
+    file = tmp_path / "out" / "solution" / "000002.npz"
+    with zipfile.ZipFile(file) as archive:
+        assert archive.testzip() is None
+    with np.load(file) as arrays:
+        assert list(arrays) == list(QUANTITIES)
+        for name in QUANTITIES:
+            np.testing.assert_array_equal(arrays[name], getattr(record, name), err_msg=name)
+
+
+def test_a_result_of_the_last_schema_is_refused_in_one_line_and_can_be_overwritten(tmp_path: Path) -> None:
+    """It held the frames in files of 500."""
+    out = make_result(tmp_path / "out", frames=1).path
+    document = json.loads((out / "provenance.json").read_text())
+    (out / "provenance.json").write_text(
+        json.dumps({**document, "schema_version": 10, "versions": {"rgbmidic": "0.0"}})
+    )
+    (out / "solution" / "000000.npz").rename(out / "solution" / "000000.frames")
+    with pytest.raises(ResultError) as told:
+        Result.open(out)
+    assert str(told.value) == (
+        f"{out} has schema version 10, written by rgbmidic 0.0; this rgbmidic {__version__} reads schema version 11: "
+        "read it with the version that wrote it, or measure the test again"
+    )
+    make_result(out, frames=1, overwrite=True)
+    assert [file.name for file in (out / "solution").iterdir()] == ["000000.npz"]
 
 
 def test_a_quantity_is_read_once_and_kept_a_record_is_not(tmp_path: Path) -> None:
@@ -238,7 +250,7 @@ def test_damage_of_each_part_is_told(tmp_path: Path) -> None:
     assert "not a result folder" in damaged("provenance.json", None)
     assert "damaged" in damaged("provenance.json", b"{")
     assert "schema" in damaged("provenance.json", b"[]")
-    assert "schema version 11" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 11}')
+    assert "schema version 12" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 12}')
     assert "schema version 3" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 3}')
     whole = make_result(tmp_path / "whole").provenance
     for part, odd in {"frames": [1], "lights": [1], "settings": {"a": 1}, "references": ["a"], "inputs": None}.items():
@@ -249,8 +261,9 @@ def test_damage_of_each_part_is_told(tmp_path: Path) -> None:
     assert "frames.json is damaged" in damaged("frames.json", b'["frame 0", "frame 2"]')
     assert "mesh.npz is missing" in damaged("mesh.npz", None)
     assert "mesh.npz is damaged" in damaged("mesh.npz", b"PK")
-    assert "of 2 frames are lost 0 (frame 0), 1 (frame 1);" in damaged("solution/000000.frames", None)
-    assert "is damaged (000000.frames): of 2 frames are lost" in damaged("solution/000000.frames", bytes(30_000))
+    assert "is damaged: of 2 frames are lost 0 (frame 0);" in damaged("solution/000000.npz", None)
+    assert "000000.npz is damaged in frame 0: its directory" in damaged("solution/000000.npz", bytes(30_000))
+    assert "000000.npz is damaged in frame 0: its directory" in damaged("solution/000000.npz", b"")
 
 
 def test_frame_of_another_mesh_is_refused(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from bokeh.events import MouseMove
 from bokeh.models import Div, Select
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from results import LIGHTS, MESH, NODES, make_origin, make_result, random_record, smooth_record
+from results import LIGHTS, MESH, NODES, corrupt, make_origin, make_result, random_record, smooth_record
 
 from rgbmidic import CameraCalibration
 from rgbmidic.fields import MEASURES
@@ -555,10 +555,7 @@ def test_nothing_is_shown_of_a_frame_that_cannot_be_read(tmp_path):
     page = ResultPage(Document(), made, ViewState(frame=0), Progress(3))
     page.show()
     page.canvas.plot._trigger_event(MouseMove(page.canvas.plot, sx=1, sy=1, x=50, y=40))
-    file = next((made.path / "solution").glob("*.frames"))
-    content = bytearray(file.read_bytes())
-    content[int(made.table.places["start"][1]) + 3] ^= 255
-    file.write_bytes(content)
+    corrupt(made, 1)
     page.state.asked = 1
     assert "damaged in frame 1" in page.parts.description.text
     assert page.parts.under.text == ""

@@ -1,0 +1,95 @@
+"""Claims on a result folder: files that name a process that writes into it, and the frames that it writes."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import secrets
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from rgbmidic.errors import ResultError
+from rgbmidic.results.files import may_live, read_json, writing
+
+ALL_FRAMES = range(sys.maxsize)
+"""All frames that a folder has or will have."""
+_PAUSES = (0.02, 0.05, 0.1, 0.2)
+"""Seconds, at most, between tries. Two that start at once see each other and both step back; a pause drawn by chance
+lets one be first. A process of an array looks at a folder in some ms."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Claim:
+    """A claim that this process holds; other processes of copies cannot release it.
+
+    Attributes
+    ----------
+    file
+        The file of the claim.
+    process
+        Who holds it.
+    """
+
+    file: Path
+    process: int
+
+    @classmethod
+    def take(cls, folder: Path, frames: range) -> Self:
+        """Claim frames (consecutive) of a folder; claims that dead processes of this host left are removed.
+
+        Raises
+        ------
+        ResultError
+            Another run holds some of them, or the claim cannot be written.
+        """
+        for pause in _PAUSES:
+            file = folder / f"in_use.{secrets.token_hex(8)}.json"
+            if not (other := next(_others(file, frames), None)):
+                holder = {"process": os.getpid(), "host": socket.gethostname()}
+                part = file.with_suffix(".part")
+                with writing(file):  # whole at once; it need not outlive the machine
+                    part.write_text(json.dumps(holder | {"first": frames.start, "stop": frames.stop}), encoding="utf-8")
+                    part.replace(file)
+                if not (other := next(_others(file, frames), None)):
+                    return cls(file=file, process=os.getpid())
+                file.unlink(missing_ok=True)
+            time.sleep(random.uniform(0, pause))
+        assert other
+        name, holder = other
+        raise ResultError(
+            f"{folder} is in use by process {holder.get('process', '?')} on {holder.get('host', '?')}; "
+            f"give another folder, or delete {name} if that run is dead"
+        )
+
+    def release(self) -> None:
+        """Remove the claim, so that other processes can write the frames."""
+        if self.process == os.getpid():
+            with writing(self.file):
+                self.file.unlink(missing_ok=True)
+
+
+def _others(mine: Path, frames: range) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Yield the claims of other processes on any of these frames; one that cannot be read is on all of them."""
+    for file in mine.parent.glob("in_use.*.json"):
+        if file == mine:
+            continue
+        try:
+            document = read_json(file)
+        except FileNotFoundError:
+            continue
+        except ResultError:
+            document = {}
+        holder = document if isinstance(document, dict) else {}
+        first, stop = holder.get("first"), holder.get("stop")
+        if not may_live(holder):
+            file.unlink(missing_ok=True)
+        elif not (isinstance(first, int) and isinstance(stop, int)) or (
+            max(first, frames.start) < min(stop, frames.stop)
+        ):
+            yield file, holder

@@ -1,0 +1,283 @@
+"""The frames of a result on disk: an npz file for each, and the table of those that are there.
+
+``000007.npz`` holds every quantity of frame 7, for `numpy.load` and others: a zip archive with a CRC-32 of every array,
+its directory at the end. All records have the same arrays in the same order, so that the directory is one structure of
+fixed length: a quantity is found without a look at the others, which `zipfile` takes (0.04 instead of 0.18 ms a frame;
+to write one 0.4 instead of 1.6 ms). The archive's comment holds the digest of the run, the frame, and a CRC-32 of the
+directory and these. A record that is replaced or discarded is gone at once; nothing is ever written into a file.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import zlib
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import AnotherTestError, ResultError, disk_faults
+from rgbmidic.results.files import npy_array, npy_bytes, write_complete, writing
+from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
+from rgbmidic.results.quantities import QUANTITIES, FrameRecord
+from rgbmidic.settings import regular
+from rgbmidic.typing import BoolArray
+
+_NAME = re.compile(r"([0-9]{6}|[1-9][0-9]{6,})\.npz")
+_LOCAL = struct.Struct("<4s5H3I2H")
+"""What precedes the name and content of an array; this and the following: PKWARE's APPNOTE.TXT 6.3, 4.3.7 to 4.3.16."""
+_CHECK, _END, _COMMENT = struct.Struct("<I"), struct.calcsize("<4s4H2IH"), struct.calcsize("<16sQI")
+_VERSION, _DATE = 20, 0x21
+"""Version 2.0 of the format has all that is used; the first of January 1980 is its first date."""
+_STORED, _DEFLATED = 0, 8
+_FAST = 1
+"""zlib's quickest level."""
+_NOT_YET, _DAMAGED = "not measured yet", "damaged"
+_REMEDY = "`rgbmidic run` with --resume measures it again, --partial (partial=True) reads the rest"
+
+
+class _Layout(NamedTuple):
+    """The directory of every record.
+
+    Attributes
+    ----------
+    files
+        Name of each array in the archive, by its quantity.
+    order
+        Its place among them.
+    tail
+        The directory, its end, and the comment without its checksum.
+    found
+        What is read of them: method, CRC-32, bytes and place of every array; run and frame.
+    """
+
+    files: dict[str, bytes]
+    order: dict[str, int]
+    tail: struct.Struct
+    found: struct.Struct
+
+
+@lru_cache(maxsize=4)
+def _layout(names: tuple[str, ...]) -> _Layout:
+    files = {name: f"{name}.npy".encode() for name in names}
+    tail = "".join(f"4s6H3I5H2I{len(file)}s" for file in files.values())
+    found = "".join(f"10xH4x2I18xI{len(file)}x" for file in files.values())
+    order = {name: order for order, name in enumerate(names)}
+    return _Layout(files, order, struct.Struct(f"<{tail}4s4H2IH16sQ"), struct.Struct(f"<{found}{_END}x16sQ"))
+
+
+def record_files(folder: Path) -> dict[int, os.DirEntry[str]]:
+    """List the files of records in a folder by their frames."""
+    with suppress(FileNotFoundError), os.scandir(folder) as entries:
+        return {int(entry.name.removesuffix(".npz")): entry for entry in entries if _NAME.fullmatch(entry.name)}
+    return {}
+
+
+def record_file(folder: Path, frame: int) -> Path:
+    """Return the name of a frame's file."""
+    return folder / f"{frame:06d}.npz"
+
+
+def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes) -> None:
+    """Write a frame, which counts from the moment this returns; a record that is there is replaced.
+
+    Parameters
+    ----------
+    folder
+        Where the files are; it must exist.
+    frame
+        Its index in the result.
+    record
+        What is kept of it.
+    run : bytes, length 16
+        Digest of what the frames of the result share.
+
+    Raises
+    ------
+    ResultError
+        The disk is full or refuses; nothing is left of the frame.
+    """
+    layout, parts, entries, end = _layout(tuple(QUANTITIES)), list[bytes](), list[Any](), 0
+    for name, file in layout.files.items():
+        content = npy_bytes(record.values[name])
+        picture = QUANTITIES[name].dtype is np.uint8 and not QUANTITIES[name].stackable
+        stored = zlib.compress(content, _FAST, wbits=-zlib.MAX_WBITS) if picture else content
+        method, sizes = _DEFLATED if picture else _STORED, (len(stored), len(content), len(file), 0)
+        about = (_VERSION, 0, method, 0, _DATE, zlib.crc32(content), *sizes)
+        parts += _LOCAL.pack(b"PK\x03\x04", *about), file, stored
+        entries += b"PK\x01\x02", _VERSION, *about, 0, 0, 0, 0, end, file
+        end += _LOCAL.size + len(file) + len(stored)
+    count, length = len(layout.files), layout.tail.size + _CHECK.size - _COMMENT - _END
+    tail = layout.tail.pack(*entries, b"PK\x05\x06", 0, 0, count, count, length, end, _COMMENT, run, frame)
+    content = b"".join([*parts, tail, _CHECK.pack(zlib.crc32(tail))])
+    write_complete(record_file(folder, frame), lambda file: file.write(content), lasting=False)
+
+
+def _read_record(folder: Path, frame: int, names: Iterable[str], run: bytes) -> dict[str, Any]:
+    """Read some quantities of a frame and verify their checksums; what is of this run has its shapes."""
+    files, order, end, found = _layout(tuple(QUANTITIES))
+    with regular(record_file(folder, frame)).open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - end.size - _CHECK.size, 0))
+        tail = file.read()
+        if len(tail) < end.size or _CHECK.pack(zlib.crc32(tail[: end.size])) != tail[end.size :]:
+            raise ResultError("its directory is damaged or cut off")
+        *places, owner, number = found.unpack(tail[: end.size])
+        if owner != run:
+            raise AnotherTestError(f"{file.name} is of another run than {folder.parent / PROVENANCE}: {PUT_BACK}")
+        if number != frame:
+            raise ResultError(f"it holds frame {number}")
+        values = {}
+        for name in names:
+            first = 4 * order[name]
+            method, check, length, start = places[first : first + 4]
+            file.seek(start + _LOCAL.size + len(files[name]))
+            content = file.read(min(length, size))
+            content = zlib.decompress(content, wbits=-zlib.MAX_WBITS) if method == _DEFLATED else content
+            if zlib.crc32(content) != check:
+                raise ResultError(f"the checksum of {name} is wrong")
+            array = npy_array(content)
+            values[name] = array if QUANTITIES[name].axes else array.item()
+    return values
+
+
+def discard(folder: Path, frames: Collection[int]) -> None:
+    """Discard the records of some frames for good; no other run may write meanwhile.
+
+    Raises
+    ------
+    ResultError
+        The disk refuses.
+    """
+    for frame in frames:
+        with writing(file := record_file(folder, frame)):
+            file.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameTable:
+    """Which frames a result holds at the time it is loaded; reads them.
+
+    Attributes
+    ----------
+    folder
+        Where the files of the records are.
+    sizes
+        Number of nodes (``"node"``) and of lights (``"light"``) of every frame.
+    run : bytes, length 16
+        Digest of the run.
+    written : ndarray, shape (T,), int64
+        When each frame was written, ns; -1 where it is not measured yet.
+    damaged : ndarray, shape (T,), bool
+        Frames that are known to be lost to damage; they are not `finished`.
+    """
+
+    folder: Path
+    sizes: Mapping[str, int]
+    run: bytes
+    written: npt.NDArray[np.int64]
+    damaged: BoolArray
+
+    @classmethod
+    def load(cls, folder: Path, sizes: Mapping[str, int], count: int, run: bytes) -> FrameTable:
+        """Look which of `count` frames are there; none of them is read.
+
+        Raises
+        ------
+        ResultError
+            The folder cannot be read.
+        """
+        written = np.full(count, -1, dtype=np.int64)
+        with disk_faults(ResultError, f"{folder} cannot be read"):
+            for frame, file in record_files(folder).items():
+                with suppress(FileNotFoundError, IndexError):  # discarded just now, or of no frame
+                    written[frame] = file.stat().st_mtime_ns
+        lost = np.zeros(count, dtype=bool)
+        return cls(folder=folder, sizes=dict(sizes), run=run, written=written, damaged=lost)
+
+    @property
+    def finished(self) -> BoolArray:
+        """Which frames there are, shape (T,)."""
+        return np.asarray((self.written >= 0) & ~self.damaged)
+
+    def without_damaged(self, *, ended: bool) -> FrameTable:
+        """Read every record once and return the table without the damaged ones.
+
+        Parameters
+        ----------
+        ended
+            Whether all frames were there once: what is missing is then damaged too.
+
+        Raises
+        ------
+        AnotherTestError
+            A record is of another run.
+        """
+        damaged = ~self.finished & ended
+        for frame in np.flatnonzero(self.finished).tolist():
+            try:
+                next(self.each(None, [frame]))
+            except AnotherTestError:
+                raise
+            except ResultError:
+                damaged[frame] = True
+        return replace(self, damaged=damaged)
+
+    def read(self, frame: int) -> FrameRecord:
+        """Read all of one frame; a frame that is not measured yet gives a blank record with that as its reason.
+
+        Raises
+        ------
+        ResultError
+            It is damaged.
+        """
+        return FrameRecord(values=next(self.each(None, [frame])), sizes=self.sizes)
+
+    def each(self, names: Sequence[str] | None, frames: Iterable[int]) -> Iterator[dict[str, Any]]:
+        """Read some quantities of one frame after the other.
+
+        Parameters
+        ----------
+        names
+            The quantities; None: all.
+        frames
+            Their indices, in any order.
+
+        Yields
+        ------
+        dict
+            The quantities of a frame by name.
+
+        Raises
+        ------
+        ResultError
+            A record is damaged, or of another run; the message names file and frame.
+        """
+        chosen, finished = tuple(QUANTITIES if names is None else names), self.finished
+        blanks = dict[str, Mapping[str, Any]]()
+        for frame in frames:
+            if not finished[frame]:
+                reason = _DAMAGED if self.damaged[frame] else _NOT_YET
+                if reason not in blanks:
+                    blank = FrameRecord.failed(reason, nodes=self.sizes["node"], lights=self.sizes["light"])
+                    blanks[reason] = blank.values
+                yield {name: blanks[reason][name] for name in chosen}
+                continue
+            try:
+                values = _read_record(self.folder, frame, chosen, self.run)
+            except OSError as error:
+                reason = error.strerror or str(error)
+                raise ResultError(f"{record_file(self.folder, frame)} cannot be read: {reason}") from None
+            except (AnotherTestError, KeyError):  # KeyError: there is no quantity of this name
+                raise
+            except Exception as error:  # numpy and zlib raise a dozen kinds on damaged files
+                file = record_file(self.folder, frame)
+                raise ResultError(f"{file} is damaged in frame {frame}: {error}; {_REMEDY}") from None
+            yield values
