@@ -81,7 +81,6 @@ Stored as the steps from one code to the next; the codes above 1014, white, are 
 """
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class CineFile(Movie):
     """A Phantom .cine file. Flips and rotation are settings of the camera's viewer and left to it."""
 

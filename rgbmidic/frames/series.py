@@ -22,10 +22,11 @@ from pathlib import Path
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.formats import advice, frame_endings, open_source, reader_name
-from rgbmidic.frames.images import TIFF_ENDINGS, write_tiff
+from rgbmidic.frames.images import write_tiff
 from rgbmidic.frames.source import FrameSource, file_fingerprint
 from rgbmidic.frames.stacks import split_dataset
 from rgbmidic.frames.stored import Camera
+from rgbmidic.frames.tiff import TIFF_ENDINGS
 from rgbmidic.settings import FrameSettings
 
 logger = logging.getLogger(__name__)

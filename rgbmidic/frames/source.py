@@ -26,7 +26,8 @@ read in a millisecond; a movie that was exchanged differs in all of them, one th
 class FrameSource(ABC):
     """A file of one frame or several, read in any order; frames count from 0.
 
-    A format says how header and samples are read; one of several frames is a `Movie`.
+    A format says how header and samples are read; one of several frames is a `Movie`. It is a dataclass only where it
+    has fields of its own.
 
     Attributes
     ----------
@@ -184,21 +185,23 @@ def _on_disk(path: Path) -> Iterator[None]:
         yield
 
 
-def remembered(parse: Callable[[Path], _T]) -> Callable[[Path], _T]:
-    """Decorate `parse` so that a file that does not change is parsed once; an OSError where there is none."""
+def remembered(parse: Callable[[Path], _T]) -> Callable[[Path | str], _T]:
+    """Decorate `parse` so that a file that does not change is parsed once; what the disk refuses is a FrameError."""
 
     @lru_cache(maxsize=1024)
     def found(path: Path, size: int, modified: int) -> _T:
         return parse(path)
 
     @wraps(parse)
-    def look(path: Path) -> _T:
-        status = path.stat()
-        return found(path, status.st_size, status.st_mtime_ns)
+    def look(path: Path | str) -> _T:
+        with disk_faults(FrameError, f"{path} cannot be read"):
+            status = Path(path).stat()
+            return found(Path(path), status.st_size, status.st_mtime_ns)
 
     return look
 
 
+@remembered
 def file_hash(path: Path | str) -> str:
     """Return the SHA-256 of a file, in hexadecimal digits; it is computed once for a file that does not change.
 
@@ -217,10 +220,11 @@ def file_hash(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
-    with disk_faults(FrameError, f"{path} cannot be read"):
-        return _sha256(Path(path))
+    with regular(Path(path)).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+@remembered
 def file_fingerprint(path: Path | str) -> str:
     """Return the SHA-256 of a file's size and of 64 pieces of 4 KiB spread evenly over it: of all of it up to 256 KiB.
 
@@ -239,19 +243,7 @@ def file_fingerprint(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
-    with disk_faults(FrameError, f"{path} cannot be read"):
-        return _sampled(Path(path))
-
-
-@remembered
-def _sha256(path: Path) -> str:
-    with regular(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-@remembered
-def _sampled(path: Path) -> str:
-    with regular(path).open("rb") as file:
+    with regular(Path(path)).open("rb") as file:
         size = file.seek(0, 2)
         digest = hashlib.sha256(str(size).encode())
         for number in range(_SAMPLES):

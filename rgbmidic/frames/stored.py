@@ -155,6 +155,11 @@ class Layout:
             file.seek(begin + first)
             return file.read(last - first)
 
+    def samples(self, path: Path, index: int, rows: range, of: int, stored: np.dtype[Any]) -> AnyArray:
+        """Read the samples (n, ...) of some rows that are `stored` one behind the other, as `read` reads bytes."""
+        values = np.frombuffer(self.read(path, index, rows, of), dtype=stored)
+        return values.astype(stored.newbyteorder("="), copy=False).reshape(len(rows), -1)
+
 
 def unpack_bits(packed: bytes | AnyArray, bits: int) -> AnyArray:
     """Unpack samples of 9 to 15 bits that follow one another without a gap, the highest bit of each first.

@@ -216,7 +216,7 @@ def test_absurd_pages_are_refused_before_anything_is_allocated(tmp_path: Path) -
 
 
 def _check(path: Path) -> None:
-    from rgbmidic.frames.stacks import TiffStack
+    from rgbmidic.frames.tiff import TiffStack
 
     len(TiffStack(path=path, stated=STATED))
 
