@@ -95,8 +95,8 @@ def check_count(path: Path, count: int) -> None:
 
 def cut_short(path: Path, *, whole: int, count: int) -> FrameError:
     """Return the error for a frame behind the end of a file that holds only the first `whole` of its `count` frames."""
-    where = f"after frame {whole - 1} of {count}" if whole else f"before the first of its {count} frames"
-    return FrameError(f"{path}: the file ends {where}: truncated or still being written")
+    where = f"after frame {whole - 1} of {count}" if whole else f"before the first frame of {count}"
+    return FrameError(f"{path}: the file ends {where} (0 to {count - 1}): truncated or still being written")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
