@@ -667,6 +667,10 @@ def crack_jump(
     start, end
         Points (x, y) on the crack, px: left and right are those of who walks from one to the other.
 
+    Returns
+    -------
+    Jump
+
     Raises
     ------
     InputError
@@ -701,6 +705,10 @@ def stress_intensity(
         Inner and outer radius of the annulus whose nodes are taken, px.
     williams
         Material, scale, and what is fitted.
+
+    Returns
+    -------
+    StressIntensity
 
     Raises
     ------

@@ -52,7 +52,19 @@ class FrameFormat:
     movies: tuple[str, ...] = ()
 
     def reads(self, path: Path, stated: FrameSettings) -> bool:
-        """Report whether it reads a file of which the user states this."""
+        """Report whether it reads a file of which the user states this.
+
+        Parameters
+        ----------
+        path
+            The file.
+        stated
+            What the user states of it.
+
+        Returns
+        -------
+        bool
+        """
         if self.recognises is None:
             return path.suffix.lower() in self.endings + self.movies
         return self.recognises(path, stated)
@@ -113,7 +125,12 @@ def _added_formats() -> tuple[FrameFormat, ...]:
 
 
 def known_formats() -> tuple[FrameFormat, ...]:
-    """All formats, the package's own first: the first that recognises a file reads it."""
+    """All formats, the package's own first: the first that recognises a file reads it.
+
+    Returns
+    -------
+    tuple of FrameFormat
+    """
     return (*FORMATS, *_added_formats())
 
 

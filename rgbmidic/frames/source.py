@@ -71,11 +71,32 @@ class FrameSource(ABC):
         return self.read(index)
 
     def name(self, index: int) -> str:
-        """Return the name of a frame in messages and results: the file's name."""
+        """Return the name of a frame in messages and results: the file's name.
+
+        Parameters
+        ----------
+        index
+            Index of the frame in the file.
+
+        Returns
+        -------
+        str
+        """
         return legible(self.path.name)
 
     def read(self, index: int, window: Window | None = None) -> Mosaic | ChannelFrame:
         """Read frame `index`, or a part of it.
+
+        Parameters
+        ----------
+        index
+            Index of the frame in the file.
+        window
+            The part of it that is read; None: all of it.
+
+        Returns
+        -------
+        Mosaic or ChannelFrame
 
         Raises
         ------
@@ -91,7 +112,23 @@ class FrameSource(ABC):
     def stored(self, index: int, window: Window | None = None) -> StoredFrame:
         """Return the samples of frame `index`, or of a part of it, with what the file alone states.
 
-        It raises as `read` does.
+        Parameters
+        ----------
+        index
+            Index of the frame in the file.
+        window
+            The part of it that is read; None: all of it.
+
+        Returns
+        -------
+        StoredFrame
+
+        Raises
+        ------
+        FrameError
+            The file is missing, damaged, truncated, or of another size than the window's frame.
+        IndexError
+            There is no such frame.
         """
         if not 0 <= index < len(self):
             raise IndexError(f"there is no frame {index} in {self.path}, which holds {len(self)}")
@@ -156,7 +193,17 @@ class Movie(FrameSource):
         return file_fingerprint(self.path)
 
     def name(self, index: int) -> str:
-        """Return the name of a frame in messages and results: the file's name and the frame's index."""
+        """Return the name of a frame in messages and results: the file's name and the frame's index.
+
+        Parameters
+        ----------
+        index
+            Index of the frame in the file.
+
+        Returns
+        -------
+        str
+        """
         return f"{legible(self.path.name)} frame {index}"
 
     def _shape(self) -> tuple[int, int]:

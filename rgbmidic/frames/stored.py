@@ -253,6 +253,19 @@ class StoredFrame:
     def plain(cls, values: AnyArray, path: Path, cfa: str | None = None) -> StoredFrame:
         """Return samples (H, W) or (H, W, C) of a picture that states neither levels nor, as a rule, its pattern.
 
+        Parameters
+        ----------
+        values : ndarray, shape (H, W) or (H, W, C), uint8 or uint16
+            Grey levels (DN).
+        path
+            The file, for messages.
+        cfa
+            Bayer pattern where the file states it.
+
+        Returns
+        -------
+        StoredFrame
+
         Raises
         ------
         FrameError

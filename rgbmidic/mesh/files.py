@@ -59,6 +59,10 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
     part
         Only the elements of this set: an Abaqus element set, a gmsh physical group, a Nastran property. None: all.
 
+    Returns
+    -------
+    FiniteElementMesh
+
     Raises
     ------
     InputError

@@ -73,6 +73,17 @@ class PixelMap:
 
         Pixels that the chords of a curved outline leave out go with their nearest covered pixel, up to 3 px away.
 
+        Parameters
+        ----------
+        mesh
+            N nodes, E elements.
+        region
+            The pixels to measure.
+
+        Returns
+        -------
+        PixelMap
+
         Raises
         ------
         RegionError
@@ -134,44 +145,120 @@ class PixelMap:
     def of_elements(
         self, chosen: BoolArray
     ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Slots, columns and rows (n,) of the pixels of the chosen elements (E,)."""
+        """Slots, columns and rows (n,) of the pixels of the chosen elements (E,).
+
+        Parameters
+        ----------
+        chosen : ndarray, shape (E,), bool
+            The elements.
+
+        Returns
+        -------
+        slots, columns, rows : ndarray, shape (n,), int64
+        """
         counts = np.diff(self.offsets)
         slots = np.flatnonzero(np.repeat(chosen, counts))
         x, y = np.repeat(self.origin[chosen].T, counts[chosen], axis=1)
         return slots, self.local_x[slots].astype(np.int64) + x, self.local_y[slots].astype(np.int64) + y
 
     def gather(self, image: FloatImage) -> FloatImage:
-        """Values of an image (..., H, W) at the owned pixels, shape (..., P)."""
+        """Values of an image (..., H, W) at the owned pixels, shape (..., P).
+
+        Parameters
+        ----------
+        image : ndarray, shape (..., H, W)
+            One image or several.
+
+        Returns
+        -------
+        ndarray, shape (..., P), float32
+        """
         out = np.empty((*image.shape[:-2], self.local_x.size), dtype=np.float32)
         images = np.ascontiguousarray(image, dtype=np.float32).reshape(-1, *image.shape[-2:])
         from_image(self.lines, images, *self.bounds[:2], out.reshape(len(images), -1))
         return out
 
     def grid(self, side: int) -> tuple[int, int]:
-        """Rows and columns of the blocks of `side` px that cover `bounds`."""
+        """Rows and columns of the blocks of `side` px that cover `bounds`.
+
+        Parameters
+        ----------
+        side
+            Side of the blocks in px.
+
+        Returns
+        -------
+        rows, columns : int
+        """
         _, _, height, width = self.bounds
         return -(-height // side), -(-width // side)
 
     def block_sums(self, values: FloatImage, side: int) -> FloatImage:
-        """Sum `values` (n, P) over such blocks, shape (n, rows, columns)."""
+        """Sum `values` (n, P) over such blocks, shape (n, rows, columns).
+
+        Parameters
+        ----------
+        values : ndarray, shape (n, P), float32
+            Fields at the owned pixels.
+        side
+            Side of the blocks in px.
+
+        Returns
+        -------
+        ndarray, shape (n, rows, columns), float32
+        """
         out = np.empty((len(values), *self.grid(side)), dtype=np.float32)
         block_sums(values, self.lines, self.line_offsets, side, out)
         return out
 
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
-        """Interpolate grids (n, rows, columns) of such blocks between their centres at the owned pixels (n, P)."""
+        """Interpolate grids (n, rows, columns) of such blocks between their centres at the owned pixels (n, P).
+
+        Parameters
+        ----------
+        grids : ndarray, shape (n, rows, columns)
+            Values at the centres of the blocks.
+        side
+            Side of the blocks in px.
+
+        Returns
+        -------
+        ndarray, shape (n, P), float32
+        """
         out = np.empty((len(grids), self.local_x.size), dtype=np.float32)
         from_grid(self.lines, self.line_offsets, np.ascontiguousarray(grids, dtype=np.float32), side, out)
         return out
 
     def window(self, values: FloatImage) -> FloatImage:
-        """`values` (n, P) as images of the rectangle `bounds`; 0 where no pixel is owned."""
+        """`values` (n, P) as images of the rectangle `bounds`; 0 where no pixel is owned.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n, P), float32
+            Fields at the owned pixels.
+
+        Returns
+        -------
+        ndarray, shape (n, height, width), float32
+        """
         images = np.zeros((len(values), *self.bounds[2:]), dtype=np.float32)
         to_image(self.lines, values, 0, 0, images)
         return images
 
     def scatter(self, values: FloatImage, fill: float = 0.0) -> FloatImage:
-        """Image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere."""
+        """Image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere.
+
+        Parameters
+        ----------
+        values : ndarray, shape (P,)
+            Field at the owned pixels.
+        fill
+            Value of all other pixels.
+
+        Returns
+        -------
+        ndarray, shape (H, W), float32
+        """
         image = np.full(self.shape, fill, dtype=np.float32)
         to_image(self.lines, np.asarray(values, dtype=np.float32)[None], *self.bounds[:2], image[None])
         return image

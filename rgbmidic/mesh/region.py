@@ -61,6 +61,17 @@ class Region:
     def from_rectangle(cls, rectangle: Sequence[float], shape: tuple[int, int]) -> Region:
         """Rectangle (x0, y0, x1, y1) in px, clipped to the image of `shape` (H, W).
 
+        Parameters
+        ----------
+        rectangle
+            Corners x0, y0, x1, y1 in px.
+        shape
+            Rows and columns of the image.
+
+        Returns
+        -------
+        Region
+
         Raises
         ------
         RegionError
@@ -88,6 +99,17 @@ class Region:
     def from_polygon(cls, corners: npt.ArrayLike, shape: tuple[int, int]) -> Region:
         """Polygon with corners (x, y) in px, shape (M, 2), on an image of `shape` (H, W).
 
+        Parameters
+        ----------
+        corners : array_like, shape (M, 2)
+            Corners (x, y) in px.
+        shape
+            Rows and columns of the image.
+
+        Returns
+        -------
+        Region
+
         Raises
         ------
         RegionError
@@ -112,6 +134,10 @@ class Region:
         holes
             Corners (x, y) of each in px, shape (M, 2).
 
+        Returns
+        -------
+        Region
+
         Raises
         ------
         RegionError
@@ -123,7 +149,17 @@ class Region:
         return Region(mask=self.mask & ~np.logical_or.reduce(inside))
 
     def part(self, rows: slice, columns: slice) -> Region:
-        """Return the same region on a part of the image that holds it."""
+        """Return the same region on a part of the image that holds it.
+
+        Parameters
+        ----------
+        rows, columns
+            Rows and columns of the part in the image.
+
+        Returns
+        -------
+        Region
+        """
         corners = None
         if self.rectangle is not None:
             (x0, y0, x1, y1), x, y = self.rectangle, columns.start, rows.start
@@ -134,6 +170,17 @@ class Region:
     @classmethod
     def from_mask(cls, mask: npt.ArrayLike, shape: tuple[int, int] | None = None) -> Region:
         """Non-zero pixels of a mask image (H, W); `shape`, where given, is the size it must have.
+
+        Parameters
+        ----------
+        mask : array_like, shape (H, W)
+            Not zero where the region is.
+        shape
+            Rows and columns of the images.
+
+        Returns
+        -------
+        Region
 
         Raises
         ------

@@ -157,6 +157,16 @@ class Tri3Mesh:
         """Distance (N,) in px and index (N,) of the nearest of the `chosen` nodes (N,), along the edges of the mesh.
 
         The way is not across a crack or a hole; a part without any takes the nearest of another, infinitely far.
+
+        Parameters
+        ----------
+        chosen : ndarray, shape (N,), bool
+            The nodes that are looked for, one at least.
+
+        Returns
+        -------
+        distance : ndarray, shape (N,)
+        index : ndarray, shape (N,), int64
         """
         if chosen.all():
             return np.zeros(len(self.nodes)), np.arange(len(self.nodes))
@@ -172,18 +182,49 @@ class Tri3Mesh:
         return distance, index.astype(np.int64)
 
     def to_nodes(self, per_element: FloatArray) -> FloatArray:
-        """Sum of a value per element (E,) over the elements around each node, shape (N,)."""
+        """Sum of a value per element (E,) over the elements around each node, shape (N,).
+
+        Parameters
+        ----------
+        per_element : ndarray, shape (E,)
+            Value of every element.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+        """
         sums = np.bincount(self.elements.ravel(), weights=np.repeat(per_element, 3), minlength=len(self.nodes))
         return np.asarray(sums, dtype=np.float64)
 
     def beside(self, nodes: BoolArray) -> BoolArray:
-        """Nodes (N,) that share an element with one of `nodes` (N,), these included."""
+        """Nodes (N,) that share an element with one of `nodes` (N,), these included.
+
+        Parameters
+        ----------
+        nodes : ndarray, shape (N,), bool
+            The chosen nodes.
+
+        Returns
+        -------
+        ndarray, shape (N,), bool
+        """
         near = np.zeros(len(self.nodes), dtype=bool)
         near[self.elements[nodes[self.elements].any(axis=1)]] = True
         return near
 
     def element_gradient(self, values: FloatArray) -> FloatArray:
-        """Gradient of the linear interpolant of nodal values (N, C) in every element, shape (E, C, 2)."""
+        """Gradient of the linear interpolant of nodal values (N, C) in every element, shape (E, C, 2).
+
+        Parameters
+        ----------
+        values : ndarray, shape (N, C)
+            Nodal values.
+
+        Returns
+        -------
+        ndarray, shape (E, C, 2)
+            Per px, by the axes x and y.
+        """
         (first_x, first_y), (second_x, second_y) = _legs(self.nodes, self.elements)
         first, second = (leg / (2 * self.areas) for leg in _legs(values, self.elements))
         return np.stack([first * second_y - second * first_y, second * first_x - first * second_x], axis=-1).swapaxes(
@@ -191,7 +232,13 @@ class Tri3Mesh:
         )
 
     def shape_gradients(self) -> FloatArray:
-        """Gradient of the three shape functions of every element, shape (E, 3, 2), per px."""
+        """Gradient of the three shape functions of every element, shape (E, 3, 2), per px.
+
+        Returns
+        -------
+        ndarray, shape (E, 3, 2)
+            By element, corner and axis.
+        """
         p = self.nodes[self.elements]
         x, y = p[..., 0], p[..., 1]
         slopes_x = np.stack([y[:, 1] - y[:, 2], y[:, 2] - y[:, 0], y[:, 0] - y[:, 1]], axis=1)
@@ -199,7 +246,18 @@ class Tri3Mesh:
         return np.asarray(np.stack([slopes_x, slopes_y], axis=-1) / (2 * self.areas)[:, None, None])
 
     def nodal_gradient(self, values: FloatArray) -> FloatArray:
-        """Gradient of nodal values (N, C) at the nodes: the area-weighted mean of the elements around; (N, C, 2)."""
+        """Gradient of nodal values (N, C) at the nodes: the area-weighted mean of the elements around; (N, C, 2).
+
+        Parameters
+        ----------
+        values : ndarray, shape (N, C)
+            Nodal values.
+
+        Returns
+        -------
+        ndarray, shape (N, C, 2)
+            Per px, by the axes x and y.
+        """
         gradient = self.element_gradient(values) * self.areas[:, None, None]
         flat = gradient.reshape(len(gradient), -1).T
         sums = np.stack([self.to_nodes(np.ascontiguousarray(part)) for part in flat], axis=-1)

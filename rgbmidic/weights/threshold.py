@@ -83,7 +83,19 @@ def threshold_weights(images: IlluminationImages, *, threshold: float = 2 / 3, b
 
 
 def blurred(images: IlluminationImages, blur: float) -> FloatImage:
-    """Gaussian blur (k, H, W) of each light's image, invalid pixels taken as full scale."""
+    """Gaussian blur (k, H, W) of each light's image, invalid pixels taken as full scale.
+
+    Parameters
+    ----------
+    images
+        One image a light.
+    blur
+        Standard deviation in px.
+
+    Returns
+    -------
+    ndarray, shape (k, H, W), float32
+    """
     filled = np.where(images.valid, images.values, np.float32(images.full_scale))
     return np.stack([cv2.GaussianBlur(image, (0, 0), blur, borderType=cv2.BORDER_REFLECT_101) for image in filled])
 
@@ -156,6 +168,10 @@ def disturbed_zone(high_passed: FloatArray, centre: tuple[float, float]) -> Dist
     centre
         Middle of the reflection, (x, y) in px.
 
+    Returns
+    -------
+    DisturbedZone
+
     Raises
     ------
     InputError
@@ -201,6 +217,10 @@ def set_up_threshold(
         Index of the light that was used.
     blur
         Standard deviation (px) of the blur that the weights will use.
+
+    Returns
+    -------
+    SetUpThreshold
 
     Raises
     ------
