@@ -196,7 +196,9 @@ def test_a_truncated_movie_is_read_up_to_its_last_whole_frame(tmp_path: Path, an
     for index in range(5):
         np.testing.assert_array_equal(source.read(index).values[0], frames[index])
     for index in range(5, 9):
-        with pytest.raises(FrameError, match=r"f\.cine: the file ends after frame 4 of 9 \(0 to 8\): truncated or still being"):
+        with pytest.raises(
+            FrameError, match=r"f\.cine: the file ends after frame 4 of 9 \(0 to 8\): truncated or still being"
+        ):
             source.read(index)
     path.write_bytes(whole)  # the rest is written: nothing of the shorter file is remembered
     np.testing.assert_array_equal(source.read(8).values[0], frames[8])

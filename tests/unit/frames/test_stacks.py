@@ -90,7 +90,9 @@ def test_an_npy_stack_that_ends_early(tmp_path: Path) -> None:
     assert len(series) == 6
     np.testing.assert_array_equal(series.read(3)[0].values[0], FRAMES[3])
     for index in (4, 5):
-        with pytest.raises(FrameError, match=r"m\.npy: the file ends after frame 3 of 6 \(0 to 5\): truncated or still being"):
+        with pytest.raises(
+            FrameError, match=r"m\.npy: the file ends after frame 3 of 6 \(0 to 5\): truncated or still being"
+        ):
             series.read(index)
 
 
