@@ -14,9 +14,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
-from scipy.spatial import cKDTree
+from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from rgbmidic.errors import InputError, RegionError
+from rgbmidic.mesh.finite_elements import cross
 from rgbmidic.typing import BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
@@ -257,8 +258,7 @@ def outline_mesh(
     points, triangles, pieces = _triangulated(np.concatenate([outline, inner]), paths)
     centre = np.round(points[triangles].mean(axis=1)).astype(int)
     inside = mask[np.clip(centre[:, 1], 0, mask.shape[0] - 1), np.clip(centre[:, 0], 0, mask.shape[1] - 1)]
-    a, b = (points[triangles[:, corner]] - points[triangles[:, 0]] for corner in (1, 2))
-    large = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > _SLIVER * size**2
+    large = np.abs(cross(points, triangles)) > _SLIVER * size**2
     triangles = triangles[inside & large]
     if not len(triangles):
         raise RegionError(f"the region of {int(mask.sum())} px is too small for one element of {size} px")
@@ -275,8 +275,6 @@ def _triangulated(
     tuple
         Nodes, triangles, and the pieces of the paths as edges (n, 2) of the mesh.
     """
-    from scipy.spatial import Delaunay, QhullError
-
     for _ in range(_HALVINGS + 1):
         nodes = np.concatenate([points, *paths])
         nodes = nodes[uncrowded(nodes, 1e-6)]

@@ -12,8 +12,10 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
+from scipy.spatial import cKDTree
 
 from rgbmidic.errors import InputError, RegionError
+from rgbmidic.mesh.finite_elements import cross
 from rgbmidic.mesh.region import Region, edge_keys, outline_mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -67,8 +69,7 @@ class Tri3Mesh:
             )
         if not np.isfinite(nodes).all() or elements.min() < 0 or elements.max() >= len(nodes):
             raise InputError("mesh nodes must be finite and elements must name existing nodes")
-        first, second = _legs(nodes, elements)
-        area = (first[0] * second[1] - first[1] * second[0]) / 2
+        area = cross(nodes, elements) / 2
         if (area == 0).any():
             raise InputError(f"element {int(np.argmin(np.abs(area)))} of the mesh has no area")
         elements[area < 0] = elements[area < 0][:, [0, 2, 1]]
@@ -137,8 +138,6 @@ class Tri3Mesh:
     @property
     def copies(self) -> npt.NDArray[np.int32]:
         """Pairs of nodes at one place, on two sides of a crack, shape (C, 2)."""
-        from scipy.spatial import cKDTree
-
         return cKDTree(self.nodes).query_pairs(1e-9, output_type="ndarray").astype(np.int32)
 
     @property
@@ -170,13 +169,11 @@ class Tri3Mesh:
         """
         if chosen.all():
             return np.zeros(len(self.nodes)), np.arange(len(self.nodes))
-        from scipy.sparse import coo_matrix
-        from scipy.sparse.csgraph import dijkstra
-        from scipy.spatial import cKDTree
-
         (i, j), count, sources = self.neighbours.T, len(self.nodes), np.flatnonzero(chosen)
-        graph = coo_matrix((np.hypot(*(self.nodes[i] - self.nodes[j]).T), (i, j)), shape=(count, count))
-        distance, _, index = dijkstra(graph, directed=False, indices=sources, min_only=True, return_predecessors=True)
+        graph = sp.coo_matrix((np.hypot(*(self.nodes[i] - self.nodes[j]).T), (i, j)), shape=(count, count))
+        distance, _, index = sp.csgraph.dijkstra(
+            graph, directed=False, indices=sources, min_only=True, return_predecessors=True
+        )
         apart = ~np.isfinite(distance)
         index[apart] = sources[cKDTree(self.nodes[sources]).query(self.nodes[apart])[1]]
         return distance, index.astype(np.int64)
@@ -227,9 +224,8 @@ class Tri3Mesh:
         """
         (first_x, first_y), (second_x, second_y) = _legs(self.nodes, self.elements)
         first, second = (leg / (2 * self.areas) for leg in _legs(values, self.elements))
-        return np.stack([first * second_y - second * first_y, second * first_x - first * second_x], axis=-1).swapaxes(
-            0, 1
-        )
+        slopes = np.stack([first * second_y - second * first_y, second * first_x - first * second_x], axis=-1)
+        return slopes.swapaxes(0, 1)
 
     def shape_gradients(self) -> FloatArray:
         """Gradient of the three shape functions of every element, shape (E, 3, 2), per px.
@@ -239,11 +235,10 @@ class Tri3Mesh:
         ndarray, shape (E, 3, 2)
             By element, corner and axis.
         """
-        p = self.nodes[self.elements]
-        x, y = p[..., 0], p[..., 1]
-        slopes_x = np.stack([y[:, 1] - y[:, 2], y[:, 2] - y[:, 0], y[:, 0] - y[:, 1]], axis=1)
-        slopes_y = np.stack([x[:, 2] - x[:, 1], x[:, 0] - x[:, 2], x[:, 1] - x[:, 0]], axis=1)
-        return np.asarray(np.stack([slopes_x, slopes_y], axis=-1) / (2 * self.areas)[:, None, None])
+        corners = self.nodes[self.elements]
+        following, last = (np.roll(corners, turn, axis=1) for turn in (-1, -2))
+        slopes = np.stack([following[..., 1] - last[..., 1], last[..., 0] - following[..., 0]], axis=-1)
+        return np.asarray(slopes / (2 * self.areas)[:, None, None])
 
     def nodal_gradient(self, values: FloatArray) -> FloatArray:
         """Gradient of nodal values (N, C) at the nodes: the area-weighted mean of the elements around; (N, C, 2).
