@@ -28,7 +28,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.history import History, Nodal, Units
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.region import edge_keys
+from rgbmidic.mesh.outline_mesh import edge_keys
 from rgbmidic.typing import BoolArray, FloatArray
 
 _NEAR = 0.5

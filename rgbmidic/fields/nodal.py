@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.mesh.pixel_map import blended, quadratic_fit
+from rgbmidic.mesh.quadratic_fit import blended, quadratic_fit
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 _CANDIDATES = 24

@@ -26,7 +26,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.strain import StrainGauges
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.pixel_map import quadratic_fit
+from rgbmidic.mesh.quadratic_fit import quadratic_fit
 from rgbmidic.typing import BoolArray, FloatArray
 
 ARRIVALS = ("front", "peak")

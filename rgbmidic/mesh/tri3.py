@@ -16,7 +16,8 @@ from scipy.spatial import cKDTree
 
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.finite_elements import cross
-from rgbmidic.mesh.region import Region, edge_keys, outline_mesh
+from rgbmidic.mesh.outline_mesh import edge_keys, outline_mesh
+from rgbmidic.mesh.region import Region
 from rgbmidic.typing import BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
