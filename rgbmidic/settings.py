@@ -717,6 +717,10 @@ class TestSettings(_Checked):
         base
             Folder that relative paths start from.
 
+        Returns
+        -------
+        TestSettings
+
         Raises
         ------
         ConfigurationError
@@ -744,6 +748,10 @@ class TestSettings(_Checked):
         """The settings as sections of plain values, defaults included, without `base` and what is not known.
 
         ``TestSettings.from_mapping(settings.to_mapping(), settings.base)`` gives the settings back.
+
+        Returns
+        -------
+        dict of str to dict
         """
         document: dict[str, dict[str, Any]] = {}
         for entry in fields(self):
@@ -858,6 +866,15 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 
 def read_test(path: Path | str) -> TestSettings:
     """Read the settings of a test from a TOML file; paths in it are relative to it.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Returns
+    -------
+    TestSettings
 
     Raises
     ------

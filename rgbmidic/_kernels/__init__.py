@@ -6,7 +6,12 @@ __all__ = ["are_compiled"]
 
 
 def are_compiled() -> bool:
-    """Whether kernels were compiled on this machine before: one that every solve needs is in the cache."""
+    """Whether kernels were compiled on this machine before: one that every solve needs is in the cache.
+
+    Returns
+    -------
+    bool
+    """
     from rgbmidic._kernels.mesh import claim_pixels
 
     return any(Path(claim_pixels.dispatcher.stats.cache_path or "").glob("mesh.claim_pixels*.nbi"))

@@ -31,7 +31,7 @@ from rgbmidic.correlation.reference import Deformed, Reference, ReferenceGeometr
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, corrected_values
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.mesh.pixel_map import quadratic_fit
+from rgbmidic.mesh.quadratic_fit import quadratic_fit
 from rgbmidic.settings import SMALLEST_HALVED, SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 

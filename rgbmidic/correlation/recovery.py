@@ -25,7 +25,7 @@ from scipy.sparse.linalg import splu
 from rgbmidic._kernels.factors import node_energies
 from rgbmidic._kernels.mesh import colour_nodes
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.pixel_map import quadratic_fit
+from rgbmidic.mesh.quadratic_fit import quadratic_fit
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray
 

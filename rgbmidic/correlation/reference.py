@@ -66,6 +66,15 @@ class Deformed:
         """Return the images, holes filled and prefiltered, and the weights, both (k, H, W) on the first light's pixels.
 
         The others follow by the affine motion nearest to their registration: good enough to look at and search in.
+
+        Parameters
+        ----------
+        registration
+            Of the lights; None: their images lie on one another.
+
+        Returns
+        -------
+        images, weights : ndarray, shape (k, H, W), float32
         """
         values, weights = spline_values(self.coefficients), self.weights
         if registration is not None:
@@ -301,7 +310,18 @@ class Reference:
         return self.geometry.origin
 
     def offset(self, deformed: Deformed) -> FloatArray:
-        """Column and row of these images (2,) at which those of a deformed state begin."""
+        """Column and row of these images (2,) at which those of a deformed state begin.
+
+        Parameters
+        ----------
+        deformed
+            The deformed images, which may be a part of the frame.
+
+        Returns
+        -------
+        ndarray, shape (2,)
+            In px.
+        """
         return np.subtract(deformed.origin, self.origin).astype(np.float64)
 
     def motion(self, deformed: Deformed, light: int, displacement: FloatArray) -> FloatArray:
@@ -309,6 +329,20 @@ class Reference:
 
         A light's registration is part of it, as linear in each element as the displacement, here and in the reference's
         own grey levels: what the elements do not follow of it cancels.
+
+        Parameters
+        ----------
+        deformed
+            The deformed images.
+        light
+            Index of the light.
+        displacement : ndarray, shape (N, 2)
+            Nodal displacement in px.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            In px.
         """
         motion = displacement - self.offset(deformed)
         if self.registration is None:
@@ -316,13 +350,36 @@ class Reference:
         return np.asarray(motion + self.registration.displacement(self.mesh.nodes + displacement + self.origin, light))
 
     def blocks(self, weight: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
-        """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), for fields (P,)."""
+        """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), for fields (P,).
+
+        Parameters
+        ----------
+        weight : ndarray, shape (P,)
+            Weight w of every owned pixel.
+        gradient : iterable of ndarray, shape (P,)
+            Gradient of the grey level along x and y.
+
+        Returns
+        -------
+        ndarray, shape (E, 3, 3, 3)
+        """
         out = np.zeros((len(self.mesh.elements), 3, 3, 3))
         element_hessian(*gradient, weight, *self.pixels.positions, out)
         return out
 
     def hessians(self, weights: FloatImage) -> list[FloatArray]:
-        """Element blocks of each light's Hessian for pixel weights (k, P)."""
+        """Element blocks of each light's Hessian for pixel weights (k, P).
+
+        Parameters
+        ----------
+        weights : ndarray, shape (k, P)
+            Weight of every light at the owned pixels.
+
+        Returns
+        -------
+        list of ndarray, shape (E, 3, 3, 3)
+            One array a light.
+        """
         return [self.blocks(*light) for light in zip(weights, self.gradient.swapaxes(0, 1), strict=True)]
 
     def warp(
@@ -359,20 +416,67 @@ class Reference:
     def right_side(
         self, deformed: Deformed, light: int, values: FloatImage, weight: FloatImage, displacement: FloatArray
     ) -> FloatArray:
-        """Sum a light's right-hand side over each element, (E, 3, 2), for reference grey levels `values` (P,)."""
+        """Sum a light's right-hand side over each element, (E, 3, 2), for reference grey levels `values` (P,).
+
+        Parameters
+        ----------
+        deformed
+            The deformed images.
+        light
+            Index of the light.
+        values : ndarray, shape (P,)
+            Grey levels of the reference.
+        weight : ndarray, shape (P,)
+            Weight of every owned pixel.
+        displacement : ndarray, shape (N, 2)
+            Nodal displacement in px.
+
+        Returns
+        -------
+        ndarray, shape (E, 3, 2)
+            By element, corner and axis.
+        """
         parts, motion = np.empty((len(self.mesh.elements), 3, 2)), self.motion(deformed, light, displacement)
         images = deformed.coefficients[light], values, *self.gradient[:, light], weight
         element_right_side(*images, *self.geometry.parts, motion, parts)
         return parts
 
     def projected(self, weight: FloatImage, difference: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
-        """Sum the same for a difference that is known: ``sum w (f - g) grad f phi``, for fields (P,)."""
+        """Sum the same for a difference that is known: ``sum w (f - g) grad f phi``, for fields (P,).
+
+        Parameters
+        ----------
+        weight : ndarray, shape (P,)
+            Weight w of every owned pixel.
+        difference : ndarray, shape (P,)
+            Difference f - g of the grey levels.
+        gradient : iterable of ndarray, shape (P,)
+            Gradient of the grey level along x and y.
+
+        Returns
+        -------
+        ndarray, shape (E, 3, 2)
+            By element, corner and axis.
+        """
         parts = np.empty((len(self.mesh.elements), 3, 2))
         element_vector(weight, difference, *gradient, *self.pixels.positions, parts)
         return parts
 
     def sums(self, values: FloatImage, factor: FloatImage) -> FloatArray:
-        """Sum fields (n, P) over each element, and their products with a `factor` (P,); shape (n, E, 2)."""
+        """Sum fields (n, P) over each element, and their products with a `factor` (P,); shape (n, E, 2).
+
+        Parameters
+        ----------
+        values : ndarray, shape (n, P)
+            Fields at the owned pixels.
+        factor : ndarray, shape (P,)
+            What they are multiplied with in the second sum.
+
+        Returns
+        -------
+        ndarray, shape (n, E, 2)
+            Sums of the fields, and of their products with the factor.
+        """
         out = np.empty((len(values), len(self.mesh.elements), 2))
         element_sums(values, factor, self.pixels.offsets, out)
         return out

@@ -61,13 +61,40 @@ class ReferenceUpdate:
 
     @classmethod
     def none(cls, first: Reference) -> ReferenceUpdate:
-        """Return the first frame as its own reference."""
+        """Return the first frame as its own reference.
+
+        Parameters
+        ----------
+        first
+            The first frame's reference.
+
+        Returns
+        -------
+        ReferenceUpdate
+        """
         return cls(first=first, reference=first, displacement=np.zeros_like(first.mesh.nodes))
 
     def track(
         self, deformed: Deformed, start: Start, options: SolverSettings, method: PrecisionMethod | None
     ) -> Solution:
-        """Solve for the displacement of a later frame on the first one, from a start on the first one; see `track`."""
+        """Solve for the displacement of a later frame on the first one, from a start on the first one; see `track`.
+
+        Parameters
+        ----------
+        deformed
+            Images of the later frame.
+        start
+            Initial guess on the first frame.
+        options
+            Settings of the solver.
+        method
+            What learns the precision of the lights from the residual; None: nothing does.
+
+        Returns
+        -------
+        Solution
+            On the first frame.
+        """
         last = start.displacement
         own = replace(start, displacement=None if last is None else last - self.displacement)
         return self.accumulated(track(self.reference, deformed, own, options, method), deformed)
@@ -82,6 +109,18 @@ class ReferenceUpdate:
         Measured on draws of noise, of changing paint and of noise under rotation, after 1 to 4 updates: rms of error
         over stated uncertainty .92 to 1.07, g .43 to .50 and, for paint, .02 to .03. Strains, linear in the
         displacement, add up likewise.
+
+        Parameters
+        ----------
+        step
+            Solution on this reference.
+        deformed
+            The images that it was found in.
+
+        Returns
+        -------
+        Solution
+            On the first frame.
         """
         if self.solution is None or self.scores is None:
             return step
@@ -111,6 +150,18 @@ class ReferenceUpdate:
         """Correlation coefficient (E,) of the elements with this reference, of the light that matches best.
 
         NaN where a node has no displacement, and where no light sees the element in both images.
+
+        Parameters
+        ----------
+        deformed
+            Images of the frame.
+        solution
+            Its displacement on this reference.
+
+        Returns
+        -------
+        ndarray, shape (E,)
+            From -1 to 1.
         """
         residual, known = _residual(self.reference, deformed, *self._step(solution.displacement, solution))
         lights = zip(*residual.centred_products(), strict=True)
@@ -130,6 +181,10 @@ class ReferenceUpdate:
             See `match`.
         best
             Largest median of `match` of the frames on this reference: camera noise alone keeps it below 1.
+
+        Returns
+        -------
+        bool
         """
         known = np.isfinite(match)
         return bool(known.any() and (match[known] < _POOR * best).mean() > _POOR_FRACTION)

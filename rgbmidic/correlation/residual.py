@@ -56,7 +56,21 @@ class Residual:
     def at(
         cls, reference: Reference, deformed: Deformed, values: FloatImage, displacements: Sequence[FloatArray]
     ) -> Residual:
-        """At one nodal displacement (N, 2) per light, for reference grey levels `values` (k, P)."""
+        """At one nodal displacement (N, 2) per light, for reference grey levels `values` (k, P).
+
+        Parameters
+        ----------
+        reference, deformed
+            Images of both states.
+        values : ndarray, shape (k, P)
+            Grey levels of the reference.
+        displacements : sequence of ndarray, shape (N, 2)
+            Nodal displacement of every light in px.
+
+        Returns
+        -------
+        Residual
+        """
         difference, weights = np.empty_like(values), np.empty_like(values)
         moments = np.empty((len(values), len(reference.mesh.elements), 6))
         for light, displacement in enumerate(displacements):
@@ -76,13 +90,32 @@ class Residual:
         return max(float(ff - f * f), 0.0) if total else 0.0
 
     def difference_from(self, values: FloatImage) -> FloatImage:
-        """Return the difference for other reference grey levels (k, P)."""
+        """Return the difference for other reference grey levels (k, P).
+
+        Parameters
+        ----------
+        values : ndarray, shape (k, P)
+            Grey levels of the reference.
+
+        Returns
+        -------
+        ndarray, shape (k, P)
+        """
         return self.difference if values is self.values else self.difference + (values - self.values)
 
     def squares(self, weights: FloatImage) -> FloatArray:
         """Sum w r^2, w and the pixels with weight over each element, for the solve's `weights` (k, P).
 
         The result has the shape (k, E, 3).
+
+        Parameters
+        ----------
+        weights : ndarray, shape (k, P)
+            Weights of the solve.
+
+        Returns
+        -------
+        ndarray, shape (k, E, 3)
         """
         pixels = self.reference.pixels
         out = np.empty((len(weights), len(pixels.origin), 3))
@@ -90,7 +123,12 @@ class Residual:
         return out
 
     def centred_products(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Sum f g, f f and g g over each element, of what f and g are beyond their means in it, (k, E)."""
+        """Sum f g, f f and g g over each element, of what f and g are beyond their means in it, (k, E).
+
+        Returns
+        -------
+        fg, ff, gg : ndarray, shape (k, E)
+        """
         total, f, g, ff, fg, gg = np.moveaxis(self.moments, -1, 0)
         total = np.maximum(total, 1e-30)
         beyond_f, beyond_g = (
@@ -108,6 +146,10 @@ class Residual:
             What the fit has at the nodes beyond the field, px.
         curvature : ndarray, shape (N, 2, 3)
             Second derivatives xx, xy, yy of the field at the nodes, 1/px.
+
+        Returns
+        -------
+        Residual
         """
         known, pixels, out = self.reference, self.reference.pixels, np.empty_like(self.difference)
         deviation = curved_deviation(known.geometry.material, pixels.barycentric, carried, curvature)
@@ -132,7 +174,19 @@ class Precision:
     bend: FloatImage
 
     def robust_loss(self, reference: Reference, weights: FloatImage) -> FloatArray:
-        """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less."""
+        """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less.
+
+        Parameters
+        ----------
+        reference
+            The reference that was solved on.
+        weights : ndarray, shape (k, P)
+            Weights of the solve.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+        """
         total, bent = (reference.mesh.to_nodes(part) for part in reference.sums(weights, self.bend).sum(axis=0).T)
         return np.divide(total, np.maximum(bent, _LEAST_BEND * total), out=np.ones_like(total), where=total > 0)
 
@@ -141,7 +195,17 @@ class PrecisionMethod(Protocol):
     """A method of weighting that learns from the residual; `rgbmidic.weights.Statistics` is the package's own."""
 
     def precision(self, residual: Residual) -> Precision | None:
-        """Precision of the lights for the next pass; None leaves the weights as they are given."""
+        """Precision of the lights for the next pass; None leaves the weights as they are given.
+
+        Parameters
+        ----------
+        residual
+            Of the pass before.
+
+        Returns
+        -------
+        Precision or None
+        """
         ...
 
 

@@ -104,7 +104,23 @@ class Solution:
 
     @classmethod
     def failed(cls, mesh: Tri3Mesh, lights: int, reason: str, history: FloatArray) -> Solution:
-        """Return a solution where nothing can be measured: NaN everywhere, and the reason."""
+        """Return a solution where nothing can be measured: NaN everywhere, and the reason.
+
+        Parameters
+        ----------
+        mesh
+            N nodes, E elements.
+        lights
+            Number of lights.
+        reason
+            Why nothing is measured.
+        history : ndarray, shape (iterations,)
+            Norms of the steps that were made, px.
+
+        Returns
+        -------
+        Solution
+        """
         count = len(mesh.nodes)
         return cls(
             nodes=mesh.nodes,

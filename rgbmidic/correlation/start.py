@@ -354,6 +354,10 @@ class Start:
             Of that frame, px.
         measured : ndarray, shape (N,)
             Which of them are measured.
+
+        Returns
+        -------
+        Start
         """
         if not measured.any():
             return self

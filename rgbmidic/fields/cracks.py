@@ -28,7 +28,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.history import History, Nodal, Units
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.region import edge_keys
+from rgbmidic.mesh.outline_mesh import edge_keys
 from rgbmidic.typing import BoolArray, FloatArray
 
 _NEAR = 0.5
@@ -667,6 +667,10 @@ def crack_jump(
     start, end
         Points (x, y) on the crack, px: left and right are those of who walks from one to the other.
 
+    Returns
+    -------
+    Jump
+
     Raises
     ------
     InputError
@@ -701,6 +705,10 @@ def stress_intensity(
         Inner and outer radius of the annulus whose nodes are taken, px.
     williams
         Material, scale, and what is fitted.
+
+    Returns
+    -------
+    StressIntensity
 
     Raises
     ------

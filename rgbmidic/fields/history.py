@@ -73,6 +73,10 @@ class Units:
         point_std
             Standard uncertainty of a point along either axis in px: half a pixel where it is read off by eye.
 
+        Returns
+        -------
+        Units
+
         Raises
         ------
         InputError
@@ -101,18 +105,53 @@ class Units:
         return "s" if self.timed else "frame"
 
     def per_time(self, unit: str, power: int = 1) -> str:
-        """Write a unit over the time or its square, such as ``"mm/s"``, ``"mm/s²"`` or, of no unit, ``"1/s"``."""
+        """Write a unit over the time or its square, such as ``"mm/s"``, ``"mm/s²"`` or, of no unit, ``"1/s"``.
+
+        Parameters
+        ----------
+        unit
+            What is divided; empty for a quantity without unit.
+        power
+            Power of the time.
+
+        Returns
+        -------
+        str
+        """
         return f"{unit or '1'}/{self.time}" + ("²" if power == 2 else "")
 
     def lengths(self, values: FloatArray, std: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Convert lengths in px (or px over time) and their standard uncertainty to mm where the scale is known."""
+        """Convert lengths in px (or px over time) and their standard uncertainty to mm where the scale is known.
+
+        Parameters
+        ----------
+        values, std : ndarray
+            Lengths in px and their standard uncertainty.
+
+        Returns
+        -------
+        values, std : ndarray
+            In mm, or as they were where the scale is not known.
+        """
         if self.mm_per_pixel is None:
             return values, std
         return self.mm_per_pixel * values, np.hypot(self.mm_per_pixel * std, self.mm_per_pixel_std * values)
 
 
 def column(name: str, unit: str) -> str:
-    """Return the name of a column with its unit in plain letters: `u` in ``"mm/s²"`` is ``"u_mm_per_s2"``."""
+    """Return the name of a column with its unit in plain letters: `u` in ``"mm/s²"`` is ``"u_mm_per_s2"``.
+
+    Parameters
+    ----------
+    name
+        Of the quantity.
+    unit
+        Its unit; empty for none.
+
+    Returns
+    -------
+    str
+    """
     plain = unit.replace("²", "2").replace(" √", "_sqrt_")
     over, _, below = plain.partition("/")
     words = [part for part in ("" if over == "1" else over, f"per_{below}" if below else "") if part]
@@ -180,7 +219,17 @@ class Probe(Protocol):
         """Nodes that it needs."""
 
     def histories(self, nodal: Nodal) -> list[History]:
-        """Compute its histories from the displacements of its `nodes`."""
+        """Compute its histories from the displacements of its `nodes`.
+
+        Parameters
+        ----------
+        nodal
+            Displacements of its `nodes` in every frame.
+
+        Returns
+        -------
+        list of History
+        """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -253,6 +253,10 @@ class RigidMotion:
         u, v, u_std, v_std : ndarray, shape (N,)
             In px; NaN where not measured.
 
+        Returns
+        -------
+        RigidMotion
+
         Raises
         ------
         InputError
@@ -309,6 +313,16 @@ class RigidMotion:
         return np.concatenate([left.T, np.sqrt(back**2 @ field[2:] ** 2)])
 
     def at(self, points: FloatArray) -> FloatArray:
-        """Compute the displacement (P, 2) in px of points (P, 2) by the rigid motion alone."""
+        """Compute the displacement (P, 2) in px of points (P, 2) by the rigid motion alone.
+
+        Parameters
+        ----------
+        points : ndarray, shape (P, 2)
+            Points (x, y) on the reference, px.
+
+        Returns
+        -------
+        ndarray, shape (P, 2)
+        """
         c, s = np.cos(self.rotation), np.sin(self.rotation)
         return np.asarray((points - self.centre) @ (np.array([[c, -s], [s, c]]) - np.eye(2)).T + self.shift)

@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.mesh.pixel_map import blended, quadratic_fit
+from rgbmidic.mesh.quadratic_fit import blended, quadratic_fit
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 _CANDIDATES = 24
@@ -62,7 +62,19 @@ class Places:
 
     @classmethod
     def of(cls, mesh: Tri3Mesh, points: npt.ArrayLike) -> Self:
-        """Find the elements of points (P, 2) in a mesh."""
+        """Find the elements of points (P, 2) in a mesh.
+
+        Parameters
+        ----------
+        mesh
+            N nodes, E elements.
+        points : array_like, shape (P, 2)
+            Points (x, y) on the reference, px.
+
+        Returns
+        -------
+        Places
+        """
         from scipy.spatial import cKDTree
 
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
@@ -80,6 +92,11 @@ class Places:
     def check(self, what: str) -> None:
         """Refuse points outside the mesh.
 
+        Parameters
+        ----------
+        what
+            What the points are, for the message.
+
         Raises
         ------
         InputError
@@ -96,7 +113,13 @@ class Places:
         return f"the region that was measured, which lies within x {left:g} to {right:g}, y {top:g} to {bottom:g}"
 
     def mean(self) -> FloatArray:
-        """Compute the weight (N,) of every node in the mean over the points that are inside."""
+        """Compute the weight (N,) of every node in the mean over the points that are inside.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Of unit sum.
+        """
         nodes, weights = self.mesh.elements[self.element[self.inside]], self.barycentric[self.inside]
         sums = np.bincount(nodes.ravel(), weights=weights.ravel(), minlength=len(self.mesh.nodes))
         return np.asarray(sums / max(self.inside.sum(), 1))
@@ -168,6 +191,10 @@ def field_rms(mesh: Tri3Mesh, values: FloatArray, truth: FloatArray, *, border: 
         At the pixels; NaN pixels are left out.
     border
         Width in px of the rim of the mesh's bounding box that is left out.
+
+    Returns
+    -------
+    float
     """
     difference = at_pixels(mesh, values, truth.shape[1:]) - truth
     low, high = mesh.nodes.min(axis=0) + border, mesh.nodes.max(axis=0) - border
@@ -195,7 +222,17 @@ class NodalCovariance:
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh) -> Self:
-        """Propagate the covariance of the linear fit (inverse mass matrix) through the recovery of the nodal values."""
+        """Propagate the covariance of the linear fit (inverse mass matrix) through the recovery of the nodal values.
+
+        Parameters
+        ----------
+        mesh
+            N nodes, E elements.
+
+        Returns
+        -------
+        NodalCovariance
+        """
         mass = mass_matrix(mesh)
         scale = sp.diags(1 / np.sqrt(mass.diagonal()))
         inverse = scale @ _chebyshev_inverse(sp.csr_matrix(scale @ mass @ scale), _RINGS) @ scale
@@ -225,7 +262,17 @@ class NodalCovariance:
         return np.asarray(np.maximum(total, 0)).reshape(parts.shape[:-1])
 
     def part(self, nodes: npt.NDArray[np.int64]) -> FloatArray:
-        """Extract the correlation (m, m) of some nodes, given by their indices (m,)."""
+        """Extract the correlation (m, m) of some nodes, given by their indices (m,).
+
+        Parameters
+        ----------
+        nodes : ndarray, shape (m,)
+            Indices of the nodes.
+
+        Returns
+        -------
+        ndarray, shape (m, m)
+        """
         chosen = sp.csr_matrix(
             (np.ones(len(nodes)), (np.arange(len(nodes)), nodes)), shape=(len(nodes), len(self.mesh.nodes))
         )
@@ -251,7 +298,17 @@ def _chebyshev_inverse(matrix: sp.csr_matrix, degree: int) -> sp.csr_matrix:
 
 
 def reference_fraction(count: int) -> float:
-    """Return the fraction of a frame's variance that comes from the mean of `count` reference frames, common to all."""
+    """Return the fraction of a frame's variance that comes from the mean of `count` reference frames, common to all.
+
+    Parameters
+    ----------
+    count
+        Number of reference frames.
+
+    Returns
+    -------
+    float
+    """
     return 1 / (1 + count)
 
 
@@ -295,6 +352,10 @@ def difference_std(first: FloatArray, second: FloatArray, common_fraction: float
         Standard uncertainty in either frame.
     common_fraction
         See `reference_fraction`.
+
+    Returns
+    -------
+    ndarray
     """
     first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     shared = common_fraction * np.minimum(first, second) ** 2

@@ -161,7 +161,18 @@ class CameraCalibration:
         return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
 
     def to_px(self, points: FloatArray) -> FloatArray:
-        """Return the inverse of `to_mm` at points (N, 2) of the plane, px."""
+        """Return the inverse of `to_mm` at points (N, 2) of the plane, px.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 2)
+            Points on the plane, mm.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            Points (x, y) of the image, px.
+        """
         values = self.parameters
         back = np.linalg.inv(np.r_[values[8:], 1.0].reshape(3, 3))
         homogeneous = np.c_[points, np.ones(len(points))] @ back.T
@@ -169,7 +180,18 @@ class CameraCalibration:
         return straight if self.lens is None else distorted(values[:8], straight)
 
     def jacobian(self, points: FloatArray) -> FloatArray:
-        """Derivative (N, 2, 2) of `to_mm` by the pixel at points (N, 2): ``[n, mm axis, px axis]``, mm per px."""
+        """Derivative (N, 2, 2) of `to_mm` by the pixel at points (N, 2): ``[n, mm axis, px axis]``, mm per px.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 2)
+            Points (x, y) of the image, px.
+
+        Returns
+        -------
+        ndarray, shape (N, 2, 2)
+            In mm per px.
+        """
         values = self.parameters
         lens, homography = values[:8], np.r_[values[8:], 1.0].reshape(3, 3)
         straight, bent = points, np.broadcast_to(np.eye(2), (len(points), 2, 2))
@@ -186,7 +208,17 @@ class CameraCalibration:
         return np.asarray(flat @ np.linalg.inv(bent))
 
     def sensitivity(self, points: FloatArray) -> FloatArray:
-        """Derivative (N, 2, 16) of `to_mm` by the `parameters`, scaled by the root of the covariance's diagonal."""
+        """Derivative (N, 2, 16) of `to_mm` by the `parameters`, scaled by the root of the covariance's diagonal.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 2)
+            Points (x, y) of the image, px.
+
+        Returns
+        -------
+        ndarray, shape (N, 2, 16)
+        """
         return self._by_parameters(lambda values: self.to_mm(points, values))
 
     def _by_parameters(self, function: Callable[[FloatArray], FloatArray]) -> FloatArray:
@@ -200,6 +232,11 @@ class CameraCalibration:
         """Return the camera with the plane in the axes of the image, and the motion (3, 3) of its points to there.
 
         The top left pixel is (0, 0) mm, and in the middle of the frame x runs along the rows.
+
+        Returns
+        -------
+        camera : CameraCalibration
+        motion : ndarray, shape (3, 3)
         """
         assert self.homography is not None
         homography = self.homography / self.homography[2, 2]
@@ -244,7 +281,18 @@ class CameraCalibration:
         return np.asarray(normal[:2] / normal[2])
 
     def scale(self, point: FloatArray) -> tuple[float, float]:
-        """Return mm per px at a point (2,), the root of the map's determinant there, and its standard uncertainty."""
+        """Return mm per px at a point (2,), the root of the map's determinant there, and its standard uncertainty.
+
+        Parameters
+        ----------
+        point : ndarray, shape (2,)
+            Point (x, y) of the image, px.
+
+        Returns
+        -------
+        scale, std : float
+            In mm per px.
+        """
         scale = float(np.sqrt(np.linalg.det(self.jacobian(point[None])[0])))
         around = point + _SPAN * np.array([[-1.0, 0], [1, 0], [0, -1], [0, 1]])
         places, slopes = self.to_mm(around), self.sensitivity(around)
@@ -256,6 +304,11 @@ class CameraCalibration:
 
     def check(self, shape: tuple[int, int]) -> None:
         """Refuse frames of a `shape` (rows, columns) that it was not made with.
+
+        Parameters
+        ----------
+        shape
+            Rows and columns of the frames.
 
         Raises
         ------
@@ -272,7 +325,12 @@ class CameraCalibration:
         _ = self.parameters
 
     def summary(self) -> str:
-        """Return scale in the middle of the frame and tilt, with their standard uncertainties, as text."""
+        """Return scale in the middle of the frame and tilt, with their standard uncertainties, as text.
+
+        Returns
+        -------
+        str
+        """
         (scale, scale_std), (tilt, tilt_std) = self.scale(self.centre), self.tilt_deg
         known = f"tilt {tilt:.3f} ± {tilt_std:.2g} degrees" if np.isfinite(tilt) else "tilt not known without a lens"
         return f"{scale:.6g} ± {scale_std:.2g} mm per px in the middle of the frame, {known}"
@@ -281,6 +339,16 @@ class CameraCalibration:
         """Standard uncertainty (N,) that the calibration leaves in a displacement of one px at points (N, 2), mm.
 
         Of both components of its error together, as the rms over the displacement's directions.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 2)
+            Points (x, y) of the image, px.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            In mm per px.
         """
         steps = _SPAN * np.eye(2)
         slopes = [(self.sensitivity(points + step) - self.sensitivity(points - step)) / (2 * _SPAN) for step in steps]
@@ -289,7 +357,17 @@ class CameraCalibration:
 
     @classmethod
     def is_in(cls, path: Path) -> bool:
-        """Whether a file is one that `read` reads, if not damaged."""
+        """Whether a file is one that `read` reads, if not damaged.
+
+        Parameters
+        ----------
+        path
+            The file.
+
+        Returns
+        -------
+        bool
+        """
         try:
             return bool(json.loads(path.read_text(encoding="utf-8"))["schema"] == _SCHEMA)
         except (OSError, ValueError, KeyError, TypeError):
@@ -298,6 +376,15 @@ class CameraCalibration:
     @classmethod
     def read(cls, path: Path | str) -> Self:
         """Read the file that ``rgbmidic-calibrate camera`` wrote.
+
+        Parameters
+        ----------
+        path
+            The file.
+
+        Returns
+        -------
+        CameraCalibration
 
         Raises
         ------
@@ -309,6 +396,17 @@ class CameraCalibration:
     @classmethod
     def from_document(cls, document: Mapping[str, Any], name: str) -> Self:
         """Take the content of such a file, as `to_document` gives it; `name` it in messages.
+
+        Parameters
+        ----------
+        document
+            Content of the file.
+        name
+            What messages call it.
+
+        Returns
+        -------
+        CameraCalibration
 
         Raises
         ------
@@ -331,7 +429,12 @@ class CameraCalibration:
             raise CalibrationError(f"{name} is damaged: {reason}") from None
 
     def to_document(self) -> dict[str, Any]:
-        """Return the content of the file, in plain values."""
+        """Return the content of the file, in plain values.
+
+        Returns
+        -------
+        dict
+        """
         return {
             "schema": _SCHEMA,
             "schema_version": _VERSION,
@@ -344,7 +447,13 @@ class CameraCalibration:
         }
 
     def write(self, path: Path | str) -> None:
-        """Write the file; errors as `rgbmidic.illumination.calibration.write_document`."""
+        """Write the file; errors as `rgbmidic.illumination.calibration.write_document`.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        """
         write_document(path, self.to_document())
 
 
@@ -380,6 +489,19 @@ class Rectification:
     def of(cls, mesh: Tri3Mesh, scale: ScaleSettings, camera: CameraCalibration | None = None) -> Self:
         """Rectify a mesh in px of the image by a `camera`, or leave it with the `scale`.
 
+        Parameters
+        ----------
+        mesh
+            Mesh in px of the image.
+        scale
+            Scale of the result.
+        camera
+            Lens and plane; None: the image is not rectified.
+
+        Returns
+        -------
+        Rectification
+
         Raises
         ------
         InputError
@@ -399,7 +521,20 @@ class Rectification:
         return cls(camera=camera, image=mesh, mesh=flat, units=units)
 
     def place(self, place: Sequence[float], points: int) -> tuple[float, ...]:
-        """Rectify the numbers that place a probe: so many points (x, y) one after the other, then lengths."""
+        """Rectify the numbers that place a probe: so many points (x, y) one after the other, then lengths.
+
+        Parameters
+        ----------
+        place
+            Numbers in px of the image.
+        points
+            Number of points that they begin with.
+
+        Returns
+        -------
+        tuple of float
+            In rectified px.
+        """
         if self.camera is None or self.units.mm_per_pixel is None:
             return tuple(map(float, place))
         ends = np.array(place[: 2 * points], dtype=np.float64).reshape(-1, 2)
@@ -408,7 +543,18 @@ class Rectification:
     def displacement(
         self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Rectify the displacement of every node and its standard uncertainty, (N,) each in px; NaN stays NaN."""
+        """Rectify the displacement of every node and its standard uncertainty, (N,) each in px; NaN stays NaN.
+
+        Parameters
+        ----------
+        u, v, u_std, v_std : ndarray, shape (N,)
+            Displacement and its standard uncertainty, px of the image.
+
+        Returns
+        -------
+        u, v, u_std, v_std : ndarray, shape (N,)
+            In rectified px.
+        """
         if self.camera is None or self.units.mm_per_pixel is None:
             return u, v, u_std, v_std
         moved = self.image.nodes + np.stack([u, v], axis=1)

@@ -63,6 +63,23 @@ class Mean:
     ) -> Mean:
         """Average over points (P, 2) that stand for a place, px.
 
+        Parameters
+        ----------
+        covariance
+            Of the mesh.
+        name
+            Name of the probe.
+        points : array_like, shape (P, 2)
+            Points (x, y) on the reference, px.
+        least
+            Fraction of the weight that nodes with data must have in a frame.
+        inside
+            Whether all points must lie in the region; else half of them.
+
+        Returns
+        -------
+        Mean
+
         Raises
         ------
         InputError
@@ -85,7 +102,17 @@ class Mean:
         )
 
     def histories(self, nodal: Nodal) -> list[History]:
-        """Compute u and v in px."""
+        """Compute u and v in px.
+
+        Parameters
+        ----------
+        nodal
+            Displacements of its `nodes` in every frame.
+
+        Returns
+        -------
+        list of History
+        """
         uv = [*zip("uv", self.read(nodal), strict=True)]
         used = np.where(np.isfinite(uv[0][1][0]), _known(nodal) @ self.weights, 1.0)
         note = _cut(self.name, "mean", self.inside * used)
@@ -95,7 +122,18 @@ class Mean:
         ]
 
     def read(self, nodal: Nodal) -> list[tuple[FloatArray, FloatArray]]:
-        """Average u and v, each (T,), with their standard uncertainty."""
+        """Average u and v, each (T,), with their standard uncertainty.
+
+        Parameters
+        ----------
+        nodal
+            Displacements of its `nodes` in every frame.
+
+        Returns
+        -------
+        list of (ndarray, ndarray), shape (T,) each
+            Mean of u, then of v, with its standard uncertainty, px.
+        """
         known = _known(nodal)
         return [self.average(*pair, known) for pair in ((nodal.u, nodal.u_std), (nodal.v, nodal.v_std))]
 
@@ -106,6 +144,19 @@ class Mean:
 
         The errors are correlated between nodes as those of a displacement, or where they are `alike` the same at all
         nodes, which is the most that they can add up to.
+
+        Parameters
+        ----------
+        values, std : ndarray, shape (T, m)
+            The quantity and its standard uncertainty.
+        known : ndarray, shape (T, m), bool
+            Where it is known.
+        alike
+            Whether the errors are the same at all nodes.
+
+        Returns
+        -------
+        values, std : ndarray, shape (T,)
         """
         measured = known @ self.weights
         enough = measured >= self.least
@@ -173,6 +224,21 @@ class Gauge:
     def between(cls, covariance: NodalCovariance, name: str, *place: float, moving: bool = True) -> Gauge:
         """Lay a gauge between two points, x0, y0, x1, y1 in px.
 
+        Parameters
+        ----------
+        covariance
+            Of the mesh.
+        name
+            Name of the gauge.
+        *place
+            Ends x0, y0, x1, y1 in px on the reference.
+        moving
+            Whether the gauge goes with the specimen.
+
+        Returns
+        -------
+        Gauge
+
         Raises
         ------
         InputError
@@ -199,7 +265,17 @@ class Gauge:
         return float(np.hypot(*(self.ends[1] - self.ends[0])))
 
     def histories(self, nodal: Nodal) -> list[History]:
-        """Compute the extension in px and the strain."""
+        """Compute the extension in px and the strain.
+
+        Parameters
+        ----------
+        nodal
+            Displacements of its `nodes` in every frame.
+
+        Returns
+        -------
+        list of History
+        """
         d = self.difference
         apart = np.stack([nodal.u @ d.weights, nodal.v @ d.weights], axis=1)
         arm = self.ends[1] - self.ends[0]
@@ -241,7 +317,25 @@ class StrainGauge:
     def around(
         cls, covariance: NodalCovariance, name: str, x: float, y: float, length: float, *, measure: str = MEASURES[0]
     ) -> StrainGauge:
-        """Lay a gauge of a length around a point, px; an `InputError` where it is outside the region or too short."""
+        """Lay a gauge of a length around a point, px; an `InputError` where it is outside the region or too short.
+
+        Parameters
+        ----------
+        covariance
+            Of the mesh.
+        name
+            Name of the gauge.
+        x, y
+            Its middle in px on the reference.
+        length
+            Its length in px.
+        measure
+            Strain measure, as of `strain_of`.
+
+        Returns
+        -------
+        StrainGauge
+        """
         gauges = StrainGauges.at_points(covariance, np.array([[x, y]]), length)
         nodes = np.unique(gauges.nodes)
         reduced = replace(
@@ -254,7 +348,17 @@ class StrainGauge:
         return cls(name=name, nodes=nodes, gauges=reduced, measure=measure, inside=inside)
 
     def histories(self, nodal: Nodal) -> list[History]:
-        """Compute exx, eyy, exy, e1, e2, the direction of e1 and the von Mises equivalent."""
+        """Compute exx, eyy, exy, e1, e2, the direction of e1 and the von Mises equivalent.
+
+        Parameters
+        ----------
+        nodal
+            Displacements of its `nodes` in every frame.
+
+        Returns
+        -------
+        list of History
+        """
         rows = zip(nodal.u, nodal.v, nodal.u_std, nodal.v_std, strict=True)
         gradients, covariances = zip(*(self.gauges.gradient(*row) for row in rows), strict=True)
         s = strain_of_gradient(np.concatenate(gradients), np.concatenate(covariances), self.measure)
@@ -309,6 +413,10 @@ def make_probe(
         Strain measure of a strain gauge; material and fit of a crack's tip; names. None: the defaults.
     rectified
         Change from px of the image, and the scale, which a crack's tip needs; None: places are in px of the mesh.
+
+    Returns
+    -------
+    Probe
 
     Raises
     ------

@@ -26,7 +26,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.strain import StrainGauges
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.pixel_map import quadratic_fit
+from rgbmidic.mesh.quadratic_fit import quadratic_fit
 from rgbmidic.typing import BoolArray, FloatArray
 
 ARRIVALS = ("front", "peak")
@@ -116,6 +116,10 @@ class ProfileLine:
         x0, y0, x1, y1
             Ends in px on the reference.
 
+        Returns
+        -------
+        ProfileLine
+
         Raises
         ------
         InputError
@@ -161,6 +165,11 @@ class ProfileLine:
             Of the mesh; NaN where not measured.
         kind
             Key of `correlations`.
+
+        Returns
+        -------
+        values, std : ndarray, shape (P,)
+            NaN where a node around is not measured.
         """
         values, std = values[self.nodes], std[self.nodes]
         weights = _weights(self, np.isfinite(values).tobytes())
@@ -170,7 +179,17 @@ class ProfileLine:
         return found, np.where(np.isfinite(found), np.sqrt(np.maximum(spread, 0)), np.nan)
 
     def correlation(self, kind: str = "") -> FloatArray:
-        """Compute the correlation (P, P) of the noise of a field between the points; 0 outside the mesh."""
+        """Compute the correlation (P, P) of the noise of a field between the points; 0 outside the mesh.
+
+        Parameters
+        ----------
+        kind
+            Key of `correlations`.
+
+        Returns
+        -------
+        ndarray, shape (P, P)
+        """
         weights = np.nan_to_num(_weights(self, np.ones(len(self.nodes), dtype=bool).tobytes()))
         return _unit(weights @ self.correlations[kind] @ weights.T)
 

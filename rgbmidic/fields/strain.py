@@ -29,7 +29,18 @@ _FLAT = 1e-2
 
 
 def shortest_gauge(mesh: Tri3Mesh) -> float:
-    """Return the length in px of the shortest virtual strain gauge on a mesh."""
+    """Return the length in px of the shortest virtual strain gauge on a mesh.
+
+    Parameters
+    ----------
+    mesh
+        N nodes, E elements.
+
+    Returns
+    -------
+    float
+        In px.
+    """
     return SHORTEST * mesh.size
 
 
@@ -113,13 +124,38 @@ class StrainGauges:
 
     @classmethod
     def at_nodes(cls, covariance: NodalCovariance, length: float | None = None) -> Self:
-        """Lay a gauge around every node; errors as `strain_of`."""
+        """Lay a gauge around every node; errors as `strain_of`.
+
+        Parameters
+        ----------
+        covariance
+            Of the mesh.
+        length
+            Length of the gauges in px; None: the shortest.
+
+        Returns
+        -------
+        StrainGauges
+        """
         mesh = covariance.mesh
         return cls._around(covariance, mesh.nodes, length, _ring(mesh))
 
     @classmethod
     def at_points(cls, covariance: NodalCovariance, points: FloatArray, length: float | None = None) -> Self:
         """Lay gauges around points (G, 2) within the mesh.
+
+        Parameters
+        ----------
+        covariance
+            Of the mesh.
+        points : ndarray, shape (G, 2)
+            Middles of the gauges in px on the reference.
+        length
+            Their length in px; None: the shortest.
+
+        Returns
+        -------
+        StrainGauges
 
         Raises
         ------
@@ -207,7 +243,19 @@ class StrainGauges:
     def strain(
         self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray, *, measure: str = MEASURES[0]
     ) -> Strain:
-        """Compute the strain of every gauge from the displacements (N,) of one frame; errors as `strain_of`."""
+        """Compute the strain of every gauge from the displacements (N,) of one frame; errors as `strain_of`.
+
+        Parameters
+        ----------
+        u, v, u_std, v_std : ndarray, shape (N,)
+            Displacement and its standard uncertainty, px; NaN where not measured.
+        measure
+            Strain measure, as of `strain_of`.
+
+        Returns
+        -------
+        Strain
+        """
         return strain_of_gradient(*self.gradient(u, v, u_std, v_std), measure)
 
     def _weights(self, measured: BoolArray) -> FloatArray:

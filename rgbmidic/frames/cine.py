@@ -22,7 +22,7 @@ import numpy.typing as npt
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import Recording
 from rgbmidic.frames.source import Movie, remembered
-from rgbmidic.frames.stored import StoredFrame, check_size, damaged, unpack_bits
+from rgbmidic.frames.stored import StoredFrame, check_size, cut_short, damaged, unpack_bits
 from rgbmidic.settings import FrameKind
 from rgbmidic.typing import AnyArray, FloatArray
 
@@ -81,7 +81,6 @@ Stored as the steps from one code to the next; the codes above 1014, white, are 
 """
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class CineFile(Movie):
     """A Phantom .cine file. Flips and rotation are settings of the camera's viewer and left to it."""
 
@@ -125,24 +124,27 @@ class _Header:
     size: int
 
     @property
-    def last_whole(self) -> int:
-        """Index of the last frame before the first that the file does not hold whole; -1 where it holds none."""
+    def whole(self) -> int:
+        """Number of frames before the first that the file does not hold whole."""
         begun = (self.pointers >= _FILE.size) & (self.pointers <= self.size - 8 - _needed(self.shape, self.bits))
-        return int(np.argmin(np.append(begun, False))) - 1
+        return int(np.argmin(np.append(begun, False)))
 
-    def lines(self, size: int) -> tuple[int, int] | None:
-        """Return number and bytes of the lines that hold a frame of `size` bytes; None where its size cannot be."""
+    def row_bits(self, size: int) -> int | None:
+        """Return the bits from one row to the next of a frame of `size` bytes; None where its size cannot be."""
         rows, columns = self.shape
-        if size == _needed(self.shape, self.bits):
-            return (rows, size // rows) if self.bits in (8, 16) else (1, size)
-        line = math.ceil(columns * self.bits / 32) * 4  # as in Windows bitmaps
-        return (rows, line) if size == rows * line else None
+        tight = columns * self.bits
+        filled = math.ceil(tight / 32) * 32  # as in Windows bitmaps
+        return {rows * filled // 8: filled, _needed(self.shape, self.bits): tight}.get(size)
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame."""
-        height = self.shape[0]
-        stored = range(height - rows.stop, height - rows.start) if self.bottom_up else rows
-        values = _samples(self, *self._lines(path, index, stored))
+        height, columns = self.shape
+        lines = self._lines(path, index, range(height - rows.stop, height - rows.start) if self.bottom_up else rows)
+        if self.bits in (8, 16):
+            samples: AnyArray = lines.view("u1" if self.bits == 8 else "<u2")
+        else:
+            samples = unpack_bits(lines, self.bits)
+        values = samples[:, : columns * len(rows) // len(lines)].reshape(len(rows), columns)
         if self.bits == _CODED_BITS:
             values = _LINEAR[values]
         return StoredFrame(
@@ -153,44 +155,27 @@ class _Header:
             white_level=self.white_level,
         )
 
-    def _lines(self, path: Path, index: int, rows: range) -> tuple[npt.NDArray[np.uint8], range]:
-        """Read the lines (n, bytes) that hold some rows of a frame; return them and the rows in them."""
+    def _lines(self, path: Path, index: int, rows: range) -> npt.NDArray[np.uint8]:
+        """Read the bytes of some rows of a frame, (n, bytes), or (1, bytes) where a row ends within a byte."""
         start = int(self.pointers[index])
+        ends = cut_short(path, whole=min(self.whole, index), count=self.recording.count)
         with path.open("rb") as file:
             if start < _FILE.size or start + 8 > self.size:
-                raise self._ends(path, index)
+                raise ends
             file.seek(start)
             annotation = int.from_bytes(file.read(4), "little")
             if annotation < 8 or start + annotation > self.size:
                 raise damaged(path, f"the annotation of frame {index} has {annotation} bytes")
             file.seek(start + annotation - 4)
-            lines = self.lines(int.from_bytes(file.read(4), "little"))
-            if lines is None:
+            size = int.from_bytes(file.read(4), "little")
+            if (row_bits := self.row_bits(size)) is None:
                 raise damaged(path, f"frame {index} has not the size that its header announces")
-            if start + annotation + lines[0] * lines[1] > self.size:
-                raise self._ends(path, index)
-            if lines[0] == 1:  # all samples in a row
-                return np.fromfile(file, dtype=np.uint8, count=lines[1]).reshape(lines), rows
-            file.seek(rows.start * lines[1], 1)
-            part = np.fromfile(file, dtype=np.uint8, count=len(rows) * lines[1])
-            return part.reshape(len(rows), lines[1]), range(len(rows))
-
-    def _ends(self, path: Path, index: int) -> FrameError:
-        last, count = min(self.last_whole, index - 1), self.recording.count
-        place = f"after frame {last}" if last >= 0 else "before the first frame"
-        return FrameError(f"{path} ends {place} of {count} (0 to {count - 1}): truncated or still being written")
-
-
-def _samples(header: _Header, lines: npt.NDArray[np.uint8], rows: range) -> AnyArray:
-    """Return samples (n, W), uint8 or uint16, of some of the rows in the lines that they are stored in."""
-    columns = header.shape[1]
-    if header.bits in (8, 16):
-        samples: AnyArray = lines.view("u1" if header.bits == 8 else "<u2")
-    else:
-        samples = unpack_bits(lines, header.bits)
-    if len(lines) == 1 and header.shape[0] > 1:
-        return samples[0, rows.start * columns : rows.stop * columns].reshape(len(rows), columns)
-    return samples[:, :columns]
+            if start + annotation + size > self.size:
+                raise ends
+            first, last = rows.start * row_bits // 8, math.ceil(rows.stop * row_bits / 8)
+            file.seek(first, 1)
+            part = np.fromfile(file, dtype=np.uint8, count=last - first)
+            return part.reshape(1 if row_bits % 8 else len(rows), -1)
 
 
 @remembered
@@ -225,7 +210,8 @@ def _header(path: Path) -> _Header:
         check_size(path, needed=2 * math.prod(shape), stored=_needed(shape, bits))
         if version not in (0, 1):
             raise damaged(path, f"its header announces the version {version} of the format; known are 0 and 1")
-        pointers = _array(path, file, np.dtype("<i8" if version else "<u4"), count, places[2]).astype(np.int64)
+        place = np.dtype("<i8" if version else "<u4")
+        pointers = np.frombuffer(_piece(path, file, places[2], count * place.itemsize), place)
         times, exposures = _stamps(path, file, (end, places[2]), count)
     depth = _depth(bits, setup.get("bits", 0), levels)
     black, white, remarks = _levels(setup, depth)
@@ -246,7 +232,7 @@ def _header(path: Path) -> _Header:
             times_ns=None if times is None else _since(times, trigger),
             **_settings(setup, exposures, remarks),
         ),
-        pointers=pointers,
+        pointers=pointers.astype(np.int64),
         size=size,
     )
 
@@ -257,11 +243,11 @@ def _needed(shape: tuple[int, int], bits: int) -> int:
 
 
 def _piece(path: Path, file: BinaryIO, start: int, length: int) -> bytes:
+    size = os.fstat(file.fileno()).st_size
+    if start + length > size:
+        raise damaged(path, f"its header goes on to byte {start + length}, behind the end of the file at byte {size}")
     file.seek(start)
-    piece = file.read(length)
-    if len(piece) < length:
-        raise damaged(path, f"its header goes on to byte {start + length}, the file has {start + len(piece)} or less")
-    return piece
+    return file.read(length)
 
 
 def _setup(path: Path, file: BinaryIO, start: int) -> tuple[dict[str, Any], int]:
@@ -320,13 +306,6 @@ def _levels(setup: Mapping[str, int], depth: int) -> tuple[int | None, int, tupl
     return None, largest, (remark,) if black or white else ()
 
 
-def _array(path: Path, file: BinaryIO, stored: np.dtype[Any], count: int, start: int) -> npt.NDArray[Any]:
-    size = os.fstat(file.fileno()).st_size
-    if start + count * stored.itemsize > size:
-        raise damaged(path, f"a table of its {count} frames ends behind the end of the file, at byte {size}")
-    return np.frombuffer(_piece(path, file, start, count * stored.itemsize), dtype=stored)
-
-
 def _stamps(
     path: Path, file: BinaryIO, between: tuple[int, int], count: int
 ) -> tuple[npt.NDArray[np.uint64] | None, npt.NDArray[np.uint32] | None]:
@@ -341,7 +320,7 @@ def _stamps(
             stored = np.dtype(_STAMPS[kind])
             if length - 8 < count * stored.itemsize:
                 raise damaged(path, f"block {kind} of its header has {length} bytes, too few for {count} frames")
-            found[kind] = _array(path, file, stored, count, place + 8)
+            found[kind] = np.frombuffer(_piece(path, file, place + 8, count * stored.itemsize), stored)
         if length < 8:
             break
         place += length

@@ -38,12 +38,36 @@ class Window:
 
     @classmethod
     def whole(cls, frame: tuple[int, int]) -> Window:
-        """Return the window that is all of a frame."""
+        """Return the window that is all of a frame.
+
+        Parameters
+        ----------
+        frame
+            Rows and columns of the frame.
+
+        Returns
+        -------
+        Window
+        """
         return cls(origin=(0, 0), shape=frame, frame=frame)
 
     @classmethod
     def around(cls, points: FloatArray, margin: float, frame: tuple[int, int]) -> Window:
-        """Return what lies within `margin` px of points (N, 2) in x and y, and little more."""
+        """Return what lies within `margin` px of points (N, 2) in x and y, and little more.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 2)
+            Points (x, y) of the frame, px.
+        margin
+            Distance from them, px.
+        frame
+            Rows and columns of the frame.
+
+        Returns
+        -------
+        Window
+        """
         size = np.array(frame[::-1])
         low = np.clip(np.floor(points.min(axis=0) - margin), 0, size - 1).astype(int) // _GRID * _GRID
         last = np.clip(np.ceil(points.max(axis=0) + margin), low, size - 1).astype(int)
@@ -67,7 +91,17 @@ class Window:
         return range(self.origin[0], self.origin[0] + self.shape[1])
 
     def part_of(self, other: Window) -> tuple[slice, slice]:
-        """Return where it lies, rows and columns, in a window that holds all of it."""
+        """Return where it lies, rows and columns, in a window that holds all of it.
+
+        Parameters
+        ----------
+        other
+            Window that holds all of this one.
+
+        Returns
+        -------
+        rows, columns : slice
+        """
         (left, top), (x, y), (rows, columns) = self.origin, other.origin, self.shape
         return slice(top - y, top - y + rows), slice(left - x, left - x + columns)
 

@@ -11,22 +11,15 @@ from pathlib import Path
 from typing import Literal, NoReturn, TypedDict, Unpack
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
+from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
 from rgbmidic.frames.cine import CINE_ENDINGS, CineFile
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.images import (
-    CAMERA_RAW_ENDINGS,
-    TIFF_ENDINGS,
-    CameraRaw,
-    HeaderlessFile,
-    PngFile,
-    TiffFile,
-    has_camera_header,
-    is_headerless,
-)
+from rgbmidic.frames.images import HeaderlessFile, PngFile, is_headerless
 from rgbmidic.frames.movies import MRAW_ENDINGS, MrawFile, SeqFile
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile, TiffStack, is_tiff_stack, split_dataset
+from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile, split_dataset
 from rgbmidic.frames.stored import Camera
+from rgbmidic.frames.tiff import TIFF_ENDINGS, TiffFile, TiffStack, is_tiff_stack
 from rgbmidic.frames.tiff_pages import is_dng
 from rgbmidic.settings import FrameKind, FrameSettings
 
@@ -59,7 +52,19 @@ class FrameFormat:
     movies: tuple[str, ...] = ()
 
     def reads(self, path: Path, stated: FrameSettings) -> bool:
-        """Report whether it reads a file of which the user states this."""
+        """Report whether it reads a file of which the user states this.
+
+        Parameters
+        ----------
+        path
+            The file.
+        stated
+            What the user states of it.
+
+        Returns
+        -------
+        bool
+        """
         if self.recognises is None:
             return path.suffix.lower() in self.endings + self.movies
         return self.recognises(path, stated)
@@ -120,7 +125,12 @@ def _added_formats() -> tuple[FrameFormat, ...]:
 
 
 def known_formats() -> tuple[FrameFormat, ...]:
-    """All formats, the package's own first: the first that recognises a file reads it."""
+    """All formats, the package's own first: the first that recognises a file reads it.
+
+    Returns
+    -------
+    tuple of FrameFormat
+    """
     return (*FORMATS, *_added_formats())
 
 

@@ -52,13 +52,16 @@ class _Header:
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame."""
-        data = self.layout.read(path, (index + self.oldest) % self.layout.count, rows, self.shape[0])
+        index = (index + self.oldest) % self.layout.count
         if self.stored_bits in (8, 16):
-            values = np.frombuffer(data, dtype=f"{self.order}u{self.stored_bits // 8}")
+            stored = np.dtype(f"{self.order}u{self.stored_bits // 8}")
+            values = self.layout.samples(path, index, rows, self.shape[0], stored)
         else:
-            values = unpack_bits(data, self.stored_bits)
-        values = (values >> self.shift).reshape(len(rows), -1)
-        return StoredFrame(values=values, kind="bayer" if self.cfa else None, cfa=self.cfa, bits=self.bits)
+            packed = self.layout.read(path, index, rows, self.shape[0])
+            values = unpack_bits(packed, self.stored_bits).reshape(len(rows), -1)
+        return StoredFrame(
+            values=values >> self.shift, kind="bayer" if self.cfa else None, cfa=self.cfa, bits=self.bits
+        )
 
 
 # Photron .mraw
@@ -233,7 +236,6 @@ _PATTERNS = {1: "GRBG", 2: "BGGR", 3: "RGGB"}
 """By NorPix's `eHBayerPatternOrigin`; 0, green beside blue, is also what a header holds that states no pattern."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SeqFile(Movie):
     """An uncompressed sequence of StreamPix, of monochrome or raw samples with a time stamp behind each frame."""
 

@@ -22,10 +22,11 @@ from pathlib import Path
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.formats import advice, frame_endings, open_source, reader_name
-from rgbmidic.frames.images import TIFF_ENDINGS, write_tiff
+from rgbmidic.frames.images import write_tiff
 from rgbmidic.frames.source import FrameSource, file_fingerprint
 from rgbmidic.frames.stacks import split_dataset
 from rgbmidic.frames.stored import Camera
+from rgbmidic.frames.tiff import TIFF_ENDINGS
 from rgbmidic.settings import FrameSettings
 
 logger = logging.getLogger(__name__)
@@ -98,7 +99,12 @@ class FrameSeries:
         return max((numbers[-1] - numbers[0]) // step + 1 - len(numbers), 0) if numbers else 0
 
     def shapes(self) -> Iterator[tuple[FrameSource, tuple[int, int]]]:
-        """Every source whose header can be read, with its rows and columns."""
+        """Every source whose header can be read, with its rows and columns.
+
+        Yields
+        ------
+        source, shape : FrameSource, tuple of int
+        """
         for source in (source for sources in self.lights for source in sources):
             try:
                 yield source, source.shape
@@ -113,6 +119,17 @@ class FrameSeries:
     def read(self, index: int, window: Window | None = None) -> tuple[Mosaic | ChannelFrame, ...]:
         """Read state `index` or a part of it: one frame per light fired in succession, else a single one.
 
+        Parameters
+        ----------
+        index
+            Index of the state.
+        window
+            The part of it that is read; None: all of it.
+
+        Returns
+        -------
+        tuple of Mosaic or ChannelFrame
+
         Raises
         ------
         FrameError
@@ -123,17 +140,42 @@ class FrameSeries:
         return tuple(source.read(inner, window) for source, inner in self._locate(index))
 
     def gone(self) -> str:
-        """Name the lights of which no file exists any more, by first file and number of files; else empty."""
+        """Name the lights of which no file exists any more, by first file and number of files; else empty.
+
+        Returns
+        -------
+        str
+        """
         exists = os.path.exists  # which raises nothing
         lost = [sources for sources in self.lights if not any(exists(source.path) for source in sources)]
         return "; ".join(f"{sources[0].path} and all {len(sources)} files of its series" for sources in lost)
 
     def name(self, index: int) -> str:
-        """Return the name of state `index`; those of several lights in succession joined by " + "."""
+        """Return the name of state `index`; those of several lights in succession joined by " + ".
+
+        Parameters
+        ----------
+        index
+            Index of the state.
+
+        Returns
+        -------
+        str
+        """
         return " + ".join(source.name(inner) for source, inner in self._locate(index))
 
     def time_ns(self, index: int) -> int | None:
-        """Return when state `index` was taken (the first light's frame), in ns from the trigger; None: not stated."""
+        """Return when state `index` was taken (the first light's frame), in ns from the trigger; None: not stated.
+
+        Parameters
+        ----------
+        index
+            Index of the state.
+
+        Returns
+        -------
+        int or None
+        """
         source, inner = next(self._locate(index))
         times = source.recording.times_ns
         return None if times is None else int(times[inner])
@@ -143,6 +185,17 @@ class FrameSeries:
 
         Where a `window` of it is read, the fingerprint is that of the sampled content (`file_fingerprint`), so that the
         file is not read whole for it.
+
+        Parameters
+        ----------
+        index
+            Index of the state.
+        window
+            The part of it that is read; None: all of it.
+
+        Returns
+        -------
+        dict of str to str
         """
         in_part = window is not None and not window.is_whole
         sources = [source for source, _ in self._locate(index)]
@@ -154,6 +207,16 @@ class FrameSeries:
         The sampled content is that of `file_fingerprint`, the order that of the files. With their name alone count
         those that cannot be read, which fail their own frames only, and those named as `unread` when the fingerprint
         was made that this one is compared with.
+
+        Parameters
+        ----------
+        unread
+            Names of files that count with their name alone.
+
+        Returns
+        -------
+        digest : str
+        without : tuple of str
         """
         digest, without = hashlib.sha256(), []
         for source in (source for sources in self.lights for source in sources):

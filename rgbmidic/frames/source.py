@@ -26,7 +26,8 @@ read in a millisecond; a movie that was exchanged differs in all of them, one th
 class FrameSource(ABC):
     """A file of one frame or several, read in any order; frames count from 0.
 
-    A format says how header and samples are read; one of several frames is a `Movie`.
+    A format says how header and samples are read; one of several frames is a `Movie`. It is a dataclass only where it
+    has fields of its own.
 
     Attributes
     ----------
@@ -70,11 +71,32 @@ class FrameSource(ABC):
         return self.read(index)
 
     def name(self, index: int) -> str:
-        """Return the name of a frame in messages and results: the file's name."""
+        """Return the name of a frame in messages and results: the file's name.
+
+        Parameters
+        ----------
+        index
+            Index of the frame in the file.
+
+        Returns
+        -------
+        str
+        """
         return legible(self.path.name)
 
     def read(self, index: int, window: Window | None = None) -> Mosaic | ChannelFrame:
         """Read frame `index`, or a part of it.
+
+        Parameters
+        ----------
+        index
+            Index of the frame in the file.
+        window
+            The part of it that is read; None: all of it.
+
+        Returns
+        -------
+        Mosaic or ChannelFrame
 
         Raises
         ------
@@ -90,7 +112,23 @@ class FrameSource(ABC):
     def stored(self, index: int, window: Window | None = None) -> StoredFrame:
         """Return the samples of frame `index`, or of a part of it, with what the file alone states.
 
-        It raises as `read` does.
+        Parameters
+        ----------
+        index
+            Index of the frame in the file.
+        window
+            The part of it that is read; None: all of it.
+
+        Returns
+        -------
+        StoredFrame
+
+        Raises
+        ------
+        FrameError
+            The file is missing, damaged, truncated, or of another size than the window's frame.
+        IndexError
+            There is no such frame.
         """
         if not 0 <= index < len(self):
             raise IndexError(f"there is no frame {index} in {self.path}, which holds {len(self)}")
@@ -155,7 +193,17 @@ class Movie(FrameSource):
         return file_fingerprint(self.path)
 
     def name(self, index: int) -> str:
-        """Return the name of a frame in messages and results: the file's name and the frame's index."""
+        """Return the name of a frame in messages and results: the file's name and the frame's index.
+
+        Parameters
+        ----------
+        index
+            Index of the frame in the file.
+
+        Returns
+        -------
+        str
+        """
         return f"{legible(self.path.name)} frame {index}"
 
     def _shape(self) -> tuple[int, int]:
@@ -184,21 +232,23 @@ def _on_disk(path: Path) -> Iterator[None]:
         yield
 
 
-def remembered(parse: Callable[[Path], _T]) -> Callable[[Path], _T]:
-    """Decorate `parse` so that a file that does not change is parsed once; an OSError where there is none."""
+def remembered(parse: Callable[[Path], _T]) -> Callable[[Path | str], _T]:
+    """Decorate `parse` so that a file that does not change is parsed once; what the disk refuses is a FrameError."""
 
     @lru_cache(maxsize=1024)
     def found(path: Path, size: int, modified: int) -> _T:
         return parse(path)
 
     @wraps(parse)
-    def look(path: Path) -> _T:
-        status = path.stat()
-        return found(path, status.st_size, status.st_mtime_ns)
+    def look(path: Path | str) -> _T:
+        with disk_faults(FrameError, f"{path} cannot be read"):
+            status = Path(path).stat()
+            return found(Path(path), status.st_size, status.st_mtime_ns)
 
     return look
 
 
+@remembered
 def file_hash(path: Path | str) -> str:
     """Return the SHA-256 of a file, in hexadecimal digits; it is computed once for a file that does not change.
 
@@ -217,10 +267,11 @@ def file_hash(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
-    with disk_faults(FrameError, f"{path} cannot be read"):
-        return _sha256(Path(path))
+    with regular(Path(path)).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+@remembered
 def file_fingerprint(path: Path | str) -> str:
     """Return the SHA-256 of a file's size and of 64 pieces of 4 KiB spread evenly over it: of all of it up to 256 KiB.
 
@@ -239,19 +290,7 @@ def file_fingerprint(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
-    with disk_faults(FrameError, f"{path} cannot be read"):
-        return _sampled(Path(path))
-
-
-@remembered
-def _sha256(path: Path) -> str:
-    with regular(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-@remembered
-def _sampled(path: Path) -> str:
-    with regular(path).open("rb") as file:
+    with regular(Path(path)).open("rb") as file:
         size = file.seek(0, 2)
         digest = hashlib.sha256(str(size).encode())
         for number in range(_SAMPLES):

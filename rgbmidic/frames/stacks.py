@@ -16,13 +16,11 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
-from xml.etree import ElementTree
 
 import numpy as np
 
 from rgbmidic.errors import FrameError, first_line, legible
-from rgbmidic.frames.data import Integers, Recording, even_times, fraction
-from rgbmidic.frames.images import checked_page, page_frame, page_rows
+from rgbmidic.frames.data import Integers, Recording, even_times
 from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import (
     MAXIMUM_BYTES,
@@ -35,13 +33,9 @@ from rgbmidic.frames.stored import (
     damaged,
     faults_of,
 )
-from rgbmidic.frames.tiff_pages import COLUMNS, DESCRIPTION, ROWS, PageList, is_stored_as_is, tiff_page
-from rgbmidic.settings import regular
-from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
     import h5py
-    from tifffile import TiffPage
 
 _MAXIMUM_HEADER = 2**16
 """Bytes: numpy refuses to parse more than 10,000, but reads as many as a damaged header announces, up to 4 GB."""
@@ -90,12 +84,7 @@ class _Stack:
         """Bytes of a frame."""
         return math.prod(self.frame) * self.dtype.itemsize
 
-    def stored(self, values: AnyArray, path: Path) -> StoredFrame:
-        """Return the samples in the machine's byte order."""
-        return StoredFrame.plain(values.astype(self.dtype.newbyteorder("="), copy=False), path)
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class NpyFile(Movie):
     """A numpy array of frames, of which one is read at a time."""
 
@@ -110,8 +99,8 @@ class _NpyStack(_Stack):
         return Layout.checked(path, count=self.count, start=self.place, size=self.size)
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
-        data = self.layout(path).read(path, index, rows, self.frame[0])
-        return self.stored(np.frombuffer(data, dtype=self.dtype).reshape(len(rows), *self.frame[1:]), path)
+        samples = self.layout(path).samples(path, index, rows, self.frame[0], self.dtype)
+        return StoredFrame.plain(samples.reshape(len(rows), *self.frame[1:]), path)
 
 
 @remembered
@@ -198,7 +187,7 @@ class _Dataset(_Stack):
             dataset = file[self.place]
             _check_written(dataset, index, self, path)
             values = np.asarray(dataset[index, part] if dataset.ndim > len(self.frame) else dataset[part])
-        return self.stored(values, path)
+        return StoredFrame.plain(values.astype(self.dtype.newbyteorder("="), copy=False), path)
 
 
 @contextmanager
@@ -253,17 +242,17 @@ def _check_written(dataset: h5py.Dataset, index: int, stack: _Stack, path: Path)
     check_size(path, needed=stack.size, stored=min(dataset.id.get_storage_size(), size))
     if dataset.external or dataset.is_virtual:
         raise FrameError(f"{path}: the samples of {dataset.name} lie in other files; name the file that holds them")
+    created = dataset.id.get_create_plist()
     if dataset.chunks is None:
-        offset = dataset.id.get_offset()
-        inside_header = dataset.id.get_create_plist().get_layout() == h5py.h5d.COMPACT
+        offset, inside_header = dataset.id.get_offset(), created.get_layout() == h5py.h5d.COMPACT
         if not inside_header and (offset is None or offset + (index + 1) * stack.size > size):
             raise cut_short(path, whole=max(size - offset, 0) // stack.size if offset else 0, count=stack.count)
         return
-    if math.prod(dataset.chunks) * dataset.dtype.itemsize > MAXIMUM_BYTES:
+    whole = math.prod(dataset.chunks) * dataset.dtype.itemsize
+    if whole > MAXIMUM_BYTES:
         raise FrameError(
             f"{path} is stored in chunks of shape {dataset.chunks}, more than {MAXIMUM_BYTES / 1e6:.0f} MB each"
         )
-    created, whole = dataset.id.get_create_plist(), math.prod(dataset.chunks) * dataset.dtype.itemsize
     filters = [created.get_filter(place)[0] for place in range(created.get_nfilters())]
     axes = len(stack.frame)
     before, lengths = [index // step * step for step in dataset.chunks[:-axes]], dataset.chunks[-axes:]
@@ -280,115 +269,3 @@ def _check_written(dataset: h5py.Dataset, index: int, stack: _Stack, path: Path)
         found = len(dataset.id.read_direct_chunk(place)[1])
         if used <= {h5py.h5z.FILTER_SHUFFLE} and found != whole:
             raise damaged(path, f"a chunk of frame {index} has {found} bytes; needed are {whole}")
-
-
-_UNITS = {"s": 1, "sec": 1, "seconds": 1}
-_UNITS |= {"ms": 10**3, "msec": 10**3, "µs": 10**6, "us": 10**6, "usec": 10**6, "ns": 10**9}
-"""Of time, by how many make a second."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TiffStack(Movie):
-    """A TIFF file of several frames of one size, in the order of the file."""
-
-    packages = ("tifffile",)
-
-    def _header(self) -> _Hyperstack:
-        return _stack(self.path)
-
-
-def is_tiff_stack(path: Path) -> bool:
-    """Return whether a TIFF file holds several frames; False for what cannot be read."""
-    try:
-        return _stack(path).recording.count > 1
-    except (OSError, FrameError):
-        return False
-
-
-def _behind(page: TiffPage, path: Path, index: int, count: int, rows: range) -> AnyArray:
-    """Read some rows of a frame of which only the first has a page, as ImageJ stores more than 4 GB."""
-    if not is_stored_as_is(page) or not page.is_contiguous:
-        raise FrameError(f"{path} announces {count} frames but has one page, whose samples are compressed or in pieces")
-    layout = Layout.checked(path, count=count, start=page.dataoffsets[0], size=page.nbytes)
-    dtype = np.dtype(page.dtype)
-    data = layout.read(path, index, rows, page.imagelength)
-    stored = np.frombuffer(data, dtype=dtype.newbyteorder(page.parent.byteorder))
-    return stored.astype(dtype, copy=False).reshape(len(rows), *page.shape[1:])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Hyperstack:
-    """Where the pages begin (one, where all frames lie behind the first), the size of the first, and the recording."""
-
-    offsets: Integers
-    shape: tuple[int, int]
-    recording: Recording
-
-    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
-        """Read some rows of a frame."""
-        if index >= len(self.offsets) > 1:
-            raise FrameError(f"{path}: its list of frames ends after {index - 1}: truncated or still being written")
-        alone = len(self.offsets) == 1
-        with tiff_page(path, int(self.offsets[0 if alone else index])) as page:
-            checked_page(page, path)
-            if (page.imagelength, page.imagewidth) != self.shape:
-                here = f"{page.imagelength} rows of {page.imagewidth} pixels"
-                raise FrameError(f"{path}: frame {index} has {here}, the first {self.shape[0]} of {self.shape[1]}")
-            count = self.recording.count
-            samples = _behind(page, path, index, count, rows) if alone else page_rows(page, path, rows)
-            stored = page_frame(page, path, samples)
-            return stored if samples is not None else replace(stored, values=stored.values[rows.start : rows.stop])
-
-
-@remembered
-def _stack(path: Path) -> _Hyperstack:
-    with regular(path).open("rb") as file:
-        pages = PageList.begin(file, path)
-        offsets, ends_early = pages.offsets(path)
-        content = pages.content(offsets[0]) or b""
-        text = pages.text(content, DESCRIPTION)
-        shape = (pages.value(content, ROWS), pages.value(content, COLUMNS))
-    images = re.search(r"^images=([0-9]{1,9})$", text, re.MULTILINE) if text.startswith("ImageJ=") else None
-    count = int(images[1]) if images and len(offsets) == 1 else len(offsets) + (ends_early and len(offsets) > 1)
-    check_count(path, count)
-    times = _imagej_times(text, count) if images else _ome_times(text, count)
-    recording = Recording(count=count, times_ns=times)
-    return _Hyperstack(offsets=np.array(offsets, dtype=np.int64), shape=shape, recording=recording)
-
-
-def _imagej_times(text: str, count: int) -> Integers | None:
-    """Derive times from ImageJ's frame interval, where all images are frames in time."""
-    entries = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
-    others = {"channels", "slices"} & entries.keys()
-    if entries.get("frames", "" if others else str(count)) != str(count):
-        return None
-    return _even_times(entries.get("finterval", ""), entries.get("tunit", "s"), count)
-
-
-def _ome_times(text: str, count: int) -> Integers | None:
-    """Derive times from OME's time increment or the time of every plane."""
-    if "<OME" not in text[:1000] or "<!ENTITY" in text:
-        return None
-    try:
-        pixels = ElementTree.fromstring(text.encode()).find(".//{*}Pixels")
-    except ElementTree.ParseError:
-        return None
-    if pixels is None or pixels.get("SizeT") != str(count):
-        return None
-    if pixels.get("TimeIncrement"):
-        return _even_times(pixels.get("TimeIncrement", ""), pixels.get("TimeIncrementUnit", "s"), count)
-    planes = {plane.get("TheT"): plane for plane in pixels.iterfind("{*}Plane")}
-    each = [planes.get(str(index), pixels) for index in range(count)]
-    times = [_seconds(plane.get("DeltaT", ""), plane.get("DeltaTUnit", "s")) for plane in each]
-    known = [round(time * 10**9) for time in times if time is not None]
-    return np.array(known, dtype=np.int64) if len(known) == count else None
-
-
-def _even_times(interval: str, unit: str, count: int) -> Integers | None:
-    seconds = _seconds(interval, unit)
-    return even_times(range(count), seconds) if seconds else None
-
-
-def _seconds(text: str, unit: str) -> Fraction | None:
-    number = fraction(text)
-    return None if number is None or unit not in _UNITS else number / _UNITS[unit]

@@ -95,8 +95,8 @@ def check_count(path: Path, count: int) -> None:
 
 def cut_short(path: Path, *, whole: int, count: int) -> FrameError:
     """Return the error for a frame behind the end of a file that holds only the first `whole` of its `count` frames."""
-    where = f"after frame {whole - 1} of {count}" if whole else f"before the first of its {count} frames"
-    return FrameError(f"{path}: the file ends {where}: truncated or still being written")
+    where = f"after frame {whole - 1} of {count}" if whole else f"before the first frame of {count}"
+    return FrameError(f"{path}: the file ends {where} (0 to {count - 1}): truncated or still being written")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,6 +154,11 @@ class Layout:
             first, last = (self.size * row // of for row in (rows.start, rows.stop))
             file.seek(begin + first)
             return file.read(last - first)
+
+    def samples(self, path: Path, index: int, rows: range, of: int, stored: np.dtype[Any]) -> AnyArray:
+        """Read the samples (n, ...) of some rows that are `stored` one behind the other, as `read` reads bytes."""
+        values = np.frombuffer(self.read(path, index, rows, of), dtype=stored)
+        return values.astype(stored.newbyteorder("="), copy=False).reshape(len(rows), -1)
 
 
 def unpack_bits(packed: bytes | AnyArray, bits: int) -> AnyArray:
@@ -247,6 +252,19 @@ class StoredFrame:
     @classmethod
     def plain(cls, values: AnyArray, path: Path, cfa: str | None = None) -> StoredFrame:
         """Return samples (H, W) or (H, W, C) of a picture that states neither levels nor, as a rule, its pattern.
+
+        Parameters
+        ----------
+        values : ndarray, shape (H, W) or (H, W, C), uint8 or uint16
+            Grey levels (DN).
+        path
+            The file, for messages.
+        cfa
+            Bayer pattern where the file states it.
+
+        Returns
+        -------
+        StoredFrame
 
         Raises
         ------

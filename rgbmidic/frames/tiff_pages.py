@@ -8,18 +8,16 @@ from __future__ import annotations
 
 import logging
 import math
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
-import numpy as np
-
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.stored import damaged, faults_of
 from rgbmidic.settings import regular
-from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage
@@ -31,21 +29,20 @@ _HEADERS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 """Of TIFF and BigTIFF; several cameras' raws begin with II or MM, too, and are none."""
 UNCOMPRESSED = 1
 _REDUCED = 1
-_RAW_PHOTOMETRIC = (32803, 34892)
 _DNG_VERSION = 50706
 COLUMNS, ROWS, DESCRIPTION = 256, 257, 270
 _NEW_TYPE = 254
 _SHORT = 3
 _CLASSIC = 4
 """Bytes of an offset in TIFF; in BigTIFF, which LibRaw does not read, they are 8."""
-_PIECE = 512
-"""Bytes that are read of a page at once: its usual one to two dozen entries."""
 _MOST_ENTRIES = 4096
 """Entries of a page beyond which it is no page: those seen have a few dozen."""
 _TEXT_BYTES = 256 * 2**20
 """Most bytes of a description: OME uses some 300 for every frame."""
 _CFA_REPEAT, _CFA_PATTERN = 33421, 33422
-_ACTIVE_AREA, _BLACK_REPEAT, _BLACK, _BLACK_DELTAS = 50829, 50713, 50714, (50715, 50716)
+
+Entries = dict[int, tuple[int, int, bytes]]
+"""Type, number of values, and the values or where they lie, of the entries of a page by their codes."""
 
 
 @contextmanager
@@ -100,8 +97,8 @@ def is_dng(path: Path) -> bool:
     try:
         with regular(path).open("rb") as file:
             pages = PageList.begin(file, path)
-            first = pages.content(pages.first) if pages.offset == _CLASSIC else None
-            return first is not None and pages.place(first, _DNG_VERSION) > 0
+            first = pages.page(pages.first) if pages.offset == _CLASSIC else None
+            return first is not None and _DNG_VERSION in first[0]
     except (OSError, FrameError):
         return False
 
@@ -116,8 +113,8 @@ class PageList:
         The file and its bytes.
     order
         Its byte order.
-    offset, count, entry
-        Widths in bytes of an offset, of a number of entries, of an entry.
+    offset
+        Bytes of an offset: 4, in BigTIFF 8.
     first
         Where the first page begins.
     """
@@ -126,8 +123,6 @@ class PageList:
     size: int
     order: Literal["little", "big"]
     offset: int
-    count: int
-    entry: int
     first: int
 
     @classmethod
@@ -137,67 +132,55 @@ class PageList:
         if head not in _HEADERS:
             raise damaged(path, "it is not a TIFF file")
         order: Literal["little", "big"] = "little" if head[:1] == b"I" else "big"
-        offset, count, entry = (8, 8, 20) if head in _HEADERS[2:] else (4, 2, 12)
-        file.seek(offset)  # 4 or 8: of both headers the offset of the first page is the last field
+        offset = 8 if head in _HEADERS[2:] else _CLASSIC
+        file.seek(offset)  # of both headers the offset of the first page is the last field
         first = int.from_bytes(file.read(offset), order)
-        size = file.seek(0, 2)
-        return cls(file=file, size=size, order=order, offset=offset, count=count, entry=entry, first=first)
+        return cls(file=file, size=file.seek(0, 2), order=order, offset=offset, first=first)
 
     def offsets(self, path: Path) -> tuple[list[int], bool]:
         """Where the pages in full resolution begin, and whether their list leads out of the file."""
-        offset = self.first
-        found: list[int] = []
-        seen: set[int] = set()
+        offset, found, seen = self.first, list[int](), set[int]()
         while offset:
-            content = self.content(offset)
-            if offset in seen or (content is None and not found):
+            page = self.page(offset)
+            if offset in seen or (page is None and not found):
                 raise damaged(path, "its list of images leads back to itself" if found else "it leads to no image")
-            if content is None:
+            if page is None:
                 return found, True
             seen.add(offset)
-            # entries come in the order of their codes, and that of reduced images is the lowest
-            if self._number(content, self.count, 2) != _NEW_TYPE or not self.value(content, _NEW_TYPE) & 1:
+            entries, following = page
+            if not self.value(entries, _NEW_TYPE) & _REDUCED:
                 found.append(offset)
-            offset = self._number(content, len(content) - self.offset, self.offset)
+            offset = following
         if not found:
             raise damaged(path, "its header leads to no image")
         return found, False
 
-    def content(self, offset: int) -> bytes | None:
-        """Read the number of entries, the entries and the offset of the next page; None where the file ends before."""
-        if offset + self.count > self.size:
+    def page(self, offset: int) -> tuple[Entries, int] | None:
+        """Read the entries of a page and the offset of the next one; None where the file ends before."""
+        counter, entry = (8, "HHQ8s") if self.offset == 8 else (2, "HHI4s")
+        if offset + counter > self.size:
             return None
         self.file.seek(offset)
-        content = self.file.read(_PIECE)
-        number = self._number(content, 0, self.count)
-        needed = self.count + number * self.entry + self.offset
-        if not 0 < number <= _MOST_ENTRIES or offset + needed > self.size:
+        number = int.from_bytes(self.file.read(counter), self.order)
+        length = number * (4 + 2 * self.offset)
+        if not 0 < number <= _MOST_ENTRIES or offset + counter + length + self.offset > self.size:
             return None
-        return content[:needed] + self.file.read(max(needed - len(content), 0))
+        stored = struct.iter_unpack(("<" if self.order == "little" else ">") + entry, self.file.read(length))
+        entries = {code: (kind, many, place) for code, kind, many, place in stored}
+        return entries, int.from_bytes(self.file.read(self.offset), self.order)
 
-    def value(self, content: bytes, code: int) -> int:
+    def value(self, entries: Entries, code: int) -> int:
         """Return the one value of an entry; 0 where there is none."""
-        found = self.place(content, code)
-        width = 2 if self._number(content, found + 2, 2) == _SHORT else 4
-        return self._number(content, found + 4 + self.offset, width) if found else 0
+        kind, _, place = entries.get(code, (_SHORT, 0, b""))
+        return int.from_bytes(place[: 2 if kind == _SHORT else 4], self.order)
 
-    def text(self, content: bytes, code: int) -> str:
+    def text(self, entries: Entries, code: int) -> str:
         """Return the text of an entry; empty where there is none."""
-        found = self.place(content, code)
-        number = self._number(content, found + 4, self.offset) if found else 0
-        start = found + 4 + self.offset
-        if number <= self.offset:
-            return content[start : start + number].decode(errors="replace").rstrip("\0")
-        self.file.seek(min(self._number(content, start, self.offset), self.size))
-        return self.file.read(min(number, _TEXT_BYTES)).decode(errors="replace").rstrip("\0")
-
-    def place(self, content: bytes, code: int) -> int:
-        """Return where the entry begins; 0 where there is none."""
-        starts = range(self.count, len(content) - self.offset, self.entry)
-        return next((start for start in starts if self._number(content, start, 2) == code), 0)
-
-    def _number(self, content: bytes, start: int, width: int) -> int:
-        return int.from_bytes(content[start : start + width], self.order)
+        _, number, content = entries.get(code, (0, 0, b""))
+        if number > self.offset:  # the entry holds where the text lies
+            self.file.seek(min(int.from_bytes(content, self.order), self.size))
+            content = self.file.read(min(number, _TEXT_BYTES))
+        return content[:number].decode(errors="replace").rstrip("\0")
 
 
 def missing_data(page: TiffPage, size: int) -> str | None:
@@ -232,66 +215,3 @@ def cfa_pattern(page: TiffPage) -> str | None:
     if pattern is None or tag(page, _CFA_REPEAT) != (2, 2) or not set(pattern) <= {0, 1, 2}:
         return None
     return "".join("RGB"[channel] for channel in pattern)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RawStructure:
-    """What the TIFF tags of a camera raw state beyond what LibRaw gives.
-
-    Attributes
-    ----------
-    stored_as_is
-        Whether the samples are uncompressed and all there, so that zeros in them are real.
-    black_cell : ndarray, shape (2, 2), or None
-        DNG black level by position at `origin`; None where no tag states it or states more than a 2x2 cell can hold.
-    origin
-        First row and column of the DNG's active area on the sensor.
-    """
-
-    stored_as_is: bool
-    black_cell: FloatArray | None
-    origin: tuple[int, int]
-
-    @classmethod
-    def read(cls, path: Path) -> RawStructure | None:
-        """Read and check the tags; None for files that are not TIFF inside or that only LibRaw can follow.
-
-        Raises
-        ------
-        FrameError
-            Image data that the header announces is not in the file.
-        """
-        try:
-            with tiff_pages(path) as pages:
-                raw = [page for page in pages if page.photometric in _RAW_PHOTOMETRIC] or pages
-                page = max(raw, key=lambda page: page.imagewidth * page.imagelength)
-                area = tag(page, _ACTIVE_AREA) or (0, 0)
-                black = _black_cell(page)
-                structure = cls(stored_as_is=is_stored_as_is(page), black_cell=black, origin=(area[0], area[1]))
-                missing = [reason for page in raw if (reason := missing_data(page, path.stat().st_size))]
-        except FrameError:
-            return None
-        if missing:
-            raise damaged(path, missing[0])
-        return structure
-
-    def black_level(self, top: int, left: int) -> FloatArray | None:
-        """Return the black level of each position of the 2x2 cell that starts at row `top`, column `left`.
-
-        LibRaw moves odd margins to the next even row and column without moving the black levels along.
-        """
-        if self.black_cell is None:
-            return None
-        return np.roll(self.black_cell, (self.origin[0] - top, self.origin[1] - left), axis=(0, 1))
-
-
-def _black_cell(page: TiffPage) -> FloatArray | None:
-    levels, repeat = tag(page, _BLACK), tag(page, _BLACK_REPEAT) or (1, 1)
-    if levels is None or any(delta in page.tags for delta in _BLACK_DELTAS) or not set(repeat) <= {1, 2}:
-        return None
-    numbers = np.array(levels, dtype=np.float64)
-    if len(numbers) == 2 * math.prod(repeat):  # rationals come as numerator, denominator
-        numbers = numbers[::2] / numbers[1::2]
-    if len(numbers) != math.prod(repeat):
-        return None
-    return np.tile(numbers.reshape(repeat), (2 // repeat[0], 2 // repeat[1]))

@@ -199,7 +199,12 @@ class Calibration:
         )
 
     def to_document(self) -> dict[str, Any]:
-        """Return the JSON document, as plain dictionaries, lists and numbers."""
+        """Return the JSON document, as plain dictionaries, lists and numbers.
+
+        Returns
+        -------
+        dict
+        """
         document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION}
         camera = {name: plain(getattr(self, name)) for name in _CAMERA}
         document["camera"] = {key: value for key, value in camera.items() if value is not None}
@@ -216,7 +221,12 @@ class Calibration:
         return {**document, **self.extra, "provenance": dict(self.provenance)}
 
     def figures(self) -> dict[str, Any]:
-        """Return what a report states of the calibration: the document without what varies over the field."""
+        """Return what a report states of the calibration: the document without what varies over the field.
+
+        Returns
+        -------
+        dict
+        """
         document = self.to_document()
         kept = {"lights", "matrix", "std", "noise_amplification", "gain", "read_noise", "parameters"}
         figures: dict[str, Any] = {
@@ -237,6 +247,11 @@ class Calibration:
 
     def write(self, path: Path | str) -> None:
         """Write the calibration file; an existing file is replaced only once the new one is complete.
+
+        Parameters
+        ----------
+        path
+            File to write.
 
         Raises
         ------

@@ -254,7 +254,22 @@ class Led:
             raise InputError(f"an LED has its centre in 200 to 1200 nm and its width in 0 to 300 nm, not {self}")
 
     def power(self, wavelengths: FloatArray) -> FloatArray:
-        """Return the spectral power at the wavelengths (nm), of unit sum: equal spacing is assumed."""
+        """Return the spectral power at the wavelengths (nm), of unit sum: equal spacing is assumed.
+
+        Parameters
+        ----------
+        wavelengths : ndarray, shape (n,)
+            In nm, equally spaced.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+
+        Raises
+        ------
+        InputError
+            It emits nothing there.
+        """
         g = np.exp(-(((wavelengths - self.centre) * HALF_MAXIMUM / self.width) ** 2))
         shape = (g + 2 * g**5) / 3
         if not shape.sum() > 0:
@@ -291,7 +306,22 @@ class Sensitivities:
 
     @classmethod
     def from_colour(cls, name: str) -> Sensitivities:
-        """Return a camera of colour-science (``colour.MSDS_CAMERA_SENSITIVITIES``), such as "Nikon 5100 (NPL)"."""
+        """Return a camera of colour-science (``colour.MSDS_CAMERA_SENSITIVITIES``), such as "Nikon 5100 (NPL)".
+
+        Parameters
+        ----------
+        name
+            Name of the camera there.
+
+        Returns
+        -------
+        Sensitivities
+
+        Raises
+        ------
+        InputError
+            There is none of this name.
+        """
         import colour
 
         known = colour.MSDS_CAMERA_SENSITIVITIES
@@ -303,6 +333,15 @@ class Sensitivities:
     @classmethod
     def read(cls, path: Path | str) -> Sensitivities:
         """Read a camera file: the JSON of rawtoaces, or a CSV with wavelength, R, G, B in its first four columns.
+
+        Parameters
+        ----------
+        path
+            The file.
+
+        Returns
+        -------
+        Sensitivities
 
         Raises
         ------

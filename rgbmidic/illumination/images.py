@@ -243,7 +243,17 @@ class IlluminationImages:
         )
 
     def placed(self, origin: tuple[int, int]) -> IlluminationImages:
-        """Return the images as those of a part of the frame that begins at the pixel `origin` (column, row)."""
+        """Return the images as those of a part of the frame that begins at the pixel `origin` (column, row).
+
+        Parameters
+        ----------
+        origin
+            Column and row of the part's first pixel in the frame.
+
+        Returns
+        -------
+        IlluminationImages
+        """
         known = self.registration
         return replace(self, origin=origin, registration=known and known.cropped((-origin[0], -origin[1])))
 
@@ -371,5 +381,17 @@ def _gaussian(image: FloatImage, sigma: float) -> FloatImage:
 
 
 def correlated(images: IlluminationImages, sigma: float = LOCAL_MEAN) -> FloatImage:
-    """What the solve correlates (k, H, W): the lights' images, over their local mean of width `sigma` (0: as is)."""
+    """What the solve correlates (k, H, W): the lights' images, over their local mean of width `sigma` (0: as is).
+
+    Parameters
+    ----------
+    images
+        One image a light.
+    sigma
+        Standard deviation of the Gaussian mean, px.
+
+    Returns
+    -------
+    ndarray, shape (k, H, W), float32
+    """
     return normalise(images.values, sigma, images.full_scale) if sigma else images.values

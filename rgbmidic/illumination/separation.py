@@ -250,11 +250,31 @@ class Separation:
         return replace(images, registration=known.registration)
 
     def within(self, window: Window) -> Separation:
-        """The separation of a part of the frames."""
+        """The separation of a part of the frames.
+
+        Parameters
+        ----------
+        window
+            The part of the frame.
+
+        Returns
+        -------
+        Separation
+        """
         return replace(self, calibration=self.calibration and self.calibration.cropped(window.origin, window.shape))
 
     def learnt(self, images: IlluminationImages) -> Separation:
-        """The separation that takes the speckle's texture from the images of one state for all others."""
+        """The separation that takes the speckle's texture from the images of one state for all others.
+
+        Parameters
+        ----------
+        images
+            One image a light, of the state that the texture is taken from.
+
+        Returns
+        -------
+        Separation
+        """
         return replace(self, texture=images.texture)
 
     def _crosstalk(self) -> Crosstalk:

@@ -19,6 +19,15 @@ __all__ = ["check_folder", "number_or_none", "write_findings"]
 def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
     """Refuse a folder in which one of the files would be overwritten.
 
+    Parameters
+    ----------
+    out
+        The folder; it need not exist.
+    files
+        Names of the files that will be written.
+    overwrite
+        Whether they may be replaced.
+
     Raises
     ------
     ResultError
@@ -34,12 +43,33 @@ def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
 
 
 def number_or_none(value: float) -> float | None:
-    """Return a number for a JSON document, which has neither NaN nor infinity: None for these."""
+    """Return a number for a JSON document, which has neither NaN nor infinity: None for these.
+
+    Parameters
+    ----------
+    value
+        The number.
+
+    Returns
+    -------
+    float or None
+    """
     return float(value) if math.isfinite(value) else None
 
 
 def write_findings(out: Path, name: str, document: Mapping[str, Any], figure: Figure) -> None:
     """Write a document as NAME.json and a figure as NAME.png into a folder, which is made where it does not exist.
+
+    Parameters
+    ----------
+    out
+        The folder.
+    name
+        Name of both files, without ending.
+    document
+        Content of the JSON file.
+    figure
+        Figure of matplotlib.
 
     Raises
     ------

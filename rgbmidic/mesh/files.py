@@ -35,11 +35,6 @@ _READERS: Mapping[str, Callable[[Path], MeshContent]] = {
     **dict.fromkeys((".bdf", ".nas", ".fem"), read_nastran),
     **{ending: partial(read_with_meshio, kind=kind) for ending, kind in FORMATS.items()},
 }
-_UNREADABLE = (
-    *(ValueError, TypeError, ArithmeticError, LookupError, OSError, EOFError),
-    *(StopIteration, RecursionError, MemoryError),
-)
-"""What text that is no mesh leads to: no number, one beyond its type, too few of them, a file that is not there."""
 
 
 def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) -> FiniteElementMesh:
@@ -59,6 +54,10 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
     part
         Only the elements of this set: an Abaqus element set, a gmsh physical group, a Nastran property. None: all.
 
+    Returns
+    -------
+    FiniteElementMesh
+
     Raises
     ------
     InputError
@@ -76,7 +75,7 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
         content = reader(path)
     except RgbmidicError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
-    except _UNREADABLE as error:
+    except Exception as error:  # text that is no mesh may raise any, in meshio's readers above all
         told = str(error) if isinstance(error, OSError) else str(error)[:120]  # the latter may quote the file
         raise InputError(f"{path} is not a readable mesh: {told or 'it ends early'}") from None
     faces, numbers = _faces(content, path, part)

@@ -80,7 +80,17 @@ class FiniteElementMesh:
             object.__setattr__(self, key, values)
 
     def part(self, chosen: BoolArray) -> Self:
-        """Return the chosen triangles (E,), and their nodes."""
+        """Return the chosen triangles (E,), and their nodes.
+
+        Parameters
+        ----------
+        chosen : ndarray, shape (E,), bool
+            The triangles that stay.
+
+        Returns
+        -------
+        FiniteElementMesh
+        """
         used, index = np.unique(self.elements[chosen], return_inverse=True)
         return replace(
             self,
@@ -101,6 +111,10 @@ class FiniteElementMesh:
 
         The triangles are sorted into strips along x, and those within a strip by their left ends. Two of them overlap
         by the least depth along the normals of their sides (separating axis theorem).
+
+        Returns
+        -------
+        tuple of int, or None
         """
         corners = self.points[self.elements]
         low, high = corners.min(axis=1), corners.max(axis=1)

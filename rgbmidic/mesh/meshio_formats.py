@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rgbmidic.command import optional
-from rgbmidic.errors import InputError, RgbmidicError, first_line
+from rgbmidic.errors import InputError
 from rgbmidic.mesh.content import CORNERS, MOST_BYTES, MeshContent, sized, unique
 from rgbmidic.mesh.vtu import NUMBERS, labels_of
 from rgbmidic.typing import IntArray
@@ -30,16 +30,11 @@ def read_with_meshio(path: Path, kind: str) -> MeshContent:
     """Read a file of one of meshio's formats, and the labels that it leaves out."""
     reader = optional(f"meshio.{kind}", "fe")
     said = io.StringIO()
-    try:
-        _check_limits(path, kind)
-        with warnings.catch_warnings(), redirect_stderr(said):
-            warnings.simplefilter("ignore")
-            warnings.filterwarnings("error", "string or file could not be read to its end")
-            mesh = reader.read(str(path))
-    except RgbmidicError:
-        raise
-    except Exception as error:  # of meshio's readers any may come, from text that is no mesh
-        raise InputError(f"{path} is not a readable mesh ({kind}: {first_line(error)[:120]})") from None
+    _check_limits(path, kind)
+    with warnings.catch_warnings(), redirect_stderr(said):
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("error", "string or file could not be read to its end")
+        mesh = reader.read(str(path))
     if said.getvalue():
         logger.warning("%s: %s", path, " ".join(said.getvalue().split()))
     points = np.zeros((len(mesh.points), 3))

@@ -76,6 +76,10 @@ class Placement:
         where
             Name of the pairs in messages.
 
+        Returns
+        -------
+        Placement
+
         Raises
         ------
         InputError
@@ -151,42 +155,119 @@ class Placement:
         return float(self.mm_per_pixel * np.sqrt((self.residuals**2).sum() / free / spread))
 
     def to_px(self, points: FloatArray) -> FloatArray:
-        """Return where points (N, 2) of the mesh, in mm, lie on the image, px."""
+        """Return where points (N, 2) of the mesh, in mm, lie on the image, px.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 2)
+            Points of the mesh, mm.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            Points (x, y) of the image, px.
+        """
         places = points @ self.matrix.T + self.shift
         return places if self.camera is None else self.camera.to_px(places)
 
     def to_mm(self, points: FloatArray) -> FloatArray:
-        """Return points (N, 2) of the image, in px, in mm in the mesh's axes."""
+        """Return points (N, 2) of the image, in px, in mm in the mesh's axes.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 2)
+            Points (x, y) of the image, px.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            In mm.
+        """
         places = points if self.camera is None else self.camera.to_mm(points)
         return np.asarray((places - self.shift) @ np.linalg.inv(self.matrix).T)
 
     def jacobian(self, points: FloatArray) -> FloatArray:
-        """Derivative (N, 2, 2) of `to_mm` at points (N, 2) in px: ``[n, mesh axis, px axis]``, mm per px."""
+        """Derivative (N, 2, 2) of `to_mm` at points (N, 2) in px: ``[n, mesh axis, px axis]``, mm per px.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 2)
+            Points (x, y) of the image, px.
+
+        Returns
+        -------
+        ndarray, shape (N, 2, 2)
+            In mm per px.
+        """
         back = np.linalg.inv(self.matrix)
         if self.camera is None:
             return np.broadcast_to(back, (len(points), 2, 2)).copy()
         return np.asarray(back @ self.camera.jacobian(points))
 
     def vectors_to_mm(self, points: FloatArray, vectors: FloatArray) -> FloatArray:
-        """Displacements (N, 2) in mm in the mesh's axes, of `vectors` (N, 2) in px from `points` (N, 2) in px."""
+        """Displacements (N, 2) in mm in the mesh's axes, of `vectors` (N, 2) in px from `points` (N, 2) in px.
+
+        Parameters
+        ----------
+        points, vectors : ndarray, shape (N, 2)
+            Points of the image and displacements of them, px.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            In mm.
+        """
         return self.to_mm(points + vectors) - self.to_mm(points)
 
     def vectors_to_px(self, points: FloatArray, vectors: FloatArray) -> FloatArray:
-        """Displacements (N, 2) in px, of `vectors` (N, 2) in mm from `points` (N, 2) in mm, in the mesh's axes."""
+        """Displacements (N, 2) in px, of `vectors` (N, 2) in mm from `points` (N, 2) in mm, in the mesh's axes.
+
+        Parameters
+        ----------
+        points, vectors : ndarray, shape (N, 2)
+            Points of the mesh and displacements of them, mm.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            In px.
+        """
         return self.to_px(points + vectors) - self.to_px(points)
 
     def to_document(self) -> dict[str, Any]:
-        """Return all but the camera in plain values, as the provenance of a result holds it."""
+        """Return all but the camera in plain values, as the provenance of a result holds it.
+
+        Returns
+        -------
+        dict
+        """
         return {name: getattr(self, name).tolist() for name in ("matrix", "shift", "pairs")}
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any], camera: Plane | None = None) -> Self:
-        """Return the placement of such values, and the `camera` that it was fitted with."""
+        """Return the placement of such values, and the `camera` that it was fitted with.
+
+        Parameters
+        ----------
+        document
+            Values as `to_document` gives them.
+        camera
+            Lens and plane; None where it was fitted without.
+
+        Returns
+        -------
+        Placement
+        """
         values = {name: np.array(document[name], dtype=np.float64) for name in ("matrix", "shift", "pairs")}
         return cls(**values, camera=camera)
 
     def summary(self) -> str:
-        """Return what it is, in words."""
+        """Return what it is, in words.
+
+        Returns
+        -------
+        str
+        """
         turned = np.degrees(np.arctan2(self.matrix[1, 0], self.matrix[0, 0]))
         scale = (
             "" if self.mm_per_pixel is None else f"{self.mm_per_pixel:.6g} ± {self.mm_per_pixel_std:.2g} mm per px, "

@@ -1,22 +1,16 @@
-"""The region of interest, and the Delaunay mesh of a region of any outline with its holes and cracks.
-
-A stated crack is a path through the region: a row of mesh nodes, along which the mesh is split.
-"""
+"""The region of interest: the pixels to measure."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
-from scipy.spatial import cKDTree
 
-from rgbmidic.errors import InputError, RegionError
+from rgbmidic.errors import RegionError
 from rgbmidic.typing import BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
@@ -61,6 +55,17 @@ class Region:
     def from_rectangle(cls, rectangle: Sequence[float], shape: tuple[int, int]) -> Region:
         """Rectangle (x0, y0, x1, y1) in px, clipped to the image of `shape` (H, W).
 
+        Parameters
+        ----------
+        rectangle
+            Corners x0, y0, x1, y1 in px.
+        shape
+            Rows and columns of the image.
+
+        Returns
+        -------
+        Region
+
         Raises
         ------
         RegionError
@@ -88,6 +93,17 @@ class Region:
     def from_polygon(cls, corners: npt.ArrayLike, shape: tuple[int, int]) -> Region:
         """Polygon with corners (x, y) in px, shape (M, 2), on an image of `shape` (H, W).
 
+        Parameters
+        ----------
+        corners : array_like, shape (M, 2)
+            Corners (x, y) in px.
+        shape
+            Rows and columns of the image.
+
+        Returns
+        -------
+        Region
+
         Raises
         ------
         RegionError
@@ -112,6 +128,10 @@ class Region:
         holes
             Corners (x, y) of each in px, shape (M, 2).
 
+        Returns
+        -------
+        Region
+
         Raises
         ------
         RegionError
@@ -123,7 +143,17 @@ class Region:
         return Region(mask=self.mask & ~np.logical_or.reduce(inside))
 
     def part(self, rows: slice, columns: slice) -> Region:
-        """Return the same region on a part of the image that holds it."""
+        """Return the same region on a part of the image that holds it.
+
+        Parameters
+        ----------
+        rows, columns
+            Rows and columns of the part in the image.
+
+        Returns
+        -------
+        Region
+        """
         corners = None
         if self.rectangle is not None:
             (x0, y0, x1, y1), x, y = self.rectangle, columns.start, rows.start
@@ -134,6 +164,17 @@ class Region:
     @classmethod
     def from_mask(cls, mask: npt.ArrayLike, shape: tuple[int, int] | None = None) -> Region:
         """Non-zero pixels of a mask image (H, W); `shape`, where given, is the size it must have.
+
+        Parameters
+        ----------
+        mask : array_like, shape (H, W)
+            Not zero where the region is.
+        shape
+            Rows and columns of the images.
+
+        Returns
+        -------
+        Region
 
         Raises
         ------
@@ -159,269 +200,3 @@ def _warn_clipped(what: str, points: FloatArray, shape: tuple[int, int]) -> None
     last = np.array(shape[::-1]) - 1
     if (points < -1).any() or (points > last + 1).any():
         logger.warning("the %s %s reaches outside the image of %d x %d px: clipped", what, points.tolist(), *(last + 1))
-
-
-_CROWDED = 0.3
-"""Distance in elements under which a node of the outline is left out beside another one, or beside a crack: the least
-angle of a triangle with two other sides of an element is then 17 degrees (derived)."""
-_DEEP = 0.6
-"""Depth in elements from which a lattice point is a node: over half the pitch, so that triangles at the outline are no
-flatter than those inside."""
-_SMOOTHED = 0.06
-"""Distance in elements within which the polygon of the outline follows its pixels, but at least a pixel: a chord of an
-element's length is that far from an arc with a radius of two elements (derived)."""
-_CLEAR = 0.55
-"""Distance in elements that nodes inside keep from a crack: they see a piece of it, at most an element long, under less
-than 85 degrees, two of them from both sides under less than 180, which makes it an edge of the Delaunay mesh."""
-_HALVINGS = 4
-"""Times that a piece of a crack is halved where another crack or the outline keeps it from being an edge: pieces of a
-16th of an element, 1.6 px for 25 px elements, are nearly as fine as a path is followed (`_FINE`)."""
-_SLIVER = 0.04
-"""Twice the area, in squares of an element's side, under which a triangle at the edge is left out: a regular one has
-.87, and one under .04 has too few pixels (8 for 20 px elements) for its six unknowns to be measured."""
-
-
-def outline_mesh(
-    mask: BoolArray, size: float, cracks: Sequence[npt.ArrayLike], origin: tuple[int, int] = (0, 0)
-) -> tuple[FloatArray, npt.NDArray[np.int32]]:
-    """Nodes (N, 2) and elements (E, 3) of about `size` px for the region `mask` (H, W), split along `cracks`.
-
-    The mask may be a part of a frame that begins at column and row `origin`: the nodes then lie as in all of it.
-
-    Raises
-    ------
-    RegionError
-        The region is too small for one element, or a crack misses it.
-    """
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    polygons = [cv2.approxPolyDP(line, max(1.0, _SMOOTHED * size), True)[:, 0].astype(np.float64) for line in contours]
-    edge, outlines = np.concatenate(contours)[:, 0].astype(np.float64), [line for line in polygons if len(line) >= 3]
-    outline = _outline_points(outlines, size)
-    padded = np.pad(mask, 1).astype(np.uint8)
-    depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
-    inner = _lattice_points(mask.shape, size, origin)
-    inner = inner[depth[np.round(inner[:, 1]).astype(int), np.round(inner[:, 0]).astype(int)] > _DEEP * size]
-    sharp = sharp_corners(outlines)
-    paths = crack_paths(cracks, mask, edge, sharp, size)
-    if paths:
-        is_sharp = (outline[:, None] == sharp).all(axis=2).any(axis=1)
-        outline = outline[is_sharp | (distance_to(paths, outline) > _CROWDED * size)]
-        inner = inner[distance_to(paths, inner) > _CLEAR * size]
-    points, triangles, pieces = _triangulated(np.concatenate([outline, inner]), paths)
-    centre = np.round(points[triangles].mean(axis=1)).astype(int)
-    inside = mask[np.clip(centre[:, 1], 0, mask.shape[0] - 1), np.clip(centre[:, 0], 0, mask.shape[1] - 1)]
-    a, b = (points[triangles[:, corner]] - points[triangles[:, 0]] for corner in (1, 2))
-    large = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > _SLIVER * size**2
-    triangles = triangles[inside & large]
-    if not len(triangles):
-        raise RegionError(f"the region of {int(mask.sum())} px is too small for one element of {size} px")
-    return split_along(points, triangles, pieces)
-
-
-def _triangulated(
-    points: FloatArray, paths: list[FloatArray]
-) -> tuple[FloatArray, npt.NDArray[np.int32], npt.NDArray[np.int64]]:
-    """Delaunay mesh of points (N, 2) and of the nodes of the paths.
-
-    Returns
-    -------
-    tuple
-        Nodes, triangles, and the pieces of the paths as edges (n, 2) of the mesh.
-    """
-    from scipy.spatial import Delaunay, QhullError
-
-    for _ in range(_HALVINGS + 1):
-        nodes = np.concatenate([points, *paths])
-        nodes = nodes[uncrowded(nodes, 1e-6)]
-        try:
-            triangles = Delaunay(nodes).simplices.astype(np.int32)
-        except (QhullError, ValueError):
-            raise RegionError("the region is too small for one element") from None
-        rows = [np.asarray(cKDTree(nodes).query(path)[1]) for path in paths]
-        pieces = np.concatenate([np.empty((0, 2), dtype=np.int64), *(np.stack([r[:-1], r[1:]], axis=1) for r in rows)])
-        edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-        missing = ~np.isin(edge_keys(pieces, len(nodes)), edge_keys(edges, len(nodes)))
-        if not missing.any():
-            return nodes, triangles, pieces
-        parts = np.split(missing, np.cumsum([len(path) - 1 for path in paths])[:-1])
-        paths = [halved(path, part) for path, part in zip(paths, parts, strict=True)]
-    raise RegionError(
-        "mesh.cracks cross, or run too close to each other or to a corner of the region, for the elements"
-    )
-
-
-def _lattice_points(shape: tuple[int, int], size: float, origin: tuple[int, int]) -> FloatArray:
-    """Points of a triangular lattice with pitch `size` over a frame, in its part of `shape` that begins at `origin`."""
-    rise, (left, top) = size * np.sqrt(3) / 2, origin
-    rows = np.arange(rise / 2, top + shape[0] - 1, rise)
-    x = np.arange(0, left + shape[1] - 1 - size / 2, size)
-    x = x[x >= left] - left
-    points = [np.stack([x + (i % 2) * size / 2, np.full_like(x, y - top)], 1) for i, y in enumerate(rows) if y >= top]
-    return np.concatenate(points) if points else np.empty((0, 2))
-
-
-def _outline_points(outlines: list[FloatArray], size: float) -> FloatArray:
-    """Points about `size` px apart along polygons; corners are kept."""
-    points = [np.empty((0, 2))]
-    for corners in outlines:
-        for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            pieces = max(1, round(float(np.hypot(*(end - start))) / size))
-            points.append(start + np.arange(pieces)[:, None] / pieces * (end - start))
-    every = np.concatenate(points)
-    return every[uncrowded(every, _CROWDED * size)]
-
-
-_STEP = 0.5
-"""Distance (px) of the points at which a path is looked at: no pixel that it crosses by more than half is missed."""
-_FINE = 1.0
-"""How far (px) the row of nodes may be beside the stated path: pixels that near its edges are left out."""
-_CRACKS_CROWDED = 0.5
-"""Least distance of nodes along a path, and most by which a branch moves along the path it leaves, in elements: the
-nodes of an earlier path are at most an element apart."""
-_AT_EDGE = 0.3
-"""Distance in elements from the region's edge within which a path's end counts as on it: that of crowded nodes."""
-_SHARP = np.cos(np.radians(60))
-"""Cosine of the turn from which a corner of the outline is not given up for a crack beside it: polygons around round
-holes turn less from a radius of 12 px on."""
-
-
-def crack_paths(
-    cracks: Sequence[npt.ArrayLike], mask: BoolArray, edge: FloatArray, sharp: FloatArray, size: float
-) -> list[FloatArray]:
-    """Nodes of every crack within the region, shape (n, 2) each, at most `size` px apart.
-
-    Parameters
-    ----------
-    cracks
-        Corners (x, y) in px of each path, shape (M, 2).
-    mask : ndarray, shape (H, W), bool
-        The region.
-    edge, sharp : ndarray, shape (n, 2)
-        Points of its edge, on which a path ends that leaves the region or nearly reaches it, and the sharp corners.
-    size
-        Side of the elements in px.
-
-    Raises
-    ------
-    InputError
-        A path is not at least two finite corners.
-    RegionError
-        A path has no part within the region that is as long as an element.
-    """
-    paths: list[FloatArray] = []
-    for number, crack in enumerate(cracks):
-        corners = np.asarray(crack, dtype=np.float64)
-        if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 2 or not np.isfinite(corners).all():
-            raise InputError(f"mesh.cracks[{number}] is at least two finite corners (x, y) in px; given is {crack!r}")
-        for part in _parts_within(corners, mask, size, number):
-            earlier = np.concatenate([np.empty((0, 2)), *paths])
-            paths.append(_path_nodes(part, ((earlier, _CRACKS_CROWDED), (sharp, _AT_EDGE), (edge, _AT_EDGE)), size))
-    return paths
-
-
-def _parts_within(corners: FloatArray, mask: BoolArray, size: float, number: int) -> list[FloatArray]:
-    """Return the parts of a path within the region that are as long as an element, as points `_STEP` px apart."""
-    points = _subdivided(corners, _STEP)
-    column, row = np.round(points).astype(int).T
-    in_image = (column >= 0) & (column < mask.shape[1]) & (row >= 0) & (row < mask.shape[0])
-    within = np.zeros(len(points), dtype=bool)
-    within[in_image] = mask[row[in_image], column[in_image]]
-    changes = np.flatnonzero(np.diff(within, prepend=False, append=False))
-    parts = [points[first:last] for first, last in changes.reshape(-1, 2)]
-    lengths = [float(np.hypot(*np.diff(part, axis=0).T).sum()) for part in parts]
-    if max(lengths, default=0.0) + 2 * _STEP < size:
-        rows, columns = np.nonzero(mask)
-        raise RegionError(
-            f"mesh.cracks[{number}] must run through the region (x {columns.min()} to {columns.max()}, y {rows.min()} "
-            f"to {rows.max()} px) for at least an element, {size:g} px; given is {corners.tolist()}, with "
-            f"{max(lengths, default=0.0):.0f} px in it"
-        )
-    return [part for part, length in zip(parts, lengths, strict=True) if length + 2 * _STEP >= size]
-
-
-def _path_nodes(part: FloatArray, ends: Sequence[tuple[FloatArray, float]], size: float) -> FloatArray:
-    """Nodes (n, 2) along a part of a path, at most `size` px apart, each end moved as by `_end`."""
-    corners = cv2.approxPolyDP(part.astype(np.float32), _FINE, False)[:, 0].astype(np.float64)
-    for end in (0, -1):
-        corners[end] = _end(corners[end], ends, size)
-    nodes = _subdivided(corners, size)
-    ends_first = np.roll(nodes, 1, axis=0)
-    nodes = np.roll(ends_first[uncrowded(ends_first, _CRACKS_CROWDED * size)], -1, axis=0)
-    # a crack between two tips opens only if a node lies in between
-    return nodes if len(nodes) > 2 else _subdivided(nodes, float(np.hypot(*(nodes[1] - nodes[0]))) / 2)
-
-
-def _end(end: FloatArray, places: Sequence[tuple[FloatArray, float]], size: float) -> FloatArray:
-    """Return the nearest of the first `places` (points, reach in elements) within reach of a path's end, or the end."""
-    for points, reach in places:
-        distance = np.hypot(*(points - end).T)
-        if distance.min(initial=np.inf) <= reach * size:
-            return np.asarray(points[np.argmin(distance)])
-    return end
-
-
-def sharp_corners(polygons: Sequence[FloatArray]) -> FloatArray:
-    """Corners (n, 2) at which polygons (M, 2) turn sharply."""
-    sharp = [np.empty((0, 2))]
-    for corners in polygons:
-        side = np.roll(corners, -1, axis=0) - corners
-        side /= np.hypot(*side.T)[:, None]
-        sharp.append(corners[(side * np.roll(side, 1, axis=0)).sum(axis=1) < _SHARP])
-    return np.concatenate(sharp)
-
-
-def _subdivided(corners: FloatArray, longest: float) -> FloatArray:
-    """Return a path's corners (M, 2) and points between them, at most `longest` px apart."""
-    points = [corners[:1]]
-    for start, end in pairwise(corners):
-        pieces = max(1, int(np.ceil(np.hypot(*(end - start)) / longest - 1e-9)))
-        points.append(start + np.arange(1, pieces + 1)[:, None] / pieces * (end - start))
-    return np.concatenate(points)
-
-
-def distance_to(paths: Sequence[FloatArray], points: FloatArray) -> FloatArray:
-    """Distance (px) of points (N, 2) from the nearest path, shape (N,), within a pixel's quarter."""
-    dense = np.concatenate([_subdivided(path, _STEP) for path in paths])
-    return np.asarray(cKDTree(dense).query(points)[0])
-
-
-def halved(path: FloatArray, pieces: BoolArray) -> FloatArray:
-    """Return a path (n, 2) with another node in the middle of the chosen pieces (n - 1,)."""
-    middles = (path[1:] + path[:-1]) / 2
-    return np.insert(path, np.flatnonzero(pieces) + 1, middles[pieces], axis=0)
-
-
-def split_along(
-    nodes: FloatArray, elements: npt.NDArray[np.int32], pieces: npt.NDArray[np.int64]
-) -> tuple[FloatArray, npt.NDArray[np.int32]]:
-    """Split a mesh along its edges `pieces` (n, 2): a node gets a copy for each side; unused nodes are left out.
-
-    Corners of elements are one node if they meet at a shared edge that is not cut; so both sides share the node at a
-    tip, and only that.
-    """
-    corner = elements.ravel()
-    ends = np.stack([np.arange(corner.size), np.arange(corner.size).reshape(-1, 3)[:, [1, 2, 0]].ravel()], axis=1)
-    ends = np.take_along_axis(ends, np.argsort(corner[ends], axis=1), axis=1)  # each edge from its lower node
-    key, cut = edge_keys(corner[ends], len(nodes)), edge_keys(pieces, len(nodes))
-    order = np.argsort(key)
-    shared = (key[order][1:] == key[order][:-1]) & ~np.isin(key[order][1:], cut)
-    first_corner, second_corner = ends[order[:-1][shared]].ravel(), ends[order[1:][shared]].ravel()
-    graph = sp.coo_matrix((np.ones(first_corner.size), (first_corner, second_corner)), shape=(corner.size, corner.size))
-    side = sp.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
-    side[~np.isin(corner, pieces)] = 0
-    _, first, index = np.unique(corner * np.int64(corner.size) + side, return_index=True, return_inverse=True)
-    return nodes[corner[first]], index.reshape(-1, 3).astype(np.int32)
-
-
-def edge_keys(edges: npt.NDArray[np.integer], nodes: int) -> npt.NDArray[np.int64]:
-    """One number for each edge (n, 2) of a mesh of so many nodes, whichever way it runs."""
-    return np.asarray(edges.min(axis=1).astype(np.int64) * nodes + edges.max(axis=1))
-
-
-def uncrowded(points: FloatArray, distance: float) -> BoolArray:
-    """Points (N,) to keep: without those that lie closer than `distance` to a kept one before them."""
-    keep = np.ones(len(points), dtype=bool)
-    for i, j in sorted(cKDTree(points).query_pairs(distance)):
-        if keep[i]:
-            keep[j] = False
-    return keep

@@ -12,9 +12,12 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
+from scipy.spatial import cKDTree
 
 from rgbmidic.errors import InputError, RegionError
-from rgbmidic.mesh.region import Region, edge_keys, outline_mesh
+from rgbmidic.mesh.finite_elements import cross
+from rgbmidic.mesh.outline_mesh import edge_keys, outline_mesh
+from rgbmidic.mesh.region import Region
 from rgbmidic.typing import BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
@@ -67,8 +70,7 @@ class Tri3Mesh:
             )
         if not np.isfinite(nodes).all() or elements.min() < 0 or elements.max() >= len(nodes):
             raise InputError("mesh nodes must be finite and elements must name existing nodes")
-        first, second = _legs(nodes, elements)
-        area = (first[0] * second[1] - first[1] * second[0]) / 2
+        area = cross(nodes, elements) / 2
         if (area == 0).any():
             raise InputError(f"element {int(np.argmin(np.abs(area)))} of the mesh has no area")
         elements[area < 0] = elements[area < 0][:, [0, 2, 1]]
@@ -137,8 +139,6 @@ class Tri3Mesh:
     @property
     def copies(self) -> npt.NDArray[np.int32]:
         """Pairs of nodes at one place, on two sides of a crack, shape (C, 2)."""
-        from scipy.spatial import cKDTree
-
         return cKDTree(self.nodes).query_pairs(1e-9, output_type="ndarray").astype(np.int32)
 
     @property
@@ -157,49 +157,103 @@ class Tri3Mesh:
         """Distance (N,) in px and index (N,) of the nearest of the `chosen` nodes (N,), along the edges of the mesh.
 
         The way is not across a crack or a hole; a part without any takes the nearest of another, infinitely far.
+
+        Parameters
+        ----------
+        chosen : ndarray, shape (N,), bool
+            The nodes that are looked for, one at least.
+
+        Returns
+        -------
+        distance : ndarray, shape (N,)
+        index : ndarray, shape (N,), int64
         """
         if chosen.all():
             return np.zeros(len(self.nodes)), np.arange(len(self.nodes))
-        from scipy.sparse import coo_matrix
-        from scipy.sparse.csgraph import dijkstra
-        from scipy.spatial import cKDTree
-
         (i, j), count, sources = self.neighbours.T, len(self.nodes), np.flatnonzero(chosen)
-        graph = coo_matrix((np.hypot(*(self.nodes[i] - self.nodes[j]).T), (i, j)), shape=(count, count))
-        distance, _, index = dijkstra(graph, directed=False, indices=sources, min_only=True, return_predecessors=True)
+        graph = sp.coo_matrix((np.hypot(*(self.nodes[i] - self.nodes[j]).T), (i, j)), shape=(count, count))
+        distance, _, index = sp.csgraph.dijkstra(
+            graph, directed=False, indices=sources, min_only=True, return_predecessors=True
+        )
         apart = ~np.isfinite(distance)
         index[apart] = sources[cKDTree(self.nodes[sources]).query(self.nodes[apart])[1]]
         return distance, index.astype(np.int64)
 
     def to_nodes(self, per_element: FloatArray) -> FloatArray:
-        """Sum of a value per element (E,) over the elements around each node, shape (N,)."""
+        """Sum of a value per element (E,) over the elements around each node, shape (N,).
+
+        Parameters
+        ----------
+        per_element : ndarray, shape (E,)
+            Value of every element.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+        """
         sums = np.bincount(self.elements.ravel(), weights=np.repeat(per_element, 3), minlength=len(self.nodes))
         return np.asarray(sums, dtype=np.float64)
 
     def beside(self, nodes: BoolArray) -> BoolArray:
-        """Nodes (N,) that share an element with one of `nodes` (N,), these included."""
+        """Nodes (N,) that share an element with one of `nodes` (N,), these included.
+
+        Parameters
+        ----------
+        nodes : ndarray, shape (N,), bool
+            The chosen nodes.
+
+        Returns
+        -------
+        ndarray, shape (N,), bool
+        """
         near = np.zeros(len(self.nodes), dtype=bool)
         near[self.elements[nodes[self.elements].any(axis=1)]] = True
         return near
 
     def element_gradient(self, values: FloatArray) -> FloatArray:
-        """Gradient of the linear interpolant of nodal values (N, C) in every element, shape (E, C, 2)."""
+        """Gradient of the linear interpolant of nodal values (N, C) in every element, shape (E, C, 2).
+
+        Parameters
+        ----------
+        values : ndarray, shape (N, C)
+            Nodal values.
+
+        Returns
+        -------
+        ndarray, shape (E, C, 2)
+            Per px, by the axes x and y.
+        """
         (first_x, first_y), (second_x, second_y) = _legs(self.nodes, self.elements)
         first, second = (leg / (2 * self.areas) for leg in _legs(values, self.elements))
-        return np.stack([first * second_y - second * first_y, second * first_x - first * second_x], axis=-1).swapaxes(
-            0, 1
-        )
+        slopes = np.stack([first * second_y - second * first_y, second * first_x - first * second_x], axis=-1)
+        return slopes.swapaxes(0, 1)
 
     def shape_gradients(self) -> FloatArray:
-        """Gradient of the three shape functions of every element, shape (E, 3, 2), per px."""
-        p = self.nodes[self.elements]
-        x, y = p[..., 0], p[..., 1]
-        slopes_x = np.stack([y[:, 1] - y[:, 2], y[:, 2] - y[:, 0], y[:, 0] - y[:, 1]], axis=1)
-        slopes_y = np.stack([x[:, 2] - x[:, 1], x[:, 0] - x[:, 2], x[:, 1] - x[:, 0]], axis=1)
-        return np.asarray(np.stack([slopes_x, slopes_y], axis=-1) / (2 * self.areas)[:, None, None])
+        """Gradient of the three shape functions of every element, shape (E, 3, 2), per px.
+
+        Returns
+        -------
+        ndarray, shape (E, 3, 2)
+            By element, corner and axis.
+        """
+        corners = self.nodes[self.elements]
+        following, last = (np.roll(corners, turn, axis=1) for turn in (-1, -2))
+        slopes = np.stack([following[..., 1] - last[..., 1], last[..., 0] - following[..., 0]], axis=-1)
+        return np.asarray(slopes / (2 * self.areas)[:, None, None])
 
     def nodal_gradient(self, values: FloatArray) -> FloatArray:
-        """Gradient of nodal values (N, C) at the nodes: the area-weighted mean of the elements around; (N, C, 2)."""
+        """Gradient of nodal values (N, C) at the nodes: the area-weighted mean of the elements around; (N, C, 2).
+
+        Parameters
+        ----------
+        values : ndarray, shape (N, C)
+            Nodal values.
+
+        Returns
+        -------
+        ndarray, shape (N, C, 2)
+            Per px, by the axes x and y.
+        """
         gradient = self.element_gradient(values) * self.areas[:, None, None]
         flat = gradient.reshape(len(gradient), -1).T
         sums = np.stack([self.to_nodes(np.ascontiguousarray(part)) for part in flat], axis=-1)

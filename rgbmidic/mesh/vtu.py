@@ -43,17 +43,14 @@ def read_vtu(path: Path) -> MeshContent:
     """Read the one piece of a file."""
     head, mark, tail = sized(path).read_bytes().partition(b"<AppendedData")
     encoding, _, appended = tail.partition(b"_")
-    try:
-        root = ElementTree.fromstring(head + b"</VTKFile>" if mark else head)
-        arrays = _Arrays(root, appended, b"raw" in encoding)
-        if len(pieces := root.findall("UnstructuredGrid/Piece")) != 1:
-            raise ValueError(f"it has {len(pieces)} pieces of an unstructured grid: write it as one")
-        data: list[dict[str, AnyArray]] = [
-            {item.get("Name", ""): arrays.read(item) for item in pieces[0].iterfind(f"{section}/DataArray")}
-            for section in ("Points", "PointData", "Cells", "CellData")
-        ]
-    except (ElementTree.ParseError, zlib.error, lzma.LZMAError) as error:
-        raise InputError(f"{path} is not a readable mesh: {error}") from None
+    root = ElementTree.fromstring(head + b"</VTKFile>" if mark else head)
+    arrays = _Arrays(root, appended, b"raw" in encoding)
+    if len(pieces := root.findall("UnstructuredGrid/Piece")) != 1:
+        raise ValueError(f"it has {len(pieces)} pieces of an unstructured grid: write it as one")
+    data: list[dict[str, AnyArray]] = [
+        {item.get("Name", ""): arrays.read(item) for item in pieces[0].iterfind(f"{section}/DataArray")}
+        for section in ("Points", "PointData", "Cells", "CellData")
+    ]
     (points,), point_data, cells, cell_data = data[0].values(), *data[1:]
     types, ends, nodes = (cells[name].ravel() for name in ("types", "offsets", "connectivity"))
     counts = (int(pieces[0].get("NumberOfPoints", -1)), int(pieces[0].get("NumberOfCells", -1)))

@@ -61,6 +61,10 @@ def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[
         From where its displacement is looked for; a frame of the reference starts from rest.
     updated
         Index and solution of the last two of ``start.reference_updates``: all that the reference they make depends on.
+
+    Returns
+    -------
+    FrameRecord
     """
     keep_memory()
     try:

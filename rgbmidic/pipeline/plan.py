@@ -200,6 +200,10 @@ class Plan:
         region
             What is measured, in px of the frame.
 
+        Returns
+        -------
+        Plan
+
         Raises
         ------
         RgbmidicError
@@ -270,16 +274,49 @@ class Plan:
         return precision_method(self.weights, self.settings.weights.method)
 
     def on_mesh(self, mesh: Tri3Mesh) -> Plan:
-        """The same test on another mesh of its region, in px of the window."""
+        """The same test on another mesh of its region, in px of the window.
+
+        Parameters
+        ----------
+        mesh
+            The other mesh.
+
+        Returns
+        -------
+        Plan
+        """
         reference = _reference(self.images, self.weights, self.region, mesh, self.normalise, self.solver, self.window)
         return replace(self, reference=reference)
 
     def lights(self, state: RawState, window: Window) -> IlluminationImages:
-        """One image per light of a state, or of a `window` of it."""
+        """One image per light of a state, or of a `window` of it.
+
+        Parameters
+        ----------
+        state
+            Raw frames of the state.
+        window
+            The part of it that is wanted.
+
+        Returns
+        -------
+        IlluminationImages
+        """
         return light_images(self.separation, state, window)
 
     def prepared(self, images: IlluminationImages, index: int) -> tuple[FloatImage, FloatImage]:
         """What the solve takes of the images of frame `index`: grey levels and weights, (k, H, W) each.
+
+        Parameters
+        ----------
+        images
+            One image a light.
+        index
+            Index of the frame.
+
+        Returns
+        -------
+        values, weights : ndarray, shape (k, H, W), float32
 
         Raises
         ------
@@ -294,6 +331,15 @@ class Plan:
         """Part of a frame that is read to find its displacement from rest and from nodal `displacements` (N, 2).
 
         It holds what a search looks at, what the separation of that depends on, and the reference's window.
+
+        Parameters
+        ----------
+        *displacements : ndarray, shape (N, 2), or None
+            Nodal displacements in px that the frame may have.
+
+        Returns
+        -------
+        Window
         """
         if self.window.is_whole:
             return self.window

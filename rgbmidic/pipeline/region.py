@@ -63,6 +63,17 @@ def window_around(points: FloatArray, reach: float, settings: TestSettings, fram
 def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
     """The region of interest of the settings on images of `shape` (H, W).
 
+    Parameters
+    ----------
+    settings
+        The section ``[region]``.
+    shape
+        Rows and columns of the images.
+
+    Returns
+    -------
+    Region
+
     Raises
     ------
     RegionError

@@ -21,7 +21,7 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionEr
 from rgbmidic.fields import NodalCovariance, Places, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.pixel_map import quadratic_fit
+from rgbmidic.mesh.quadratic_fit import quadratic_fit
 from rgbmidic.mesh.tri3 import refined
 from rgbmidic.pipeline.frame import read_state
 from rgbmidic.pipeline.plan import SPECKLES, Choice, Plan

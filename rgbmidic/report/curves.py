@@ -247,7 +247,19 @@ def _rows_shown(values: FloatArray) -> list[int]:
 
 
 def wave_text(profile: Profile, wave: Wave) -> str:
-    """Return the speed of a wave with its uncertainty and chi-square as text."""
+    """Return the speed of a wave with its uncertainty and chi-square as text.
+
+    Parameters
+    ----------
+    profile
+        The profile that the wave travels along.
+    wave
+        The wave.
+
+    Returns
+    -------
+    str
+    """
     front, unit = wave.front, f"{profile.units.length}/{profile.units.time}"
     speed, std = front.speed, front.speed_std
     if unit == "mm/s":

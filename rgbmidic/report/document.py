@@ -372,17 +372,35 @@ class Page:
         self._html = [f"<h1>{html.escape(title)}</h1>"]
 
     def heading(self, text: str) -> None:
-        """Add the heading of a section."""
+        """Add the heading of a section.
+
+        Parameters
+        ----------
+        text
+            The heading.
+        """
         self._markdown.append(f"## {text}")
         self._html.append(f"<h2>{html.escape(text)}</h2>")
 
     def text(self, text: str) -> None:
-        """Add a paragraph; words between backquotes are code."""
+        """Add a paragraph; words between backquotes are code.
+
+        Parameters
+        ----------
+        text
+            The paragraph.
+        """
         self._markdown.append(text)
         self._html.append(f"<p>{_inline(text)}</p>")
 
     def bullets(self, texts: Sequence[str]) -> None:
-        """Add a list of texts; words between backquotes are code."""
+        """Add a list of texts; words between backquotes are code.
+
+        Parameters
+        ----------
+        texts
+            One text a bullet.
+        """
         self._markdown.append("\n".join(f"- {text}" for text in texts))
         self._html.append("<ul>" + "".join(f"<li>{_inline(text)}</li>" for text in texts) + "</ul>")
 

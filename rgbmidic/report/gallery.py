@@ -161,6 +161,11 @@ def _file(folder: Path, kind: str, frame: int | None) -> Path:
 def remove_figures(folder: Path | str) -> None:
     """Remove the pictures that an earlier run left, since they would show another result; nothing else is touched.
 
+    Parameters
+    ----------
+    folder
+        Folder of the figures.
+
     Raises
     ------
     ResultError
@@ -174,6 +179,11 @@ def remove_figures(folder: Path | str) -> None:
 
 def remove_report(folder: Path | str) -> None:
     """Remove the report in a folder whose result is measured anew, since it would show the earlier one.
+
+    Parameters
+    ----------
+    folder
+        Folder of the result.
 
     Raises
     ------

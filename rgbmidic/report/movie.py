@@ -92,6 +92,10 @@ class Curve:
         offset
             Seconds that are added to the times of channels.
 
+        Returns
+        -------
+        Curve
+
         Raises
         ------
         InputError
@@ -179,6 +183,11 @@ def write_movie(
         Replace a file that is already there.
     progress
         Called after every frame with the number of frames done, their total and an empty line.
+
+    Returns
+    -------
+    Path
+        The file.
 
     Raises
     ------

@@ -103,6 +103,11 @@ class Histories:
 def history_rows(histories: Histories) -> tuple[list[str], list[list[str]]]:
     """Summarise histories for a table.
 
+    Parameters
+    ----------
+    histories
+        What is summarised.
+
     Returns
     -------
     headings : list of str
@@ -121,6 +126,15 @@ def history_rows(histories: Histories) -> tuple[list[str], list[list[str]]]:
 
 def write_histories(histories: Histories, out: Path | str, *, overwrite: bool = False) -> None:
     """Write `history_csv` into a file.
+
+    Parameters
+    ----------
+    histories
+        What is written.
+    out
+        File to write.
+    overwrite
+        Whether it may be replaced.
 
     Raises
     ------
@@ -471,7 +485,28 @@ class Profile:
 
     @classmethod
     def along(cls, maps: Maps, field: str, place: Sequence[float], frames: Sequence[int] | AnyArray) -> Self:
-        """Lay the points of a profile whose values are not read yet; parameters and errors as `read_profile`."""
+        """Lay the points of a profile whose values are not read yet; parameters and errors as `read_profile`.
+
+        Parameters
+        ----------
+        maps
+            The result and how its fields are derived.
+        field
+            Name of the field.
+        place
+            Ends x0, y0, x1, y1 of the line in px of the image.
+        frames
+            Indices of the frames.
+
+        Returns
+        -------
+        Profile
+
+        Raises
+        ------
+        InputError
+            The field has no uncertainty, or no frame is measured yet.
+        """
         found, result, physical = maps.field(field), maps.result, maps.physical
         if f"{field}_std" not in maps.all:
             raise InputError(
@@ -502,7 +537,15 @@ class Profile:
         return replace(profile, rate_window=(maps.window - 1) * interval if rated else 0.0)
 
     def fill(self, maps: Maps, rows: Iterable[int]) -> None:
-        """Read some rows of the values and of their uncertainties, in place."""
+        """Read some rows of the values and of their uncertainties, in place.
+
+        Parameters
+        ----------
+        maps
+            The result and how its fields are derived.
+        rows
+            Indices of the rows, one a frame.
+        """
         for row in rows:
             read = maps.read(self.field.name, int(self.frames[row]))
             self.values[row], self.std[row] = self.line.read(read.values, read.std, self.kind)
@@ -531,6 +574,10 @@ class Profile:
         ----------
         what, level
             As of `rgbmidic.fields.profiles.arrival_times`.
+
+        Returns
+        -------
+        Wave
 
         Raises
         ------
@@ -564,6 +611,10 @@ def read_profile(maps: Maps, field: str, place: Sequence[float], frames: Sequenc
         Ends x0, y0, x1, y1 of the line in px of the image.
     frames
         Indices of the frames; None: all that are measured.
+
+    Returns
+    -------
+    Profile
 
     Raises
     ------

@@ -149,7 +149,19 @@ class MapField:
         return fixed.get(self.kind)
 
     def text(self, value: float, std: float = float("nan")) -> str:
-        """Return a value with its standard uncertainty and unit as text."""
+        """Return a value with its standard uncertainty and unit as text.
+
+        Parameters
+        ----------
+        value
+            The value in the field's unit.
+        std
+            Its standard uncertainty; NaN where not known.
+
+        Returns
+        -------
+        str
+        """
         if not np.isfinite(value):
             return "not measured"
         if self.codes:
@@ -239,6 +251,10 @@ class Maps:
         since, rigid_removed, window
             See the class; the window is that of ``[probes]``, or 9 frames, where None is stated.
 
+        Returns
+        -------
+        Maps
+
         Raises
         ------
         InputError
@@ -256,7 +272,22 @@ class Maps:
         rigid_removed: bool = False,
         window: int | None = None,
     ) -> Self:
-        """Choose anew how fields are derived; parameters and errors as `of`."""
+        """Choose anew how fields are derived.
+
+        Parameters
+        ----------
+        gauge, measure, since, rigid_removed, window
+            As of `of`.
+
+        Returns
+        -------
+        Maps
+
+        Raises
+        ------
+        InputError
+            There is no frame `since`, nothing is measured in it, or the `window` is too short for rates.
+        """
         frames = len(self.result)
         if since is not None and not 0 <= since < frames:
             raise InputError(f"there is no frame {since} in a result of {frames} frames (0 to {frames - 1})")
@@ -307,7 +338,22 @@ class Maps:
         return {each.name: each for each in sorted(found.values(), key=lambda each: _GROUPS.index(each.group))}
 
     def field(self, name: str) -> MapField:
-        """Return a field by its name; an `InputError` that lists all names where there is none."""
+        """Return a field by its name.
+
+        Parameters
+        ----------
+        name
+            Name of the field.
+
+        Returns
+        -------
+        MapField
+
+        Raises
+        ------
+        InputError
+            There is none of this name; the message lists all names.
+        """
         if name not in self.all:
             raise InputError(f'there is no field "{name}"; the fields are {", ".join(self.all)}')
         return self.all[name]
@@ -411,13 +457,36 @@ class Maps:
         return self._units.lengths(values, std) if name in _OF_LENGTHS else (values, std)
 
     def displacement(self, frame: int) -> FloatArray:
-        """Return u, v and their standard uncertainties (4, N) in rectified px, since `since`, rigid motion removed."""
+        """Return u, v and their standard uncertainties (4, N) in rectified px, since `since`, rigid motion removed.
+
+        Parameters
+        ----------
+        frame
+            Index of the frame.
+
+        Returns
+        -------
+        ndarray, shape (4, N)
+        """
         moved = self._since(frame)
         motion = self._rigid(moved)
         return moved if motion is None else motion.removed(self._covariance.mesh.nodes, moved)
 
     def strain_at(self, frame: int, x: float, y: float, length: float) -> dict[str, FloatArray]:
         """Compute the strain of one virtual gauge at a place of the image, px; each quantity, (1,), by its name.
+
+        Parameters
+        ----------
+        frame
+            Index of the frame.
+        x, y
+            Middle of the gauge in px of the image.
+        length
+            Length of the gauge in px.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (1,)
 
         Raises
         ------

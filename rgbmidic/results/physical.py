@@ -57,17 +57,47 @@ _FEWEST, _ALIKE = 8, 0.7
 
 
 def scale_of(result: Result) -> ScaleSettings:
-    """Return the ``[scale]`` that a result was measured with."""
+    """Return the ``[scale]`` that a result was measured with.
+
+    Parameters
+    ----------
+    result
+        The result.
+
+    Returns
+    -------
+    ScaleSettings
+    """
     return read_section(ScaleSettings, "scale", result.provenance.get("settings", {}).get("scale", {}))
 
 
 def probes_of(result: Result) -> ProbeSettings:
-    """Return the ``[probes]`` that a result was measured with."""
+    """Return the ``[probes]`` that a result was measured with.
+
+    Parameters
+    ----------
+    result
+        The result.
+
+    Returns
+    -------
+    ProbeSettings
+    """
     return read_section(ProbeSettings, "probes", result.provenance.get("settings", {}).get("probes", {}))
 
 
 def channels_of(result: Result) -> ChannelSettings:
-    """Return the ``[channels]`` that a result was measured with."""
+    """Return the ``[channels]`` that a result was measured with.
+
+    Parameters
+    ----------
+    result
+        The result.
+
+    Returns
+    -------
+    ChannelSettings
+    """
     return read_section(ChannelSettings, "channels", result.provenance.get("settings", {}).get("channels", {}))
 
 
@@ -102,7 +132,17 @@ def rectification_of(result: Result, scale: ScaleSettings | None = None) -> Rect
 
 
 def placement_of(result: Result) -> Placement | None:
-    """Return where the mesh of ``mesh.file`` lies on the image; None where the result has none."""
+    """Return where the mesh of ``mesh.file`` lies on the image; None where the result has none.
+
+    Parameters
+    ----------
+    result
+        The result.
+
+    Returns
+    -------
+    Placement or None
+    """
     kept = result.provenance.get("finite_elements")
     if kept is None:
         return None
@@ -112,7 +152,19 @@ def placement_of(result: Result) -> Placement | None:
 
 
 def units_of(result: Result, scale: ScaleSettings | None = None) -> Units:
-    """Return the units of a result, with its own ``[scale]`` or another one in its place."""
+    """Return the units of a result, with its own ``[scale]`` or another one in its place.
+
+    Parameters
+    ----------
+    result
+        The result.
+    scale
+        It replaces the ``[scale]`` that was kept with the result; None: that one.
+
+    Returns
+    -------
+    Units
+    """
     return replace(rectification_of(result, scale).units, timed=frame_times(result, scale) is not None)
 
 
@@ -162,20 +214,50 @@ def _compare(recorded: float, stated: float | None, contradiction: str) -> None:
 
 
 def exposure(result: Result) -> float | None:
-    """Return the exposure time of a frame in seconds; None where the files do not report it."""
+    """Return the exposure time of a frame in seconds; None where the files do not report it.
+
+    Parameters
+    ----------
+    result
+        The result.
+
+    Returns
+    -------
+    float or None
+    """
     nanoseconds = result.provenance.get("exposure_ns")
     return None if nanoseconds is None else float(nanoseconds) * 1e-9
 
 
 def reference_frames(result: Result) -> BoolArray:
-    """Return a mask (T,) of the frames that belong to the reference."""
+    """Return a mask (T,) of the frames that belong to the reference.
+
+    Parameters
+    ----------
+    result
+        The result.
+
+    Returns
+    -------
+    ndarray, shape (T,), bool
+    """
     chosen = np.zeros(len(result), dtype=bool)
     chosen[list(result.provenance["references"])] = True
     return chosen
 
 
 def shared_part(result: Result) -> float:
-    """Return the fraction of a frame's variance that all frames have in common (see `reference_fraction`)."""
+    """Return the fraction of a frame's variance that all frames have in common (see `reference_fraction`).
+
+    Parameters
+    ----------
+    result
+        The result.
+
+    Returns
+    -------
+    float
+    """
     return reference_fraction(len(result.setting("frames", "reference", [0])))
 
 
@@ -214,6 +296,10 @@ class Channels:
             Seconds that are added to its times to make them those of the frames.
         trigger
             In place of `offset`: the channel whose first crossing of the middle of its range is the time 0.
+
+        Returns
+        -------
+        Channels
 
         Raises
         ------
@@ -269,11 +355,30 @@ class Channels:
         return channels.shifted(offset)
 
     def shifted(self, offset: float) -> Self:
-        """Return the channels with an offset (s) added to the times."""
+        """Return the channels with an offset (s) added to the times.
+
+        Parameters
+        ----------
+        offset
+            In seconds.
+
+        Returns
+        -------
+        Channels
+        """
         return replace(self, times=self.times + offset, offset=self.offset + offset)
 
     def named(self, name: str) -> FloatArray:
         """Return the values (n,) of a channel.
+
+        Parameters
+        ----------
+        name
+            Name of the channel.
+
+        Returns
+        -------
+        ndarray, shape (n,)
 
         Raises
         ------
@@ -353,6 +458,10 @@ class Channels:
         times
             In seconds.
 
+        Returns
+        -------
+        dict of str to ndarray, shape (T,)
+
         Raises
         ------
         InputError
@@ -374,6 +483,11 @@ class Channels:
         ----------
         name
             Of the channel; None: the only one whose name ends in N or kN.
+
+        Returns
+        -------
+        name : str
+        factor : float
 
         Raises
         ------

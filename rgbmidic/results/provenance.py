@@ -93,7 +93,12 @@ class Origin:
         return {name: SHARED[name].convert(array, {}) for name, array in arrays.items()}
 
     def provenance(self) -> dict[str, Any]:
-        """Return the content of ``provenance.json`` at the start of a run, in plain values."""
+        """Return the content of ``provenance.json`` at the start of a run, in plain values.
+
+        Returns
+        -------
+        dict
+        """
         document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION, "created": now()}
         versions = {"rgbmidic": __version__, "python": platform.python_version()}
         for name in _PACKAGES:

@@ -56,7 +56,17 @@ class ResultQuantity:
     codes: tuple[str, ...] = ()
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int | None, ...]:
-        """Return the shape in one frame for these sizes of ``"node"`` and ``"light"``; None for an open axis."""
+        """Return the shape in one frame for these sizes of ``"node"`` and ``"light"``; None for an open axis.
+
+        Parameters
+        ----------
+        sizes
+            Numbers of ``"node"`` and ``"light"``.
+
+        Returns
+        -------
+        tuple of int or None
+        """
         return tuple(axis if isinstance(axis, int) else sizes.get(axis) for axis in self.axes)
 
     @property
@@ -79,7 +89,24 @@ class ResultQuantity:
         return about
 
     def convert(self, value: Any, sizes: Mapping[str, int]) -> Any:
-        """Return `value` in the type of the table; an `InputError` where it has another shape."""
+        """Return `value` in the type of the table.
+
+        Parameters
+        ----------
+        value
+            The quantity in one frame.
+        sizes
+            Numbers of ``"node"`` and ``"light"``.
+
+        Returns
+        -------
+        ndarray, or a plain number or text
+
+        Raises
+        ------
+        InputError
+            It has another shape.
+        """
         array, shape = np.asarray(value, dtype=self.dtype), self.shape(sizes)
         fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
         if not fits:
@@ -87,11 +114,31 @@ class ResultQuantity:
         return array if self.axes else array.item()
 
     def unmeasured(self, sizes: Mapping[str, int]) -> Any:
-        """Return the value of a frame that could not be measured; open axes have the length 0."""
+        """Return the value of a frame that could not be measured; open axes have the length 0.
+
+        Parameters
+        ----------
+        sizes
+            Numbers of ``"node"`` and ``"light"``.
+
+        Returns
+        -------
+        ndarray, or a plain number or text
+        """
         return np.full([size or 0 for size in self.shape(sizes)], self.blank, dtype=self.dtype)
 
     def of(self, source: object) -> Any:
-        """Take the quantity from an object with the attribute that `source` names."""
+        """Take the quantity from an object with the attribute that `source` names.
+
+        Parameters
+        ----------
+        source
+            Object with the attribute.
+
+        Returns
+        -------
+        Any
+        """
         attribute, _, column = self.source.partition(".")
         value = getattr(source, attribute)
         return value[:, int(column)] if column else value
@@ -253,6 +300,10 @@ class FrameRecord:
             Their numbers N and k.
         **values
             Quantities by name; None where not known.
+
+        Returns
+        -------
+        FrameRecord
         """
         sizes = {"node": nodes, "light": lights}
         blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items()}
@@ -271,6 +322,10 @@ class FrameRecord:
             Path and SHA-256 of the files that the frame was read from.
         **given
             The others, such as `number`, `time_ns`, `brightness` and `weights_thumbnail`; None where not known.
+
+        Returns
+        -------
+        FrameRecord
         """
         nodes, lights = np.shape(solution.light_fraction)
         known = [name for name, entry in QUANTITIES.items() if entry.source]
@@ -283,7 +338,23 @@ class FrameRecord:
     def failed(
         cls, reason: str, *, nodes: int, lights: int, inputs: Mapping[str, str] | None = None, **given: Any
     ) -> FrameRecord:
-        """Make the record of a frame that could not be measured at all: NaN everywhere, and the reason."""
+        """Make the record of a frame that could not be measured at all: NaN everywhere, and the reason.
+
+        Parameters
+        ----------
+        reason
+            Why nothing could be measured.
+        nodes, lights
+            Their numbers N and k.
+        inputs
+            Path and SHA-256 of the files that the frame was read from.
+        **given
+            Other quantities by name.
+
+        Returns
+        -------
+        FrameRecord
+        """
         return cls.of(nodes=nodes, lights=lights, reason=reason, inputs=_pairs(inputs), **given)
 
     def __getattr__(self, name: str) -> Any:

@@ -99,6 +99,10 @@ class Result:
             Whether a `partial` result is read once at opening, so that damaged frames are blank with that reason, and
             named in a warning; else a damaged frame is an error when it is read.
 
+        Returns
+        -------
+        Result
+
         Raises
         ------
         ResultError
@@ -117,6 +121,10 @@ class Result:
 
     def refresh(self) -> Self:
         """Open the result again, with the frames that were added since.
+
+        Returns
+        -------
+        Result
 
         Raises
         ------
@@ -147,11 +155,32 @@ class Result:
         return tuple(index for index in range(len(self)) if index not in references)
 
     def setting(self, section: str, key: str, default: Any = None) -> Any:
-        """Return a setting of the run, as TEST.toml names it; `default` where it was not kept."""
+        """Return a setting of the run, as TEST.toml names it; `default` where it was not kept.
+
+        Parameters
+        ----------
+        section, key
+            Names of section and key.
+        default
+            What is returned where it was not kept.
+
+        Returns
+        -------
+        Any
+        """
         return self.provenance.get("settings", {}).get(section, {}).get(key, default)
 
     def frame(self, index: int) -> FrameRecord:
         """Read everything that is kept of one frame.
+
+        Parameters
+        ----------
+        index
+            Index of the frame.
+
+        Returns
+        -------
+        FrameRecord
 
         Raises
         ------
@@ -163,12 +192,34 @@ class Result:
         return self.table.read(index)
 
     def each(self, name: str, frames: Iterable[int] | None = None) -> Iterator[Any]:
-        """Read one quantity, frame after frame (None: all); yields arrays, or plain numbers or texts."""
+        """Read one quantity, frame after frame (None: all); yields arrays, or plain numbers or texts.
+
+        Parameters
+        ----------
+        name
+            Name of the quantity.
+        frames
+            Indices of the frames; None: all.
+
+        Yields
+        ------
+        Any
+        """
         chosen = range(len(self)) if frames is None else frames
         return (values[name] for values in self.table.each([name], chosen))
 
     def stack(self, name: str) -> AnyArray:
-        """Read one quantity of all frames into one array, the frames as first axis."""
+        """Read one quantity of all frames into one array, the frames as first axis.
+
+        Parameters
+        ----------
+        name
+            Name of the quantity.
+
+        Returns
+        -------
+        ndarray, shape (T, ...)
+        """
         entry = QUANTITIES[name]
         shape = (len(self.nodes),) if entry.estimated else entry.unmeasured(self.table.sizes).shape
         stacked = np.full((len(self), *shape), entry.blank, dtype=entry.dtype)

@@ -81,6 +81,10 @@ class ResultStore:
         overwrite
             Whether a result that is already in the folder may be replaced.
 
+        Returns
+        -------
+        ResultStore
+
         Raises
         ------
         ResultError
@@ -104,6 +108,10 @@ class ResultStore:
         frames
             Those to be written here, consecutive; None: all.
 
+        Returns
+        -------
+        ResultStore
+
         Raises
         ------
         ResultError
@@ -124,6 +132,19 @@ class ResultStore:
         """Start a result where there is none, else go on with it: for runs of parts of a test, in any order or at once.
 
         Parameters and errors are those of `resume`; foreign files are refused as in `create`.
+
+        Parameters
+        ----------
+        path
+            The folder; made where it does not exist.
+        origin
+            What all frames share.
+        frames
+            Frames that this run claims; None: all.
+
+        Returns
+        -------
+        ResultStore
         """
         return cls._claimed(Path(path), origin, range(len(origin.names)) if frames is None else frames)
 
@@ -159,6 +180,13 @@ class ResultStore:
 
         Frames that others claim may be written too, where this run needs them: all runs give them the same values.
 
+        Parameters
+        ----------
+        index
+            Index of the frame.
+        record
+            All that is kept of it.
+
         Raises
         ------
         InputError
@@ -173,17 +201,38 @@ class ResultStore:
         write_record(self.path / _FRAMES, index, record, self._run)
 
     def discard(self, frames: Collection[int]) -> None:
-        """Discard frames that are to be measured again; a `ResultError` where the disk refuses."""
+        """Discard frames that are to be measured again.
+
+        Parameters
+        ----------
+        frames
+            Indices of the frames.
+
+        Raises
+        ------
+        ResultError
+            The disk refuses.
+        """
         if frames:
             self.reopen()
             discard(self.path / _FRAMES, frames)
 
     def finished(self) -> BoolArray:
-        """Read which frames of the test are in the folder, whoever wrote them, shape (T,)."""
+        """Read which frames of the test are in the folder, whoever wrote them, shape (T,).
+
+        Returns
+        -------
+        ndarray, shape (T,), bool
+        """
         return self.table().finished
 
     def table(self) -> FrameTable:
-        """Read the table of the frames that are in the folder now, whoever wrote them."""
+        """Read the table of the frames that are in the folder now, whoever wrote them.
+
+        Returns
+        -------
+        FrameTable
+        """
         return load_frames(self.path, self.sizes, self.frame_count, self._run)
 
     def reopen(self) -> None:
@@ -210,6 +259,11 @@ def _releasing(holder: ResultStore | Claim) -> Iterator[None]:
 
 def finish_result(path: Path | str) -> None:
     """Put the date of its end into the provenance of a result, once every record is read and found whole.
+
+    Parameters
+    ----------
+    path
+        The folder.
 
     Raises
     ------

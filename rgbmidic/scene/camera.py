@@ -61,11 +61,37 @@ class Light:
             raise InputError(f"light {self.name}: magnification is a small relative change, not {self.magnification}")
 
     def aimed(self, target: Vector, irradiance: float = 1.0) -> Light:
-        """Return the light with the power that gives `irradiance` (1: the camera's exposure) at the target."""
+        """Return the light with the power that gives `irradiance` (1: the camera's exposure) at the target.
+
+        Parameters
+        ----------
+        target
+            Point (x, y, z) in mm, in the camera's axes.
+        irradiance
+            In units of the camera's exposure.
+
+        Returns
+        -------
+        Light
+        """
         return replace(self, power=irradiance * math.dist(self.position, target) ** 2 / NOMINAL_DISTANCE**2)
 
     def turned(self, angle_deg: float, pivot: Vector, axis: Vector = (0.0, 1.0, 0.0)) -> Light:
-        """Return the light turned about an axis through a pivot, as on the goniometer of paper section 2.3."""
+        """Return the light turned about an axis through a pivot, as on the goniometer of paper section 2.3.
+
+        Parameters
+        ----------
+        angle_deg
+            Angle in degrees.
+        pivot
+            Point (x, y, z) in mm, in the camera's axes.
+        axis
+            Direction of the axis.
+
+        Returns
+        -------
+        Light
+        """
         position = rotation(angle_deg, axis) @ (np.array(self.position) - pivot) + pivot
         return replace(self, position=(float(position[0]), float(position[1]), float(position[2])))
 
@@ -257,6 +283,15 @@ class Camera:
     def response(self, lights: tuple[Light, ...]) -> FloatArray:
         """Response (C, k) of each channel to each light; its largest entry is 1.
 
+        Parameters
+        ----------
+        lights
+            k lights.
+
+        Returns
+        -------
+        ndarray, shape (C, k)
+
         Raises
         ------
         InputError
@@ -286,12 +321,32 @@ class Camera:
         return np.eye(3)[:, : len(lights)]
 
     def mixing(self, lights: tuple[Light, ...]) -> FloatArray:
-        """Return A (C, k) in channels = A . light images; every column's largest entry is 1."""
+        """Return A (C, k) in channels = A . light images; every column's largest entry is 1.
+
+        Parameters
+        ----------
+        lights
+            k lights.
+
+        Returns
+        -------
+        ndarray, shape (C, k)
+        """
         matrix = self.response(lights)
         return np.asarray(matrix / matrix.max(axis=0))
 
     def true_crosstalk(self, lights: tuple[Light, ...]) -> Crosstalk:
-        """Return the crosstalk that a perfect calibration would find."""
+        """Return the crosstalk that a perfect calibration would find.
+
+        Parameters
+        ----------
+        lights
+            k lights.
+
+        Returns
+        -------
+        Crosstalk
+        """
         return Crosstalk(matrix=self.mixing(lights), lights=tuple(light.name for light in lights))
 
 
@@ -299,6 +354,17 @@ def reference_camera(shape: tuple[int, int], **changes: object) -> Camera:
     """RGGB, 12 bit, 4 e-/DN, read noise 12 e-, lens blur 0.45 px, 0.055 mm per px; `changes` to any setting.
 
     A monochrome camera has no crosstalk of its own.
+
+    Parameters
+    ----------
+    shape
+        Rows and columns.
+    **changes
+        Fields of `Camera` that differ.
+
+    Returns
+    -------
+    Camera
     """
     camera = Camera(shape=shape, focal_px=DISTANCE / PIXEL)
     if changes.get("kind") != "monochrome" and "sensitivities" not in changes:

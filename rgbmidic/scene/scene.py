@@ -52,7 +52,12 @@ class Sphere:
         return np.eye(3)
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels."""
+        """[kind, radius, half width, half height] for the kernels.
+
+        Returns
+        -------
+        ndarray, shape (4,)
+        """
         return np.array([kernels.SPHERE, self.radius, np.inf, np.inf])
 
 
@@ -90,7 +95,12 @@ class Cylinder:
         return rotation(self.tilt_deg, (0.0, 0.0, 1.0))
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels."""
+        """[kind, radius, half width, half height] for the kernels.
+
+        Returns
+        -------
+        ndarray, shape (4,)
+        """
         return np.array([kernels.CYLINDER, self.radius, np.inf, self.length / 2])
 
 
@@ -128,7 +138,12 @@ class Plate:
         return rotation(self.tilt_deg[1], (1.0, 0.0, 0.0)) @ rotation(self.tilt_deg[0], (0.0, 1.0, 0.0))
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels."""
+        """[kind, radius, half width, half height] for the kernels.
+
+        Returns
+        -------
+        ndarray, shape (4,)
+        """
         return np.array([kernels.PLATE, 0.0, self.width / 2, self.height / 2])
 
 
@@ -171,13 +186,35 @@ class State:
         return any(self.velocity) or self.spin_deg != 0
 
     def after(self, seconds: float) -> State:
-        """Return the state some time later, at rest."""
+        """Return the state some time later, at rest.
+
+        Parameters
+        ----------
+        seconds
+            Time in s.
+
+        Returns
+        -------
+        State
+        """
         x, y, z = (p + v * seconds for p, v in zip(self.translation, self.velocity, strict=True))
         angle = self.angle_deg + self.spin_deg * seconds
         return replace(self, angle_deg=angle, translation=(x, y, z), velocity=(0.0, 0.0, 0.0), spin_deg=0.0)
 
     def pose(self, body: Body) -> tuple[FloatArray, FloatArray]:
-        """Rotation R (3, 3) and origin t (3,): camera point = R . body point + t."""
+        """Rotation R (3, 3) and origin t (3,): camera point = R . body point + t.
+
+        Parameters
+        ----------
+        body
+            The body, whose front point is turned about.
+
+        Returns
+        -------
+        rotation : ndarray, shape (3, 3)
+        origin : ndarray, shape (3,)
+            In mm.
+        """
         pivot = np.array(body.front if self.pivot is None else self.pivot)
         turn = rotation(self.angle_deg, self.axis)
         origin = turn @ (np.array(body.centre) - pivot) + pivot + np.array(self.translation)
@@ -201,19 +238,54 @@ class Scene:
         self.camera.response(self.lights)
 
     def light(self, name: str) -> Light:
-        """Return the light of that name."""
+        """Return the light of that name.
+
+        Parameters
+        ----------
+        name
+            Name of the light.
+
+        Returns
+        -------
+        Light
+
+        Raises
+        ------
+        InputError
+            There is none of this name.
+        """
         for light in self.lights:
             if light.name == name:
                 return light
         raise InputError(f"no light {name!r}; the scene has {', '.join(light.name for light in self.lights)}")
 
     def with_light(self, light: Light) -> Scene:
-        """Return the same scene with the light of that name exchanged."""
+        """Return the same scene with the light of that name exchanged.
+
+        Parameters
+        ----------
+        light
+            It takes the place of the one with its name.
+
+        Returns
+        -------
+        Scene
+        """
         self.light(light.name)
         return replace(self, lights=tuple(light if old.name == light.name else old for old in self.lights))
 
     def polarised(self, polarisers: Polarisers) -> Scene:
-        """Return the scene behind crossed polarisers: less light, and less gloss than there is diffuse light."""
+        """Return the scene behind crossed polarisers: less light, and less gloss than there is diffuse light.
+
+        Parameters
+        ----------
+        polarisers
+            How much light they pass.
+
+        Returns
+        -------
+        Scene
+        """
         white, black = (
             replace(paint, gloss=paint.gloss * polarisers.glare) for paint in (self.surface.white, self.surface.black)
         )
@@ -224,6 +296,17 @@ class Scene:
         """Where a lamp must stand for its reflection to cover the body's front point, seen from the camera.
 
         On a flat plate it covers the whole field. `distance` from the front point in mm.
+
+        Parameters
+        ----------
+        distance
+            Distance of the lamp from the front point in mm.
+        state
+            Pose of the body; None: the reference state.
+
+        Returns
+        -------
+        Point (x, y, z) in mm, in the camera's axes
         """
         turn, origin = (state or State()).pose(self.body)
         point = turn @ self.body.attitude.T @ (np.array(self.body.front) - np.array(self.body.centre)) + origin

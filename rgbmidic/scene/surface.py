@@ -124,7 +124,13 @@ class Surface:
         return -math.log(1 - self.coverage) / (math.pi / 4 * self.droplet**2 * mean_square)
 
     def parameters(self) -> tuple[FloatArray, FloatArray, np.uint32]:
-        """Paint, counts and seed, as the kernels of `rgbmidic._kernels.render` take them."""
+        """Paint, counts and seed, as the kernels of `rgbmidic._kernels.render` take them.
+
+        Returns
+        -------
+        paint, counts : ndarray
+        seed : uint32
+        """
         radius = self.droplet / 2
         shell = 0.3 * radius
         far = radius * math.exp(BOUND * self.spread) + self.softness / 2
@@ -157,7 +163,19 @@ class Surface:
         return out[:, 0], out[:, 1], out[:, 2:]
 
     def on_plate(self, columns: npt.ArrayLike, rows: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Cover by black paint (0 to 1) and height (mm), both (h, w), on a plate at x of columns and y of rows (mm)."""
+        """Cover by black paint (0 to 1) and height (mm), both (h, w), on a plate at x of columns and y of rows (mm).
+
+        Parameters
+        ----------
+        columns : array_like, shape (w,)
+            x of the columns in mm.
+        rows : array_like, shape (h,)
+            y of the rows in mm.
+
+        Returns
+        -------
+        cover, height : ndarray, shape (h, w)
+        """
         x, y = np.meshgrid(columns, rows)
         points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
         cover, height, _ = self.sample(points, np.array([PLATE, 0.0, np.inf, np.inf]))
@@ -184,6 +202,11 @@ def height_map(
         Height in mm, rows along y.
     black : (N, N)
         Cover by black paint, 0 to 1.
+
+    Raises
+    ------
+    InputError
+        There are fewer than 3 points a side.
     """
     if not (pitch > 0 and size >= 2 * pitch):
         raise InputError(f"a height map has at least 3 points a side; given are size {size} mm, pitch {pitch} mm")
@@ -236,12 +259,28 @@ class AffineField:
         return xx * x + xy * y + self.offset[0], yx * x + yy * y + self.offset[1]
 
     def inverse(self) -> FloatArray:
-        """[m00, m01, m10, m11, t0, t1]: spatial to material point."""
+        """[m00, m01, m10, m11, t0, t1]: spatial to material point.
+
+        Returns
+        -------
+        ndarray, shape (6,)
+        """
         matrix = np.linalg.inv(np.eye(2) + np.array(self.gradient))
         return np.concatenate([matrix.ravel(), -matrix @ np.array(self.offset)])
 
     def material(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Material points of spatial ones."""
+        """Material points of spatial ones.
+
+        Parameters
+        ----------
+        x, y : ndarray
+            Spatial points in mm.
+
+        Returns
+        -------
+        x, y : ndarray
+            In mm.
+        """
         m = self.inverse()
         return m[0] * x + m[1] * y + m[4], m[2] * x + m[3] * y + m[5]
 
@@ -293,7 +332,18 @@ class MeshField:
         return _interpolate(x, y, self.nodes, self.elements, self.displacement)
 
     def material(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Material points of spatial ones: linear in the deformed triangles, hence exact; NaN off the mesh."""
+        """Material points of spatial ones: linear in the deformed triangles, hence exact; NaN off the mesh.
+
+        Parameters
+        ----------
+        x, y : ndarray
+            Spatial points in mm.
+
+        Returns
+        -------
+        x, y : ndarray
+            In mm.
+        """
         return _interpolate(x, y, self.nodes + self.displacement, self.elements, self.nodes)
 
 

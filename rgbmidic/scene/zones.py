@@ -32,6 +32,20 @@ def material_points(
     """Material point (mm, body axes) that an ideal lens sees at every pixel centre, shape (3, H, W); NaN off it.
 
     `pixels`: image points (x, y) in px, two arrays of one shape, instead of the pixel centres.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    state
+        Pose and displacement; None: the reference state.
+    pixels
+        Image points x and y in px, arrays of one shape; None: the pixel centres.
+
+    Returns
+    -------
+    ndarray, shape (3, H, W)
+        Or (3, ...) for `pixels` of another shape.
     """
     state = state or State()
     if pixels is None:

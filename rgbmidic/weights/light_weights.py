@@ -44,11 +44,33 @@ class LightWeights(Protocol):
     """
 
     def reference(self, images: IlluminationImages) -> FloatImage:
-        """Weights of the reference images."""
+        """Weights of the reference images.
+
+        Parameters
+        ----------
+        images
+            One image a light.
+
+        Returns
+        -------
+        ndarray, shape (k, H, W), float32
+        """
         ...
 
     def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
-        """Weights of the images of frame `index`."""
+        """Weights of the images of frame `index`.
+
+        Parameters
+        ----------
+        images
+            One image a light.
+        index
+            Index of the frame.
+
+        Returns
+        -------
+        ndarray, shape (k, H, W), float32
+        """
         ...
 
 
@@ -87,6 +109,15 @@ class MaskWeights:
         An image of one value besides 0 counts fully where it is not 0; one of several values counts by their fraction
         of the largest that its type has (255 in 8 bit, 65535 in 16 bit).
 
+        Parameters
+        ----------
+        paths
+            One file a light.
+
+        Returns
+        -------
+        MaskWeights
+
         Raises
         ------
         FrameError
@@ -107,14 +138,34 @@ class MaskWeights:
         return cls(np.stack(masks), tuple(map(str, paths)))
 
     def describe(self) -> str:
-        """Shape and checksum of the masks; the name of a function."""
+        """Shape and checksum of the masks; the name of a function.
+
+        Returns
+        -------
+        str
+        """
         if callable(self.masks):
             return f"masks by {getattr(self.masks, '__qualname__', type(self.masks).__qualname__)}"
         masks = np.asarray(self.masks)
         return f"masks of shape {masks.shape}, {hashlib.sha256(masks.tobytes()).hexdigest()[:16]}"
 
     def reference(self, images: IlluminationImages) -> FloatImage:
-        """The masks where the images are valid."""
+        """The masks where the images are valid.
+
+        Parameters
+        ----------
+        images
+            One image a light.
+
+        Returns
+        -------
+        ndarray, shape (k, H, W), float32
+
+        Raises
+        ------
+        InputError
+            The masks are not one per light, of the size of the frame.
+        """
         masks = _fractions(self.masks(images)) if callable(self.masks) else np.asarray(self.masks)
         (x, y), (height, width) = images.origin, images.shape
         part = masks if callable(self.masks) else masks[:, y : y + height, x : x + width]
@@ -127,7 +178,19 @@ class MaskWeights:
         return np.where(images.valid, part, np.float32(0))
 
     def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
-        """The masks where the images are valid."""
+        """The masks where the images are valid.
+
+        Parameters
+        ----------
+        images
+            One image a light.
+        index
+            Index of the frame.
+
+        Returns
+        -------
+        ndarray, shape (k, H, W), float32
+        """
         return self.reference(images)
 
 
@@ -145,7 +208,19 @@ def _size(image: FloatImage) -> str:
 
 
 def precision_method(weights: Any, method: str) -> PrecisionMethod | None:
-    """What learns from the residual: the `weights`, or the statistics where `method` is that; None if nothing does."""
+    """What learns from the residual: the `weights`, or the statistics where `method` is that; None if nothing does.
+
+    Parameters
+    ----------
+    weights
+        The method of weighting, or the weights themselves.
+    method
+        ``weights.method`` of the settings.
+
+    Returns
+    -------
+    PrecisionMethod or None
+    """
     if hasattr(weights, "precision"):
         return weights  # type: ignore[no-any-return]
     return Statistics() if method == "statistics" else None
@@ -207,6 +282,10 @@ def prepare_weights(
         Number of frames of the test.
     images_of
         Gives the images of a frame; the automatic threshold looks at the first deformed one.
+
+    Returns
+    -------
+    LightWeights
 
     Raises
     ------
@@ -281,6 +360,15 @@ class Statistics(ValidPixels):
         averages out, blurred noise one that it does not. It holds whatever corrupts the mean there: camera noise,
         demosaicing, the erratic part of a reflection. Its unit is the median over the region. The pixel's own factor is
         that of a Student distribution, so that dust or a fragment does not corrupt a node.
+
+        Parameters
+        ----------
+        residual
+            Of the pass before.
+
+        Returns
+        -------
+        Precision
         """
         pixels, weights = residual.reference.pixels, residual.weights
         covariance = window_covariance(pixels, residual.difference, weights)

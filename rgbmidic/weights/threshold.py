@@ -84,7 +84,19 @@ def threshold_weights(images: IlluminationImages, *, threshold: float = 2 / 3, b
 
 
 def blurred(images: IlluminationImages, blur: float) -> FloatImage:
-    """Gaussian blur (k, H, W) of each light's image, invalid pixels taken as full scale."""
+    """Gaussian blur (k, H, W) of each light's image, invalid pixels taken as full scale.
+
+    Parameters
+    ----------
+    images
+        One image a light.
+    blur
+        Standard deviation in px.
+
+    Returns
+    -------
+    ndarray, shape (k, H, W), float32
+    """
     filled = np.where(images.valid, images.values, np.float32(images.full_scale))
     return np.stack([cv2.GaussianBlur(image, (0, 0), blur, borderType=cv2.BORDER_REFLECT_101) for image in filled])
 
@@ -168,6 +180,10 @@ def disturbed_zone(
     element_size
         Of the measurement, px: its P² has the distribution of chi square.
 
+    Returns
+    -------
+    DisturbedZone
+
     Raises
     ------
     InputError
@@ -222,6 +238,10 @@ def set_up_threshold(
         Standard deviation (px) of the blur that the weights will use.
     element_size
         Of the measurement, px.
+
+    Returns
+    -------
+    SetUpThreshold
 
     Raises
     ------

@@ -69,6 +69,10 @@ def inspect_files(
     **options
         As in `inspect_frame`; those that are stated and not None replace the test's.
 
+    Returns
+    -------
+    Inspection
+
     Raises
     ------
     RgbmidicError
@@ -148,6 +152,10 @@ def inspect_frame(
     progress
         Called with the number of steps done, their total and the next step.
 
+    Returns
+    -------
+    Inspection
+
     Raises
     ------
     InputError
@@ -216,6 +224,19 @@ def inspect_frame(
 
 def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) -> FrameSettings:
     """Return the test's frame settings, or none, with what else is stated (`FrameSettings`; None: not stated).
+
+    Parameters
+    ----------
+    test
+        Settings of a test; None: nothing but what is stated.
+    count
+        Number of files that are inspected.
+    **stated
+        Properties of the frames, by the names of the fields of `FrameSettings`.
+
+    Returns
+    -------
+    FrameSettings
 
     Raises
     ------

@@ -32,7 +32,17 @@ class Spread:
 
     @classmethod
     def of(cls, std: FloatArray) -> Spread:
-        """Of standard uncertainties (N,)."""
+        """Of standard uncertainties (N,).
+
+        Parameters
+        ----------
+        std : ndarray, shape (N,)
+            Standard uncertainties; NaN where not measured.
+
+        Returns
+        -------
+        Spread
+        """
         measured = std[np.isfinite(std)]
         if not measured.size:
             return cls(median=float("nan"), q95=float("nan"))

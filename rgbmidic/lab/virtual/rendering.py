@@ -241,6 +241,21 @@ def paper_scene(*, size: int = 1024, seed: int = 0, colour: bool = False, **came
     `sphere_scene` with droplets 4 um high (paper, Fig. 10): plain DIC then scatters 3.3 to 4.6 times as much in the
     reflection as beside it from 1/3 to 2 degrees, where the paper found about 4. The exposure
     leaves the brightest pixel just below saturation.
+
+    Parameters
+    ----------
+    size
+        Rows and columns of the camera.
+    seed
+        Of the paint's droplets.
+    colour
+        Whether three coloured lights are seen by a colour camera.
+    **camera
+        Changes of the camera's settings, as of `reference_camera`.
+
+    Returns
+    -------
+    Scene
     """
     places = {"left": _lamp_at(-48.0, -1.5), "right": _lamp_at(32.0, 1.5)}
     if colour:
@@ -257,7 +272,21 @@ def paper_scene(*, size: int = 1024, seed: int = 0, colour: bool = False, **came
 
 
 def expose(scene: Scene, state: State | None = None, level: float = 0.97) -> Scene:
-    """Return the scene with the exposure at which the brightest sample of all channels is a fraction of full scale."""
+    """Return the scene with the exposure at which the brightest sample of all channels is a fraction of full scale.
+
+    Parameters
+    ----------
+    scene
+        Scene with any exposure.
+    state
+        Pose and displacement at which it is exposed; None: the reference state.
+    level
+        Fraction of full scale.
+
+    Returns
+    -------
+    Scene
+    """
     images = render(scene, state)
     together = np.einsum("cl,lyx->cyx", scene.camera.mixing(scene.lights), images)
     brightest = float((images if scene.camera.kind == "monochrome" else together).max())
@@ -273,13 +302,37 @@ def _lamp_at(angle_deg: float, height_deg: float, distance: float = 550.0) -> Ve
 
 
 def turned(angle_deg: float) -> State:
-    """Return the body turned by an angle about the vertical through its front point (paper, section 2.1)."""
+    """Return the body turned by an angle about the vertical through its front point (paper, section 2.1).
+
+    Parameters
+    ----------
+    angle_deg
+        Angle in degrees.
+
+    Returns
+    -------
+    State
+    """
     return State(angle_deg=angle_deg)
 
 
 def strained_plate(
     *, shift_px: tuple[float, float] = (0.25, 0.075), strain: float = 0.002, pixel: float = PIXEL
 ) -> State:
-    """Return a plate stretched by the same strain along x and y and shifted by about `shift_px` in the image."""
+    """Return a plate stretched by the same strain along x and y and shifted by about `shift_px` in the image.
+
+    Parameters
+    ----------
+    shift_px
+        Shift along x and y in px.
+    strain
+        Strain along x and y.
+    pixel
+        Size of a pixel on the plate in mm.
+
+    Returns
+    -------
+    State
+    """
     offset = (shift_px[0] * pixel, shift_px[1] * pixel)
     return State(displacement=AffineField(gradient=((strain, 0.0), (0.0, strain)), offset=offset))

@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from real_files import CROPS, RealData
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames import images as camera_raw
-from rgbmidic.frames import open_source, read_frame
+from rgbmidic.frames import camera_raw, open_source, read_frame
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.frames.images import write_dng
 from rgbmidic.settings import BAYER_PATTERNS, FrameSettings

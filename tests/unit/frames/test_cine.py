@@ -153,8 +153,8 @@ def test_flips_of_the_viewer_are_left_to_it_and_told(tmp_path: Path) -> None:
         (6, 7, "version 7"),
         (20, 0, "announces 0 frames"),
         (20, 2**31, "announces 2147483648 frames"),
-        (20, 2**20, "ends behind the end of the file"),
-        (32, 2**31, "ends behind the end of the file"),
+        (20, 2**20, "goes on to byte .* behind the end of the file"),
+        (32, 2**31, "goes on to byte .* behind the end of the file"),
         (28, 2**30, "goes on to byte"),
         (28, 3, "not where they should be"),
         (48, 0, "12 rows of 0 pixels"),
@@ -196,7 +196,9 @@ def test_a_truncated_movie_is_read_up_to_its_last_whole_frame(tmp_path: Path, an
     for index in range(5):
         np.testing.assert_array_equal(source.read(index).values[0], frames[index])
     for index in range(5, 9):
-        with pytest.raises(FrameError, match=r"f\.cine ends after frame 4 of 9 \(0 to 8\): truncated or still being"):
+        with pytest.raises(
+            FrameError, match=r"f\.cine: the file ends after frame 4 of 9 \(0 to 8\): truncated or still being"
+        ):
             source.read(index)
     path.write_bytes(whole)  # the rest is written: nothing of the shorter file is remembered
     np.testing.assert_array_equal(source.read(8).values[0], frames[8])

@@ -183,7 +183,7 @@ def test_a_movie_that_ends_early_gives_its_whole_frames(tmp_path: Path) -> None:
     frames = _frames(12)
     path = write_mraw(tmp_path, frames, bits=12)
     size = path.stat().st_size // 5
-    for held, where in ((3.5, "after frame 2 of 5"), (0.5, "before the first of its 5 frames")):
+    for held, where in ((3.5, "after frame 2 of 5"), (0.5, "before the first frame of 5")):
         path.write_bytes(b"".join(pack_bits(frame, 12) for frame in frames)[: int(held * size)])
         source = _source(path)
         assert len(source) == 5

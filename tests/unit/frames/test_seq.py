@@ -96,7 +96,9 @@ def test_a_sequence_that_ends_early_gives_its_whole_frames(tmp_path: Path) -> No
     assert (len(source), source.recording.times_ns) == (5, None)
     np.testing.assert_array_equal(source.read(2).values[0], FRAMES[2])
     for index in (3, 4):
-        with pytest.raises(FrameError, match=r"m\.seq: the file ends after frame 2 of 5: truncated or still"):
+        with pytest.raises(
+            FrameError, match=r"m\.seq: the file ends after frame 2 of 5 \(0 to 4\): truncated or still"
+        ):
             source.read(index)
 
 

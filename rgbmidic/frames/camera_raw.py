@@ -1,0 +1,212 @@
+"""Camera raw files (DNG, NEF, CR2, ARW, ...) through LibRaw."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import FrameError
+from rgbmidic.frames.source import FrameSource
+from rgbmidic.frames.stored import StoredFrame, check_size, complaints, damaged
+from rgbmidic.frames.tiff_pages import is_stored_as_is, missing_data, tag, tiff_pages
+from rgbmidic.settings import BAYER_PATTERNS, regular
+from rgbmidic.typing import AnyArray, FloatArray
+
+if TYPE_CHECKING:
+    import rawpy
+    from tifffile import TiffPage
+
+logger = logging.getLogger(__name__)
+
+_NAMES = "3fr arw cr2 cr3 dcr dng erf fff iiq kdc mef mos mrw nef nrw orf pef raf rw2 rwl sr2 srf srw x3f"
+CAMERA_RAW_ENDINGS = tuple(f".{name}" for name in _NAMES.split())
+
+MAXIMUM_FLAT_ROWS = 0.01
+"""Fraction of rows without any noise above which a camera raw counts as not decoded: defective rows may exist."""
+
+_CAMERA_HEADERS = (
+    *(b"II*\0", b"MM\0*"),  # TIFF: DNG, NEF, CR2, ARW, PEF, KDC, ...
+    *(b"IIU\0", b"IIRO", b"IIRS", b"MMOR"),  # Panasonic, Olympus
+    *(b"II\x1a\0", b"IIII", b"MMMM"),  # Canon CRW, Phase One
+    *(b"\0MRM", b"FUJIFILM", b"FOVb"),  # Minolta, Fujifilm, Sigma
+)
+_CR3_HEADER = b"ftypcrx "
+_RAW_PHOTOMETRIC = (32803, 34892)
+_ACTIVE_AREA, _BLACK_REPEAT, _BLACK, _BLACK_DELTAS = 50829, 50713, 50714, (50715, 50716)
+_BROKEN_JPEG = ("Corrupt JPEG data", "Premature end of JPEG file", "Inconsistent progression sequence")
+"""How libjpeg's warnings begin (JWRN in its jerror.h) after which it goes on with invented samples."""
+_ODD_JPEG = ("Invalid SOS parameters", "Unknown Adobe color transform code", "Warning: unknown JFIF revision")
+"""And those of headers that it can read all the same."""
+
+
+class CameraRaw(FrameSource):
+    """The visible part of a camera raw: the mosaic of a Bayer camera or the image of a monochrome one.
+
+    Orientation and default crop of the file are not applied: pixels stay where they are on the sensor. Refused are
+    files that LibRaw cannot decode, images already demosaiced, and colour filter arrays that are no Bayer pattern.
+    """
+
+    packages = ("rawpy",)
+
+    def _shape(self) -> tuple[int, int]:
+        with _libraw(self.path) as raw:
+            return int(raw.sizes.height), int(raw.sizes.width)
+
+    def _stored(self, index: int) -> StoredFrame:
+        stored_as_is, black_by_tags = _tags(self.path)
+        with _libraw(self.path) as raw:
+            cell = _colour_cell(raw, self.path)
+            values = np.array(raw.raw_image_visible, dtype=np.uint16)
+            black = np.asarray(raw.black_level_per_channel, dtype=np.float64)[cell]
+            white, sizes, names = float(raw.white_level), raw.sizes, _names(raw, cell)
+            monochrome = raw.num_colors == 1
+        if values.shape != (sizes.height, sizes.width):
+            raise damaged(self.path, f"its visible part ({sizes.height} x {sizes.width}) reaches beyond its samples")
+        if black_by_tags is not None:
+            # LibRaw moves odd margins to the next even row and column without moving the black levels along
+            black = np.roll(black_by_tags, (-sizes.top_margin, -sizes.left_margin), axis=(0, 1))
+        _check_filled(values, black, white, stored_as_is=stored_as_is, path=self.path)
+        return StoredFrame(
+            values=values,
+            kind="monochrome" if monochrome else "bayer",
+            cfa=None if monochrome else names,
+            black_level=black,
+            white_level=white,
+        )
+
+
+def _tags(path: Path) -> tuple[bool, FloatArray | None]:
+    """Read what the TIFF tags of a raw state beyond what LibRaw gives, and check that its image data are all there.
+
+    Returns
+    -------
+    stored_as_is : bool
+        Whether the samples are uncompressed and all there, so that zeros in them are real.
+    black : ndarray, shape (2, 2), or None
+        DNG black level by position from the sensor's first pixel on; None where no tag states it or states more than a
+        2x2 cell can hold, in files that are not TIFF inside, or that only LibRaw can follow.
+
+    Raises
+    ------
+    FrameError
+        Image data that the header announces is not in the file.
+    """
+    try:
+        with tiff_pages(path) as pages:
+            raw = [page for page in pages if page.photometric in _RAW_PHOTOMETRIC] or pages
+            page = max(raw, key=lambda page: page.imagewidth * page.imagelength)
+            top, left, *_ = tag(page, _ACTIVE_AREA) or (0, 0)
+            stored_as_is, black = is_stored_as_is(page), _black_cell(page)
+            missing = [reason for page in raw if (reason := missing_data(page, path.stat().st_size))]
+            black = None if black is None else np.roll(black, (top, left), axis=(0, 1))
+    except FrameError:
+        return False, None
+    if missing:
+        raise damaged(path, missing[0])
+    return stored_as_is, black
+
+
+def _black_cell(page: TiffPage) -> FloatArray | None:
+    levels, repeat = tag(page, _BLACK), tag(page, _BLACK_REPEAT) or (1, 1)
+    if levels is None or any(delta in page.tags for delta in _BLACK_DELTAS) or not set(repeat) <= {1, 2}:
+        return None
+    numbers = np.array(levels, dtype=np.float64)
+    if len(numbers) == 2 * math.prod(repeat):  # rationals come as numerator, denominator
+        numbers = numbers[::2] / numbers[1::2]
+    if len(numbers) != math.prod(repeat):
+        return None
+    return np.tile(numbers.reshape(repeat), (2 // repeat[0], 2 // repeat[1]))
+
+
+@contextmanager
+def _libraw(path: Path) -> Iterator[rawpy.RawPy]:
+    """Open the file by LibRaw; what LibRaw raises while it is open becomes a FrameError, what it prints a warning.
+
+    Where libjpeg, which unpacks some, reports that the data are broken, that is a FrameError, too.
+    """
+    import rawpy
+
+    try:
+        starts = (os.fsencode(path), *(start.encode() for start in _BROKEN_JPEG + _ODD_JPEG))
+        with complaints(*starts) as lines, rawpy.imread(str(path)) as raw:
+            needed = 2 * raw.sizes.raw_height * raw.sizes.raw_width
+            check_size(path, needed=needed, stored=path.stat().st_size)
+            yield raw
+    except rawpy.LibRawFileUnsupportedError:
+        raise FrameError(f"{path} is a camera raw that LibRaw does not know") from None
+    except NotImplementedError:  # rawpy's answer to filters that repeat neither after 2x2 nor after 6x6 pixels
+        raise _not_bayer(path, "that is no mosaic of 2x2 pixels") from None
+    except rawpy.LibRawError as error:
+        reason = error.args[0] if error.args else type(error).__name__
+        reason = reason.decode(errors="replace") if isinstance(reason, bytes) else reason
+        raise damaged(path, f"LibRaw reports: {reason}") from None
+    for line in lines:
+        if line.startswith(_BROKEN_JPEG):
+            raise damaged(path, f"libjpeg reports: {line}")
+        logger.warning("LibRaw reports: %s", line)
+
+
+def has_camera_header(path: Path) -> bool:
+    """Return whether the file starts as camera raws do.
+
+    LibRaw takes a file without a header for some camera's by its length alone, and so gives a wrong picture.
+    """
+    try:
+        with regular(path).open("rb") as file:
+            head = file.read(12)
+    except OSError:  # reported by whoever reads the file
+        return False
+    return head.startswith(_CAMERA_HEADERS) or head[4:] == _CR3_HEADER
+
+
+def _not_bayer(path: Path, what: str) -> FrameError:
+    allowed = ", ".join(BAYER_PATTERNS)
+    return FrameError(f"{path} has a colour filter array {what}; allowed are the Bayer patterns {allowed}")
+
+
+def _colour_cell(raw: rawpy.RawPy, path: Path) -> AnyArray:
+    """Return the colour numbers of the first visible 2x2 cell; only sensors of one plane, Bayer or mono, have one."""
+    pattern = raw.raw_pattern
+    if raw.raw_type.name != "Flat" or pattern is None:
+        raise FrameError(
+            f"{path} holds an image that is already demosaiced (linear raw); needed is the mosaic as the sensor "
+            "recorded it"
+        )
+    if raw.num_colors == 1:
+        return np.zeros((2, 2), dtype=np.intp)
+    top, left = raw.sizes.top_margin, raw.sizes.left_margin  # `raw_colors_visible` would fill the whole frame
+    cell = np.array([[raw.raw_color(top + row, left + column) for column in (0, 1)] for row in (0, 1)])
+    if pattern.shape != (2, 2) or _names(raw, cell) not in BAYER_PATTERNS:
+        rows, columns = pattern.shape
+        raise _not_bayer(path, f"of {rows}x{columns} pixels with the colours {_names(raw, pattern)}")
+    return cell
+
+
+def _names(raw: rawpy.RawPy, colours: AnyArray) -> str:
+    return "".join(raw.color_desc.decode()[colour] for colour in colours.ravel())
+
+
+def _check_filled(
+    values: npt.NDArray[np.uint16], black: FloatArray, white: float, *, stored_as_is: bool, path: Path
+) -> None:
+    """Refuse a mosaic that LibRaw filled with zeros because the file's data ended.
+
+    A row of a real sensor has noise, even in the dark: rows of one single value are not measured unless they are
+    saturated. Where the samples are stored uncompressed and the file is complete, such rows may be real (a computed
+    frame), except zeros below a positive black level, which no sensor gives.
+    """
+    lowest, highest = values.min(axis=1), values.max(axis=1)
+    flat = (lowest == highest) & (highest < white)
+    if stored_as_is:
+        flat &= (highest == 0) & (black.min() > 0)
+    fraction = float(flat.mean())
+    if flat[-1] or fraction > MAXIMUM_FLAT_ROWS:
+        raise damaged(path, f"{fraction:.1%} of its rows are empty (one single value, {highest[flat][-1]} in the last)")

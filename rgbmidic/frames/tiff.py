@@ -1,0 +1,267 @@
+"""TIFF files: of one image, grey or RGB, 8 or 16 bit; or of several, one frame a page.
+
+ImageJ's hyperstacks and OME-TIFF are read as they store their frames and times.
+"""
+
+from __future__ import annotations
+
+import lzma
+import re
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from rgbmidic.errors import FrameError
+from rgbmidic.frames.data import Integers, Recording, even_times, fraction
+from rgbmidic.frames.images import decode
+from rgbmidic.frames.source import FrameSource, Movie, remembered
+from rgbmidic.frames.stored import CHECKED_FROM, Layout, StoredFrame, check_count, check_size, damaged
+from rgbmidic.frames.tiff_pages import (
+    COLUMNS,
+    DESCRIPTION,
+    ROWS,
+    UNCOMPRESSED,
+    PageList,
+    cfa_pattern,
+    is_stored_as_is,
+    missing_data,
+    tag,
+    tiff_page,
+    tiff_pages,
+)
+from rgbmidic.settings import regular
+from rgbmidic.typing import AnyArray
+
+if TYPE_CHECKING:
+    from tifffile import TiffPage
+
+TIFF_ENDINGS = (".tif", ".tiff")
+
+_BY_TIFFFILE: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
+"""Compressions (deflate, LZMA) that tifffile undoes, without a limit, and what undoes them up to one."""
+_BY_OPENCV = (5, 7, 32773)
+"""LZW, JPEG, PackBits."""
+_MIN_IS_WHITE, _PALETTE = 0, 3
+_COLOUR_MAP, _ORIENTATION = 320, 274
+
+
+class TiffFile(FrameSource):
+    """A TIFF file of one image with 1 or 3 channels; a table of colours is refused."""
+
+    packages = ("tifffile",)
+
+    def _shape(self) -> tuple[int, int]:
+        with _only_page(self.path) as page:
+            return int(page.imagelength), int(page.imagewidth)
+
+    def _stored(self, index: int) -> StoredFrame:
+        return self._rows(index, range(self._shape()[0]))
+
+    def _rows(self, index: int, rows: range) -> StoredFrame:
+        with _only_page(self.path) as page:
+            values = _stored_rows(page, self.path, rows)
+            if values is None:
+                values = _by_opencv(page, self.path)[rows.start : rows.stop]
+            return _as_shown(values, page, self.path)
+
+
+def _stored_rows(page: TiffPage, path: Path, rows: range, index: int = 0, count: int = 1) -> AnyArray | None:
+    """Read some rows (n, W, C) of a checked page, or of frame `index` of `count` that lie one behind the other from it.
+
+    None where they must be unpacked, all at once.
+    """
+    in_planes = page.planarconfig == 2 and page.samplesperpixel > 1
+    if not is_stored_as_is(page) or not page.is_final or in_planes:
+        return None
+    layout = Layout.checked(path, count=count, start=page.dataoffsets[0], size=page.nbytes)
+    stored = np.dtype(page.dtype).newbyteorder(page.parent.byteorder)
+    return layout.samples(path, index, rows, page.imagelength, stored).reshape(len(rows), page.imagewidth, -1)
+
+
+def _as_shown(values: AnyArray, page: TiffPage, path: Path) -> StoredFrame:
+    """Return samples of a page as its tags state that they are shown; a colour table that changes them is refused."""
+    if page.photometric == _PALETTE:
+        table = np.asarray(page.tags[_COLOUR_MAP].value, dtype=np.int64).reshape(3, -1)
+        # some cameras' software writes grey images with a table that changes nothing, of 257 i or of 256 i
+        if values.dtype != np.uint8 or not (table // 256 == np.arange(table.shape[1])).all():
+            raise FrameError(f"{path} shows its grey levels through a colour table; save it as a plain grey image")
+    elif page.photometric == _MIN_IS_WHITE:
+        values = np.iinfo(values.dtype).max - values
+    return StoredFrame.plain(values, path, cfa_pattern(page))
+
+
+@contextmanager
+def _only_page(path: Path) -> Iterator[TiffPage]:
+    with tiff_pages(path) as pages:
+        if not pages:
+            raise damaged(path, "its header leads to no image")
+        if len(pages) > 1:
+            raise FrameError(f"{path} holds {len(pages)} frames; allowed is one frame per TIFF file")
+        _check_page(pages[0], path)
+        yield pages[0]
+
+
+def _check_page(page: TiffPage, path: Path) -> None:
+    """Refuse a page whose samples are no raw frame's or not all there, before anything is unpacked."""
+    if page.dtype is None or page.dtype.name not in ("uint8", "uint16"):
+        kind = page.dtype or f"{page.bitspersample}-bit"
+        raise FrameError(f"{path} has {kind} samples; allowed are unsigned 8 or 16 bit")
+    if not (page.imagelength and page.imagewidth and page.samplesperpixel):  # an entry that is damaged counts as 0
+        told = f"{page.imagelength} rows of {page.imagewidth} pixels with {page.samplesperpixel} samples"
+        raise damaged(path, f"its header announces {told}")
+    size = path.stat().st_size
+    if reason := missing_data(page, size):
+        raise damaged(path, reason)
+    stored = sum(page.databytecounts)
+    if page.compression == UNCOMPRESSED and not is_stored_as_is(page):
+        raise damaged(path, f"its header announces {stored} bytes of image data, too few for its size")
+    check_size(path, needed=page.nbytes, stored=min(stored, size))
+
+
+def _unpacked(page: TiffPage, path: Path) -> AnyArray:
+    """Unpack the samples of a page, (H, W) or (H, W, C)."""
+    if page.compression not in (UNCOMPRESSED, *_BY_TIFFFILE):
+        name = getattr(page.compression, "name", page.compression)
+        raise FrameError(f"{path} is stored in a way that is not read ({name}); save it as a plain uncompressed TIFF")
+    if page.compression in _BY_TIFFFILE:
+        _check_unpacked(page, path)
+    values = np.asarray(page.asarray())
+    one_plane_after_the_other = values.ndim == 3 and page.planarconfig == 2
+    return np.moveaxis(values, 0, -1) if one_plane_after_the_other else values
+
+
+def _by_opencv(page: TiffPage, path: Path) -> AnyArray:
+    """Unpack the samples of the only page of a file, by OpenCV what tifffile cannot."""
+    # OpenCV turns such samples, some more than others
+    turned = (tag(page, _ORIENTATION) or (1,)) != (1,) or page.photometric in (_MIN_IS_WHITE, _PALETTE)
+    if turned or page.compression not in _BY_OPENCV:
+        return _unpacked(page, path)
+    values = decode(path.read_bytes(), path)
+    if (*values.shape[:2], values.dtype) != (page.imagelength, page.imagewidth, page.dtype):
+        raise damaged(path, f"its header announces another image than its data hold, {values.shape} {values.dtype}")
+    return values
+
+
+def _check_unpacked(page: TiffPage, path: Path) -> None:
+    """Refuse parts that unpack to more than the whole image, and all of them to less: tifffile fills up with zeros."""
+    limit, total = max(page.nbytes, CHECKED_FROM), 0
+    with path.open("rb") as file:
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            file.seek(offset)
+            unpacked = len(_BY_TIFFFILE[page.compression]().decompress(file.read(count), limit + 1))
+            if unpacked > limit:
+                raise damaged(path, f"a part of its image data unpacks to more than {limit} bytes")
+            total += unpacked
+    if total < page.nbytes:
+        raise damaged(path, f"its image data unpack to {total} bytes, too few for its size")
+
+
+_UNITS = {"s": 1, "sec": 1, "seconds": 1}
+_UNITS |= {"ms": 10**3, "msec": 10**3, "µs": 10**6, "us": 10**6, "usec": 10**6, "ns": 10**9}
+"""Of time, by how many make a second."""
+
+
+class TiffStack(Movie):
+    """A TIFF file of several frames of one size, in the order of the file."""
+
+    packages = ("tifffile",)
+
+    def _header(self) -> _Hyperstack:
+        return _stack(self.path)
+
+
+def is_tiff_stack(path: Path) -> bool:
+    """Return whether a TIFF file holds several frames; False for what cannot be read."""
+    try:
+        return _stack(path).recording.count > 1
+    except (OSError, FrameError):
+        return False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Hyperstack:
+    """Where the pages begin (one, where ImageJ stored all frames behind it), the size of the first, the recording."""
+
+    offsets: Integers
+    shape: tuple[int, int]
+    recording: Recording
+
+    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        """Read some rows of a frame."""
+        if index >= len(self.offsets) > 1:
+            raise FrameError(f"{path}: its list of frames ends after {index - 1}: truncated or still being written")
+        count = self.recording.count
+        behind = len(self.offsets) == 1  # all frames lie behind the first, as ImageJ stores more than 4 GB
+        with tiff_page(path, int(self.offsets[0 if behind else index])) as page:
+            _check_page(page, path)
+            if (page.imagelength, page.imagewidth) != self.shape:
+                here = f"{page.imagelength} rows of {page.imagewidth} pixels"
+                raise FrameError(f"{path}: frame {index} has {here}, the first {self.shape[0]} of {self.shape[1]}")
+            values = _stored_rows(page, path, rows, *((index, count) if behind else ()))
+            if values is None and behind:
+                reason = "has one page, whose samples are compressed or in pieces"
+                raise FrameError(f"{path} announces {count} frames but {reason}")
+            if values is None:
+                values = _unpacked(page, path)[rows.start : rows.stop]
+            return _as_shown(values, page, path)
+
+
+@remembered
+def _stack(path: Path) -> _Hyperstack:
+    with regular(path).open("rb") as file:
+        pages = PageList.begin(file, path)
+        offsets, ends_early = pages.offsets(path)
+        entries, _ = pages.page(offsets[0]) or ({}, 0)
+        text = pages.text(entries, DESCRIPTION)
+        shape = (pages.value(entries, ROWS), pages.value(entries, COLUMNS))
+    images = re.search(r"^images=([0-9]{1,9})$", text, re.MULTILINE) if text.startswith("ImageJ=") else None
+    count = int(images[1]) if images and len(offsets) == 1 else len(offsets) + (ends_early and len(offsets) > 1)
+    check_count(path, count)
+    times = _imagej_times(text, count) if images else _ome_times(text, count)
+    recording = Recording(count=count, times_ns=times)
+    return _Hyperstack(offsets=np.array(offsets, dtype=np.int64), shape=shape, recording=recording)
+
+
+def _imagej_times(text: str, count: int) -> Integers | None:
+    """Derive times from ImageJ's frame interval, where all images are frames in time."""
+    entries = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
+    others = {"channels", "slices"} & entries.keys()
+    if entries.get("frames", "" if others else str(count)) != str(count):
+        return None
+    return _even_times(entries.get("finterval", ""), entries.get("tunit", "s"), count)
+
+
+def _ome_times(text: str, count: int) -> Integers | None:
+    """Derive times from OME's time increment or the time of every plane."""
+    if "<OME" not in text[:1000] or "<!ENTITY" in text:
+        return None
+    try:
+        pixels = ElementTree.fromstring(text.encode()).find(".//{*}Pixels")
+    except ElementTree.ParseError:
+        return None
+    if pixels is None or pixels.get("SizeT") != str(count):
+        return None
+    if pixels.get("TimeIncrement"):
+        return _even_times(pixels.get("TimeIncrement", ""), pixels.get("TimeIncrementUnit", "s"), count)
+    planes = {plane.get("TheT"): plane for plane in pixels.iterfind("{*}Plane")}
+    each = [planes.get(str(index), pixels) for index in range(count)]
+    times = [_seconds(plane.get("DeltaT", ""), plane.get("DeltaTUnit", "s")) for plane in each]
+    known = [round(time * 10**9) for time in times if time is not None]
+    return np.array(known, dtype=np.int64) if len(known) == count else None
+
+
+def _even_times(interval: str, unit: str, count: int) -> Integers | None:
+    seconds = _seconds(interval, unit)
+    return even_times(range(count), seconds) if seconds else None
+
+
+def _seconds(text: str, unit: str) -> Fraction | None:
+    number = fraction(text)
+    return None if number is None or unit not in _UNITS else number / _UNITS[unit]
