@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rgbmidic.lab.inspection import Inspection, inspect_frame
     from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
     from rgbmidic.pipeline import correlate, measure, measure_sequence
-    from rgbmidic.results import Result
+    from rgbmidic.results import Result, export_result
     from rgbmidic.results.histories import read_histories
     from rgbmidic.settings import SolverSettings, TestSettings, read_test
 
@@ -43,6 +43,7 @@ __all__ = [
     "__version__",
     "correlate",
     "discretisation_error",
+    "export_result",
     "inspect_frame",
     "measure",
     "measure_sequence",
@@ -70,6 +71,7 @@ _HOMES = {
     "Tri3Mesh": "rgbmidic.mesh",
     "correlate": "rgbmidic.pipeline",
     "discretisation_error": "rgbmidic.correlation",
+    "export_result": "rgbmidic.results",
     "inspect_frame": "rgbmidic.lab.inspection",
     "measure": "rgbmidic.pipeline",
     "measure_sequence": "rgbmidic.pipeline",

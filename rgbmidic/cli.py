@@ -454,7 +454,7 @@ def resolution(
     ] = "",
     frames: Annotated[
         str,
-        typer.Option("--frames", help="Frames, such as 5,10, among which the key frame is; else five."),
+        typer.Option("--frames", help="Frames, such as 5,10:20, among which the key frame is; else five."),
     ] = "",
     out: Annotated[Path | None, typer.Option("--out", help="Folder for resolution.csv, .json and .png.")] = None,
     overwrite: Overwrite = False,
@@ -468,7 +468,7 @@ def resolution(
     if out is not None:
         check_folder(out, report.FILES, overwrite=overwrite)
     settings = read_test(test)
-    chosen = cli_results.frame_indices(frames) or []
+    chosen = command.read_frames(frames) or []
     lengths = command.read_lengths(gauges, "--gauges")
     asked = command.read_lengths(sizes, "--sizes")
     _explain_first_run()
@@ -521,7 +521,7 @@ def _print_summary(result: Result, seconds: float) -> None:
         rows["mean"] = f"of {count} frames is the reference: camera noise counts {gain:.2f} of what it does with one"
     for light, fraction in zip(result.lights, result.mean_light_fraction[deformed].T, strict=True):
         known = fraction[fraction == fraction]
-        rows[light] = f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
+        rows[f'light "{light}"'] = f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
     timed = [seconds for seconds in result.each("seconds", deformed) if seconds[0] == seconds[0]] if measured else []
     if timed:  # the mean time of a frame and what each stage takes of it
         mean = sum(timed) / len(timed)

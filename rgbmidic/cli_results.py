@@ -128,13 +128,13 @@ def figures(
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the pictures; by default RESULT/figures.")
     ] = None,
-    frames: Annotated[str, typer.Option("--frames", help="Indices such as 0,5,10; by default three frames.")] = "",
+    frames: Annotated[str, typer.Option("--frames", help="Such as 0,5,10:20; by default three frames.")] = "",
     fields: Annotated[
         str, typer.Option("--field", help="Fields to map, with their uncertainty, such as exx,velocity,magnitude.")
     ] = "",
     gauge: Annotated[
         float | None,
-        typer.Option("--gauge", help="Length of the virtual strain gauge in px; by default the shortest."),
+        typer.Option("--gauge-length", "--gauge", help="Of the virtual strain gauge, px; by default the shortest."),
     ] = None,
     measure: Annotated[str | None, typer.Option("--measure", help="Strain measure, such as hencky.")] = None,
     since: Annotated[int | None, typer.Option("--since", help="Frame that the fields are relative to.")] = None,
@@ -149,7 +149,7 @@ def figures(
     from rgbmidic.report import write_figures, write_maps
     from rgbmidic.results import Maps, Result
 
-    chosen, folder, settings = frame_indices(frames), out or result / "figures", read_settings(test)
+    chosen, folder, settings = command.read_frames(frames), out or result / "figures", read_settings(test)
     if fields:
         maps = Maps.of(
             Result.open(result, partial=partial), None if settings is None else settings.scale, gauge=gauge,
@@ -187,7 +187,7 @@ def report(
     result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
     out: Annotated[Path | None, typer.Option("--out", help="HTML file; by default RESULT/report.html.")] = None,
     test: Reading = None,
-    frames: Annotated[str, typer.Option("--frames", help="Indices of frames to show as maps, such as 0,5,10.")] = "",
+    frames: Annotated[str, typer.Option("--frames", help="Frames to show as maps, such as 0,5,10:20.")] = "",
     overwrite: Overwrite = False,
     partial: Partial = False,
 ) -> None:
@@ -195,7 +195,7 @@ def report(
     from rgbmidic.report import REPORT, write_report
     from rgbmidic.results import Result
 
-    file, chosen, settings = out or result / REPORT, frame_indices(frames), read_settings(test)
+    file, chosen, settings = out or result / REPORT, command.read_frames(frames), read_settings(test)
     if file.suffix.lower() not in (".html", ".htm"):  # which browsers do not open as a page
         file = file.with_name(f"{file.name}.html")
     opened = Result.open(result, partial=partial)
@@ -270,7 +270,7 @@ def history(
 
 
 _DERIVED: dict[str, Any] = {
-    "gauge": Annotated[float | None, typer.Option("--gauge", metavar="PX", help="Virtual strain gauge length, px.")],
+    "gauge": Annotated[float | None, typer.Option("--gauge-length", "--gauge", help="Virtual strain gauge, px.")],
     "measure": _PROBE_OPTIONS["measure"],
     "since": Annotated[int | None, typer.Option("--since", metavar="N", help="Show the fields relative to frame N.")],
     "rigid_removed": Annotated[bool, typer.Option("--remove-rigid", help="Remove the rigid motion.")],
@@ -283,13 +283,10 @@ _derived_options = command.gather("derived", _DERIVED, lambda options: options, 
 
 
 def _chosen_frames(result: Result, text: str) -> list[int] | None:
-    """The measured frames of a range that ``--frames`` states; None where it states none."""
-    from rgbmidic.settings import read_range
-
-    if not text:
+    """The measured ones of the frames that ``--frames`` states; None where it states none."""
+    if (asked := command.read_frames(text)) is None:
         return None
-    asked = read_range(text, "--frames")
-    if asked[-1] >= len(result):
+    if max(asked) >= len(result):
         raise InputError(f"--frames {text}: {result.path} has frames 0 to {len(result) - 1}")
     chosen = [frame for frame in asked if result.finished[frame]]
     if not chosen:
@@ -307,7 +304,7 @@ def movie(
     range_: Annotated[
         str, typer.Option("--range", metavar="LOW:HIGH", help="Range of the colour bars; else that of all frames.")
     ] = "",
-    frames: Annotated[str, typer.Option("--frames", help="Only these, such as 10:200; by default all.")] = "",
+    frames: Annotated[str, typer.Option("--frames", help="Only these, such as 0,5,10:200; by default all.")] = "",
     fps: Annotated[float, typer.Option("--fps", help="Frames per second of the movie.")] = 15.0,
     over: Annotated[str, typer.Option("--over", help="reference, or frame (the raw frames, deformed).")] = "reference",
     curve: Annotated[
@@ -362,7 +359,7 @@ def profile(
     out: Annotated[Path, typer.Option("--out", help="CSV file to write; a picture gets the same name.")],
     derived: dict[str, Any],
     field: Annotated[str, typer.Option("--field", help="One field, such as exx, u or u_velocity.")] = "u",
-    frames: Annotated[str, typer.Option("--frames", help="Only these, such as 10:200; by default all.")] = "",
+    frames: Annotated[str, typer.Option("--frames", help="Only these, such as 0,5,10:200; by default all.")] = "",
     curves: Annotated[str, typer.Option("--curves", help="Frames drawn as curves, such as 10,20,30.")] = "",
     speed: Annotated[str, typer.Option("--speed", metavar="WHAT", help="Fit the speed of a wave: front or peak.")] = "",
     level: Annotated[
@@ -386,7 +383,7 @@ def profile(
     result, settings = Result.open(folder, partial=partial), read_settings(test)
     maps = Maps.of(result, None if settings is None else settings.scale, **derived)
     read = read_profile(maps, field, place, _chosen_frames(result, frames))
-    shown, there = frame_indices(curves, "--curves") or [], list(read.frames)
+    shown, there = command.read_frames(curves, "--curves") or [], list(read.frames)
     if beyond := [frame for frame in shown if frame not in there]:
         raise InputError(f"--curves {curves}: frames {beyond} are not among those read, {there[0]} to {there[-1]}")
     rows = [there.index(frame) for frame in dict.fromkeys(shown)]
@@ -421,7 +418,7 @@ def compare(
         float | None, typer.Option("--interval", metavar="S", help="Time between files with successive numbers.")
     ] = None,
     offset: Annotated[float, typer.Option("--offset", metavar="S", help="Time added to the simulation, s.")] = 0.0,
-    frames: Annotated[str, typer.Option("--frames", help="Indices such as 0,5,10; by default all.")] = "",
+    frames: Annotated[str, typer.Option("--frames", help="Such as 0,5,10:20; by default all.")] = "",
     rigid: Annotated[str, typer.Option("--rigid", help="Rigid motion: tell (report it) or remove.")] = "tell",
     test: Reading = None,
     overwrite: Overwrite = False,
@@ -443,7 +440,7 @@ def compare(
         raise InputError(f"--mesh is for a .csv with numbers of nodes; {fe} has a mesh of its own")
     form = "X_MM,Y_MM:X_PX,Y_PX"
     pairs = [command.read_place(text, "--points", form) for text in points or ()]
-    chosen, settings, result = frame_indices(frames), read_settings(test), Result.open(folder, partial=partial)
+    chosen, settings, result = command.read_frames(frames), read_settings(test), Result.open(folder, partial=partial)
     scale = None if settings is None else settings.scale
     placement = place(result, scale=scale, pairs=pairs)
     numbered = measured_mesh(result) if mesh is None else read_mesh(mesh, unit=unit)
@@ -493,14 +490,6 @@ def print_table(title: str, headings: list[str], rows: list[list[str]], words: M
     for heading, meaning in (words or {}).items():
         print(f"  {heading}: {meaning}")
     print()
-
-
-def frame_indices(text: str, option: str = "--frames") -> list[int] | None:
-    """Indices that an option states, None where it states none."""
-    try:
-        return [int(part) for part in text.split(",")] if text else None
-    except ValueError:
-        raise InputError(f"{option} are whole numbers with commas between them, such as 0,5,10; not {text!r}") from None
 
 
 def progress_of(what: str) -> AbstractContextManager[Callable[[int, int, str], None]]:

@@ -147,7 +147,7 @@ def optional(module: str, extra: str) -> Any:
 
 
 def read_place(text: str, option: str, form: str) -> tuple[float, ...]:
-    """The numbers of a place that is stated in a `form` such as ``"X0,Y0:X1,Y1"``.
+    """The numbers of a place that is stated in a `form` such as ``"X0,Y0:X1,Y1"``, or with commas between all of them.
 
     Raises
     ------
@@ -155,16 +155,40 @@ def read_place(text: str, option: str, form: str) -> tuple[float, ...]:
         It is not of that form.
     """
     groups = [part.split(",") for part in text.split(":")]
+    forms = (form, form.replace(":", ","), form.replace("Y0,X1", "Y0:X1"))
+    shapes = [[len(group.split(",")) for group in one.split(":")] for one in forms]
     try:
-        numbers = [[float(number) for number in group] for group in groups]
+        numbers = tuple(float(number) for group in groups for number in group)
     except ValueError:
-        numbers = []
-    if [len(group) for group in numbers] != [len(group.split(",")) for group in form.split(":")]:
+        numbers = ()
+    if not numbers or [len(group) for group in groups] not in shapes:
         unit = "" if "MM" in form else " in px"
         raise InputError(f"{option} is {form}{unit}, such as {_EXAMPLES[form]}, not {text!r}")
-    return tuple(number for group in numbers for number in group)
+    return numbers
 
 
+def read_frames(text: str, option: str = "--frames") -> list[int] | None:
+    """The indices of frames that an option states, such as ``"0,5,10:20"`` (10 to 19); None where it states none.
+
+    Raises
+    ------
+    InputError
+        It is something else.
+    """
+    chosen = list[int]()
+    for part in text.split(",") if text else ():
+        low, colon, high = (side.strip() for side in part.partition(":"))
+        if not (low.isdecimal() and len(low + high) < 16 and (high.isdecimal() if colon else not high)):
+            chosen.clear()
+            break
+        chosen += range(int(low), min(int(high), int(low) + _MOST_FRAMES) if colon else int(low) + 1)
+    if text and not chosen:
+        raise InputError(f"{option} are indices and ranges such as 0,5,10:20 (10 to 19), not {text!r}")
+    return chosen or None
+
+
+_MOST_FRAMES = 10**7
+"""Most frames of a range: a longer one is a slip, which a result or test refuses, and takes no memory before."""
 _EXAMPLES = {
     "X,Y": "120,85.5",
     "X0,Y0:X1,Y1": "40,60:200,60",

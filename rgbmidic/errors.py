@@ -23,6 +23,8 @@ __all__ = [
     "legible",
 ]
 
+_LONG_WORD, _LONGEST = re.compile(r"\S{1000,}"), 4000
+"""Characters that no name of a file or key has (Linux allows 255 for a name), and a screenful of them."""
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
 
@@ -47,11 +49,15 @@ class RgbmidicError(Exception):
     r"""Base of all errors that rgbmidic raises on purpose.
 
     The message is one line: line ends and other control characters, which come from damaged files and from other
-    libraries, stand in it as ``\n``, ``\x1b``.
+    libraries, stand in it as ``\n``, ``\x1b``. What it quotes of a file is cut where it is longer than a reader needs.
     """
 
     def __init__(self, message: str = "") -> None:
-        super().__init__(_CONTROL.sub(lambda found: ascii(found[0])[1:-1], legible(message)))
+        line = _CONTROL.sub(lambda found: ascii(found[0])[1:-1], legible(message))
+        line = _LONG_WORD.sub(lambda word: f"{word[0][:100]}...{word[0][-40:]} ({len(word[0])} characters)", line)
+        if len(line) > _LONGEST:
+            line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 4 :]} (shortened from {len(line)} characters)"
+        super().__init__(line)
 
 
 class InputError(RgbmidicError, ValueError):

@@ -17,7 +17,7 @@ from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, 
 from functools import cache
 from pathlib import Path, PurePath
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypedDict, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from rgbmidic.errors import ConfigurationError
 
@@ -36,6 +36,7 @@ __all__ = [
     "RegionSettings",
     "ScaleSettings",
     "SetupSettings",
+    "SolverOptions",
     "SolverSettings",
     "TestSettings",
     "WeightSettings",
@@ -348,6 +349,17 @@ class SolverSettings(_Checked):
     fill: float = bounded(0.0, at_least=0)
     tolerance: float = bounded(1e-3, above=0)
     max_iterations: int = bounded(50, at_least=1)
+
+
+class SolverOptions(TypedDict, total=False):
+    """The fields of `SolverSettings` as options of a function."""
+
+    prefilter: Literal["none", "binomial", "gaussian"]
+    rigid: Literal["none", "translation", "translation+rotation"]
+    brightness: Literal["auto", "none", "global", "local", "mean"]
+    fill: float
+    tolerance: float
+    max_iterations: int
 
 
 def grey_levels(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import Any, Literal
+from typing import Literal, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,7 @@ from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.images import normalise as divide_by_local_mean
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, check_names, grey_levels
+from rgbmidic.settings import ELEMENT_SIZE, SolverOptions, SolverSettings, check_names, grey_levels
 from rgbmidic.typing import FloatArray
 from rgbmidic.weights import Statistics, as_weights
 
@@ -43,7 +43,7 @@ def correlate(
     normalise: float | Literal["auto"] | None = None,
     statistics: bool | PrecisionMethod = True,
     mesh_error: bool = False,
-    **options: Any,
+    **options: Unpack[SolverOptions],
 ) -> Solution:
     """Measure the displacement between two states seen under k lights (k = 1: plain DIC).
 
@@ -124,7 +124,7 @@ def correlate(
     return fill(mesh, solution, solver.fill) if solver.fill else solution
 
 
-def solver_settings(options: dict[str, Any]) -> SolverSettings:
+def solver_settings(options: SolverOptions) -> SolverSettings:
     """The settings of the solve that options of a function state.
 
     Raises

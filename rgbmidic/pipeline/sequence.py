@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any, Literal, cast
+from typing import Any, Literal, Unpack, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,7 @@ from rgbmidic.settings import (
     FrameSettings,
     IlluminationSettings,
     RegionSettings,
+    SolverOptions,
     TestSettings,
     WeightSettings,
 )
@@ -54,7 +55,7 @@ def measure_sequence(
     separation: LightSeparation | None = None,
     weights: LightWeights | npt.ArrayLike | None = None,
     mesh: Tri3Mesh | None = None,
-    **options: Any,
+    **options: Unpack[SolverOptions],
 ) -> Iterator[Solution]:
     """Measure states one by one, each as soon as it is available: from a list, a generator, a camera.
 

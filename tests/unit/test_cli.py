@@ -23,8 +23,8 @@ from results import corrupt, make_origin, make_result, random_record, smooth_rec
 from small_tests import colour_test
 
 from rgbmidic import __version__, cli, report
-from rgbmidic.command import FRAME_OPTIONS, execute, gather, read_shape
-from rgbmidic.errors import FrameError
+from rgbmidic.command import FRAME_OPTIONS, execute, gather, read_frames, read_place, read_shape
+from rgbmidic.errors import FrameError, InputError
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 
 TEST = '[frames]\npath = "f*.tif"\nkind = "monochrome"\n[region]\nrectangle = [40, 40, 160, 120]\n'
@@ -293,7 +293,7 @@ def test_figures_later(command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert command("figures", result.path, "--out", tmp_path / "few")[0] == 2
     assert command("figures", result.path, "--out", tmp_path / "few", "--partial")[0] == 0
     assert {file.name for file in (tmp_path / "few").glob("strain*")} == {"strain_000001.png", "strain_000003.png"}
-    for frames, word in (("0,x", "whole numbers"), ("9", "no frame 9")):
+    for frames, word in (("0,x", "indices and ranges"), ("9", "no frame 9")):
         status, _, error = command("figures", result.path, "--out", tmp_path / "none", "--frames", frames, "--partial")
         assert status == 2
         assert word in error
@@ -534,7 +534,7 @@ def test_movie_and_profile_write_what_is_asked_for_or_nothing(command: Run, tmp_
         (("profile", result, "--out", table, "--line", "20,40:900,40"), "half or more of the line"),
         (("profile", result, "--out", table, *line, "--level", ".3"), "--level is of --speed front"),
         (("profile", result, "--out", table, *line, "--curves", "2,9"), "--curves 2,9: frames [9] are not among"),
-        (("profile", result, "--out", table, *line, "--curves", "a"), "--curves are whole numbers"),
+        (("profile", result, "--out", table, *line, "--curves", "a"), "--curves are indices and ranges"),
         (("profile", result, "--out", tmp_path / "p.png", *line), "--out is the table, such as p.csv, not 'p.png'"),
         (("history", result, "--out", tmp_path / "h.PNG", "--point", "30,40"), "--out is the table, such as h.csv"),
     ):
@@ -569,3 +569,21 @@ def test_batch_goes_on_after_a_failure_and_ends_with_status_1(command: Run, tmp_
     status, _, err = command("batch", tmp_path / "a.toml", "--out", tmp_path / "out2", "--elastic", "2:1")
     assert status == 2
     assert not (tmp_path / "out2").exists()
+
+
+@pytest.mark.parametrize("form", ["X0,Y0:X1,Y1", "X0,Y0,X1,Y1"])
+@pytest.mark.parametrize("text", ["40,60:200,160.5", "40,60,200,160.5"])
+def test_two_corners_have_one_grammar_in_all_commands(form: str, text: str) -> None:
+    assert read_place(text, "--region", form) == (40, 60, 200, 160.5)
+    for wrong in ("40,60:200", "40:60,200,160", "40,60,200,x", ""):
+        with pytest.raises(InputError, match=f"--region is {form} in px, such as"):
+            read_place(wrong, "--region", form)
+
+
+def test_frames_have_one_grammar_in_all_commands() -> None:
+    assert read_frames("") is None
+    assert read_frames("5") == [5]
+    assert read_frames("0, 5,10:13") == [0, 5, 10, 11, 12]
+    for wrong in ("a", "5:", ":5", "5,,6", "7:7", "-1", "1.5", "9" * 30):
+        with pytest.raises(InputError, match="--frames are indices and ranges such as"):
+            read_frames(wrong)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import gc
 import weakref
+from dataclasses import fields
+from typing import get_type_hints
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift
 
+import rgbmidic
 from rgbmidic import correlate, measure, measure_sequence
 from rgbmidic.correlation import Status
 from rgbmidic.errors import FrameError, InputError
-from rgbmidic.settings import TestSettings
+from rgbmidic.settings import SolverOptions, SolverSettings, TestSettings
 
 SIDE, COUNT = 72, 20
 
@@ -127,3 +130,15 @@ def test_masked_samples_of_a_raw_frame_are_refused(tmp_path):
     raw = [np.ma.masked_greater(np.round(one).astype(np.uint16), 2500) for one in states()[:2]]
     with pytest.raises(FrameError, match="has masked samples, which a raw frame cannot have"):
         measure(settings(), tmp_path / "out", source=raw)
+
+
+def test_options_are_typed_as_the_settings_of_the_solve():
+    stated = {field.name: field.type for field in fields(SolverSettings)}
+    assert {name: str(kind) for name, kind in SolverOptions.__annotations__.items()}.keys() == stated.keys()
+    assert get_type_hints(SolverOptions) == get_type_hints(SolverSettings)
+
+
+def test_what_scripts_need_is_imported_from_the_package():
+    assert rgbmidic.SolverSettings().max_iterations == 50
+    raw = rgbmidic.separate.__module__, rgbmidic.read_histories.__module__, rgbmidic.export_result.__module__
+    assert raw == ("rgbmidic.illumination.separation", "rgbmidic.results.histories", "rgbmidic.results.export")
