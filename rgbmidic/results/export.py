@@ -18,7 +18,7 @@ import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -56,15 +56,15 @@ _TURNED = ("exy", "direction")
 def write_hdf5(physical: Physical, file: BinaryIO) -> None:
     """Write all frames of a result, one after the other: the memory that is needed is that of one frame.
 
-    HDF5 lays the file out, with the room for all frames, and reports where each array begins; the numbers are then
-    written there as into any file. A disk that fills up is then an ordinary error; HDF5 would not recover from it.
+    HDF5 writes through the open file: what the disk refuses is then Python's error. With a file of its own, h5py 3
+    crashes where the disk is full.
 
     Parameters
     ----------
     physical
         The result, in its units.
     file
-        Open file on the disk, empty.
+        Open file on the disk, empty, that can be read and written.
 
     Raises
     ------
@@ -80,60 +80,23 @@ def write_hdf5(physical: Physical, file: BinaryIO) -> None:
     shared = _SHARED_BYTES * (len(physical.result) + sum(sizes.values())) + _HEADERS
     if shutil.disk_usage(Path(file.name).parent).free < frame * len(physical.result) + shared:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # before HDF5 itself meets a full disk
-    arrays, turned = _lay_out(physical, file.name)
-    for index in range(len(physical.result)):
-        values = physical.frame(index)
-        for name, rows in arrays.items():
-            rows.write(file, index, values[name])
-        u, v = values["u"], values["v"]
-        upward = {name: -values[name] for name in _TURNED}
-        upward["displacement"] = np.stack([u, -v, np.where(np.isfinite(u), 0.0, np.nan)], axis=1)
-        for name, rows in turned.items():
-            rows.write(file, index, upward[name])
-
-
-def _lay_out(physical: Physical, name: str) -> tuple[dict[str, _Rows], dict[str, _Rows]]:
-    """Write all but what belongs to a frame; return the place of each array of the root, and of VTK's group."""
     import h5py
 
-    try:
-        with h5py.File(name, "w") as out:
-            _write_shared(out, physical)
-            for entry in physical.quantities.values():
-                _declare(out, physical, entry)
-            group = out.create_group("VTKHDF")
-            _declare_grid(group, physical)
-            arrays = {name: _Rows.of(out[name]) for name in physical.quantities}
-            return arrays, {name: _Rows.of(group["PointData"][name]) for name in ("displacement", *_TURNED)}
-    except OSError as error:  # whose text is HDF5's, in several lines
-        raise OSError(error.errno, os.strerror(error.errno)) if error.errno else error from None
-
-
-class _Rows(NamedTuple):
-    """An array in the file, of which each frame has a row: where it begins, its type, the bytes of a row."""
-
-    first: int
-    dtype: np.dtype[Any]
-    size: int
-
-    @classmethod
-    def of(cls, dataset: h5py.Dataset) -> _Rows:
-        frames = dataset.file["time"].size
-        return cls(dataset.id.get_offset(), dataset.dtype, dataset.nbytes // frames)
-
-    def write(self, file: BinaryIO, index: int, values: Any) -> None:
-        file.seek(self.first + index * self.size)
-        file.write(np.asarray(values, dtype=self.dtype).tobytes())
-
-
-def _room(out: h5py.Group, name: str, shape: tuple[int, ...], dtype: Any) -> h5py.Dataset:
-    """Create an array without content, with its place in the file."""
-    import h5py
-
-    made = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    made.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-    made.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-    return out.create_dataset(name, shape, np.dtype(dtype).newbyteorder("<"), dcpl=made)
+    with h5py.File(file, "w") as out:
+        _write_shared(out, physical)
+        for entry in physical.quantities.values():
+            _declare(out, physical, entry)
+        _declare_grid(out.create_group("VTKHDF"), physical)
+        arrays, nodes = {name: out[name] for name in physical.quantities}, sizes["node"]
+        upward = {name: out[f"VTKHDF/PointData/{name}"] for name in ("displacement", *_TURNED)}
+        for index in range(len(physical.result)):
+            values, rows = physical.frame(index), slice(index * nodes, (index + 1) * nodes)
+            for name, array in arrays.items():
+                array[index] = values[name]
+            for name in _TURNED:
+                upward[name][rows] = -values[name]
+            u, v = values["u"], values["v"]
+            upward["displacement"][rows] = np.stack([u, -v, np.where(np.isfinite(u), 0.0, np.nan)], axis=1)
 
 
 def _write_shared(out: h5py.File, physical: Physical) -> None:
@@ -191,7 +154,7 @@ def _declare(out: h5py.File, physical: Physical, entry: ResultQuantity) -> None:
         if name not in out:  # an axis of a fixed length gets its scale when it is first met
             _add(out, name, np.arange(int(axis), dtype=np.int32), (), "1", "index").make_scale(name)
     shape = (len(physical.result), *(len(out[axis]) for axis in axes))
-    dataset = _room(out, entry.name, shape, entry.dtype)
+    dataset = out.create_dataset(entry.name, shape, np.dtype(entry.dtype).newbyteorder("<"))
     _describe(out, dataset, ("time", *axes), entry.attributes)
     if physical.is_strain(entry.name):
         length = f"{physical.gauges.length * physical.length:.6g} {physical.units.length}"
@@ -222,7 +185,7 @@ def _declare_grid(group: h5py.Group, physical: Physical) -> None:
     steps["NumberOfParts"] = first + 1
     for name, shape in {"Part": (-1,), "Point": (-1,), "Cell": (-1, 1), "ConnectivityId": (-1, 1)}.items():
         steps[f"{name}Offsets"] = first.reshape(shape)
-    _room(data, "displacement", (frames * nodes, 3), np.float32)
+    data.create_dataset("displacement", (frames * nodes, 3), "<f4")
     for entry in physical.quantities.values():
         if entry.axes[:1] == ("node",) and entry.name not in ("u", "v"):
             _declare_nodal(data, group.file[entry.name], turned=entry.name in _TURNED)
@@ -240,7 +203,7 @@ def _declare_nodal(data: h5py.Group, source: h5py.Dataset, *, turned: bool) -> N
 
     name, shape = source.name.strip("/"), (source.shape[0] * source.shape[1], *source.shape[2:])
     if turned:
-        _room(data, name, shape, source.dtype)
+        data.create_dataset(name, shape, source.dtype)
         return
     layout = h5py.VirtualLayout(shape, source.dtype)
     layout[...] = h5py.VirtualSource(".", source.name, source.shape, source.dtype)

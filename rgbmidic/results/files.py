@@ -120,7 +120,7 @@ def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool
     """
     temporary = path.with_name(f"{path.name}.{socket.gethostname()}.{os.getpid()}.part")
     try:
-        with writing(path), temporary.open("wb") as file:
+        with writing(path), temporary.open("w+b") as file:
             write(file)
             file.flush()
             if lasting:
