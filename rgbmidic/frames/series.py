@@ -419,9 +419,6 @@ def _matching(pattern: Path, base: Path) -> list[Path]:
     return [base / match for match in glob.glob(str(Path(*parts)), root_dir=base, recursive=True)]  # noqa: PTH207
 
 
-_SECOND = 1e9
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Description:
     """What a reader sees; None where neither the files nor the user state it.
@@ -519,7 +516,7 @@ def describe(settings: FrameSettings) -> Description:
         black_level=levels[0] if len(set(levels)) == 1 else levels,
         white_level=frame.white_level,
         frame_rate=recording.frame_rate,
-        exposure=None if recording.exposure_ns is None else recording.exposure_ns / _SECOND,
+        exposure=None if recording.exposure_ns is None else recording.exposure_ns / 1e9,
         trigger=recording.trigger,
         lost_frames=series.lost if numbered else None,
         first_time_ns=series.time_ns(0),

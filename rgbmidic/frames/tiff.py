@@ -62,14 +62,18 @@ class TiffFile(FrameSource):
             return int(page.imagelength), int(page.imagewidth)
 
     def _stored(self, index: int) -> StoredFrame:
-        return self._rows(index, range(self._shape()[0]))
+        with _only_page(self.path) as page:
+            return _only_frame(page, self.path, range(page.imagelength))
 
     def _rows(self, index: int, rows: range) -> StoredFrame:
         with _only_page(self.path) as page:
-            values = _stored_rows(page, self.path, rows)
-            if values is None:
-                values = _by_opencv(page, self.path)[rows.start : rows.stop]
-            return _as_shown(values, page, self.path)
+            return _only_frame(page, self.path, rows)
+
+
+def _only_frame(page: TiffPage, path: Path, rows: range) -> StoredFrame:
+    """Read some rows of the only page of a file."""
+    values = _stored_rows(page, path, rows)
+    return _as_shown(_by_opencv(page, path)[rows.start : rows.stop] if values is None else values, page, path)
 
 
 def _stored_rows(page: TiffPage, path: Path, rows: range, index: int = 0, count: int = 1) -> AnyArray | None:

@@ -78,6 +78,18 @@ def test_planes_one_after_the_other(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_frame(tmp_path / "f.tif").values, planes)
 
 
+def test_bytes_whose_lowest_bit_comes_first(tmp_path: Path) -> None:
+    values = np.arange(256, dtype=np.uint8).reshape(8, 32)
+    turned = np.packbits(np.unpackbits(values), bitorder="little").reshape(values.shape)
+    tifffile.imwrite(tmp_path / "f.tif", turned, photometric="minisblack", extratags=[(274, "H", 1, 2, True)])
+    content = (tmp_path / "f.tif").read_bytes()  # tifffile writes no FillOrder: the tag of the orientation becomes one
+    (tmp_path / "f.tif").write_bytes(content.replace(struct.pack("<HH", 274, 3), struct.pack("<HH", 266, 3)))
+    source = open_source(tmp_path / "f.tif", FrameSettings(path=("frame",), kind="monochrome"))
+    np.testing.assert_array_equal(source.read(0).values[0], values)
+    part = Window(origin=(0, 4), shape=(4, 32), frame=(8, 32))
+    np.testing.assert_array_equal(source.read(0, part).values[0], values[4:])
+
+
 def test_tiff_that_names_its_pattern(tmp_path: Path) -> None:
     tags = [(33421, "H", 2, (2, 2), True), (33422, "B", 4, b"\x01\x00\x02\x01", True)]
     tifffile.imwrite(tmp_path / "f.tif", GREY, photometric=32803, extratags=tags)
