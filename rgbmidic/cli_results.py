@@ -373,7 +373,7 @@ def profile(
     from rgbmidic.report import profile_figure, save_figure, wave_text
     from rgbmidic.results import Maps, Result, read_profile, write_profile
     from rgbmidic.results.files import check_file
-    from rgbmidic.results.histories import arrivals_file
+    from rgbmidic.results.profiles import arrivals_file
 
     picture, place = command.picture_beside(out), command.read_place(line, "--line", "X0,Y0:X1,Y1")
     for file in (out, picture, *([arrivals_file(out)] if speed else [])):
@@ -432,7 +432,8 @@ def compare(
     from rgbmidic.mesh import read_mesh
     from rgbmidic.report.comparison import PAGE, comparison_files, scale_text, write_comparison
     from rgbmidic.results import Result
-    from rgbmidic.results.comparison import Comparison, Simulation, measured_mesh, place
+    from rgbmidic.results.comparison import Comparison, measured_mesh
+    from rgbmidic.results.simulation import Simulation, place
 
     if rigid not in ("tell", "remove"):
         raise InputError(f'--rigid is tell or remove, not "{rigid}"')

@@ -7,7 +7,7 @@ from textures import Texture
 
 from rgbmidic import correlate
 from rgbmidic.fields import Nodal, Units, Williams
-from rgbmidic.fields.cracks import williams_series
+from rgbmidic.fields.crack_tip import williams_series
 
 SHAPE = (240, 320)
 REGION = (10, 10, 309, 229)

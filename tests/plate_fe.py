@@ -17,7 +17,8 @@ from rgbmidic import correlate
 from rgbmidic.fields.nodal import Places
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh
 from rgbmidic.results import FrameRecord
-from rgbmidic.results.comparison import Comparison, FrameComparison, Simulation
+from rgbmidic.results.comparison import Comparison, FrameComparison
+from rgbmidic.results.simulation import Simulation
 from rgbmidic.typing import FloatArray
 
 SHAPE, MM_PER_PIXEL = (210, 190), 0.05

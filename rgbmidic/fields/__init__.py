@@ -1,6 +1,7 @@
 """From a solution to what an engineer reads: the field at pixels and nodes, strain, rates, units, probes."""
 
-from rgbmidic.fields.cracks import Jump, StressIntensity, Williams, crack_jump, stress_intensity
+from rgbmidic.fields.crack_tip import StressIntensity, Williams, stress_intensity
+from rgbmidic.fields.cracks import Jump, crack_jump
 from rgbmidic.fields.history import SIGMA, History, Nodal, Probe, Rates, Units, column, high_pass, rates
 from rgbmidic.fields.measures import EQUIVALENT, MEASURES, RigidMotion, Strain, length_of, strain_of_gradient
 from rgbmidic.fields.nodal import (

@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields.cracks import CrackTip, JumpAlong, Williams
+from rgbmidic.fields.crack_tip import CrackTip, Williams
+from rgbmidic.fields.cracks import JumpAlong
 from rgbmidic.fields.history import History, Nodal, Probe, Units
 from rgbmidic.fields.measures import MEASURES, strain_of_gradient
 from rgbmidic.fields.nodal import NodalCovariance, Places

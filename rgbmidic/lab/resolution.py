@@ -26,8 +26,8 @@ from rgbmidic.errors import ResultError
 from rgbmidic.fields import NodalCovariance, StrainGauges
 from rgbmidic.lab import check_folder, number_or_none, write_findings
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.plan import SPECKLES
-from rgbmidic.pipeline.resolution import ResolutionStudy, SizeFigures
+from rgbmidic.pipeline.size_figures import ResolutionStudy, SizeFigures
+from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:

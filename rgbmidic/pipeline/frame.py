@@ -32,7 +32,9 @@ from rgbmidic.frames.data import Window
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.pipeline.order import STRIDE, is_key
-from rgbmidic.pipeline.plan import SATURATED, Plan, exposure_fault, saturated_fraction, too_small
+from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.reference_state import SATURATED
+from rgbmidic.pipeline.suitability import exposure_fault, saturated_fraction, too_small
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage

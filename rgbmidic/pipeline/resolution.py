@@ -21,10 +21,12 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionEr
 from rgbmidic.fields import NodalCovariance, Places, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.quadratic_fit import quadratic_fit
 from rgbmidic.mesh.tri3 import refined
+from rgbmidic.pipeline.field_comparison import Field
 from rgbmidic.pipeline.frame import read_state
-from rgbmidic.pipeline.plan import SPECKLES, Choice, Plan
+from rgbmidic.pipeline.plan import Choice, Plan
+from rgbmidic.pipeline.size_figures import GaugeFigures, ResolutionStudy, SizeFigures
+from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.settings import ELEMENT_SIZE, TestSettings
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -41,16 +43,7 @@ _CANDIDATES = 5
 """Frames among which the key frame is looked for. Chosen: fifths of a test."""
 _STATIC = 5
 """Static frames that the noise floor is taken from at most: 100 nodes in 5 frames give it to 4 %."""
-_MEASURED = 0.97
-"""Area that a size must measure, of the size that measures most: what it loses is where its error would be the largest,
-such as a steep bump beside one node. Chosen: a node of elements of 40 px on 250 px is 8 %."""
-_ALIKE = 1.05
-"""Total errors of the displacement within this factor count as the same, and those of strain decide: an estimate of the
-discretisation error is no better than that."""
 
-_SURE, _INDEPENDENT = 2.0, 0.5
-"""Standard deviations by which a mean square must exceed that of noise, and independent values in a nodal one, whose
-neighbours are correlated. Chosen."""
 _LARGEST = 0.99
 """Quantile over the nodes and components that stands for the largest strain: the very largest is one node's noise."""
 _EQUAL = 0.1
@@ -68,146 +61,6 @@ _EXACT = 2.0**-16
 """Places of refined nodes are multiples of it, px: where they begin to count can then be shifted without rounding."""
 
 Progress = Callable[[int, int, str], None]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GaugeFigures:
-    """Virtual strain gauges of one length on elements of one size.
-
-    Attributes
-    ----------
-    length
-        px.
-    noise
-        Noise of exx, eyy and exy, rms over the nodes: the strain resolution; from static frames, else as stated.
-    largest
-        Largest value of a component of the strain in the key frame, the 99 % quantile over the nodes.
-    """
-
-    length: float
-    noise: float
-    largest: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SizeFigures:
-    """Elements of one size on a test's own frames; what is not known is NaN.
-
-    All errors are rms over the measured nodes and over the components: u, v in px; exx, eyy, exy at the nodes.
-
-    Attributes
-    ----------
-    element_size
-        px.
-    speckles
-        On the side of an element.
-    nodes
-        Number of nodes.
-    measured
-        Fraction of the area whose nodes the key frame measures.
-    bias, scatter, strain_bias, strain_scatter
-        Noise floor: rms over the static frames of the mean over the nodes, and the scatter about it.
-    stated, strain_stated
-        Standard uncertainty from noise in the key frame.
-    discretisation, strain_discretisation
-        What the mesh and the recovery leave out in the key frame.
-    seconds
-        CPU seconds of the solve of the key frame.
-    gauges
-        Virtual strain gauges.
-    reason
-        Why nothing is known; else empty.
-    """
-
-    element_size: float
-    speckles: float = float("nan")
-    nodes: int = 0
-    measured: float = 0.0
-    bias: float = float("nan")
-    scatter: float = float("nan")
-    strain_bias: float = float("nan")
-    strain_scatter: float = float("nan")
-    stated: float = float("nan")
-    strain_stated: float = float("nan")
-    discretisation: float = float("nan")
-    strain_discretisation: float = float("nan")
-    seconds: float = float("nan")
-    gauges: tuple[GaugeFigures, ...] = ()
-    reason: str = ""
-
-    @property
-    def noise(self) -> float:
-        """Noise of the displacement, px: as stated in the key frame, or the noise floor where that is more."""
-        return float(np.fmax(self.stated, self.scatter))
-
-    @property
-    def strain_noise(self) -> float:
-        """Noise of the strain at the nodes, as `noise`."""
-        return float(np.fmax(self.strain_stated, self.strain_scatter))
-
-    @property
-    def total(self) -> float:
-        """Error of the displacement, px: root of the squares of noise and discretisation error."""
-        return float(np.hypot(self.noise, self.discretisation))
-
-    @property
-    def strain_total(self) -> float:
-        """Error of the strain at the nodes, as `total`."""
-        return float(np.hypot(self.strain_noise, self.strain_discretisation))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ResolutionStudy:
-    """Figures of several element sizes on a test's own frames.
-
-    Attributes
-    ----------
-    frame, name
-        The key frame: index and name.
-    static
-        Number of static frames that the noise floor is from; 0: the test has none, and noise is as stated.
-    speckle
-        Size of the speckle, px; NaN where it is not known.
-    preparation
-        CPU seconds of reading and separating the key frame, the same for all sizes; NaN where it was not measured.
-    sizes
-        Figures of each size.
-    """
-
-    frame: int
-    name: str
-    static: int
-    speckle: float
-    preparation: float
-    sizes: tuple[SizeFigures, ...]
-
-    @property
-    def choice(self) -> Choice | None:
-        """The size of the least total error among those that hold and measure enough; None where none is known."""
-        most = max((one.measured for one in self.sizes), default=0.0)
-        few = [one for one in self.sizes if one.speckles < SPECKLES]
-        usable = [one for one in self.sizes if one not in few and one.measured >= _MEASURED * most]
-        usable = sorted((one for one in usable if np.isfinite(one.total)), key=lambda one: one.element_size)
-        if not usable:
-            return None
-        least = min(one.total for one in usable)
-        best = min(
-            (one for one in usable if one.total <= _ALIKE * least),
-            key=lambda one: np.nan_to_num(one.strain_total, nan=np.inf),
-        )
-        smaller, larger = usable[: usable.index(best)][-1:], usable[usable.index(best) + 1 :][:1]
-        lead = "the least" if best.total == least else "within 5 % of the least"
-        parts = [
-            f"elements of {best.element_size:g} px have {lead} total error in {self.name}: {best.total:.2g} px, from "
-            f"noise of {best.noise:.2g} px and a discretisation error of {best.discretisation:.2g} px"
-        ]
-        for one, what in (*((one, "noise") for one in smaller), *((one, "discretisation error") for one in larger)):
-            value = one.noise if what == "noise" else one.discretisation
-            parts.append(f"with {one.element_size:g} px it is {one.total:.2g} px, for a {what} of {value:.2g} px")
-        if few:
-            names = ", ".join(f"{one.element_size:g}" for one in few)
-            parts.append(f"{names} px are less than {SPECKLES:g} speckles of {self.speckle:.1f} px")
-        return Choice(element_size=best.element_size, reason="; ".join(parts))
 
 
 def largest_size(plan: Plan) -> float:
@@ -297,7 +150,7 @@ def study_sizes(
     key = _KeyFrame.find(plan, frames)
     at_rest = settings.frames.reference[:_STATIC] if static and len(settings.frames.reference) > 1 else ()
     rest = [_deformed(plan, index) for index in at_rest]
-    figures, finer = [], list[_Field]()
+    figures, finer = [], list[Field]()
     for number, size in enumerate(sizes):
         report(number + 1, len(sizes) + 1, f"elements of {size:g} px")
         try:
@@ -495,58 +348,13 @@ def _beyond_affine(solution: Solution) -> float:
     return _rms(np.asarray(moved - basis @ np.linalg.lstsq(basis, moved, rcond=None)[0]))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Field:
-    """Displacement and strain (N, 5) on a mesh, and their noise."""
-
-    mesh: Tri3Mesh
-    values: FloatArray
-    noise: FloatArray
-
-    @classmethod
-    def of(cls, mesh: Tri3Mesh, solution: Solution) -> _Field:
-        """Those of a solution, the noise without the misfit of the elements."""
-        values = np.hstack([solution.displacement, solution.strain])
-        return cls(mesh=mesh, values=values, noise=np.hstack([solution.displacement_std, solution.strain_std]))
-
-    def at(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The field at points (P, 2), by the quadratics through the nodes around each node (`at_pixels`), and noise."""
-        used = np.asarray(np.isfinite(self.values)[self.mesh.elements].all(axis=(1, 2)))
-        known = np.nan_to_num(self.values)
-        _, x, y, xx, xy, yy = (operator @ known for operator in quadratic_fit(self.mesh, used))
-        places = Places.of(self.mesh, points)
-        node, weight = self.mesh.elements[places.element], places.barycentric
-        dx, dy = np.moveaxis(points[:, None] - self.mesh.nodes[node], -1, 0)[..., None]
-        bent = xx[node] * dx * dx / 2 + xy[node] * dx * dy + yy[node] * dy * dy / 2
-        out = np.einsum("pc,pci->pi", weight, self.values[node] + x[node] * dx + y[node] * dy + bent)
-        noise = np.sqrt(np.einsum("pc,pci->pi", weight, self.noise[node] ** 2))
-        return np.where(places.inside[:, None] & used[places.element][:, None], out, np.nan), noise
-
-    def apart(self, finer: Sequence[_Field]) -> tuple[list[float], list[float]]:
-        """How far this field is from each of `finer` elements beyond the noise of both, at the nodes of those.
-
-        Halved elements show little of what is far smaller than they are, or lies between their nodes; the finer sizes
-        of a study have measured it. Of displacement and strain.
-        """
-        found: tuple[list[float], list[float]] = ([], [])
-        for other in finer:
-            here, noise = self.at(other.mesh.nodes)
-            square, variance = (here - other.values) ** 2, noise**2 + other.noise**2
-            for errors, part in zip(found, (slice(2), slice(2, 5)), strict=True):
-                known = np.isfinite(square[:, part] + variance[:, part])
-                beyond, expected = (square - variance)[:, part][known], variance[:, part][known]
-                plain = beyond.sum() > _SURE * np.sqrt(2 * (expected**2).sum() / _INDEPENDENT)
-                errors.append(float(np.sqrt(beyond.mean())) if plain else 0.0)
-        return found
-
-
 def _rms(values: FloatArray) -> float:
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
 
 def _figures(
-    plan: Plan, key: _KeyFrame, rest: Sequence[Deformed], gauges: Sequence[float], finer: list[_Field]
+    plan: Plan, key: _KeyFrame, rest: Sequence[Deformed], gauges: Sequence[float], finer: list[Field]
 ) -> SizeFigures:
     """The figures of the size of a plan's elements; its field is added to those of `finer` elements."""
     mesh, speckle = plan.reference.mesh, plan.speckle or float("nan")
@@ -559,7 +367,7 @@ def _figures(
     single = np.sqrt(1 + 1 / len(plan.settings.frames.reference))
     moved, strain = (_floor([getattr(one, name) for one in still], single) for name in ("displacement", "strain"))
     known = discretisation_error(plan.reference, key.deformed, solution, plan.solver, plan.method)
-    field = _Field.of(mesh, known)
+    field = Field.of(mesh, known)
     errors = [_rms(known.displacement_error), _rms(known.strain_error)]
     other = [one for one in finer if _FINER * one.mesh.size <= mesh.size]
     # it differs from all of them, each of which has an error of its own (in proportion to the size's third power);

@@ -17,10 +17,11 @@ from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import read_state
 from rgbmidic.pipeline.order import dependants
-from rgbmidic.pipeline.plan import Choice, Plan, light_levels
+from rgbmidic.pipeline.plan import Choice, Plan
 from rgbmidic.pipeline.resolution import choose, refine
 from rgbmidic.pipeline.schedule import Schedule
 from rgbmidic.pipeline.source import FrameSequence, describe
+from rgbmidic.pipeline.suitability import light_levels
 from rgbmidic.pipeline.workers import available_cores, open_workers
 from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance

@@ -1,7 +1,7 @@
 """Figures, reports and pages of text and pictures of a result."""
 
 from rgbmidic.report.curves import history_figure, profile_figure, wave_text
-from rgbmidic.report.document import Page, write_batch_page, write_report
+from rgbmidic.report.document import write_batch_page, write_report
 from rgbmidic.report.figures import (
     MAPS,
     brightness_figure,
@@ -14,6 +14,7 @@ from rgbmidic.report.figures import (
 )
 from rgbmidic.report.gallery import REPORT, remove_figures, remove_report, write_figures, write_maps
 from rgbmidic.report.movie import MOVIES, Curve, write_movie
+from rgbmidic.report.page import Page
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
 
 __all__ = [

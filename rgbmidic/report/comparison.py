@@ -15,8 +15,8 @@ import numpy as np
 
 from rgbmidic.command import optional
 from rgbmidic.report import style
-from rgbmidic.report.document import Page
 from rgbmidic.report.figures import spread
+from rgbmidic.report.page import Page
 from rgbmidic.results.comparison import QUANTITIES, WAYS, Comparison, FrameComparison
 from rgbmidic.results.files import write_complete, writing
 from rgbmidic.typing import FloatArray

@@ -9,16 +9,11 @@ from __future__ import annotations
 import csv
 import multiprocessing
 import signal
-import subprocess
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import chain
 from pathlib import Path
-from threading import Event, Timer
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +23,7 @@ from rgbmidic.command import optional
 from rgbmidic.errors import InputError, ResultError, RgbmidicError
 from rgbmidic.report import style
 from rgbmidic.report.figures import picture_limits, spread
+from rgbmidic.report.video import PALETTE, Page, gif, video
 from rgbmidic.results import QUANTITIES, Channels, MapField, Maps, frame_times
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.typing import AnyArray, FloatArray
@@ -35,14 +31,11 @@ from rgbmidic.typing import AnyArray, FloatArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Page = npt.NDArray[np.uint8]
-"""Red, green, blue and opacity of a page, (H, W, 4)."""
 
 _SAMPLE = 4_000_000
 """Nodal values of each field that its colour range is found from: 500 frames of 8,000 nodes; of more, evenly spaced
 frames count."""
 _COLOURS = {"positive": "plasma", "fraction": "cividis", "angle": "twilight"}
-_PALETTE = 256
 _FEW = 100
 """Frames below which another process does not pay. Measured: it starts in 2 s, a page of 1 Mpx takes 20 ms."""
 _AROUND = 235
@@ -52,9 +45,6 @@ _ENCODERS = {
     ".webm": "-c:v libvpx-vp9 -crf 28 -b:v 0 -deadline realtime -cpu-used 5 -row-mt 1 -pix_fmt yuv420p -f webm",
 }
 """Quality at which text of 9 points keeps its edges; both need an even number of rows and columns."""
-_PATIENCE = 300.0
-"""Seconds after which an ffmpeg that neither takes a page nor ends is ended. Measured: noise of 3840 x 2160 px takes .5
-s a page, and 12 s at the end for the pages held back; the largest page has 8 times as many, and others may compute."""
 MOVIES = (*_ENCODERS, ".gif")
 """Endings of the files that `write_movie` writes."""
 
@@ -220,11 +210,11 @@ def write_movie(
                 progress(done, len(chosen), "")
 
     if exe:
-        write_complete(out, lambda file: _video(file, pages(), fps, [exe, *_ENCODERS[out.suffix.lower()].split()]))
+        write_complete(out, lambda file: video(file, pages(), fps, [exe, *_ENCODERS[out.suffix.lower()].split()]))
     else:
         canvas = drawer.opened()
         samples = [*canvas.mixtures(), *(canvas.page(frame) for frame in spread(chosen, 3))]
-        write_complete(out, lambda file: _gif(file, pages(), fps, samples))
+        write_complete(out, lambda file: gif(file, pages(), fps, samples))
     return out
 
 
@@ -358,7 +348,7 @@ class _Canvas:
         self._grey_part = 256 - int(solid)
         self._packed = []
         for name in drawer.colours:
-            red, green, blue = (colormaps[name](np.arange(_PALETTE) / (_PALETTE - 1))[:, :3].T * 255).astype(np.uint32)
+            red, green, blue = (colormaps[name](np.arange(PALETTE) / (PALETTE - 1))[:, :3].T * 255).astype(np.uint32)
             parts = [part * solid >> np.uint32(8) for part in (red, green, blue)]
             self._packed.append(parts[0] | parts[1] << 8 | parts[2] << 16 | np.uint32(0xFF000000))
         if drawer.times is not None:  # as many decimals in all frames: a text that changes its length jumps
@@ -408,7 +398,7 @@ class _Canvas:
         height, width = (int(side) for side in self.figure.bbox.size[::-1])
         grey = np.linspace(0, 255, height).astype(np.uint32)[:, None] * np.uint32(self._grey_part) >> np.uint32(8)
         for packed in self._packed:
-            mixed = packed[np.linspace(0, _PALETTE - 1, width).astype(int)][None] + grey * np.uint32(0x010101)
+            mixed = packed[np.linspace(0, PALETTE - 1, width).astype(int)][None] + grey * np.uint32(0x010101)
             yield mixed.astype(np.uint32).view(np.uint8).reshape(height, width, 4)
 
     def page(self, frame: int) -> Page:
@@ -496,68 +486,3 @@ def _draw(drawer: _Drawer, frames: list[int], send: Any) -> None:
         return
     except RgbmidicError as error:
         send.send(error)
-
-
-def _video(file: BinaryIO, pages: Iterator[Page], fps: float, encoder: list[str]) -> None:
-    """Encode pages by ffmpeg, which gets the whole path of the open file: `-b.mp4` is an option, `file:b.mp4` a URL."""
-    first, path = next(pages), Path(file.name).absolute()
-    rows, columns = first.shape[:2]
-    exe, *options = encoder
-    source = ["-f", "rawvideo", "-pix_fmt", "rgba", "-s", f"{columns}x{rows}", "-r", f"{fps:g}", "-i", "-"]
-    even = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white"]
-    command = [exe, "-y", "-loglevel", "error", *source, *even, *options, str(path)]
-    with tempfile.TemporaryFile() as errors:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=errors, start_new_session=True)
-        pipe, late = process.stdin, Event()
-        assert pipe is not None
-
-        def end() -> None:
-            late.set()
-            process.kill()
-
-        try:
-            with suppress(BrokenPipeError):  # it says why on stderr
-                for page in chain([first], pages):
-                    _within(_PATIENCE, partial(pipe.write, page.tobytes()), end)
-                _within(_PATIENCE, pipe.close, end)
-            status = _within(_PATIENCE, process.wait, end)
-        finally:
-            process.kill()
-            process.wait()
-        errors.seek(0)
-        said = errors.read().decode(errors="replace").strip().splitlines()
-    if late.is_set():
-        raise ResultError(f"ffmpeg could not write the movie: {exe} did nothing for {_PATIENCE:g} s and was ended")
-    if status != 0 or not path.stat().st_size:
-        reason = said[-1] if said else f"it ended with status {status} and {path.stat().st_size} bytes"
-        raise ResultError(f"ffmpeg could not write the movie: {reason}")
-
-
-def _within(seconds: float, act: Callable[[], Any], late: Callable[[], object]) -> Any:
-    """Call `act`; `late` is called where that takes longer, and lets it end."""
-    timer = Timer(seconds, late)
-    timer.start()
-    try:
-        return act()
-    finally:
-        timer.cancel()
-
-
-def _gif(file: BinaryIO, pages: Iterator[Page], fps: float, samples: list[Page]) -> None:
-    """Write pages as a GIF, one after the other, with one palette found from some of them."""
-    from PIL import GifImagePlugin, Image
-
-    colours = Image.fromarray(np.concatenate(samples)[..., :3]).quantize(_PALETTE - 2, dither=Image.Dither.NONE)
-    palette = Image.new("P", (1, 1))
-    palette.putpalette([0, 0, 0, 255, 255, 255, *(colours.getpalette() or [])])  # the page itself is exact
-    shown = 0.0
-    for number, page in enumerate(pages, 1):
-        image = Image.fromarray(page[..., :3]).quantize(palette=palette, dither=Image.Dither.NONE)
-        if number == 1:
-            for block in GifImagePlugin.getheader(image, info={"loop": 0, "optimize": False})[0]:
-                file.write(block)
-        until = 10 * round(100 * number / fps)  # whole hundredths of a second, which add up to the rate
-        for block in GifImagePlugin.getdata(image, duration=until - shown):
-            file.write(block)
-        shown = until
-    file.write(b";")

@@ -2,20 +2,11 @@
 
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
+from rgbmidic.results.channels import Channels
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
-from rgbmidic.results.histories import (
-    Histories,
-    HistoryColumn,
-    Profile,
-    Wave,
-    history_rows,
-    read_profile,
-    write_histories,
-    write_profile,
-)
+from rgbmidic.results.histories import Histories, HistoryColumn, history_rows, write_histories
 from rgbmidic.results.maps import MapField, Maps, MapValues
 from rgbmidic.results.physical import (
-    Channels,
     channels_of,
     exposure,
     frame_times,
@@ -26,6 +17,7 @@ from rgbmidic.results.physical import (
     shared_part,
     units_of,
 )
+from rgbmidic.results.profiles import Profile, Wave, read_profile, write_profile
 from rgbmidic.results.provenance import Origin
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, ResultQuantity
 from rgbmidic.results.result import Result

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -23,30 +23,19 @@ from rgbmidic.fields import (
     Nodal,
     NodalCovariance,
     Probe,
-    ProfileLine,
     Rectification,
     RigidMotion,
     Units,
-    column,
     make_probe,
     rates,
 )
 from rgbmidic.fields.history import rate_frames, rate_words
-from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
+from rgbmidic.results.channels import Channels
 from rgbmidic.results.files import check_file, write_complete
-from rgbmidic.results.maps import MapField, Maps
-from rgbmidic.results.physical import (
-    Channels,
-    exposure,
-    frame_times,
-    rectification_of,
-    reference_frames,
-    shared_part,
-    units_of,
-)
+from rgbmidic.results.physical import exposure, frame_times, rectification_of, reference_frames, shared_part, units_of
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
-from rgbmidic.typing import AnyArray, FloatArray
+from rgbmidic.typing import FloatArray
 
 _BLURRED = 1.0
 """Motion (px) within the exposure from which a frame is reported to be blurred: the speckle is smeared over a pixel."""
@@ -424,269 +413,3 @@ def _remarks(
     for name, part in read.items():
         if missing := int(np.isnan(part[0].values).sum()):
             yield f"{name} is not measured in {missing} of {len(frames)} frames"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Wave:
-    """A front or peak along a profile, in the profile's units.
-
-    Attributes
-    ----------
-    what, level
-        As of `rgbmidic.fields.profiles.arrival_times`.
-    arrivals, front
-        When it is at each position, and the straight line through that. The uncertainty of the speed includes the
-        scale's.
-    """
-
-    what: str
-    level: float
-    arrivals: Arrivals
-    front: Front
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Profile:
-    """A field along a line in some frames.
-
-    Attributes
-    ----------
-    field
-        What it is.
-    line
-        The points; its positions are in rectified px.
-    frames, numbers : ndarray, shape (T,), int
-        Place in the result and number of each frame.
-    times : ndarray, shape (T,), or None
-        In seconds.
-    units
-        Of lengths and time.
-    values, std : ndarray, shape (T, P)
-        At each point in each frame; NaN where not measured.
-    common_fraction
-        Fraction of the variance that all frames have in common.
-    rate_window
-        Time that a rate is taken over; 0 for what is no rate.
-    how
-        How the field is derived (`Maps.how`).
-    """
-
-    field: MapField
-    line: ProfileLine
-    frames: npt.NDArray[np.int64]
-    numbers: npt.NDArray[np.int64]
-    times: FloatArray | None
-    units: Units
-    values: FloatArray
-    std: FloatArray
-    common_fraction: float
-    rate_window: float
-    how: str = ""
-
-    @classmethod
-    def along(cls, maps: Maps, field: str, place: Sequence[float], frames: Sequence[int] | AnyArray) -> Self:
-        """Lay the points of a profile whose values are not read yet; parameters and errors as `read_profile`.
-
-        Parameters
-        ----------
-        maps
-            The result and how its fields are derived.
-        field
-            Name of the field.
-        place
-            Ends x0, y0, x1, y1 of the line in px of the image.
-        frames
-            Indices of the frames.
-
-        Returns
-        -------
-        Profile
-
-        Raises
-        ------
-        InputError
-            The field has no uncertainty, or no frame is measured yet.
-        """
-        found, result, physical = maps.field(field), maps.result, maps.physical
-        if f"{field}_std" not in maps.all:
-            raise InputError(
-                f'a profile is of a field with an uncertainty, not of "{field}"; these are '
-                + ", ".join(name for name in maps.all if f"{name}_std" in maps.all)
-            )
-        chosen = np.asarray(frames, dtype=np.int64)
-        if not len(chosen):
-            raise InputError(f"no frame of {result.path} is measured yet")
-        line = ProfileLine.between(physical.covariance, physical.gauges, *physical.rectified.place(place, 2))
-        times = frame_times(result, physical.scale)
-        values, std = np.full((2, len(chosen), len(line.points)), np.nan)
-        profile = cls(
-            field=found,
-            how=maps.how.get(found.group, ""),
-            line=line,
-            frames=chosen,
-            numbers=result.number[chosen],
-            times=None if times is None else times[chosen],
-            units=replace(physical.units, timed=times is not None),
-            values=values,
-            std=std,
-            common_fraction=shared_part(result),
-            rate_window=0.0,
-        )
-        rated = "velocity" in field or "acceleration" in field or "_rate" in field
-        interval = float(np.median(np.diff(profile.clock))) if len(chosen) > 1 else 0.0
-        return replace(profile, rate_window=(maps.window - 1) * interval if rated else 0.0)
-
-    def fill(self, maps: Maps, rows: Iterable[int]) -> None:
-        """Read some rows of the values and of their uncertainties, in place.
-
-        Parameters
-        ----------
-        maps
-            The result and how its fields are derived.
-        rows
-            Indices of the rows, one a frame.
-        """
-        for row in rows:
-            read = maps.read(self.field.name, int(self.frames[row]))
-            self.values[row], self.std[row] = self.line.read(read.values, read.std, self.kind)
-
-    @property
-    def positions(self) -> FloatArray:
-        """Distance (P,) of the points from the first end, in the unit of lengths."""
-        return self.line.positions * (self.units.mm_per_pixel or 1.0)
-
-    @property
-    def clock(self) -> FloatArray:
-        """Times (T,) in s, or numbers of the frames where no time is known."""
-        return np.asarray(self.numbers if self.times is None else self.times, dtype=np.float64)
-
-    @property
-    def kind(self) -> str:
-        """Key of `ProfileLine.correlations`: how the errors of the field hang together."""
-        if self.field.name[:3] in ("exx", "eyy"):
-            return self.field.name[:3]
-        return "strain" if self.field.unit in ("", "deg") or "_rate" in self.field.name else ""
-
-    def wave(self, what: str = "front", level: float = 0.5) -> Wave:
-        """Fit the speed of a front or peak.
-
-        Parameters
-        ----------
-        what, level
-            As of `rgbmidic.fields.profiles.arrival_times`.
-
-        Returns
-        -------
-        Wave
-
-        Raises
-        ------
-        InputError
-            Nothing travels along the line, or `what` or `level` is none of those allowed.
-        """
-        clock = self.clock
-        between = rate_correlation(clock, self.rate_window) if self.rate_window else None
-        more: dict[str, Any] = {
-            "common_fraction": 0.0 if self.rate_window else self.common_fraction,
-            "between_frames": between,
-        }
-        arrivals = arrival_times(clock, self.values, self.std, what=what, level=level, **more)
-        correlation = self.line.correlation(self.kind)
-        front = fit_front(self.positions, arrivals, self.std, correlation, usable=self.line.even, **more)
-        scale = self.units.mm_per_pixel_std / (self.units.mm_per_pixel or 1.0)
-        front = replace(front, speed_std=float(np.hypot(front.speed_std, scale * front.speed)))
-        return Wave(what=what, level=level, arrivals=arrivals, front=front)
-
-
-def read_profile(maps: Maps, field: str, place: Sequence[float], frames: Sequence[int] | None = None) -> Profile:
-    """Read a field along a line in every frame.
-
-    Parameters
-    ----------
-    maps
-        The result and how its fields are derived.
-    field
-        Name of the field.
-    place
-        Ends x0, y0, x1, y1 of the line in px of the image.
-    frames
-        Indices of the frames; None: all that are measured.
-
-    Returns
-    -------
-    Profile
-
-    Raises
-    ------
-    InputError
-        There is no such field or frame, it has no uncertainty, or half of the line is outside the mesh.
-    """
-    profile = Profile.along(maps, field, place, np.flatnonzero(maps.result.finished) if frames is None else frames)
-    profile.fill(maps, range(len(profile.frames)))
-    if not np.isfinite(profile.values).any():
-        raise InputError(f"{field} is measured in no frame along the line; place it elsewhere")
-    return profile
-
-
-def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *, overwrite: bool = False) -> None:
-    """Write a profile as CSV, one row for each frame and point; with a wave its arrival times beside it.
-
-    Parameters
-    ----------
-    profile
-        What is written: frame, number, time, position along the line, place, value and uncertainty.
-    out
-        File to write.
-    wave
-        Its arrival times and residuals go into a file whose name ends in ``_arrivals.csv``, one row a position.
-    overwrite
-        Replace files that are already there.
-
-    Raises
-    ------
-    ResultError
-        A file exists, its folder does not, or it cannot be written.
-    """
-    out = Path(out)
-    beside = arrivals_file(out)
-    for file in (out, *([beside] if wave else [])):
-        check_file(file, overwrite=overwrite)
-    unit, name = profile.units.length, profile.field
-    places = profile.line.points * (profile.units.mm_per_pixel or 1.0)
-    head = [column(part, unit) for part in ("position", "x", "y")]
-    at = np.column_stack([profile.positions, places]).tolist()
-    value = column(name.name, name.unit)
-
-    def table(file: BinaryIO) -> None:
-        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-        writer = csv.writer(text)
-        timed = [] if profile.times is None else ["time_s"]
-        writer.writerow(["frame", "number", *timed, *head, value, f"{value}_std"])
-        for row, (frame, number, clock) in enumerate(zip(profile.frames, profile.numbers, profile.clock, strict=True)):
-            start = [frame, number, *([f"{clock:.12g}"] if timed else [])]
-            for place, *pair in zip(at, profile.values[row], profile.std[row], strict=True):
-                writer.writerow([*start, *map(_number, (*place, *pair))])
-        text.detach()  # leaves the file open for whoever opened it
-
-    write_complete(out, table)
-    if wave is None:
-        return
-    clock = "s" if profile.times is not None else "frame"
-    columns = {
-        **dict(zip(head, np.array(at).T, strict=True)),
-        f"arrival_{clock}": wave.arrivals.times,
-        f"arrival_{clock}_std": wave.arrivals.std,
-        f"residual_{clock}": wave.front.residuals,
-        "used": wave.front.used.astype(float),
-    }
-    rows = "".join(",".join(map(_number, row)) + "\r\n" for row in np.column_stack([*columns.values()]).tolist())
-    write_complete(beside, lambda file: file.write((",".join(columns) + "\r\n" + rows).encode()))
-
-
-def arrivals_file(out: Path) -> Path:
-    """Return the file of arrival times beside that of a profile."""
-    return out.with_name(f"{out.stem}_arrivals.csv")
-
-
-def _number(value: float) -> str:
-    return "" if value != value else f"{value:.9g}"

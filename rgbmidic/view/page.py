@@ -35,8 +35,9 @@ from rgbmidic.view.address import (
     probe_place,
 )
 from rgbmidic.view.canvas import Canvas, LabelLayer, LineLayer, arrow_lines, contour_lines, direction_lines
-from rgbmidic.view.curves import CurvePanel, LinePanel, Progress, TimeLine, as_csv, marks_of, probes
+from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv, marks_of, probes
 from rgbmidic.view.draft import Confirmation, Draft, channel_section, probe_section, scale_section
+from rgbmidic.view.line_panel import LinePanel
 from rgbmidic.view.models import CONTROLS, WRITTEN, MarkLayer, ResultControls, SharedState, script
 from rgbmidic.view.picture import (
     AROUND,

@@ -14,7 +14,8 @@ from viewer import MISSING, Page, chromium, click, serving
 
 from rgbmidic.report import write_movie
 from rgbmidic.results import FrameRecord, Maps, Result, ResultStore
-from rgbmidic.results.histories import read_histories, read_profile
+from rgbmidic.results.histories import read_histories
+from rgbmidic.results.profiles import read_profile
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings
 from rgbmidic.view import setup_panel
 from rgbmidic.view.picture import element_at, robust_range

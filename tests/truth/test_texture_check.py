@@ -8,7 +8,7 @@ import pytest
 
 from rgbmidic import correlate
 from rgbmidic.frames.data import ChannelFrame
-from rgbmidic.pipeline.plan import FAINT_TEXTURE, NO_TEXTURE, neighbour_correlation
+from rgbmidic.pipeline.suitability import FAINT_TEXTURE, NO_TEXTURE, neighbour_correlation
 
 SIDE = 256
 SHIFT = (0.4, -0.3)

@@ -14,7 +14,7 @@ from rgbmidic import NodeStatus, Status, TestSettings, cli
 from rgbmidic.command import execute
 from rgbmidic.results import QUANTITIES
 from rgbmidic.results.quantities import SHARED
-from rgbmidic.settings import _place, _sections
+from rgbmidic.settings.schema import _place, _sections
 from rgbmidic_calibration import cli as calibrate
 
 ROOT = Path(__file__).resolve().parents[2]

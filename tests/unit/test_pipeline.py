@@ -28,8 +28,8 @@ from rgbmidic.errors import (
 from rgbmidic.frames import FrameSeries, file_hash
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination import demosaicing as reflection_aware
+from rgbmidic.illumination import separation
 from rgbmidic.pipeline import Plan, measure_frame
-from rgbmidic.pipeline import source as separation
 
 BAYER_RMS = 0.015
 """px: Malvar demosaicing and the noise of a 12-bit camera on a plate without reflections."""

@@ -13,7 +13,7 @@ from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.prediction import Prediction
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.plan import SPECKLES
+from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 TOO_FINE = 0.75

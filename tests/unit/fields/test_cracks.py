@@ -10,7 +10,7 @@ import pytest
 from rgbmidic import Region, Tri3Mesh
 from rgbmidic.errors import InputError
 from rgbmidic.fields import Nodal, NodalCovariance, Units, Williams, crack_jump, stress_intensity
-from rgbmidic.fields.cracks import williams_series
+from rgbmidic.fields.crack_tip import williams_series
 
 SIZE = 14
 STD = 0.01

@@ -84,7 +84,7 @@ def test_tables_files_and_one_sentence(command, test_file, tmp_path):
         (["--sizes", "16", "--gauges", "a"], "--gauges are different lengths"),
         (["--sizes", "16", "--frames", "0"], "frame 0 is of the reference"),
         (["--sizes", "16", "--frames", "7"], "frame 7 is not among 0 to 1"),
-        (["--sizes", "16", "--frames", "1.5"], "--frames are whole numbers"),
+        (["--sizes", "16", "--frames", "1.5"], "--frames are indices and ranges"),
     ],
 )
 def test_wrong_input_is_one_line_and_status_2(command, test_file, tmp_path, options, text):

@@ -18,7 +18,8 @@ from benchmarks.tables import FOLDER, Table
 from rgbmidic.errors import AnotherTestError, ConfigurationError, FrameError, InputError, RegionError
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import Plan, measure, measure_sequence, resolution
-from rgbmidic.pipeline.resolution import ResolutionStudy, SizeFigures, study_sizes
+from rgbmidic.pipeline.resolution import study_sizes
+from rgbmidic.pipeline.size_figures import ResolutionStudy, SizeFigures
 from rgbmidic.report.setup import analysis_rows
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import TestSettings

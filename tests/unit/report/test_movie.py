@@ -18,7 +18,7 @@ from results import NODES, make_result, smooth_record
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import FrameError, InputError, ResultError
-from rgbmidic.report import movie
+from rgbmidic.report import movie, video
 from rgbmidic.report.movie import Curve, write_movie
 from rgbmidic.results import FrameRecord, Maps
 from rgbmidic.view.picture import RawPictures
@@ -159,7 +159,7 @@ def test_an_ffmpeg_that_does_not_do_its_work_is_an_error_and_nothing_is_left(
     out.mkdir()
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(exe))
     if "sleep" in does:
-        monkeypatch.setattr(movie, "_PATIENCE", 0.2)
+        monkeypatch.setattr(video, "_PATIENCE", 0.2)
     with pytest.raises(ResultError, match=told):
         write_movie(maps, out / "m.mp4", ["u"], width=320)
     assert not list(out.iterdir())
@@ -184,7 +184,7 @@ def test_nothing_is_left_of_a_movie_whose_command_is_terminated(
         os.kill(os.getpid(), signal.SIGTERM)
         raise AssertionError("still writing")
 
-    monkeypatch.setattr(movie, "_gif", terminated)
+    monkeypatch.setattr(movie, "gif", terminated)
     before = signal.getsignal(signal.SIGTERM)
     out = tmp_path / "m.gif"
     assert execute(cli.app, ["movie", str(maps.result.path), "--out", str(out), "--width", "320"]) == 130

@@ -18,7 +18,8 @@ from rgbmidic.errors import InputError
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
 from rgbmidic.report.comparison import scale_text
 from rgbmidic.results import FrameRecord, Result
-from rgbmidic.results.comparison import Comparison, Levelling, Simulation, measured_mesh, place
+from rgbmidic.results.comparison import Comparison, Levelling, measured_mesh
+from rgbmidic.results.simulation import Simulation, place
 
 NODES, STD, MM = len(MESH.nodes), 0.01, 0.05
 PLACEMENT = Placement.fit([[0, 0, 10, 170], [10, 0, 210, 170], [0, 8, 10, 10]])
@@ -339,7 +340,7 @@ def option(*words: str) -> Callable[[list[str]], None]:
         (option("--points", "1,2"), "--points is X_MM,Y_MM:X_PX,Y_PX, such as"),
         (option("--frames", "99"), "there is no frame 99"),
         (option("--frames", "1,0"), "is of the reference, against which nothing has moved"),
-        (option("--frames", "a"), "--frames are whole numbers"),
+        (option("--frames", "a"), "--frames are indices and ranges"),
         (option("--rigid", "keep"), '--rigid is tell or remove, not "keep"'),
         (option("--fe", "missing.vtu"), "missing.vtu"),
         (option("--fe", "{}"), "the times of the files"),

@@ -1,0 +1,524 @@
+"""Stress intensity at the tip of a crack: Williams' series fitted to the displacements around it.
+
+Near the tip of a straight crack in a plane linear elastic body the displacement is Williams' series (J Appl Mech 24,
+1957), here in the complex form of Roux, Réthoré and Hild (J Phys D 42, 214004, 2009), with r and the angle t from the
+direction of the crack, the shear modulus G and Kolosov's constant k::
+
+    2 G (u + i v) = sum_n r^(n/2) [ a_n (k e^(i n t/2) - n/2 e^(i (2 - n/2) t) + (n/2 + (-1)^n) e^(-i n t/2))
+                                - i b_n (k e^(i n t/2) + n/2 e^(i (2 - n/2) t) - (n/2 - (-1)^n) e^(-i n t/2)) ]
+
+``K_I = sqrt(2 pi) a_1``, ``K_II = sqrt(2 pi) b_1``, the T-stress is ``4 a_2``; n = 0 and b_2 are the rigid motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import cholesky, solve_triangular
+
+from rgbmidic.errors import InputError
+from rgbmidic.fields.cracks import at_some, crack_faces, listed, lowest_copies, nearest_node
+from rgbmidic.fields.history import History, Nodal, Units
+from rgbmidic.fields.nodal import NodalCovariance, Places
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.typing import BoolArray, FloatArray
+
+_INNER = 2.0
+"""Least inner radius of an annulus, in elements: from there on K of an image without noise is right to .3 % (measured,
+docs/how-to/results.md)."""
+
+
+_STRAIGHT = 1.0
+"""Distance (px) of a straight crack's nodes from its line: as near as a row of nodes follows a stated path."""
+
+
+_MOST_TERMS = 7
+"""Highest term of the series that a test may ask for."""
+
+
+_PER_COEFFICIENT = 4
+"""Least number of measured components of displacement for a coefficient of the series."""
+
+
+_CHANCE = 1e-3
+"""Probability with which noise alone asks for more terms of the series, over all frames together."""
+
+
+_GAP_DEG = 45.0
+"""Largest angle without a measured node: half of the shortest period, 90 degrees, of the terms up to the 7th that are
+left when the smooth ones are taken (chosen)."""
+
+
+_OUTSIDE = 0.02
+"""Part of an annulus that may be outside the mesh: slivers at the edge are left out of it."""
+
+
+_STEPS, _EXACT = 20, 1e-3
+"""Most Gauss-Newton steps of a tip's place, and the step (px) that ends them."""
+
+
+_POOR = 1.5
+"""Chi-square over its degrees of freedom from which a remark says that the field is not the series'."""
+
+
+_LEAST = 1e-3
+"""Least uncertainty of a node over the median one: a node that is stated without noise does not outweigh all others."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Williams:
+    """What the fit of Williams' series needs beside the displacements.
+
+    Attributes
+    ----------
+    youngs_modulus, poissons_ratio
+        Of the material; the modulus in MPa.
+    plane
+        ``"stress"`` (a thin body) or ``"strain"`` (a thick one).
+    units
+        With the millimetres for a pixel.
+    terms
+        Highest term N of the series; 0: the least one that a chi-square test accepts in all frames.
+    fit_tip
+        Whether the tip's place along the crack is fitted in every frame; else it is that of the mesh.
+    """
+
+    youngs_modulus: float
+    poissons_ratio: float
+    plane: Literal["stress", "strain"]
+    units: Units
+    terms: int = 0
+    fit_tip: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        e, nu = self.youngs_modulus, self.poissons_ratio
+        if not (
+            e > 0 and -1 < nu <= 0.5 and self.plane in ("stress", "strain") and (self.terms == 0 or self.terms >= 2)
+        ):
+            raise InputError(
+                "Williams' series needs a Young's modulus above 0 MPa, a Poisson's ratio above -1 and at most .5, the "
+                f'plane "stress" or "strain", and terms 0, 2 or more; given are {e:g}, {nu:g}, "{self.plane}", '
+                f"{self.terms}"
+            )
+        if self.units.mm_per_pixel is None:
+            raise InputError(
+                "stress intensity factors, in MPa √m, need the scale of the image: state mm_per_pixel or camera in "
+                "[scale] (`rgbmidic scale` finds the former)"
+            )
+
+    @property
+    def shear(self) -> float:
+        """Twice the shear modulus, MPa."""
+        return self.youngs_modulus / (1 + self.poissons_ratio)
+
+    @property
+    def kolosov(self) -> float:
+        """Kolosov's constant."""
+        nu = self.poissons_ratio
+        return 3 - 4 * nu if self.plane == "strain" else (3 - nu) / (1 + nu)
+
+
+def williams_series(r: FloatArray, angle: FloatArray, orders: range, kolosov: float) -> FloatArray:
+    """Evaluate the terms of Williams' series times 2 G, in axes along the crack and to its left.
+
+    Parameters
+    ----------
+    r, angle : ndarray, shape (m,)
+        Distance from the tip, and angle from the direction of the crack to its left, rad.
+    orders
+        The numbers n of the terms.
+    kolosov
+        Kolosov's constant.
+
+    Returns
+    -------
+    ndarray, shape (m, 2, p)
+        u and v of a_n and b_n, one n after the other.
+    """
+    terms = []
+    for n in orders:
+        sign, power = (-1) ** n, r ** (n / 2)
+        turn, over, back = (np.exp(1j * k * angle) for k in (n / 2, 2 - n / 2, -n / 2))
+        terms.append(power * (kolosov * turn - n / 2 * over + (n / 2 + sign) * back))
+        terms.append(-1j * power * (kolosov * turn + n / 2 * over - (n / 2 - sign) * back))
+    series = np.stack(terms, axis=-1)
+    return np.stack([series.real, series.imag], axis=1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StressIntensity:
+    """Stress intensity at a tip; NaN in frames in which the annulus is not measured.
+
+    Attributes
+    ----------
+    factors, factors_std : ndarray, shape (T, 2)
+        K_I and K_II and their standard uncertainty, MPa √m. K_II is positive where the left side moves ahead.
+    t_stress, t_stress_std : ndarray, shape (T,)
+        MPa.
+    extension, extension_std : ndarray, shape (T,), or None
+        Distance (px) by which the fitted tip is ahead of the mesh's; None where it is not fitted.
+    chi_square : ndarray, shape (T,)
+        Of the fit over its degrees of freedom: 1 where the series describes the field within its stated uncertainty.
+    terms
+        Highest term of the series.
+    """
+
+    factors: FloatArray
+    factors_std: FloatArray
+    t_stress: FloatArray
+    t_stress_std: FloatArray
+    extension: FloatArray | None
+    extension_std: FloatArray | None
+    chi_square: FloatArray
+    terms: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CrackTip:
+    """A probe of the stress intensity factors at the tip of a straight crack.
+
+    Attributes
+    ----------
+    name, nodes
+        See `Probe`.
+    tip : ndarray, shape (2,)
+        Place of the mesh's tip, px.
+    axes : ndarray, shape (2, 2)
+        Rows: direction of the crack, and to its left as seen.
+    points : ndarray, shape (m, 2)
+        The nodes of the annulus in these axes from the tip, px.
+    face : ndarray, shape (m,)
+        1 for a node on the left side of the crack, -1 on its right side, else 0.
+    radii : tuple of float
+        Of the annulus, px.
+    correlation : ndarray, shape (m, m)
+        Of the nodes' errors.
+    williams
+        Material, scale and what is fitted.
+    """
+
+    name: str
+    nodes: npt.NDArray[np.int64]
+    tip: FloatArray
+    axes: FloatArray
+    points: FloatArray
+    face: FloatArray
+    radii: tuple[float, float]
+    correlation: FloatArray
+    williams: Williams
+
+    @classmethod
+    def at(cls, covariance: NodalCovariance, name: str, *place: float, williams: Williams) -> Self:
+        """Lay an annulus around the tip at x, y, from one radius to another, px.
+
+        Raises
+        ------
+        InputError
+            The place is no tip of the mesh, the crack is not straight up to the outer radius, or the annulus leaves the
+            region, has too few nodes, or reaches into the elements at the tip.
+        """
+        mesh, (inner, outer) = covariance.mesh, place[2:]
+        faces, places = crack_faces(mesh), lowest_copies(mesh)
+        alone = np.setdiff1d(faces, mesh.copies)
+        node = nearest_node(mesh, name, alone, np.array(place[:2]), "the tip of a crack")
+        tip = mesh.nodes[node]
+        if not _INNER * mesh.size <= inner < outer:
+            raise InputError(
+                f"{name} needs an inner radius of 2 elements, {_INNER * mesh.size:.3g} px, or more, as nearer nodes do "
+                f"not resolve the field at a tip, and a larger outer one; given are {inner:g} and {outer:g} px"
+            )
+        near = np.setdiff1d(places[faces], node)
+        behind = tip - mesh.nodes[near]
+        behind = behind[np.hypot(*behind.T) < outer]
+        ahead = behind.sum(axis=0) / np.hypot(*behind.sum(axis=0))
+        axes = np.array([ahead, [ahead[1], -ahead[0]]])
+        along, beside = axes @ behind.T
+        if np.abs(beside).max() > _STRAIGHT or along.min() < 0 or along.max() < outer - 2 * mesh.size:
+            raise InputError(
+                f"{name} needs one crack that is straight from the tip at ({listed(tip.round(1))}) px to the outer "
+                f"radius, {outer:g} px; it is {along.max():.4g} px long there and leaves its line by "
+                f"{np.abs(beside).max():.3g} px"
+            )
+        side = np.zeros(len(mesh.nodes))
+        forward = (mesh.nodes[faces[:, 1]] - mesh.nodes[faces[:, 0]]) @ ahead > 0
+        side[faces[forward]], side[faces[~forward]] = -1, 1
+        away = np.hypot(*(mesh.nodes - tip).T)
+        nodes = np.flatnonzero((away >= inner) & (away <= outer))
+        probe = cls(
+            name=name,
+            nodes=nodes,
+            tip=tip,
+            axes=axes,
+            points=(mesh.nodes[nodes] - tip) @ axes.T,
+            face=side[nodes],
+            radii=(float(inner), float(outer)),
+            correlation=covariance.part(nodes),
+            williams=williams,
+        )
+        probe._check_annulus(mesh)
+        return probe
+
+    def _check_annulus(self, mesh: Tri3Mesh) -> None:
+        inner, outer = self.radii
+        angles, radii = np.linspace(0, 2 * np.pi, 90, endpoint=False), np.linspace(inner, outer, 40)
+        ring = self.tip + radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        outside = 1 - Places.of(mesh, ring.reshape(-1, 2)).inside.reshape(ring.shape[:2]).mean(axis=1)
+        where = f"{self.name}: the annulus from {inner:g} to {outer:g} px around ({listed(self.tip.round(1))}) px"
+        if (outside > _OUTSIDE).any():
+            cut = int(np.argmax(outside > _OUTSIDE))
+            most = f"it may reach to {radii[cut - 1]:.4g} px" if cut else "no part of it is within"
+            raise InputError(
+                f"{where} leaves the region (edge or hole) at {100 * outside.max():.0f} % of its angles; {most}"
+            )
+        if not self._enough(np.ones(len(self.nodes), dtype=bool)):
+            raise InputError(
+                f"{where} has {len(self.nodes)} nodes, none over up to {self._gap(self.points):.0f} degrees; "
+                f"{self._least} are needed, and one every {_GAP_DEG:g} degrees: widen it, or take smaller elements"
+            )
+
+    @property
+    def _least(self) -> int:
+        """Least number of nodes for the terms that are asked for."""
+        return _PER_COEFFICIENT * ((self.williams.terms or 2) + 1)
+
+    @property
+    def most_terms(self) -> int:
+        """Highest term that is taken, stated or allowed to the test."""
+        return self.williams.terms or min(_MOST_TERMS, len(self.nodes) // _PER_COEFFICIENT - 1)
+
+    def series(self, points: FloatArray, face: FloatArray, orders: range) -> FloatArray:
+        """Evaluate terms at points (m, 2), those of a `face` on its side, in (r / outer radius)^(n/2); (m, 2, p)."""
+        angle = np.arctan2(points[:, 1], points[:, 0])
+        angle += 2 * np.pi * face * (angle * face < 0)
+        return williams_series(np.hypot(*points.T) / self.radii[1], angle, orders, self.williams.kolosov)
+
+    def _gap(self, points: FloatArray) -> float:
+        """Largest angle in degrees without a point, the crack's two sides being ends."""
+        return float(np.degrees(np.diff(np.sort([-np.pi, *np.arctan2(points[:, 1], points[:, 0]), np.pi])).max()))
+
+    def _enough(self, known: BoolArray) -> bool:
+        return bool(known.sum() >= self._least and self._gap(self.points[known]) <= _GAP_DEG)
+
+    def read(self, nodal: Nodal) -> StressIntensity:
+        """Fit the series to the displacements of the `nodes` in every frame.
+
+        The weights are the inverse covariance of the nodes, neighbours correlated. Where the chi-square is above its
+        degrees of freedom the uncertainty grows by the root of their ratio (Birge, Phys Rev 40, 1932). The terms go up
+        to the least N from which all those beyond it lower no frame's chi-square by more than noise would, once in a
+        thousand tests; where the tip is fitted the terms n = -1, which shift it, take part in that.
+        """
+        fields = np.stack([nodal.u, nodal.v, nodal.u_std, nodal.v_std], axis=1)
+        known: BoolArray = np.asarray(np.isfinite(fields).all(axis=1))
+        frames = np.flatnonzero([self._enough(row) for row in known])
+        data = {frame: _Weighted.of(self, fields[frame], known[frame]) for frame in frames.tolist()}
+        fit_tip = self.williams.fit_tip
+        terms = self.williams.terms or self._terms([one for one in data.values() if not one.certain])
+        found = np.full((len(fields), 4, 2), np.nan)
+        chi_square = np.full(len(fields), np.nan)
+        for frame, weighted in data.items():
+            if (fit := weighted.fit(terms, fit_tip=fit_tip)) is not None:
+                values, covariance, chi_square[frame] = fit
+                std = np.sqrt(np.diag(covariance) * max(1.0, chi_square[frame]))
+                if weighted.certain:
+                    std, chi_square[frame] = 0 * std, np.nan
+                found[frame] = np.stack([values, std], axis=1)[[2, 3, 4, -1]]
+        outer, units, scale = self.radii[1], self.williams.units, self.williams.shear
+        assert units.mm_per_pixel is not None
+        # coefficients are those of (r / outer)^(n/2); a pixel is mm_per_pixel / 1000 m
+        factors = scale * np.sqrt(2 * np.pi * units.mm_per_pixel * 1e-3 / outer) * found[:, :2]
+        factors[..., 1] = np.hypot(factors[..., 1], factors[..., 0] * units.mm_per_pixel_std / units.mm_per_pixel / 2)
+        t_stress = 4 * scale / outer * found[:, 2]
+        return StressIntensity(
+            factors=factors[..., 0],
+            factors_std=factors[..., 1],
+            t_stress=t_stress[:, 0],
+            t_stress_std=t_stress[:, 1],
+            extension=found[:, 3, 0] if fit_tip else None,
+            extension_std=found[:, 3, 1] if fit_tip else None,
+            chi_square=chi_square,
+            terms=terms,
+        )
+
+    def _terms(self, frames: list[_Weighted]) -> int:
+        """Choose the highest term of the series."""
+        from scipy.stats import chi2
+
+        most = self.most_terms
+        orders = range(-1 if self.williams.fit_tip else 0, most + 1)
+        misfits = np.array([frame.misfits(orders) for frame in frames]).reshape(-1, len(orders))
+        freedom = np.array([2 * len(frame.points) - 2 * len(orders) for frame in frames])
+        level = np.maximum(1, misfits[:, -1] / freedom)
+        for terms in range(2, most):
+            limit = chi2.isf(_CHANCE / max(len(frames), 1), 2 * (most - terms))
+            if (misfits[:, terms - most - 1] - misfits[:, -1] < limit * level).all():
+                return terms
+        return most
+
+    def histories(self, nodal: Nodal) -> list[History]:
+        """Compute the stress intensity factors, the T-stress, the fitted tip's way and the chi-square of the fit."""
+        s, w = self.read(nodal), self.williams
+        tip = "its place along the crack is fitted" if w.fit_tip else "its place is that of the mesh"
+        note = (
+            f"{self.name}: tip at ({listed(self.tip.round(1))}) px, {tip}; Williams' series up to n = {s.terms} "
+            f"({'stated' if w.terms else 'by a test'}), {len(self.nodes)} nodes at {listed(self.radii)} px, plane "
+            f"{w.plane}, E = {w.youngs_modulus:g} MPa, nu = {w.poissons_ratio:g}"
+        )
+        if np.isfinite(s.chi_square).any() and (worst := np.nanmax(s.chi_square)) > _POOR:
+            note += (
+                f"; its chi-square over the degrees of freedom is up to {worst:.3g}, where 1 is expected: the "
+                "field is not the series' within the noise, and what this makes of the factors is not known"
+            )
+        parts: list[tuple[str, str, FloatArray | None, FloatArray | None]] = [
+            ("K1", "MPa √m", s.factors[:, 0], s.factors_std[:, 0]),
+            ("K2", "MPa √m", s.factors[:, 1], s.factors_std[:, 1]),
+            ("T", "MPa", s.t_stress, s.t_stress_std),
+            ("extension", "px", s.extension, s.extension_std),
+            ("chi_square", "", s.chi_square, None),
+        ]
+        return [
+            History(name=f"{self.name}_{name}", unit=unit, values=values, std=std, note=note)
+            for name, unit, values, std in parts
+            if values is not None
+        ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Weighted:
+    """The displacements of a frame in an annulus, without rotation, and what makes their errors independent.
+
+    Attributes
+    ----------
+    probe
+        The tip.
+    points, face
+        Those of `CrackTip` that are measured.
+    data : ndarray, shape (2 m,)
+        Displacements over their errors.
+    turned : ndarray, shape (2, 2)
+        The crack's axes as the body has turned: rows.
+    whiten
+        Divides fields (2, m, p) by their errors, (2 m, p).
+    certain
+        Whether the displacements are stated without uncertainty, as those of the reference: all errors are then 1 px.
+    """
+
+    probe: CrackTip
+    points: FloatArray
+    face: FloatArray
+    data: FloatArray
+    turned: FloatArray
+    whiten: Callable[[FloatArray], FloatArray]
+    certain: bool
+
+    @classmethod
+    def of(cls, probe: CrackTip, field: FloatArray, known: BoolArray) -> Self:
+        """Take the measured of the displacements and uncertainties (4, m) of a frame."""
+        factor, std = cholesky(probe.correlation[np.ix_(known, known)], lower=True), field[2:, known]
+        level = float(np.median(std))
+        std = np.maximum(std, _LEAST * level) if level > 0 else np.ones_like(std)
+
+        def whiten(parts: FloatArray) -> FloatArray:
+            scaled = parts / std[:, :, None]
+            return np.concatenate([solve_triangular(factor, part, lower=True) for part in scaled])
+
+        points, face, most = probe.points[known], probe.face[known], probe.most_terms
+        arm = points @ probe.axes
+        arm -= arm.mean(axis=0)
+        there = arm + field[:2, known].T
+        there -= there.mean(axis=0)
+        # the series is that of small rotations: the body's, from the best one (Kabsch), is then that of its own term
+        angle = np.arctan2((arm[:, 0] * there[:, 1] - arm[:, 1] * there[:, 0]).sum(), (arm * there).sum())
+        for last in (False, True):
+            turned = probe.axes @ (turn := np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]))
+            data = there - arm @ turn
+            if not last:
+                series = probe.series(points, face, range(most + 1)).reshape(2 * len(points), -1)
+                rotation = np.linalg.lstsq(series, (data @ turned.T).ravel(), rcond=None)[0][5]
+                angle += (probe.williams.kolosov + 1) * rotation / probe.radii[1]
+        white = whiten(data.T[:, :, None])[:, 0]
+        return cls(
+            probe=probe, points=points, face=face, data=white, turned=turned, whiten=whiten, certain=not level > 0
+        )
+
+    def series(self, orders: range, tip: float = 0.0) -> FloatArray:
+        """Evaluate the terms, in (r / outer radius)^(n/2), for a tip so many px ahead; (2, m, p)."""
+        series = self.probe.series(self.points - (tip, 0.0), self.face, orders)
+        return np.asarray(np.einsum("mcp,ci->imp", series, self.turned))
+
+    def misfits(self, orders: range) -> FloatArray:
+        """Chi-square of the best fit of the terms up to each."""
+        taken = np.linalg.qr(self.whiten(self.series(orders)))[0].T @ self.data
+        return np.asarray((self.data**2).sum() - np.cumsum((taken**2).reshape(-1, 2).sum(axis=1)))
+
+    def fit(self, terms: int, *, fit_tip: bool) -> tuple[FloatArray, FloatArray, float] | None:
+        """Fit the terms: coefficients, their covariance, and chi-square over its degrees of freedom.
+
+        With `fit_tip` the last value is the way (px) by which the tip is ahead, less than half the inner radius, beyond
+        which the annulus is another one; None where it is not found.
+        """
+        orders, tip, step = range(terms + 1), 0.0, 1e-3 * self.probe.radii[1]
+        solved = self._solved(self.series(orders))
+        for _ in range(_STEPS if fit_tip else 0):
+            values = solved[0][: 2 * len(orders)]
+            slope = (self.series(orders, tip + step) - self.series(orders, tip - step)) @ values / (2 * step)
+            solved = self._solved(np.concatenate([self.series(orders, tip), slope[..., None]], axis=2))
+            change = float(solved[0][-1])
+            tip += change
+            if not abs(tip) < self.probe.radii[0] / 2:
+                return None
+            if abs(change) < _EXACT:
+                return np.r_[solved[0][:-1], tip], *solved[1:]
+        return None if fit_tip else solved
+
+    def _solved(self, parts: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        design = self.whiten(parts)
+        q, triangle = np.linalg.qr(design)
+        inverse = solve_triangular(triangle, np.eye(len(triangle)))
+        values = inverse @ (q.T @ self.data)
+        chi_square = ((self.data - design @ values) ** 2).sum() / (len(self.data) - len(values))
+        return values, inverse @ inverse.T, float(chi_square)
+
+
+def stress_intensity(
+    nodes: FloatArray,
+    elements: npt.NDArray[np.int32],
+    displacement: Nodal,
+    tip: tuple[float, float],
+    radii: tuple[float, float],
+    williams: Williams,
+) -> StressIntensity:
+    """Fit Williams' series around the tip of a straight crack of a mesh.
+
+    Parameters
+    ----------
+    nodes : ndarray, shape (N, 2)
+        In px on the reference.
+    elements : ndarray, shape (E, 3)
+        Node indices.
+    displacement
+        Of all nodes, each field (T, N), px.
+    tip
+        Point (x, y) at the tip, px.
+    radii
+        Inner and outer radius of the annulus whose nodes are taken, px.
+    williams
+        Material, scale, and what is fitted.
+
+    Returns
+    -------
+    StressIntensity
+
+    Raises
+    ------
+    InputError
+        The place is no tip of the mesh, the crack is not straight up to the outer radius, or the annulus leaves the
+        region, has too few nodes, or reaches into the elements at the tip.
+    """
+    covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
+    probe = CrackTip.at(covariance, "the tip", *tip, *radii, williams=williams)
+    return probe.read(at_some(displacement, probe.nodes))

@@ -1,0 +1,256 @@
+"""A finite-element result that a measurement is compared with: its tables, read from files."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+from xml.etree import ElementTree
+
+import numpy as np
+import numpy.typing as npt
+
+from rgbmidic.errors import InputError
+from rgbmidic.mesh import FiniteElementMesh, Placement, read_mesh
+from rgbmidic.results.physical import placement_of, rectification_of, scale_of
+from rgbmidic.results.result import Result
+from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, regular
+from rgbmidic.typing import FloatArray
+
+logger = logging.getLogger(__name__)
+
+_DIFFERENT = 0.01
+"""Relative difference of the scale of points from a stated one above which a warning names both: half a pixel at each
+end of 100 px is .7 % (derived)."""
+
+
+_FIELDS = ("displacement", "displacements", "u", "disp")
+"""Names, in small letters, under which a displacement is written: by ParaView and CalculiX, by Abaqus, by others."""
+
+
+_COMPONENT = re.compile(r"(?:u|v|u[xy12]|u_[xy12])(?:_(mm|m|um|inch))?", re.IGNORECASE)
+
+
+_TIMES = {"time": 1.0, "time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Simulation:
+    """Displacement that a simulation has at its nodes, over time.
+
+    Attributes
+    ----------
+    mesh
+        Its mesh.
+    displacement : ndarray, shape (S, M, 2)
+        Of S states, in mm along the mesh's axes; NaN where a table has no row for a node.
+    times : ndarray, shape (S,), or None
+        In seconds (or in frames, where these have no times), rising; None for one state without a time.
+    name : str
+        The file or folder, for messages.
+    """
+
+    mesh: FiniteElementMesh
+    displacement: FloatArray
+    times: FloatArray | None = None
+    name: str = "simulation"
+
+    @classmethod
+    def read(
+        cls,
+        path: Path | str,
+        *,
+        mesh: FiniteElementMesh | None = None,
+        unit: str = "mm",
+        field: str | None = None,
+        interval: float | None = None,
+        offset: float = 0.0,
+    ) -> Self:
+        """Read a simulation.
+
+        Parameters
+        ----------
+        path
+            One state as a mesh file with a nodal displacement (such as ``.vtu``); a ``.pvd`` that names such files with
+            their times, or a folder with one; a folder of such files, whose last number counts them; or a ``.csv``
+            with the columns ``node``, ``u``, ``v`` and, of several states, ``time_s``.
+        mesh
+            Of the nodes of a ``.csv``.
+        unit
+            Unit of length of the files.
+        field
+            Name of the displacement in the files; None: the first of displacement, u, disp.
+        interval
+            Time between the numbers of the files of a folder.
+        offset
+            Added to the simulation's times.
+
+        Raises
+        ------
+        InputError
+            A file is missing, not readable, or has no displacement; its nodes differ from the first one's; the times do
+            not rise.
+        """
+        path = Path(path)
+        table = path.suffix.lower() == ".csv"
+        if interval is not None and not path.is_dir():
+            raise InputError(f"--interval is the time between the files of a folder, and {path} is none")
+        if field is not None and table:
+            raise InputError(f"--field names a field of a mesh file; the columns of {path} have names of their own")
+        if table:
+            if mesh is None:
+                raise InputError(f"{path} has numbers of nodes only: state the mesh that they belong to (--mesh FILE)")
+            values, times = _read_table(path, mesh, unit)
+        else:
+            clock, files = zip(*_listed(path, interval), strict=True)
+            mesh, *others = meshes = [read_mesh(file, unit=unit) for file in files]
+            for other in others:
+                if not np.array_equal(mesh.node_numbers, other.node_numbers):
+                    raise InputError(f"{other.name} has other nodes than {mesh.name}: the states must have one mesh")
+            values = np.stack([_displacement(one, field) for one in meshes])
+            times = None if None in clock else np.array(clock, dtype=np.float64)
+        if times is not None and not (np.diff(times) > 0).all():
+            raise InputError(f"the times of the simulation {path} must rise, not {times[:5].tolist()} ...")
+        if offset and (times is None or len(times) == 1):
+            raise InputError(
+                f"--offset shifts the times of several states; {path} is one, and is compared with every frame"
+            )
+        return cls(mesh=mesh, displacement=values, times=None if times is None else times + offset, name=str(path))
+
+    def at(self, time: float) -> FloatArray:
+        """Interpolate the displacement (M, 2) linearly between the states before and after a time within theirs."""
+        if self.times is None or len(self.times) == 1:
+            return np.asarray(self.displacement[0])
+        after = int(np.clip(np.searchsorted(self.times, time), 1, len(self.times) - 1))
+        part = (time - self.times[after - 1]) / (self.times[after] - self.times[after - 1])
+        return np.asarray((1 - part) * self.displacement[after - 1] + part * self.displacement[after])
+
+
+def _listed(path: Path, interval: float | None) -> list[tuple[float | None, Path]]:
+    """Return time and file of every state; None for the time of a single file."""
+    if path.is_dir():
+        indices = sorted(path.glob("*.pvd"))
+        if len(indices) > 1:
+            raise InputError(f"{path} holds {len(indices)} .pvd files: name one of them")
+        if not indices:
+            return _numbered(path, interval)
+        path = indices[0]
+    if path.suffix.lower() != ".pvd":
+        return [(None, path)]
+    try:
+        sets = list(ElementTree.fromstring(regular(path).read_bytes()).iter("DataSet"))
+        states: list[tuple[float | None, Path]] = [
+            (float(one.attrib["timestep"]), path.parent / one.attrib["file"]) for one in sets
+        ]
+    except (OSError, ElementTree.ParseError, KeyError, ValueError) as error:
+        raise InputError(f"{path} is not a readable .pvd file: {error}") from None
+    if not states:
+        raise InputError(f"{path} names no file: a .pvd has a DataSet with timestep and file for each state")
+    return states
+
+
+def _numbered(path: Path, interval: float | None) -> list[tuple[float | None, Path]]:
+    """Return the files of a folder by the last number in their names, times the `interval`."""
+    files = {file: re.findall(r"\d+", file.stem) for file in path.iterdir() if file.suffix.lower() in (".vtu", ".vtk")}
+    if not files or not all(files.values()):
+        raise InputError(f"{path} must hold one .pvd file, or .vtu or .vtk files with a number in their names")
+    if interval is None or not interval > 0:
+        raise InputError(
+            f"the times of the files in {path} are not known: state --interval, the time between two numbers (above 0)"
+        )
+    return sorted((interval * int(numbers[-1]), file) for file, numbers in files.items())
+
+
+def _displacement(mesh: FiniteElementMesh, field: str | None) -> FloatArray:
+    """Displacement (M, 2) in mm of a mesh's nodal data."""
+    names = {name.lower(): name for name in mesh.fields}
+    name = field if field is not None else next((names[one] for one in _FIELDS if one in names), None)
+    values = None if name is None else mesh.fields.get(name)
+    if values is None or values.ndim != 2 or values.shape[1] <= max(mesh.axes):
+        there = ", ".join(f"{name} {one.shape[1:]}" for name, one in mesh.fields.items()) or "none"
+        wanted = f'"{field}"' if field is not None else f"one of {', '.join(_FIELDS)}"
+        raise InputError(f"{mesh.name} has no nodal vector {wanted} (--field); its nodal data: {there}")
+    return np.asarray(values[:, mesh.axes], dtype=np.float64) * mesh.unit_mm
+
+
+def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatArray, FloatArray | None]:
+    """Read a table of node numbers, displacements and times onto a mesh."""
+    try:
+        lines = regular(path).read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from None
+    names = [name.strip() for name in next(csv.reader(lines[:1]), [])]
+    moved = [name for name in names if _COMPONENT.fullmatch(name)]
+    clock = next((name for name in names if name.lower() in _TIMES), None)
+    if "node" not in names or len(moved) != 2:
+        raise InputError(f'{path} needs a header line with "node", "u_mm" and "v_mm" (and "time_s"), not {names}')
+    wanted = [names.index(name) for name in ("node", *moved, *([clock] if clock else []))]
+    rows = []
+    for number, row in enumerate(csv.reader(lines[1:]), 2):
+        try:
+            rows.append([float(row[place]) for place in wanted])
+        except (ValueError, IndexError):
+            raise InputError(f"row {number} of {path} is not numbers: {row}") from None
+    table = np.array(rows, dtype=np.float64).reshape(-1, len(wanted))
+    if mesh.numbering.startswith("counted"):
+        logger.warning("%s: the nodes of %s are %s: those of the table must be, too", path, mesh.name, mesh.numbering)
+    places = places_among(mesh.node_numbers, table[:, 0])
+    known = places >= 0
+    if not known.any():
+        raise InputError(f"{path} has no row for a node of {mesh.name}")
+    if not known.all():
+        logger.warning("%s: %d rows name nodes that %s does not have", path, int((~known).sum()), mesh.name)
+        table, places = table[known], places[known]
+    times = table[:, 3] * _TIMES[clock.lower()] if clock else np.zeros(len(table))
+    steps, state = np.unique(times, return_inverse=True)
+    cells, count = np.unique(state * len(mesh.points) + places, return_counts=True)
+    if (count > 1).any():
+        node = mesh.node_numbers[cells[count.argmax()] % len(mesh.points)]
+        raise InputError(f"{path} has two rows or more for node {node} at one time: several states need a time_s")
+    values = np.full((len(steps), len(mesh.points), 2), np.nan)
+    factors = [LENGTH_UNITS[(found[1] or unit).lower()] for name in moved if (found := _COMPONENT.fullmatch(name))]
+    values[state, places] = table[:, 1:3] * factors
+    return values, steps if clock else None
+
+
+def places_among(numbers: npt.NDArray[np.int64], wanted: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """Place of each wanted label among some numbers; -1 where it is none of them."""
+    index = {number: place for place, number in enumerate(numbers.tolist())}
+    return np.array([index.get(number, -1) for number in wanted.tolist()], dtype=np.int64)
+
+
+def place(result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence[Sequence[float]] = ()) -> Placement:
+    """Place a simulation's mesh on the image of a result.
+
+    Parameters
+    ----------
+    result
+        The result.
+    scale
+        It replaces the ``[scale]`` that was kept with the result; None: that one.
+    pairs
+        Points (x_mm, y_mm, x_px, y_px), two or more; none: ``mesh.points`` of the result.
+
+    Raises
+    ------
+    InputError
+        No points are known, or they place no mesh.
+    """
+    known, where = pairs, "--points"
+    if not known and (placed := placement_of(result)) is not None:
+        known, where = placed.pairs.tolist(), "mesh.points"
+    if not known:
+        raise InputError(
+            f"where the simulation's mesh lies on the image of {result.path} is not known: state two points or more, "
+            "--points X_MM,Y_MM:X_PX,Y_PX each"
+        )
+    found = Placement.fit(known, rectification_of(result, scale).camera, where=where)
+    stated = (scale or scale_of(result)).mm_per_pixel
+    if found.mm_per_pixel is not None and stated is not None and abs(found.mm_per_pixel / stated - 1) > _DIFFERENT:
+        text = "%s state %.6g mm per px, scale.mm_per_pixel %.6g: the former is taken"
+        logger.warning(text, where, found.mm_per_pixel, stated)
+    return found

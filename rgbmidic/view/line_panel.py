@@ -1,0 +1,226 @@
+"""A line on the map and the field along it: its panel, read in the background."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import bokeh.models as bk
+import numpy as np
+import numpy.typing as npt
+from bokeh.document import Document
+
+from rgbmidic.errors import ResultError
+from rgbmidic.report.style import time_axis
+from rgbmidic.results import HistoryColumn, Maps, MapValues
+from rgbmidic.results.profiles import Profile
+from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.view.canvas import columns, plain_plot
+from rgbmidic.view.curves import NOW, band
+from rgbmidic.view.picture import Background, warning
+
+_SLICE = 0.25
+"""Seconds for which frames are read along a line before they are drawn, or before another line has its turn."""
+
+
+_ACROSS = 1500
+"""Columns of a position-time picture at most: its place on a screen of 3840 has as many."""
+
+
+_IMAGE = "image x y dw dh"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Reading:
+    """A field along a line in all frames of a result, as far as it is read.
+
+    Attributes
+    ----------
+    maps, profile
+        The result, and a row of each of its frames.
+    written : ndarray, shape (T,), int64
+        When each frame was written: one that is measured again is read again.
+    read : ndarray, shape (T,), bool
+        Frames that are read, or cannot be.
+    """
+
+    maps: Maps
+    profile: Profile
+    written: npt.NDArray[np.int64]
+    read: BoolArray
+
+    @classmethod
+    def begin(cls, maps: Maps, field: str, place: Sequence[float], before: _Reading | None) -> _Reading:
+        """Lay the line; what was read `before`, of the result when it was shorter, is kept unless it may differ."""
+        profile = Profile.along(maps, field, place, range(len(maps.result)))
+        now, read = maps.result.table.written, np.zeros(len(maps.result), dtype=np.bool_)
+        if before is not None and not profile.rate_window and (now == before.written)[before.read].all():
+            profile.values[:], profile.std[:], read = before.profile.values, before.profile.std, before.read.copy()
+        return cls(maps=maps, profile=profile, written=now, read=read).further()
+
+    @property
+    def missing(self) -> npt.NDArray[np.int64]:
+        """Indices of the frames that are measured and not read."""
+        return np.flatnonzero(self.maps.result.finished & ~self.read)
+
+    def further(self) -> _Reading:
+        """Read for a while; a damaged frame stays blank."""
+        end = time.monotonic() + _SLICE
+        for frame in self.missing.tolist():
+            with suppress(ResultError):
+                self.profile.fill(self.maps, [frame])
+            self.read[frame] = True
+            if time.monotonic() > end:
+                break
+        return self
+
+
+class LinePanel:
+    """Field along a line: position against time in its colours, and the profile in the frame in view.
+
+    The frames are read in slices in another thread, and drawn after each.
+
+    Parameters
+    ----------
+    document
+        Document of the page.
+    colours
+        Colours of the field on the map.
+    look
+        Options of controls of the page.
+
+    Attributes
+    ----------
+    choice
+        Control that chooses the curves over time, or one of the lines.
+    told
+        How far the frames are read, or what went wrong.
+    wave, profile
+        The plots.
+    """
+
+    def __init__(self, document: Document, colours: bk.LinearColorMapper, look: Mapping[str, Any]) -> None:
+        self._reading: _Reading | None = None
+        self._asked: tuple[Any, ...] = ()
+        self._reader = Background(document)
+        self._view: tuple[int, MapValues | None] = (0, None)
+        self.choice = bk.RadioButtonGroup(labels=[], name="beside_map", visible=False, **look)
+        self.choice.html_attributes = {"role": "group", "aria-label": "curves over time, or the field along a line"}
+        self.told = bk.Div(name="told_of_line", **look)
+        self.told.html_attributes = {"aria-live": "polite"}
+        self._image = bk.ColumnDataSource(columns(_IMAGE), name="wave")
+        self._line = bk.ColumnDataSource(columns("x y"), name="profile")
+        self._bands = bk.ColumnDataSource(columns("xs ys"), name="profile bands")
+        hover = bk.HoverTool(visible=False, tooltips=[("at", "$x, $y"), ("value", "@image")])
+        tools = [bk.PanTool(), bk.BoxZoomTool(), bk.ResetTool(), hover]
+        self.wave = plain_plot(tools=tools, title="Along the line", toolbar_location="above", name="wave_plot")
+        self.wave.toolbar.logo, self.wave.grid.visible = None, False
+        colours.nan_color = "#00000000"  # what is not measured, or not read yet
+        self.wave.image(*_IMAGE.split(), source=self._image, color_mapper=colours)
+        self.now = bk.Span(name="wave_now", **NOW)
+        self.wave.add_layout(self.now)
+        self.profile = plain_plot(title="Profile", name="profile_plot")
+        self.profile.patches(
+            "xs", "ys", source=self._bands, fill_color=NOW["line_color"], fill_alpha=0.25, line_alpha=0
+        )
+        drawn = self.profile.line("x", "y", source=self._line, line_color=NOW["line_color"], line_width=1.5)
+        self.profile.y_range.renderers = [drawn]
+        self.parts = (self.told, self.wave, self.profile)
+        self._show(shown=False)
+
+    def _show(self, *, shown: bool) -> None:
+        for part in self.parts:
+            part.visible = shown
+        self.told.visible = shown and bool(self.told.text)
+
+    def offer(self, lines: Sequence[str], chosen: str) -> bool:
+        """Offer lines by their names; return whether the chosen one is among them, and thus shown."""
+        self.choice.labels = ["over time", *(f"along {name.replace('_', ' ')}" for name in lines)]
+        self.choice.visible = bool(lines)
+        self.choice.active = lines.index(chosen) + 1 if chosen in lines else 0
+        self._show(shown=chosen in lines)
+        if chosen not in lines:
+            self._reader.drop()
+            self._asked, self._reading = (), None
+        return chosen in lines
+
+    def ask(self, maps: Maps, field: str, place: Sequence[float], key: tuple[Any, ...], changes: int) -> None:
+        """Read a field along a line; `key` states how it is derived, `changes` how often the result has grown."""
+        asked = (field, tuple(place), key, changes)
+        if asked == self._asked:
+            return
+        before = self._reading if asked[:-1] == self._asked[:-1] else None
+        self._asked, self._reading = asked, before
+        if before is None:
+            self._draw()
+        self._tell("reading the frames …")
+        self._reader.ask(partial(_Reading.begin, maps, field, place, before), self._take)
+
+    def _tell(self, text: str) -> None:
+        self.told.text, self.told.visible = text, bool(text)
+
+    def _take(self, read: Callable[[], _Reading]) -> None:
+        """Draw what was read, and read on."""
+        try:
+            reading = self._reading = read()
+        except Exception as error:  # a line outside the mesh, a field without uncertainty: reported where it would be
+            self._reading = None
+            self._tell(warning(str(error)))
+        else:
+            missing = len(reading.missing)
+            self._tell(f"{int(reading.read.sum())} frames read, {missing} to go" if missing else "")
+            if missing:
+                self._reader.ask(reading.further, self._take)
+        self._draw()
+        self.show(*self._view)
+
+    @property
+    def _clock(self) -> tuple[FloatArray, str]:
+        """Time of all frames, and its label."""
+        profile = self._reading.profile if self._reading else None
+        return (np.zeros(0), "") if profile is None else time_axis(profile.times, profile.frames)
+
+    def _draw(self) -> None:
+        """Draw position against time: a column for each frame, or less where they are many."""
+        if self._reading is None:
+            self._image.data = columns(_IMAGE)
+            return
+        profile, (clock, label) = self._reading.profile, self._clock
+        there = np.flatnonzero(self._reading.maps.result.finished & np.isfinite(clock))
+        steps = np.diff(clock[there])
+        steps = steps[steps > 0]
+        step = float(steps.min()) if len(steps) else 1.0
+        count = min(round(float(steps.sum()) / step) + 1, _ACROSS)
+        grid = np.linspace(clock[there[0]], clock[there[-1]], count)
+        nearest = there[np.searchsorted((clock[there][1:] + clock[there][:-1]) / 2, grid)]
+        half, apart = float(grid[-1] - grid[0]) / max(count - 1, 1) / 2 or 0.5, float(profile.positions[1])
+        image = profile.values[nearest].T.astype(np.float32)
+        left, wide = float(grid[0]) - half, float(grid[-1] - grid[0]) + 2 * half
+        self._image.data = columns(_IMAGE, [(image, left, -apart / 2, wide, apart * len(profile.positions))])
+        position = f"position ({profile.units.length})"
+        self.wave.xaxis.axis_label, self.wave.yaxis.axis_label = label, position
+        self.profile.xaxis.axis_label, self.profile.yaxis.axis_label = position, profile.field.label
+        self.wave.title.text = f"{profile.field.label} along the line"
+
+    def show(self, frame: int, values: MapValues | None) -> None:
+        """Show the profile of a frame, of which the map has the values."""
+        self._view = (frame, values)
+        if self._reading is None or values is None:
+            self._line.data, self._bands.data, self.now.location = columns("x y"), columns("xs ys"), None
+            return
+        profile = self._reading.profile
+        along, std = profile.line.read(values.values, values.std, profile.kind)
+        self._line.data = {"x": profile.positions, "y": along}
+        curve = HistoryColumn(name=profile.field.name, unit=profile.field.unit, values=along, std=std)
+        self._bands.data = dict(zip(("xs", "ys"), band(profile.positions, curve), strict=True))
+        at = self._clock[0][frame]
+        self.now.location, self.profile.title.text = float(at) if np.isfinite(at) else None, f"Profile in frame {frame}"
+
+    def frame(self, x: float) -> int:
+        """Return the index of the frame at a place of the time axis."""
+        clock = self._clock[0]
+        return int(np.nanargmin(np.abs(clock - x))) if np.isfinite(clock).any() else self._view[0]
