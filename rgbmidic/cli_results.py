@@ -13,6 +13,7 @@ from rich.console import Console
 
 from rgbmidic import command
 from rgbmidic.errors import InputError
+from rgbmidic.extras import optional
 
 if TYPE_CHECKING:
     from rgbmidic.results import Result
@@ -218,7 +219,7 @@ def view(
 
     Ctrl-C ends the server. Options that state properties of frames are for raw frames only.
     """
-    serve = command.optional("rgbmidic.view", "view").serve
+    serve = optional("rgbmidic.view", "view").serve
     serve(path, port=port, browser=browser, tell=lambda address: print(address, flush=True), statement=statement)
 
 
@@ -495,6 +496,6 @@ def print_table(title: str, headings: list[str], rows: list[list[str]], words: M
 
 def progress_of(what: str) -> AbstractContextManager[Callable[[int, int, str], None]]:
     """A bar on stderr for people who watch, see `rgbmidic.timing`."""
-    from rgbmidic.timing import progress_bar
+    from rgbmidic.progress import progress_bar
 
     return progress_bar(what, messages)

@@ -13,7 +13,6 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping
 from functools import wraps
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -128,22 +127,6 @@ def gather(
         return gathering
 
     return decorate
-
-
-def optional(module: str, extra: str) -> Any:
-    """A module that needs packages of an extra.
-
-    Raises
-    ------
-    InputError
-        They are not installed.
-    """
-    try:
-        return import_module(module)
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("rgbmidic"):
-            raise
-        raise InputError(f'this needs the package {error.name}: pip install "rgbmidic[{extra}]"') from None
 
 
 def read_place(text: str, option: str, form: str) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""Time that each stage of a frame takes, and the progress bar of a long command.
+"""Time that each stage of a frame takes.
 
 The time of a stage that another one calls does not count with the caller.
 """
@@ -6,13 +6,10 @@ The time of a stage that another one calls does not count with the caller.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TypeVar
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 
 T = TypeVar("T")
 
@@ -80,23 +77,3 @@ def each(name: str, items: Iterable[T]) -> Iterator[T]:
 
 
 _END = object()
-
-
-@contextmanager
-def progress_bar(what: str, console: Console) -> Iterator[Callable[[int, int, str], None]]:
-    """A bar, and the function that moves it: frames done, their total, a line about the last one.
-
-    Nothing is shown where nobody watches: an error stays one line, a log file stays short.
-    """
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
-    last = TextColumn("{task.fields[line]}", markup=False)
-    with Progress(*columns, last, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=None, line="")
-        yield lambda done, total, line: bar.update(task, completed=done, total=total, line=line)
-
-
-class _Rate(ProgressColumn):
-    """Frames per second."""
-
-    def render(self, task: Task) -> str:
-        return f"{task.speed:.3g}/s" if task.speed else ""

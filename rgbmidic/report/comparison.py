@@ -13,7 +13,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from rgbmidic.command import optional
+from rgbmidic.extras import optional
 from rgbmidic.report import style
 from rgbmidic.report.figures import spread
 from rgbmidic.report.page import Page

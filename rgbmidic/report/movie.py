@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.picture import paint_field
-from rgbmidic.command import optional
 from rgbmidic.errors import InputError, ResultError, RgbmidicError
+from rgbmidic.extras import optional
 from rgbmidic.report import style
 from rgbmidic.report.figures import picture_limits, spread
 from rgbmidic.report.video import PALETTE, Page, gif, video

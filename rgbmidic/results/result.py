@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.command import optional
 from rgbmidic.errors import InputError, ResultError
+from rgbmidic.extras import optional
 from rgbmidic.results.provenance import fingerprint, read_provenance
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.results.records import FrameTable
