@@ -867,17 +867,23 @@ def _is_required(entry: Field[Any]) -> bool:
     return entry.default is MISSING and entry.default_factory is MISSING
 
 
-def _sections(settings: type[TestSettings]) -> dict[str, dict[str, Any]]:
-    """For every section its keys with the types of their values."""
+def section_keys(settings: type[TestSettings]) -> dict[str, dict[str, tuple[Any, Field[Any]]]]:
+    """For every section its keys, each with the type of its value and the field that holds it."""
     hints = _hints(cast(Any, settings))
-    sections: dict[str, dict[str, Any]] = {}
+    sections: dict[str, dict[str, tuple[Any, Field[Any]]]] = {}
     for entry in fields(settings):
         section, key = _place(entry)
         if key:
-            sections.setdefault(section, {})[key] = hints[entry.name]
+            sections.setdefault(section, {})[key] = hints[entry.name], entry
         elif section:
-            sections[section] = _hints(hints[entry.name])
+            parts = _hints(hints[entry.name])
+            sections[section] = {part.name: (parts[part.name], part) for part in fields(hints[entry.name])}
     return sections
+
+
+def _sections(settings: type[TestSettings]) -> dict[str, dict[str, Any]]:
+    """For every section its keys with the types of their values."""
+    return {name: {key: hint for key, (hint, _) in keys.items()} for name, keys in section_keys(settings).items()}
 
 
 _BOUNDS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le, "below": operator.lt}

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 from hypothesis import given
@@ -33,6 +35,7 @@ from rgbmidic.settings import (
     regular,
     unique_keys,
 )
+from rgbmidic.settings.json_schema import json_schema
 
 LEAST = """
 [frames]
@@ -470,3 +473,36 @@ def test_a_key_stated_twice_in_json_and_a_nul_in_a_name_are_errors() -> None:
 
 def test_names_of_the_package_are_there() -> None:
     assert all(hasattr(rgbmidic, name) for name in rgbmidic.__all__)
+
+
+SCHEMA = Path(__file__).resolve().parents[2] / "docs/reference/test.schema.json"
+
+
+def test_the_schema_of_the_page_is_that_of_the_code() -> None:
+    """Write it anew with ``python -m rgbmidic.settings.json_schema > docs/reference/test.schema.json``."""
+    assert json.loads(SCHEMA.read_text(encoding="utf-8")) == json_schema()
+
+
+@pytest.mark.parametrize("place", sorted(SCHEMA.parents[2].glob("**/*.toml")), ids=lambda place: place.name)
+def test_the_schema_accepts_every_settings_file_of_the_project(place: Path) -> None:
+    document = tomllib.loads(place.read_text(encoding="utf-8"))
+    if {"frames", "region"} <= document.keys():
+        jsonschema.validate(document, json_schema())
+
+
+def test_the_schema_refuses_what_the_settings_refuse() -> None:
+    good = {"frames": {"path": "*.tif"}, "region": {"rectangle": [0, 0, 50, 50]}}
+    jsonschema.validate(good, json_schema())
+    for section, key, value in (
+        ("frames", "pth", "x"),
+        ("solver", "tolerance", "small"),
+        ("solver", "fill", -1),
+        ("weights", "method", "magic"),
+        ("region", "rectangle", [1, 2]),
+        ("mesh", "element_size", [1]),
+    ):
+        wrong = {**good, section: {**good.get(section, {}), key: value}}
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(wrong, json_schema())
+        with pytest.raises(ConfigurationError):
+            TestSettings.from_mapping(wrong)

@@ -1,0 +1,82 @@
+"""The JSON schema of a TEST.toml, by which editors complete and check it."""
+
+from __future__ import annotations
+
+import types
+from dataclasses import MISSING, is_dataclass
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin
+
+from rgbmidic.settings.conversion import plain
+from rgbmidic.settings.schema import TestSettings, section_keys
+
+_TYPES = {bool: "boolean", float: "number", int: "integer", str: "string", Path: "string"}
+_BOUNDS = {
+    "above": "exclusiveMinimum",
+    "at_least": "minimum",
+    "at_most": "maximum",
+    "below": "exclusiveMaximum",
+}
+
+
+def json_schema() -> dict[str, Any]:
+    """Describe TEST.toml as a JSON schema (draft 2020-12), generated from `TestSettings`.
+
+    Bounds and types of single keys are in it; what keys demand of each other is checked when a file is read.
+
+    Returns
+    -------
+    dict
+    """
+    sections = {
+        name: {
+            "type": "object",
+            "additionalProperties": False,
+            "properties": {
+                key: _value(hint) | _limits(hint, entry.metadata.get("bounds", {})) | _default(entry)
+                for key, (hint, entry) in keys.items()
+            },
+            "required": [key for key, (_, entry) in keys.items() if entry.default is entry.default_factory is MISSING],
+        }
+        for name, keys in section_keys(TestSettings).items()
+    }
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "TEST.toml of rgbmidic",
+        "type": "object",
+        "additionalProperties": False,
+        "properties": sections,
+        "required": ["frames", "region"],
+    }
+
+
+def _value(hint: Any) -> dict[str, Any]:
+    kind, parts = get_origin(hint), [part for part in get_args(hint) if part is not type(None)]
+    if kind is Literal:
+        return {"enum": parts}
+    if kind in (Union, types.UnionType):
+        return {"anyOf": [_value(part) for part in parts]} if len(parts) > 1 else _value(parts[0])
+    if kind is not tuple:
+        return {"type": _TYPES[hint]} if hint in _TYPES else {}
+    if len(parts) != 2 or parts[1] is not Ellipsis:
+        return {"type": "array", "prefixItems": [*map(_value, parts)], "minItems": len(parts), "maxItems": len(parts)}
+    one = _value(parts[0])  # a single one needs no brackets
+    ranges = [{"type": "string", "pattern": r"^\s*\d+\s*:\s*\d+\s*$"}] if parts[0] is int else []
+    return {"anyOf": [{"type": "array", "items": one}, one, *ranges]}
+
+
+def _limits(hint: Any, bounds: dict[str, float]) -> dict[str, Any]:
+    """Bounds of a single number; those of numbers in lists are checked when the file is read."""
+    return {_BOUNDS[name]: value for name, value in bounds.items()} if hint in (int, float) else {}
+
+
+def _default(entry: Any) -> dict[str, Any]:
+    known = entry.default not in (MISSING, None) and not is_dataclass(entry.default)
+    return {"default": plain(entry.default)} if known else {}
+
+
+if __name__ == "__main__":
+    import json
+    import sys
+
+    sys.stdout.write(json.dumps(json_schema(), indent=1) + "\n")
