@@ -27,6 +27,7 @@ MODULES = [
     "rgbmidic.pipeline",
     "rgbmidic.results",
     "rgbmidic.results.comparison",
+    "rgbmidic.results.simulation",
     "rgbmidic.fields",
     "rgbmidic.report",
     "rgbmidic.view",
