@@ -236,7 +236,7 @@ class Plan:
             frames=len(series),
             images_of=lambda index: light_images(rest.separation, series.read(index, window), window),
         )
-        reference = _reference(rest.images, weights, region, mesh, sigma, solver, window)
+        reference = _reference(rest.images, weights, region, mesh, sigma, solver)
         if isinstance(weights, ThresholdWeights):
             _tell_no_effect(weights, rest.images, region)
         speckle = speckle_size(rest.images, region)
@@ -281,7 +281,7 @@ class Plan:
         -------
         Plan
         """
-        reference = _reference(self.images, self.weights, self.region, mesh, self.normalise, self.solver, self.window)
+        reference = _reference(self.images, self.weights, self.region, mesh, self.normalise, self.solver)
         return replace(self, reference=reference)
 
     def lights(self, state: RawState, window: Window) -> IlluminationImages:
@@ -351,7 +351,6 @@ def _reference(
     mesh: Tri3Mesh,
     sigma: float,
     solver: SolverSettings,
-    window: Window,
 ) -> Reference:
     """The reference state as the solve needs it."""
     return Reference.prepare(
@@ -360,7 +359,7 @@ def _reference(
         as_weights(weights.reference(images), images.values.shape, "weights of the reference"),
         mesh=mesh,
         prefilter=solver.prefilter,
-        origin=window.origin,
+        origin=images.origin,
         registration=images.registration,
     )
 
