@@ -21,13 +21,12 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
+from rgbmidic.illumination.unevenness import SIGNIFICANCE, unevenness
 from rgbmidic.settings import FrameCheck
 from rgbmidic.typing import BoolArray, FloatArray
 
 Frame = Mosaic | ChannelFrame
 
-SIGNIFICANCE = 6.0
-"""Standard errors beyond which a departure is not chance: 24 planes and levels are looked at."""
 LARGEST = 288
 """Side, in samples of a plane, of the middle of the region whose noise is looked at: 4 planes of it in 30 ms."""
 FLATTEST, LEVELS = (0.01, 0.05, 0.2), 6
@@ -43,9 +42,6 @@ NEAR = 0.5
 QUIET, QUIETER = 1.12, 1.25
 """Count of such differences over the predicted one from which the noise is doubtful, and certainly less than
 calibrated: a variance .80 and .64 times the calibrated one. Gains are calibrated within 2 % (calibration/README.md)."""
-WINDOW = 9
-"""Grey levels over which the histogram is smooth (a parabola) where noise has a standard deviation of `SMOOTHED`."""
-SMOOTHED = 2.0
 UNEVEN = 0.03
 """Relative variance of the histogram about its smooth course that is too much: good scenes reach .006, real raw frames
 without a table of their own .022 above 8 bit; a gain of 1.05 on stored samples gives .05."""
@@ -332,51 +328,6 @@ def _differences(planes: Sequence[_Plane]) -> tuple[npt.NDArray[Any], ...]:
     for model, part in zip(models, variance, strict=True):
         whole &= part > 4 * PHOTONS * model.read_noise**2
     return a - b - c + d, mean, variance.astype(np.float32), whole
-
-
-def unevenness(
-    samples: npt.NDArray[np.uint16], noise: NoiseModel | None = None, black: float = 0.0, step: int = 1
-) -> float:
-    """Return the relative variance of the histogram of raw samples about its smooth course, less that of counting.
-
-    It is 0 where the histogram is smooth over `WINDOW` levels as noise makes it, .05 where every 21st level is missing,
-    about 2 where every other one is; NaN where too few samples, or too little noise, leave it open.
-
-    Parameters
-    ----------
-    samples
-        Of one colour plane, none saturated.
-    noise
-        Calibrated noise: only levels at which it smooths the histogram are looked at; None: all.
-    black
-        Their black level.
-    step
-        What all samples of the frame are multiples of.
-
-    Returns
-    -------
-    float
-    """
-    from scipy.signal import savgol_coeffs, savgol_filter  # a second to import
-
-    if samples.size < 1000:
-        return float("nan")
-    count = np.bincount(samples // step).astype(np.float64)
-    if count.size < 30:
-        return float("nan")
-    count[: np.flatnonzero(count)[0] + 1] = 0  # what is clipped at the bottom
-    around = np.convolve(count, np.full(WINDOW, 1 / WINDOW), mode="same")
-    known = around >= 8
-    if noise is not None:
-        known &= noise.variance(step * np.arange(count.size) - black) >= (SMOOTHED * step) ** 2
-    if known.sum() < 30:
-        return float("nan")
-    kept = 1 - savgol_coeffs(WINDOW, 2)[WINDOW // 2]  # of the variance of counting, by the residual of the parabola
-    square = (count - savgol_filter(count, WINDOW, 2, mode="constant"))[known] ** 2 / kept
-    chance = SIGNIFICANCE * np.sqrt(2 * known.sum())
-    if (square / around[known]).sum() - known.sum() < chance:
-        return 0.0
-    return float((square.sum() - around[known].sum()) / (around[known] ** 2).sum())
 
 
 def _block_means(values: npt.NDArray[np.float32], side: int) -> FloatArray:

@@ -13,7 +13,8 @@ from rgbmidic.report.figures import (
     residual_figure,
 )
 from rgbmidic.report.gallery import REPORT, remove_figures, remove_report, write_figures, write_maps
-from rgbmidic.report.movie import MOVIES, Curve, write_movie
+from rgbmidic.report.movie import MOVIES, write_movie
+from rgbmidic.report.movie_curve import Curve
 from rgbmidic.report.page import Page
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
 

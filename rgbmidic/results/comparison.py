@@ -17,20 +17,19 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu
 
 from rgbmidic.correlation.assembly import BLOCK, OF_ELEMENT
-from rgbmidic.correlation.recovery import Recovery, linear_fit_offset
 from rgbmidic.errors import InputError
 from rgbmidic.fields import NodalCovariance, StrainGauges, strain_of_gradient
-from rgbmidic.fields.nodal import Places
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh
+from rgbmidic.results.agreement import Agreement, Fit
+from rgbmidic.results.levelling import Levelling, reading
 from rgbmidic.results.physical import frame_times, rectification_of, shared_part
 from rgbmidic.results.quantities import QUANTITIES as STORED
 from rgbmidic.results.result import Result
@@ -44,145 +43,11 @@ QUANTITIES = ("u", "v", "exx", "eyy", "exy")
 """What is compared: displacement in mm and Green-Lagrange strain, along the axes of the simulation's mesh."""
 WAYS = ("nodes", "levelled")
 """The simulation as it is at its nodes, and put through the measurement."""
-_FEWEST, _MOST = 3, 12
-"""Parts of an element's side over which the simulation is averaged: elements of half the simulation's, within these
-bounds. The rule's error falls as the square of their number: 1 % of what levelling changes at 3 (derived)."""
-_BEYOND = 0.5
-"""How far beyond an element of the simulation, in its barycentric coordinates, it is continued linearly: the outline of
-a region that was drawn by hand differs by some px (chosen)."""
-_AT_ONCE = 20_000
-"""Points that are looked up at once: some 60 MB (derived)."""
 _SAME = 1e-6
 """Distance over the size of an element under which two nodes are one: rounding of a placement (derived)."""
 _RIGID = 1e-6
 """Least squared ratio to the uncertainty, of a node on average, of what is no rigid motion in a simulation (chosen)."""
 _FAILED = STORED["status"].codes.index("failed")
-
-
-class Levelling:
-    """What a measurement on a mesh makes of a simulated displacement field.
-
-    The solve is a least-squares fit of linear elements, in which the texture counts alike everywhere on average, and
-    the nodal values are recovered from it by quadratics. Both are applied here.
-
-    Parameters
-    ----------
-    mesh
-        The measurement's mesh.
-    simulated
-        The simulation's, in the same axes and unit.
-
-    Raises
-    ------
-    InputError
-        The simulation covers no element of the measurement.
-    """
-
-    def __init__(self, mesh: Tri3Mesh, simulated: Tri3Mesh) -> None:
-        inner = _middles(int(np.clip(math.ceil(2 * mesh.size / simulated.size), _FEWEST, _MOST)))
-        points = np.einsum("qc,ecd->eqd", inner, mesh.nodes[mesh.elements])
-        read, depth = _reading(simulated, points.reshape(-1, 2))
-        used: BoolArray = np.asarray((depth.reshape(points.shape[:2]) > -_BEYOND).all(axis=1))
-        if not used.any():
-            raise InputError("the simulation's mesh covers no element of the measurement's: check where it is placed")
-        row = np.arange(len(depth))
-        columns, values = np.repeat(mesh.elements, len(inner), axis=0), np.tile(inner, (len(mesh.elements), 1))
-        shape = sp.csr_matrix((values.ravel(), (np.repeat(row, 3), columns.ravel())), shape=(len(row), len(mesh.nodes)))
-        weighted = sp.csr_matrix(sp.diags(np.repeat(used * mesh.areas / len(inner), len(inner))) @ shape).T
-        self._covered: BoolArray = np.asarray(mesh.to_nodes(np.asarray(used, dtype=np.float64)) > 0)
-        self._factors = splu(sp.csc_matrix(weighted @ shape + sp.diags(1.0 * ~self._covered)))
-        self._moments = sp.csr_matrix(weighted @ read)
-        self._recovery = Recovery.over(mesh, used, self._covered.astype(np.float64), linear_fit_offset(mesh))
-
-    def __call__(self, displacement: FloatArray) -> FloatArray:
-        """Displacement (2, N) at the measurement's nodes of a simulated one (M, 2); NaN where that does not reach."""
-        moments = self._moments @ np.nan_to_num(displacement)
-        unknown: FloatArray = np.asarray(np.isnan(displacement).any(axis=1), dtype=np.float64)
-        lost = (abs(self._moments) @ unknown) > 0
-        recovered = self._recovery.displacement(self._factors.solve(moments)).T
-        return np.where(self._covered & ~lost, recovered, np.nan)
-
-
-def _middles(parts: int) -> FloatArray:
-    """Barycentric coordinates (parts^2, 3) of the middles of equal parts of a triangle."""
-    up = [(i + 1 / 3, j + 1 / 3) for i in range(parts) for j in range(parts - i)]
-    down = [(i + 2 / 3, j + 2 / 3) for i in range(parts - 1) for j in range(parts - 1 - i)]
-    first, second = np.array(up + down).T / parts
-    return np.stack([first, second, 1 - first - second], axis=1)
-
-
-def _reading(mesh: Tri3Mesh, points: FloatArray) -> tuple[sp.csr_matrix, FloatArray]:
-    """Matrix (P, N) that reads a nodal field at points (P, 2), and the least barycentric coordinate there (P,)."""
-    parts = [Places.of(mesh, points[start : start + _AT_ONCE]) for start in range(0, len(points), _AT_ONCE)]
-    values = np.concatenate([part.barycentric for part in parts])
-    nodes = mesh.elements[np.concatenate([part.element for part in parts])]
-    row = np.repeat(np.arange(len(points)), 3)
-    matrix = sp.csr_matrix((values.ravel(), (row, nodes.ravel())), shape=(len(points), len(mesh.nodes)))
-    return matrix, values.min(axis=1)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Agreement:
-    """How one quantity of a frame agrees with the simulation.
-
-    Attributes
-    ----------
-    values
-        Their number n: nodes with data, of the displacement those of u and v.
-    mean, rms
-        Of the differences, measured minus simulated.
-    std
-        Median standard uncertainty.
-    beyond_2
-        Fraction of the differences above two standard uncertainties; .046 is ordinary.
-    chi_square
-        Per degree of freedom: 1 is expected where the simulation is right.
-    degrees_of_freedom
-        Of chi-square.
-    probability
-        Of a larger chi-square where the simulation is right.
-    """
-
-    values: int
-    mean: float = math.nan
-    rms: float = math.nan
-    std: float = math.nan
-    beyond_2: float = math.nan
-    chi_square: float = math.nan
-    degrees_of_freedom: float = math.nan
-    probability: float = math.nan
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Fit:
-    """Multiple of the levelled simulation that fits a measured displacement best, with any shift and rotation.
-
-    Where the loads are stated, a modulus that is too large by 3 % reads as a scale of 1.03.
-
-    Attributes
-    ----------
-    scale, scale_std
-        NaN where the simulation is no more than a rigid motion.
-    rigid, rigid_std : ndarray, shape (3,)
-        Shift (mm) of the middle of the measured nodes, and rotation (degrees, from x towards y), measured minus
-        simulated.
-    chi_square
-        Of what the best multiple, shift and rotation leave, per degree of freedom.
-    template : ndarray, shape (2, N)
-        The simulation without a rigid motion over the standard uncertainty, at the measurement's nodes.
-    projection, information
-        Sums of the template times the measured displacement over its uncertainty, and times itself: their quotient is
-        the scale.
-    """
-
-    template: FloatArray
-    scale: float = math.nan
-    scale_std: float = math.nan
-    rigid: FloatArray = field(default_factory=lambda: np.full(3, math.nan))
-    rigid_std: FloatArray = field(default_factory=lambda: np.full(3, math.nan))
-    chi_square: float = math.nan
-    projection: float = 0.0
-    information: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -406,7 +271,7 @@ class Comparison:
         if (inside := self._own >= 0).any():
             entries = np.ones(inside.sum()), (np.flatnonzero(inside), self._own[inside])
             return sp.csr_matrix(entries, shape=(len(inside), len(self.mesh.nodes))), inside
-        matrix, depth = _reading(self.mesh, self.simulation.mesh.points)
+        matrix, depth = reading(self.mesh, self.simulation.mesh.points)
         inside = depth > -_SAME
         if not inside.any():
             raise InputError(f"no node of {self.simulation.name} lies in the region that was measured")

@@ -10,30 +10,32 @@ from rgbmidic.settings.conversion import (
     regular,
 )
 from rgbmidic.settings.schema import (
-    BAYER_PATTERNS,
     ELEMENT_SIZE,
     LENGTH_UNITS,
-    LOCAL_MEAN,
     PROBE_NAME,
     SMALLEST_HALVED,
     ChannelSettings,
     FrameCheck,
-    FrameKind,
-    FrameSettings,
-    IlluminationSettings,
     ProbeSettings,
-    RegionSettings,
     ScaleSettings,
     SetupSettings,
-    SolverOptions,
-    SolverSettings,
     TestSettings,
-    WeightSettings,
-    bounded,
-    grey_levels,
     read_section,
     read_test,
     unique_keys,
+)
+from rgbmidic.settings.sections import (
+    BAYER_PATTERNS,
+    LOCAL_MEAN,
+    FrameKind,
+    FrameSettings,
+    IlluminationSettings,
+    RegionSettings,
+    SolverOptions,
+    SolverSettings,
+    WeightSettings,
+    bounded,
+    grey_levels,
 )
 
 __all__ = [

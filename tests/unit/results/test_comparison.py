@@ -18,7 +18,8 @@ from rgbmidic.errors import InputError
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
 from rgbmidic.report.comparison import scale_text
 from rgbmidic.results import FrameRecord, Result
-from rgbmidic.results.comparison import Comparison, Levelling, measured_mesh
+from rgbmidic.results.comparison import Comparison, measured_mesh
+from rgbmidic.results.levelling import Levelling
 from rgbmidic.results.simulation import Simulation, place
 
 NODES, STD, MM = len(MESH.nodes), 0.01, 0.05

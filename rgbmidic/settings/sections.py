@@ -1,0 +1,374 @@
+"""Sections of a TEST.toml that state how is measured: frames, lights, region, weights, solver."""
+
+from __future__ import annotations
+
+import math
+import operator
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, TypedDict, cast, get_type_hints
+
+from rgbmidic.errors import ConfigurationError
+from rgbmidic.settings.conversion import convert_value
+
+
+@cache
+def _hints(settings: Any) -> dict[str, Any]:
+    return get_type_hints(settings)
+
+
+FrameKind = Literal["bayer", "rgb", "monochrome"]
+
+
+BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+"""The four phases of the Bayer colour filter array, named by the top-left 2x2 cell read row by row."""
+
+
+def bounded(default: Any = MISSING, **bounds: float) -> Any:
+    """A field whose number, or every number of it, keeps the bounds `above`, `at_least`, `at_most`, `below`.
+
+    Parameters
+    ----------
+    default
+        Value where none is stated; none: the key is required.
+    **bounds
+        Bounds by their names.
+
+    Returns
+    -------
+    dataclasses.Field
+    """
+    return field(default=default, metadata={"bounds": bounds})
+
+
+class Checked:
+    """Settings that are checked when they are made: every field by its type and bounds, then what keys must keep."""
+
+    __slots__ = ()
+    section = ""
+
+    def __post_init__(self) -> None:
+        hints = _hints(cast(Any, self.__class__))
+        for entry in fields(cast(Any, self)):
+            where = entry.metadata.get("key") or f"{self.section}.{entry.name}".lstrip(".")
+            value = converted(entry, getattr(self, entry.name), hints[entry.name], where)
+            object.__setattr__(self, entry.name, value)
+        self._check()
+
+    def _check(self) -> None:
+        """Raise a `ConfigurationError` where keys contradict each other."""
+
+
+def require(kept: object, message: str) -> None:
+    """Refuse settings of which a condition is not kept."""
+    if not kept:
+        raise ConfigurationError(message)
+
+
+def require_corners(where: str, corners: tuple[Any, ...], least: int, words: str) -> None:
+    """Refuse a path or polygon of too few corners."""
+    require(len(corners) >= least, f"{where} needs at least {words} corners [x, y], not {len(corners)}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameSettings(Checked):
+    """Where the frames are, and what the files do not state (``[frames]``).
+
+    Attributes
+    ----------
+    path
+        File patterns or folders, one per light fired in succession (monochrome); a single one otherwise. Empty where a
+        script gives the frames (`source` of `rgbmidic.measure`).
+    kind
+        None: as the file states, else ``"bayer"``.
+    cfa, black_level, white_level
+        None: as the file states. A statement that contradicts the file is an error.
+    reference
+        Indices of the frames whose average is the reference, or a range of them: ``"0:20"`` are the first twenty.
+    first, last, step
+        The frames that are measured: every `step`-th from the first to the last (None: of all). Frames are counted from
+        0 over all files; the reference need not be among them.
+    lights
+        Number of lights that fire in turn while a monochrome camera records one series: frame i shows light
+        i mod `lights`. `lights` frames make one state, and the other keys count states.
+    update_reference
+        Whether a later frame becomes the reference where the correlation with the present one is low, for paint that
+        changes (incremental correlation). Uncertainties add up (`rgbmidic.correlation.reference_update`), and a node
+        that is without data in such a frame stays so.
+    shape, dtype
+        Rows and columns, and sample type, of headerless files.
+    crop_origin
+        Column and row in the calibrated frame of the first pixel of cropped frames; None: they are as large as the
+        calibrated ones, or nothing in the calibration depends on the position.
+    """
+
+    section = "frames"
+
+    path: tuple[str, ...]
+    kind: FrameKind | None = None
+    cfa: str | None = None
+    black_level: float | None = bounded(None, at_least=0)
+    white_level: float | None = bounded(None, above=0)
+    reference: tuple[int, ...] = bounded((0,), at_least=0)
+    first: int = bounded(0, at_least=0)
+    last: int | None = bounded(None, at_least=0)
+    step: int = bounded(1, at_least=1)
+    lights: int = bounded(1, at_least=1)
+    update_reference: bool = False
+    shape: tuple[int, int] | None = bounded(None, at_least=1)
+    dtype: Literal["uint8", "uint16", ">u2"] | None = None
+    crop_origin: tuple[int, int] | None = bounded(None, at_least=0)
+
+    def _check(self) -> None:
+        require(all(self.path), "frames.path must name the frame files")
+        require(
+            len(self.path) <= 1 or self.kind == "monochrome",
+            f"frames.path with {len(self.path)} entries means as many lights fired in succession before a monochrome "
+            'camera: state kind = "monochrome", or give a single path',
+        )
+        require(
+            self.lights == 1 or (len(self.path) == 1 and self.kind == "monochrome"),
+            f"frames.lights = {self.lights} means lights that fire in turn before a monochrome camera that records "
+            f'them in one series: state kind = "monochrome" and a single path, not {len(self.path)}',
+        )
+        require(
+            self.last is None or self.last >= self.first,
+            f"frames.last must be at least frames.first ({self.first}), not {self.last}",
+        )
+        require(
+            self.reference and len(set(self.reference)) == len(self.reference),
+            f"frames.reference must name different frames, not {list(self.reference)}",
+        )
+        if self.cfa is not None:
+            object.__setattr__(self, "cfa", self.cfa.upper())
+            allowed = ", ".join(BAYER_PATTERNS)
+            require(self.cfa in BAYER_PATTERNS, f'frames.cfa must be one of {allowed}, not "{self.cfa}"')
+        require(
+            self.black_level is None or self.white_level is None or self.white_level > self.black_level,
+            f"frames.white_level must be above black_level {self.black_level}, not {self.white_level}",
+        )
+
+
+LOCAL_MEAN = 10.0
+"""Width (px) of the local mean. Chosen: two to three speckles."""
+
+
+_WIDER_AT_CRACKS = 3.0
+"""How many times as wide it is where a mesh has cracks: a gap changes so wide a mean nearly alike all over an element,
+and the gain of the means takes that out. With 5 the gap is followed no better and a slope of the brightness worse
+(rendered cracks open by up to 5 px)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IlluminationSettings(Checked):
+    """How the frame is separated into one image per light (``[illumination]``).
+
+    Attributes
+    ----------
+    demosaic
+        Method of `rgbmidic.illumination.separation` for Bayer frames; ``"auto"``: the reflection-aware one, and
+        Malvar's for frames too small for it.
+    normalise
+        Standard deviation in px of the local mean by which each light's image is divided before the solve; 0: grey
+        levels are not changed; ``"auto"``: 10 px, or 30 px where the mesh has cracks (`grey_levels`).
+    """
+
+    section = "illumination"
+
+    demosaic: Literal["auto", "reflection-aware", "malvar", "normalised"] = "auto"
+    normalise: float | Literal["auto"] = bounded("auto", at_least=0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegionSettings(Checked):
+    """The region of interest (``[region]``): exactly one of rectangle, polygon and mask, without the holes.
+
+    With ``mesh.file`` the region is the mesh's area, and these, if stated, restrict it.
+
+    Attributes
+    ----------
+    rectangle
+        (x0, y0, x1, y1) in px.
+    polygon
+        Corners (x, y) in px.
+    mask
+        Image file; non-zero pixels belong to the region.
+    holes
+        Polygons, each of corners (x, y) in px, whose pixels do not belong to it.
+    """
+
+    section = "region"
+
+    rectangle: tuple[float, float, float, float] | None = None
+    polygon: tuple[tuple[float, float], ...] | None = None
+    mask: Path | None = None
+    holes: tuple[tuple[tuple[float, float], ...], ...] = ()
+
+    def _check(self) -> None:
+        stated = sum(getattr(self, kind) is not None for kind in ("rectangle", "polygon", "mask"))
+        require(stated <= 1, f"[region] needs exactly one of rectangle, polygon, mask; given are {stated}")
+        if self.rectangle is not None:
+            x0, y0, x1, y1 = self.rectangle
+            require(
+                x0 < x1 and y0 < y1,
+                f"region.rectangle is [x0, y0, x1, y1] with x0 < x1 and y0 < y1, not {list(self.rectangle)}",
+            )
+        if self.polygon is not None:
+            require_corners("region.polygon", self.polygon, 3, "three")
+        for number, hole in enumerate(self.holes):
+            require_corners(f"region.holes[{number}]", hole, 3, "three")
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether there is a rectangle, polygon or mask."""
+        return any(getattr(self, kind) is not None for kind in ("rectangle", "polygon", "mask"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WeightSettings(Checked):
+    """How each light is weighted (``[weights]``).
+
+    Attributes
+    ----------
+    method
+        ``"statistics"``: inverse variance of each light's own residual around each pixel, robust; ``"threshold"``: the
+        paper's second method, 0 where the blurred image exceeds `threshold`, 1 elsewhere; ``"geometry"``: the paper's
+        first method, from lamps, camera and specimen; ``"images"``: masks made by hand; ``"none"``: 1 everywhere.
+    threshold
+        Fraction of the camera's dynamic range (the paper: 2/3); ``"auto"``: found as in the paper, section 3.2, on the
+        first deformed frame.
+    blur
+        Standard deviation of the Gaussian blur in px; several speckles wide.
+    geometry
+        SCENE.toml with lamps, camera, paint and body, for ``"geometry"``.
+    height_map
+        npy file with the height (mm, towards the camera) of the specimen at every pixel of the reference over the plane
+        of the scene's front point; instead of the scene's body.
+    images
+        Masks for ``"images"``, of the size of the frames, one per light in the lights' order; see
+        `rgbmidic.weights.MaskWeights.read`.
+    limit_deg
+        Light is excluded within this angle of the mirror direction (the paper: 15); None: soft weights, the inverse of
+        the variance expected from geometry, paint and camera noise.
+    """
+
+    section = "weights"
+
+    method: Literal["statistics", "threshold", "geometry", "images", "none"] = "statistics"
+    threshold: float | Literal["auto"] = bounded(2 / 3, above=0, at_most=1)
+    blur: float = bounded(10.0, above=0)
+    geometry: Path | None = None
+    height_map: Path | None = None
+    images: tuple[Path, ...] = ()
+    limit_deg: float | None = bounded(None, above=0, below=180)
+
+    def _check(self) -> None:
+        geometric = self.method == "geometry"
+        require(
+            geometric == (self.geometry is not None),
+            'weights.method = "geometry" and weights.geometry = "SCENE.toml" go together',
+        )
+        require(
+            (self.method == "images") == bool(self.images),
+            'weights.method = "images" and weights.images = ["MASK.png", ...] go together',
+        )
+        for key in ("height_map", "limit_deg"):
+            require(geometric or getattr(self, key) is None, f'weights.{key} is for weights.method = "geometry"')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolverSettings(Checked):
+    """The MIDIC minimisation (``[solver]``), and the options of `rgbmidic.correlate`.
+
+    Attributes
+    ----------
+    prefilter
+        Filter on reference and deformed images: ``"none"``, ``"binomial"`` ([1 2 1] in x and y, zero at the Bayer
+        carriers) or ``"gaussian"`` (standard deviation 1 px).
+    rigid
+        Rigid functions per light after the first: ``"none"``, ``"translation"`` or ``"translation+rotation"``.
+    brightness
+        Grey-level correction: ``"global"``, a gain and offset per light; ``"local"``, both as linear shape functions on
+        the mesh; ``"mean"``, a gain as linear shape functions, from the mean grey levels around the nodes, each on its
+        side of a crack; ``"auto"``, none, or ``"mean"`` where the mesh has cracks and images are divided by their local
+        mean (`grey_levels`).
+    fill
+        Longest distance in px over which nodes that are not measured get a value carried over from measured ones,
+        flagged and with an uncertainty that grows with the distance; 0 leaves them NaN.
+    tolerance
+        The iteration stops when no node moves by more than this (px).
+    max_iterations
+        Iterations before the frame counts as not converged.
+    """
+
+    section = "solver"
+
+    prefilter: Literal["none", "binomial", "gaussian"] = "binomial"
+    rigid: Literal["none", "translation", "translation+rotation"] = "none"
+    brightness: Literal["auto", "none", "global", "local", "mean"] = "auto"
+    fill: float = bounded(0.0, at_least=0)
+    tolerance: float = bounded(1e-3, above=0)
+    max_iterations: int = bounded(50, at_least=1)
+
+
+class SolverOptions(TypedDict, total=False):
+    """The fields of `SolverSettings` as options of a function."""
+
+    prefilter: Literal["none", "binomial", "gaussian"]
+    rigid: Literal["none", "translation", "translation+rotation"]
+    brightness: Literal["auto", "none", "global", "local", "mean"]
+    fill: float
+    tolerance: float
+    max_iterations: int
+
+
+def grey_levels(
+    normalise: float | Literal["auto"], solver: SolverSettings, *, cracked: bool
+) -> tuple[float, SolverSettings]:
+    """Width (px) of the local mean and settings of the solve that hold for a mesh: ``"auto"`` resolved, else as stated.
+
+    A local mean takes in the gap of an open crack, and the other side, which may be lit otherwise. So it is wider where
+    a mesh has cracks, and means over the elements around each node, on one side and without the gap, do the rest.
+
+    Parameters
+    ----------
+    normalise
+        Width of the local mean as stated, px, or ``"auto"``.
+    solver
+        Settings of the solve as stated.
+    cracked
+        Whether the mesh has cracks.
+
+    Returns
+    -------
+    normalise : float
+        px; 0: images are not divided.
+    solver : SolverSettings
+    """
+    if normalise == "auto":
+        normalise = LOCAL_MEAN * (_WIDER_AT_CRACKS if cracked else 1.0)
+    if solver.brightness == "auto":
+        solver = replace(solver, brightness="mean" if cracked and normalise else "none")
+    return normalise, solver
+
+
+_BOUNDS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le, "below": operator.lt}
+
+
+def converted(entry: Field[Any], value: Any, hint: Any, where: str, base: Path | str = "") -> Any:
+    """A value in the type of a field, every number of it finite and within the field's bounds."""
+    value = convert_value(value, hint, where, base)
+    for number in _numbers(value):
+        if not math.isfinite(number):
+            raise ConfigurationError(f"{where} must be finite, not {number}")
+        for bound, limit in entry.metadata.get("bounds", {}).items():
+            if not _BOUNDS[bound](number, limit):
+                raise ConfigurationError(f"{where} must be {bound.replace('_', ' ')} {limit:g}, not {number:g}")
+    return value
+
+
+def _numbers(value: Any) -> list[float]:
+    if isinstance(value, tuple):
+        return [number for entry in value for number in _numbers(entry)]
+    return [value] if isinstance(value, int | float) else []
