@@ -521,14 +521,16 @@ def _print_summary(result: Result, seconds: float) -> None:
         rows["mean"] = f"of {count} frames is the reference: camera noise counts {gain:.2f} of what it does with one"
     for light, fraction in zip(result.lights, result.mean_light_fraction[deformed].T, strict=True):
         known = fraction[fraction == fraction]
-        rows[f'light "{light}"'] = f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
+        rows[f"light {light}"] = f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
     timed = [seconds for seconds in result.each("seconds", deformed) if seconds[0] == seconds[0]] if measured else []
     if timed:  # the mean time of a frame and what each stage takes of it
         mean = sum(timed) / len(timed)
         parts = ", ".join(f"{name} {part:.0%}" for name, part in zip(STAGES, mean / mean.sum(), strict=True))
         rows["frame"] = f"{mean.sum():.2f} s: {parts}"
-    for name, text in {**rows, "time": f"{seconds:.1f} s", "result": result.path}.items():
-        print(f"{name:<8}{text}")
+    rows |= {"time": f"{seconds:.1f} s", "result": str(result.path)}
+    width = max(map(len, rows)) + 2
+    for name, text in rows.items():
+        print(f"{name:<{width}}{text}")
 
 
 app.add_typer(cli_results.app)

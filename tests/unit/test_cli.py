@@ -207,12 +207,24 @@ def test_run_passes_everything_on_and_tells_what_came_out(
     assert {call["path"] for call in calls} == {("f*.tif",)}
 
 
-def _measure_of(*ends: str) -> Callable[..., Result]:
+def test_the_summary_keeps_names_of_lights_apart(
+    command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
+) -> None:
+    """From the fractions behind them, and from its own rows."""
+    for light in ("the lamp no. 1", "time"):
+        _replace_pipeline(monkeypatch, _measure_of("", light=light))
+        out = command("run", test_file, "--out", test_file.parent / "out", "--overwrite", "--no-figures")[1]
+        (line,) = (line for line in out.splitlines() if "of what determines the nodes" in line)
+        assert line.startswith(f"light {light}  ")
+        assert line.endswith("  100% of what determines the nodes")
+
+
+def _measure_of(*ends: str, light: str = "light") -> Callable[..., Result]:
     """Instead of the pipeline: f0 is the reference and measured, the others failed for these reasons, "" if not."""
 
     def measure(_: Any, out: Path, **__: Any) -> Result:
         names = [f"f{index}" for index in range(1 + len(ends))]
-        origin = Origin(nodes=np.zeros((4, 2)), elements=[[0, 1, 2]], names=names, lights=["light"])
+        origin = Origin(nodes=np.zeros((4, 2)), elements=[[0, 1, 2]], names=names, lights=[light])
         store = ResultStore.create(out, origin, overwrite=True)
         good = FrameRecord.of(nodes=4, lights=1, status=0, node_status=[0, 0, 0, 1], light_fraction=np.ones((4, 1)))
         for index, reason in enumerate(("", *ends)):
