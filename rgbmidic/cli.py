@@ -521,7 +521,9 @@ def _print_summary(result: Result, seconds: float) -> None:
         rows["mean"] = f"of {count} frames is the reference: camera noise counts {gain:.2f} of what it does with one"
     for light, fraction in zip(result.lights, result.mean_light_fraction[deformed].T, strict=True):
         known = fraction[fraction == fraction]
-        rows[f"light {light}"] = f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
+        rows[light if light.startswith("light ") else f"light {light}"] = (
+            f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
+        )
     timed = [seconds for seconds in result.each("seconds", deformed) if seconds[0] == seconds[0]] if measured else []
     if timed:  # the mean time of a frame and what each stage takes of it
         mean = sum(timed) / len(timed)

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rgbmidic.errors import InputError, RgbmidicError, disk_reason
+from rgbmidic.errors import InputError, RgbmidicError, disk_reason, shortened
 
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
 REQUIRED = inspect.Parameter.empty
@@ -81,7 +81,7 @@ def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> i
 
 def fail(message: str, status: int) -> int:
     """Print an error as one line; gives the status back."""
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    print(f"error: {shortened(' '.join(message.split()))}", file=sys.stderr)
     return status
 
 
@@ -161,17 +161,19 @@ def read_frames(text: str, option: str = "--frames") -> list[int] | None:
     chosen = list[int]()
     for part in text.split(",") if text else ():
         low, colon, high = (side.strip() for side in part.partition(":"))
-        if not (low.isdecimal() and len(low + high) < 16 and (high.isdecimal() if colon else not high)):
+        known = low.isdecimal() and len(low + high) < 16 and (high.isdecimal() if colon else not high)
+        frames = range(int(low), int(high) if colon else int(low) + 1) if known else range(0)
+        if not 0 < len(frames) <= _MOST_FRAMES - len(chosen):
             chosen.clear()
             break
-        chosen += range(int(low), min(int(high), int(low) + _MOST_FRAMES) if colon else int(low) + 1)
+        chosen += frames
     if text and not chosen:
         raise InputError(f"{option} are indices and ranges such as 0,5,10:20 (10 to 19), not {text!r}")
     return chosen or None
 
 
 _MOST_FRAMES = 10**7
-"""Most frames of a range: a longer one is a slip, which a result or test refuses, and takes no memory before."""
+"""Most frames that an option states: more are a slip."""
 _EXAMPLES = {
     "X,Y": "120,85.5",
     "X0,Y0:X1,Y1": "40,60:200,60",

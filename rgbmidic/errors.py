@@ -21,6 +21,7 @@ __all__ = [
     "disk_reason",
     "first_line",
     "legible",
+    "shortened",
 ]
 
 _LONG_WORD, _LONGEST = re.compile(r"\S{1000,}"), 4000
@@ -45,6 +46,14 @@ def first_line(error: Exception) -> str:
     return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
+def shortened(line: str) -> str:
+    """Return a message without what no reader needs of a long word, or of a long text."""
+    line = _LONG_WORD.sub(lambda word: f"{word[0][:100]}...{word[0][-40:]} ({len(word[0])} characters)", line)
+    if len(line) > _LONGEST:
+        line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 4 :]} (shortened from {len(line)} characters)"
+    return line
+
+
 class RgbmidicError(Exception):
     r"""Base of all errors that rgbmidic raises on purpose.
 
@@ -53,11 +62,7 @@ class RgbmidicError(Exception):
     """
 
     def __init__(self, message: str = "") -> None:
-        line = _CONTROL.sub(lambda found: ascii(found[0])[1:-1], legible(message))
-        line = _LONG_WORD.sub(lambda word: f"{word[0][:100]}...{word[0][-40:]} ({len(word[0])} characters)", line)
-        if len(line) > _LONGEST:
-            line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 4 :]} (shortened from {len(line)} characters)"
-        super().__init__(line)
+        super().__init__(shortened(_CONTROL.sub(lambda found: ascii(found[0])[1:-1], legible(message))))
 
 
 class InputError(RgbmidicError, ValueError):

@@ -250,7 +250,9 @@ def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str)
     if weights is None:
         return None
     values = plain(weights)
-    if values.shape not in (shape, shape[1:]) or values.dtype.kind not in "buif":
+    if values.dtype.kind not in "buif":
+        raise InputError(f"{name} must be real numbers, not {values.dtype}")
+    if values.shape not in (shape, shape[1:]):
         raise InputError(f"{name} must have shape {shape[1:]} or {shape}; given is {values.dtype} {values.shape}")
     if not (values.min() >= 0 and values.max() < np.inf):  # NaN spreads to both
         raise InputError(f"{name} must be finite and not negative")

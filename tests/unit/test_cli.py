@@ -92,6 +92,13 @@ def test_wrong_input_is_one_line_and_status_2(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_huge_argument_is_refused_in_a_line_that_can_be_read(command: Run) -> None:
+    for arguments in (["x" * 100_000], ["run", "--" + "y" * 100_000]):
+        status, _, error = command(*arguments)
+        assert status == 2
+        assert len(error) < 1000
+
+
 def test_failure_is_one_line_and_status_1(command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path) -> None:
     def measure(*_: Any, **__: Any) -> Result:
         raise ZeroDivisionError("a fault\nof ours")
@@ -596,6 +603,6 @@ def test_frames_have_one_grammar_in_all_commands() -> None:
     assert read_frames("") is None
     assert read_frames("5") == [5]
     assert read_frames("0, 5,10:13") == [0, 5, 10, 11, 12]
-    for wrong in ("a", "5:", ":5", "5,,6", "7:7", "-1", "1.5", "9" * 30):
+    for wrong in ("a", "5:", ":5", "5,,6", "7:7", "-1", "1.5", "9" * 30, "0,7:7", "3:1,5", "0:20000000"):
         with pytest.raises(InputError, match="--frames are indices and ranges such as"):
             read_frames(wrong)
