@@ -12,14 +12,7 @@ import typer
 
 from rgbmidic import cli_results, command
 from rgbmidic._version import __version__
-from rgbmidic.cli_results import (
-    Out,
-    Overwrite,
-    note,
-    print_table,
-    progress_of,
-    read_settings,
-)
+from rgbmidic.cli_results import Out, Overwrite, note, print_table, progress_of, read_settings
 from rgbmidic.errors import InputError
 
 if TYPE_CHECKING:

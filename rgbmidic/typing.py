@@ -1,4 +1,4 @@
-"""Array types of the annotations, whose docstrings tell their shapes, and arrays as users give them."""
+"""Array types of the annotations; a docstring tells their shapes."""
 
 from typing import Any
 
@@ -13,11 +13,3 @@ FloatImage = npt.NDArray[np.float32]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 """Indices, and labels of nodes and elements."""
-
-
-def plain(given: npt.ArrayLike) -> AnyArray:
-    """Return an array whose masked entries are NaN: as floats where there are any, else of the dtype given."""
-    if isinstance(given, np.ma.MaskedArray) and np.ma.is_masked(given):
-        values: Any = given if given.dtype.kind in "fc" else given.astype(np.float64)
-        return np.asarray(np.ma.filled(values, np.nan))
-    return np.asarray(given)

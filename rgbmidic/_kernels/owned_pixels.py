@@ -12,11 +12,7 @@ from rgbmidic._kernels.grids import expand_row
 from rgbmidic._kernels.threads import FAST, compiled, helper, over_ranges
 
 _ZERO = np.float32(0.0)
-
-
 _ONE = np.float32(1.0)
-
-
 _LANES = 8
 """Pixels in a vector register: lines have 13 on average, and what does not fill a vector costs as much as eight."""
 

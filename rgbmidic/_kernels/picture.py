@@ -8,8 +8,6 @@ from rgbmidic._kernels.threads import compiled, over_ranges
 
 _EDGE = 1e-6
 """Distance (px) within which a pixel on an edge is painted by both elements: no gap through rounding in float64."""
-
-
 _EACH, _OPAQUE = np.uint32(0x010101), np.uint32(0xFF000000)
 """A grey level in the three colours of a pixel, and its opacity, as the bytes of a number."""
 

@@ -15,8 +15,6 @@ PAD = 2
 
 _POLE = np.float32(np.sqrt(3.0) - 2.0)
 _GAIN = np.float32(6.0)  # (1 - z)(1 - 1/z) of the pole z
-
-
 _LINE = 16
 """Columns of a cache line."""
 _STEPS, _REACH = 4, 15

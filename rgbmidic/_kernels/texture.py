@@ -11,12 +11,8 @@ from rgbmidic._kernels.threads import compiled, helper, over_ranges
 
 REACH = 3
 """Rows and columns beyond a cell that its binomial sums reach."""
-
-
 PLANE_PAIRS = tuple((p, q) for p in range(4) for q in range(p, 4))
 """Pairs of the planes of a mosaic; plane 2 a + b has the samples of row a and column b of the 2x2 cells."""
-
-
 _CELLS = 128
 """Cells of a row at a time."""
 

@@ -6,11 +6,7 @@ from rgbmidic._kernels.threads import FAST, compiled, over_ranges
 
 BLOCK = 4096
 """Pixels at a time: what a core's fastest cache holds."""
-
-
 _ZERO = np.float32(0.0)
-
-
 _ONE = np.float32(1.0)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +13,7 @@ from rgbmidic._kernels.splines import PAD, bspline_coefficients
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import fill_holes
 from rgbmidic.mesh import PixelMap
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage, plain
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
 _GAUSSIAN = np.exp(-(np.arange(-3, 4) ** 2) / 2)
 PREFILTERS: dict[str, FloatArray] = {
@@ -23,6 +25,14 @@ PREFILTERS: dict[str, FloatArray] = {
 """One-dimensional prefilters, applied along both axes; ``"gaussian"`` has a standard deviation of 1 px."""
 
 
+def unmasked(given: npt.ArrayLike) -> AnyArray:
+    """Return an array whose masked entries are NaN: as floats where there are any, else of the dtype given."""
+    if isinstance(given, np.ma.MaskedArray) and np.ma.is_masked(given):
+        values: Any = given if given.dtype.kind in "fc" else given.astype(np.float64)
+        return np.asarray(np.ma.filled(values, np.nan))
+    return np.asarray(given)
+
+
 def as_light_stack(images: npt.ArrayLike, name: str) -> FloatImage:
     """Images (H, W) or (k, H, W) as a float32 stack (k, H, W).
 
@@ -31,7 +41,7 @@ def as_light_stack(images: npt.ArrayLike, name: str) -> FloatImage:
     InputError
         Another number of axes, not real numbers, or under 8 px in height or width.
     """
-    stack = plain(images)
+    stack = unmasked(images)
     if stack.ndim not in (2, 3) or stack.dtype.kind not in "buif":
         raise InputError(f"{name} must be a real image (H, W) or (k, H, W), not {stack.dtype} of shape {stack.shape}")
     stack = np.atleast_3d(stack) if stack.ndim == 3 else stack[None]

@@ -30,41 +30,23 @@ from rgbmidic.typing import BoolArray, FloatArray
 _INNER = 2.0
 """Least inner radius of an annulus, in elements: from there on K of an image without noise is right to .3 % (measured,
 docs/how-to/results.md)."""
-
-
 _STRAIGHT = 1.0
 """Distance (px) of a straight crack's nodes from its line: as near as a row of nodes follows a stated path."""
-
-
 _MOST_TERMS = 7
 """Highest term of the series that a test may ask for."""
-
-
 _PER_COEFFICIENT = 4
 """Least number of measured components of displacement for a coefficient of the series."""
-
-
 _CHANCE = 1e-3
 """Probability with which noise alone asks for more terms of the series, over all frames together."""
-
-
 _GAP_DEG = 45.0
 """Largest angle without a measured node: half of the shortest period, 90 degrees, of the terms up to the 7th that are
 left when the smooth ones are taken (chosen)."""
-
-
 _OUTSIDE = 0.02
 """Part of an annulus that may be outside the mesh: slivers at the edge are left out of it."""
-
-
 _STEPS, _EXACT = 20, 1e-3
 """Most Gauss-Newton steps of a tip's place, and the step (px) that ends them."""
-
-
 _POOR = 1.5
 """Chi-square over its degrees of freedom from which a remark says that the field is not the series'."""
-
-
 _LEAST = 1e-3
 """Least uncertainty of a node over the median one: a node that is stated without noise does not outweigh all others."""
 

@@ -9,12 +9,8 @@ from rgbmidic.illumination.linear import NoiseModel
 
 SIGNIFICANCE = 6.0
 """Standard errors beyond which a departure is not chance: 24 planes and levels are looked at."""
-
-
 WINDOW = 9
 """Grey levels over which the histogram is smooth (a parabola) where noise has a standard deviation of `SMOOTHED`."""
-
-
 SMOOTHED = 2.0
 
 

@@ -45,8 +45,6 @@ target = "speckled"
 """
 ANGLES = (0.33, 1.0, 2.0, 8.0)
 """Rotations of the sphere, degrees."""
-
-
 _SIZE = 96
 """Rows and columns of the frames, px: nine elements of the usual size."""
 _REGION = (10, 10, 86, 86)

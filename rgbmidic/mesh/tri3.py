@@ -25,8 +25,6 @@ logger = logging.getLogger(__name__)
 NARROW = 10
 """Width (px) under which a region is reported as narrow: speckles are 3 to 5 px wide, and a pixel or two at each border
 serve the filters only."""
-
-
 _GRADED = 2.0
 """Ratio of element sizes from which a mesh counts as graded. Those of `Tri3Mesh.from_region`, for which one size
 serves, differ by 1.53 at most (8 to 40 px over rectangles, discs, rings and polygons, with a crack; measured)."""

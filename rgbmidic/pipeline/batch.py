@@ -181,7 +181,7 @@ def run_batch(
     tests: Sequence[BatchTest],
     out: Path,
     *,
-    workers: int | None = 1,
+    workers: int | None = None,
     elastic: tuple[float, float] = ELASTIC,
     overwrite: bool = False,
     conclude: Callable[[Result, TestSettings, bool], None] | None = None,

@@ -17,14 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.threads import keep_memory, machine
-from rgbmidic.correlation import (
-    Deformed,
-    Solution,
-    Start,
-    Status,
-    discretisation_error,
-    fill,
-)
+from rgbmidic.correlation import Deformed, Solution, Start, Status, discretisation_error, fill
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import brightness_change
 from rgbmidic.errors import FrameError, RgbmidicError
@@ -33,8 +26,7 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.pipeline.order import STRIDE, is_key
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.reference_state import SATURATED
-from rgbmidic.pipeline.suitability import exposure_fault, saturated_fraction, too_small
+from rgbmidic.pipeline.suitability import SATURATED, exposure_fault, saturated_fraction, too_small
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage

@@ -25,24 +25,12 @@ from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import Window, open_series
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.images import IlluminationImages, correlated
-from rgbmidic.illumination.separation import (
-    LightSeparation,
-    RawState,
-    Separation,
-    WindowedSeparation,
-    light_images,
-)
+from rgbmidic.illumination.separation import LightSeparation, RawState, Separation, WindowedSeparation, light_images
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh
 from rgbmidic.pipeline.reference_state import ReferenceState
 from rgbmidic.pipeline.region import finite_elements_of, read_region, region_and_window, window_around
 from rgbmidic.pipeline.source import FrameSequence, Series, open_sequence
-from rgbmidic.pipeline.suitability import (
-    HARDLY_ENOUGH,
-    saturated_fraction,
-    speckle_size,
-    tell_small,
-    too_small,
-)
+from rgbmidic.pipeline.suitability import HARDLY_ENOUGH, saturated_fraction, speckle_size, tell_small, too_small
 from rgbmidic.settings import SolverSettings, TestSettings, grey_levels
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights

@@ -13,14 +13,11 @@ from rgbmidic.frames import Window
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import DARK, IlluminationImages
-from rgbmidic.illumination.separation import (
-    LightSeparation,
-    RawState,
-    reference_images,
-)
+from rgbmidic.illumination.separation import LightSeparation, RawState, reference_images
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline.source import Series
 from rgbmidic.pipeline.suitability import (
+    SATURATED,
     check_texture,
     exposure_fault,
     light_levels,
@@ -117,15 +114,8 @@ def _check_raw(
             logger.warning("%s may not be what %s calibrates: %s", names, settings.calibration_file, found.text)
 
 
-SATURATED = 0.1
-"""Fraction of the samples in the region that are saturated, beyond that of the reference, from which a frame is
-over-exposed. Chosen: reflections saturate a few per cent; three times the exposure saturates a fifth and more."""
-
-
 _ABOVE = 2.0
 """Samples this many times the white level have a bit more than it: it is not the camera's, or deliberately low."""
-
-
 _BLIND = 0.98
 """Fraction from which the lights are not separated: with .985 they still were, with .99 no texture was left to learn
 from in two of three frames (measured)."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from rgbmidic._kernels.threads import threads
 from rgbmidic.correlation import Status
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.illumination.separation import LightSeparation
@@ -22,14 +23,12 @@ from rgbmidic.pipeline.resolution import choose, refine
 from rgbmidic.pipeline.schedule import Schedule
 from rgbmidic.pipeline.source import FrameSequence, describe
 from rgbmidic.pipeline.suitability import light_levels
-from rgbmidic.pipeline.workers import available_cores, open_workers
+from rgbmidic.pipeline.workers import open_workers
 from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.results.store import listed, read_mesh
-from rgbmidic.settings import (
-    TestSettings,
-)
+from rgbmidic.settings import TestSettings
 from rgbmidic.weights import LightWeights
 
 logger = logging.getLogger(__name__)
@@ -87,9 +86,9 @@ def measure(
         Only these of the frames that the settings choose, with the same numbers; other processes may write to the
         folder at the same time. When all are measured, `rgbmidic.results.finish_result` finishes the result. None: all.
     workers
-        Number of frames that are measured at a time, each by a thread of this process. None: one for each core, but 1
-        with a `separation` or `weights`, which more than one thread would call at a time. A `source` is read by one
-        thread at a time.
+        Number of frames that are measured at a time, each by a thread of this process. None: one for each core, or as
+        the environment's RGBMIDIC_THREADS states, but 1 with a `separation` or `weights`, which more than one thread
+        would call at a time. A `source` is read by one thread at a time.
     scheduler
         Address of the scheduler of a Dask cluster, instead of threads of this process.
     timings
@@ -128,7 +127,7 @@ def measure(
         objects["weights"] = describe(plan.weights)
     places = _places(plan.series.chosen, frames)
     if workers is None:
-        workers = available_cores() if separation is None and weights is None else 1
+        workers = threads() if separation is None and weights is None else 1
     with _store(plan, Path(out), places if frames else None, objects, overwrite=overwrite, resume=resume) as store:
         if resume and frames is None:
             _take_back(plan, store, retry_failed=retry_failed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from dataclasses import replace
 from heapq import nsmallest
 from typing import Any
@@ -76,7 +76,7 @@ class Schedule:
         while not self.done:
             while self._ready and len(self._running) < workers.slots:
                 self._submit(workers, *self._next(workers.slots))
-            for future in workers.wait(self._running):
+            for future in wait(self._running, return_when=FIRST_COMPLETED).done:
                 position, start = self._running.pop(future)
                 self._take(position, start, self._outcome(future, position), progress)
 

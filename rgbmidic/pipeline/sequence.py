@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.correlation import Solution, Start
+from rgbmidic.correlation.images import unmasked
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.errors import FrameError, InputError, RgbmidicError
 from rgbmidic.illumination.separation import LightSeparation
@@ -36,7 +37,6 @@ from rgbmidic.settings import (
     TestSettings,
     WeightSettings,
 )
-from rgbmidic.typing import plain
 from rgbmidic.weights import LightWeights, MaskWeights
 
 logger = logging.getLogger(__name__)
@@ -153,7 +153,7 @@ class _Latest:
         state = self.state if index else self.reference
         if not self.light_images or hasattr(state, "values"):
             return state
-        images = plain(state)
+        images = unmasked(state)
         if images.dtype.kind not in "buif":
             raise FrameError(f"a state must be an array of real numbers or IlluminationImages, not {images.dtype}")
         return images.astype(np.float32)

@@ -12,8 +12,6 @@ from rgbmidic.pipeline.suitability import SPECKLES
 _MEASURED = 0.97
 """Area that a size must measure, of the size that measures most: what it loses is where its error would be the largest,
 such as a steep bump beside one node. Chosen: a node of elements of 40 px on 250 px is 8 %."""
-
-
 _ALIKE = 1.05
 """Total errors of the displacement within this factor count as the same, and those of strain decide: an estimate of the
 discretisation error is no better than that."""

@@ -16,6 +16,7 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 
+from rgbmidic.correlation.images import unmasked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RgbmidicError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.series import chosen_frames
@@ -23,7 +24,7 @@ from rgbmidic.frames.stored import Camera, StoredFrame, raw_frame
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.settings import FrameSettings
-from rgbmidic.typing import AnyArray, plain
+from rgbmidic.typing import AnyArray
 
 _LONGEST_NAME = 120
 """Characters of a description that are kept as they are; a longer one is cut and gets its checksum. Chosen; not
@@ -222,7 +223,7 @@ class SourceSeries:
         states = tuple(state) if isinstance(state, tuple | list) else (state,)
         if states and all(isinstance(one, Mosaic | ChannelFrame) for one in states):
             return states
-        values = plain(state)
+        values = unmasked(state)
         if values.dtype.kind == "f" and np.asarray(state).dtype.kind in "ui":
             raise FrameError(
                 f"{name} of {_class(self.source)} has masked samples, which a raw frame cannot have: give it saturated "

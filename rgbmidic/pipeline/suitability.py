@@ -11,9 +11,7 @@ from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import QUANTISATION
-from rgbmidic.illumination.separation import (
-    RawState,
-)
+from rgbmidic.illumination.separation import RawState
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.mesh import FiniteElementMesh, Region, Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
@@ -22,8 +20,6 @@ logger = logging.getLogger(__name__)
 
 _LOOKED_AT = 256
 """Largest side (px) of the part of the region in which the speckle is measured: a thousand speckles of 8 px."""
-
-
 SPECKLES = 3.0
 """Least number of speckles on the side of an element (iDICs Good Practices Guide, for subsets)."""
 
@@ -81,19 +77,13 @@ def speckle_size(images: IlluminationImages, region: Region) -> float | None:
 NO_TEXTURE = 0.05
 """Correlation of neighbouring samples under which nothing can be measured: with speckle of 2 to 5 px no element matched
 at a contrast of .3 times the noise, where it is .02 to .05 (tests/truth/test_texture_check.py)."""
-
-
 FAINT_TEXTURE = 0.2
 """Correlation under which the result is poor: in the same simulation displacements were wrong by .2 to .7 px (rms) at a
 contrast of .5 to .7 times the noise, where it is .08 to .23. Speckle in focus has .5 to .95."""
-
-
 HARDLY_ENOUGH, _ENOUGH = 1.3, 2.0
 """Speckles on the side of an element. Of 150 pairs of simulated images (speckle of 2.6 to 8.4 px and +-600 DN, noise of
 8, 40 and 80 DN, .4 % strain) 13 of the 46 with fewer than 1.3 did not converge, some with most of their nodes lost, 1
 of the 36 with 1.3 to 1.85, and none of the 68 with more, which lost 2 % of the nodes at most."""
-
-
 _MEAN_WIDTH = 5.0
 """Standard deviation, in samples, of the local mean that is taken off: shading is no texture."""
 
@@ -165,6 +155,11 @@ def exposure_fault(state: RawState, inside: BoolArray) -> str | None:
     faults = [_fault(frame, inside) for frame in state]
     told = [f"light {i + 1}: {fault}" if len(state) > 1 else fault for i, fault in enumerate(faults) if fault]
     return "; ".join(told) or None
+
+
+SATURATED = 0.1
+"""Fraction of the samples in the region that are saturated, beyond that of the reference, from which a frame is
+over-exposed. Chosen: reflections saturate a few per cent; three times the exposure saturates a fifth and more."""
 
 
 def saturated_fraction(state: RawState, inside: BoolArray) -> float:

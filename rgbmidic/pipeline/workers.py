@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import importlib
 import logging
-import os
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
+from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Self
@@ -53,10 +52,6 @@ class Workers(ABC):
     def close(self) -> None:
         """Stop; what has not begun is not measured."""
 
-    def wait(self, running: Collection[Future[Measured]]) -> set[Future[Measured]]:
-        """Wait for the first of some frames to end."""
-        return wait(running, return_when=FIRST_COMPLETED).done
-
     def __enter__(self) -> Self:
         return self
 
@@ -67,7 +62,7 @@ class Workers(ABC):
 class Threads(Workers):
     """Threads of this process, each with a frame; those that share a kernel are divided among the frames.
 
-    One thread is the caller's own.
+    A single one is the caller's own thread.
     """
 
     def __init__(self, plan: Plan, count: int) -> None:
@@ -179,11 +174,6 @@ def _answering() -> Iterator[None]:
 def open_workers(plan: Plan, count: int, scheduler: str | None = None) -> Workers:
     """A Dask cluster where its scheduler is named, else `count` threads of this process."""
     return Threads(plan, count) if scheduler is None else Cluster(plan, scheduler)
-
-
-def available_cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class _Messages(logging.Handler):

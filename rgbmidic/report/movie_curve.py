@@ -6,16 +6,12 @@ import csv
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rgbmidic.errors import InputError
 from rgbmidic.results import Channels
 from rgbmidic.typing import FloatArray
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -6,12 +6,8 @@ import html
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rgbmidic.errors import legible
-
-if TYPE_CHECKING:
-    pass
 
 _STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}
 h1{line-height:1.2}h2{margin-top:2.2rem;border-bottom:1px solid #ccc}

@@ -70,8 +70,6 @@ _LONGEST = 60
 """Letters of a name that are shown: a title has room for twice as many."""
 _SPAN = 4.0
 """Colours of a positive quantity end at its median over this and times this: else outliers turn the bulk black."""
-
-
 _TIP = 0.045
 """Height of the point of a colour bar, as a fraction of the panel's: as matplotlib's."""
 

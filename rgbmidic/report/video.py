@@ -10,23 +10,18 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 from threading import Event, Timer
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import ResultError
 
-if TYPE_CHECKING:
-    pass
-
 Page = npt.NDArray[np.uint8]
 """Red, green, blue and opacity of a page, (H, W, 4)."""
 
 
 PALETTE = 256
-
-
 _PATIENCE = 300.0
 """Seconds after which an ffmpeg that neither takes a page nor ends is ended. Measured: noise of 3840 x 2160 px takes .5
 s a page, and 12 s at the end for the pages held back; the largest page has 8 times as many, and others may compute."""

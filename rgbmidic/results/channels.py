@@ -22,20 +22,10 @@ from rgbmidic.typing import FloatArray
 logger = logging.getLogger(__name__)
 
 _TIME = re.compile(r"(?:time|t)(?:[\s_(\[]+(s|ms|us|µs)[)\]]?)?", re.IGNORECASE)
-
-
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
-
-
 _NEWTONS = {"N": 1.0, "kN": 1e3}
-
-
 _DECIMAL = re.compile(r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:e[+-]?\d+)?|nan", re.IGNORECASE | re.ASCII)
-
-
 _UNIT = re.compile(r".*[\s_(\[](kN|N)[)\]]?")
-
-
 _FEWEST, _ALIKE = 8, 0.7
 """Values that an alignment needs at least, and the correlation coefficient: half of the variance explained (chosen)."""
 

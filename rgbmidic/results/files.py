@@ -103,7 +103,7 @@ def read_json(path: Path) -> Any:
         raise ResultError(f"{path} is damaged: {error}") from None
 
 
-def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool = False, lasting: bool = True) -> None:
+def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool = False) -> None:
     """Write a file under another name and rename it when all of it is written; else nothing is left of it.
 
     Parameters
@@ -115,16 +115,13 @@ def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool
     new
         Whether a file of this name stays as it is, also one that another process writes at the same time; else it is
         replaced.
-    lasting
-        Whether it is on the disk before it gets its name; else a machine without power may lose it.
     """
     temporary = path.with_name(f"{path.name}.{socket.gethostname()}.{os.getpid()}.part")
     try:
         with writing(path), temporary.open("w+b") as file:
             write(file)
             file.flush()
-            if lasting:
-                os.fsync(file.fileno())
+            os.fsync(file.fileno())
             if new:
                 try:
                     path.hardlink_to(temporary)

@@ -17,13 +17,9 @@ from rgbmidic.typing import BoolArray, FloatArray
 _FEWEST, _MOST = 3, 12
 """Parts of an element's side over which the simulation is averaged: elements of half the simulation's, within these
 bounds. The rule's error falls as the square of their number: 1 % of what levelling changes at 3 (derived)."""
-
-
 _BEYOND = 0.5
 """How far beyond an element of the simulation, in its barycentric coordinates, it is continued linearly: the outline of
 a region that was drawn by hand differs by some px (chosen)."""
-
-
 _AT_ONCE = 20_000
 """Points that are looked up at once: some 60 MB (derived)."""
 

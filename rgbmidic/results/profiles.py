@@ -13,11 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import (
-    ProfileLine,
-    Units,
-    column,
-)
+from rgbmidic.fields import ProfileLine, Units, column
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.maps import MapField, Maps

@@ -117,7 +117,7 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes) -> N
     count, length = len(layout.files), layout.tail.size + _CHECK.size - _COMMENT - _END
     tail = layout.tail.pack(*entries, b"PK\x05\x06", 0, 0, count, count, length, end, _COMMENT, run, frame)
     content = b"".join([*parts, tail, _CHECK.pack(zlib.crc32(tail))])
-    write_complete(record_file(folder, frame), lambda file: file.write(content), lasting=False)
+    write_complete(record_file(folder, frame), lambda file: file.write(content))
 
 
 def _read_record(folder: Path, frame: int, names: Iterable[str], run: bytes) -> dict[str, Any]:

@@ -26,15 +26,9 @@ logger = logging.getLogger(__name__)
 _DIFFERENT = 0.01
 """Relative difference of the scale of points from a stated one above which a warning names both: half a pixel at each
 end of 100 px is .7 % (derived)."""
-
-
 _FIELDS = ("displacement", "displacements", "u", "disp")
 """Names, in small letters, under which a displacement is written: by ParaView and CalculiX, by Abaqus, by others."""
-
-
 _COMPONENT = re.compile(r"(?:u|v|u[xy12]|u_[xy12])(?:_(mm|m|um|inch))?", re.IGNORECASE)
-
-
 _TIMES = {"time": 1.0, "time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6}
 
 

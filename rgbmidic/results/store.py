@@ -9,7 +9,6 @@ it.
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -170,9 +169,7 @@ class ResultStore:
         self.release()
 
     def release(self) -> None:
-        """Have all that was written put on the disk and remove the claim, so that other runs can write these frames."""
-        if hasattr(os, "sync"):  # once: for each frame by itself it takes as long as three of them take to be written
-            os.sync()
+        """Remove the claim, so that other runs can write these frames."""
         self._claim.release()
 
     def write_frame(self, index: int, record: FrameRecord) -> None:

@@ -22,9 +22,9 @@ from rgbmidic.settings.sections import (
     RegionSettings,
     SolverSettings,
     WeightSettings,
-    _hints,
     bounded,
     converted,
+    hints_of,
     require,
     require_corners,
 )
@@ -406,7 +406,7 @@ class TestSettings(Checked):
             A section or key is unknown, missing, of the wrong type, out of range, or contradicts another.
         """
         base = Path(base).resolve()
-        hints, sections = _hints(cast(Any, cls)), _sections(cls)
+        hints, sections = hints_of(cast(Any, cls)), section_keys(cls)
         places = {_place(entry): entry.name for entry in fields(cls)}
         check_names(document, sections, "section", "the file")
         values: dict[str, Any] = {"base": base}
@@ -417,7 +417,7 @@ class TestSettings(Checked):
                 continue
             check_names(content, sections[name], "key", f"[{name}]")
             for key, value in content.items():
-                values[places[name, key]] = convert_value(value, sections[name][key], f"{name}.{key}", base)
+                values[places[name, key]] = convert_value(value, sections[name][key][0], f"{name}.{key}", base)
         for entry in fields(cls):
             if _is_required(entry) and entry.name not in values:
                 raise ConfigurationError(f"the section [{entry.name}] is missing")
@@ -470,7 +470,7 @@ def read_section(
     ConfigurationError
         A key is unknown, missing, of the wrong type, out of range, or contradicts another.
     """
-    hints = {key: hint for key, hint in _hints(cast(Any, kind)).items() if key not in ready}
+    hints = {key: hint for key, hint in hints_of(cast(Any, kind)).items() if key not in ready}
     check_names(content, hints, "key", f"[{name}]")
     for entry in fields(cast(Any, kind)):
         if entry.name in content:
@@ -544,18 +544,13 @@ def _is_required(entry: Field[Any]) -> bool:
 
 def section_keys(settings: type[TestSettings]) -> dict[str, dict[str, tuple[Any, Field[Any]]]]:
     """For every section its keys, each with the type of its value and the field that holds it."""
-    hints = _hints(cast(Any, settings))
+    hints = hints_of(cast(Any, settings))
     sections: dict[str, dict[str, tuple[Any, Field[Any]]]] = {}
     for entry in fields(settings):
         section, key = _place(entry)
         if key:
             sections.setdefault(section, {})[key] = hints[entry.name], entry
         elif section:
-            parts = _hints(hints[entry.name])
+            parts = hints_of(hints[entry.name])
             sections[section] = {part.name: (parts[part.name], part) for part in fields(hints[entry.name])}
     return sections
-
-
-def _sections(settings: type[TestSettings]) -> dict[str, dict[str, Any]]:
-    """For every section its keys with the types of their values."""
-    return {name: {key: hint for key, (hint, _) in keys.items()} for name, keys in section_keys(settings).items()}

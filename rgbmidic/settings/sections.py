@@ -14,7 +14,8 @@ from rgbmidic.settings.conversion import convert_value
 
 
 @cache
-def _hints(settings: Any) -> dict[str, Any]:
+def hints_of(settings: Any) -> dict[str, Any]:
+    """Types of the fields of a class of settings, which take a while to resolve."""
     return get_type_hints(settings)
 
 
@@ -49,7 +50,7 @@ class Checked:
     section = ""
 
     def __post_init__(self) -> None:
-        hints = _hints(cast(Any, self.__class__))
+        hints = hints_of(cast(Any, self.__class__))
         for entry in fields(cast(Any, self)):
             where = entry.metadata.get("key") or f"{self.section}.{entry.name}".lstrip(".")
             value = converted(entry, getattr(self, entry.name), hints[entry.name], where)
@@ -152,8 +153,6 @@ class FrameSettings(Checked):
 
 LOCAL_MEAN = 10.0
 """Width (px) of the local mean. Chosen: two to three speckles."""
-
-
 _WIDER_AT_CRACKS = 3.0
 """How many times as wide it is where a mesh has cracks: a gap changes so wide a mean nearly alike all over an element,
 and the gain of the means takes that out. With 5 the gap is followed no better and a slope of the brightness worse

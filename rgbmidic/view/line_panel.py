@@ -25,12 +25,8 @@ from rgbmidic.view.picture import Background, warning
 
 _SLICE = 0.25
 """Seconds for which frames are read along a line before they are drawn, or before another line has its turn."""
-
-
 _ACROSS = 1500
 """Columns of a position-time picture at most: its place on a screen of 3840 has as many."""
-
-
 _IMAGE = "image x y dw dh"
 
 

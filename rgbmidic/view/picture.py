@@ -270,8 +270,6 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 T = TypeVar("T")
-
-
 _SPREAD = 24
 """Frames, evenly spread, whose values set the colour range of a whole test: they are read within a second."""
 _KEPT = 8

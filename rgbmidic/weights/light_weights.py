@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from rgbmidic._kernels.weights import best_mean, robust_weights
 from rgbmidic.correlation import PrecisionMethod
-from rgbmidic.correlation.images import spread, window_covariance, window_means
+from rgbmidic.correlation.images import spread, unmasked, window_covariance, window_means
 from rgbmidic.correlation.residual import Precision, Residual
 from rgbmidic.correlation.uncertainty import displacing_fraction
 from rgbmidic.errors import ConfigurationError, InputError
@@ -29,7 +29,7 @@ from rgbmidic.frames import read_frame
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region
 from rgbmidic.settings import TestSettings
-from rgbmidic.typing import FloatImage, plain
+from rgbmidic.typing import FloatImage
 from rgbmidic.weights.threshold import ThresholdWeights, automatic_weights
 
 
@@ -249,7 +249,7 @@ def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str)
     """
     if weights is None:
         return None
-    values = plain(weights)
+    values = unmasked(weights)
     if values.dtype.kind not in "buif":
         raise InputError(f"{name} must be real numbers, not {values.dtype}")
     if values.shape not in (shape, shape[1:]):

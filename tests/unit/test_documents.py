@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from dataclasses import MISSING, fields
+from dataclasses import MISSING
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,7 @@ from rgbmidic import NodeStatus, Status, TestSettings, cli
 from rgbmidic.command import execute
 from rgbmidic.results import QUANTITIES
 from rgbmidic.results.quantities import SHARED
-from rgbmidic.settings.schema import _place, _sections
+from rgbmidic.settings.schema import section_keys
 from rgbmidic_calibration import cli as calibrate
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,20 +36,10 @@ def documented() -> dict[str, dict[str, str]]:
 
 def defaults() -> dict[str, dict[str, object]]:
     """Section, key and default of the code; MISSING where the key is needed."""
-    found: dict[str, dict[str, object]] = {section: {} for section in _sections(TestSettings)}
-    for entry in fields(TestSettings):
-        section, key = _place(entry)
-        if key:
-            found[section][key] = entry.default
-        elif section:
-            types = {"frames": "FrameSettings", "region": "RegionSettings"}
-            home = entry.default_factory if entry.default_factory is not MISSING else types[section]
-            if isinstance(home, str):
-                import rgbmidic.settings
-
-                home = getattr(rgbmidic.settings, home)
-            found[section] |= {part.name: part.default for part in fields(home)}
-    return found
+    return {
+        name: {key: entry.default for key, (_, entry) in keys.items()}
+        for name, keys in section_keys(TestSettings).items()
+    }
 
 
 def as_written(default: object) -> str:
@@ -75,8 +65,8 @@ def test_every_choice_of_a_key_is_named():
     text = (DOCS / "reference/test-file.md").read_text(encoding="utf-8")
     from typing import get_args
 
-    for section, keys in _sections(TestSettings).items():
-        for key, hint in keys.items():
+    for section, keys in section_keys(TestSettings).items():
+        for key, (hint, _) in keys.items():
             row = next(line for line in text.splitlines() if line.startswith(f"| `{key}` |"))
             for choice in (c for part in (hint, *get_args(hint)) for c in get_args(part) if isinstance(c, str)):
                 assert choice in row, f"{section}.{key}: {choice}"
@@ -117,7 +107,7 @@ def test_every_term_of_the_glossary_is_defined_in_a_sentence():
 
 def test_the_identifiers_of_the_glossary_exist():
     """Names in code quotes are keys of TEST.toml, quantities of a result, or names in the package."""
-    keys = {key for section in _sections(TestSettings).values() for key in section} | {*QUANTITIES, *SHARED}
+    keys = {key for section in section_keys(TestSettings).values() for key in section} | {*QUANTITIES, *SHARED}
     source = "\n".join(file.read_text(encoding="utf-8") for file in (ROOT / "rgbmidic").rglob("*.py"))
     source += "\n".join(file.read_text(encoding="utf-8") for file in (ROOT / "calibration").rglob("*.py"))
     for _, names, *_ in glossary():
