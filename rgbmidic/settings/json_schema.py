@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import types
-from dataclasses import MISSING, is_dataclass
+from dataclasses import MISSING, Field
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -32,10 +32,7 @@ def json_schema() -> dict[str, Any]:
         name: {
             "type": "object",
             "additionalProperties": False,
-            "properties": {
-                key: _value(hint) | _limits(hint, entry.metadata.get("bounds", {})) | _default(entry)
-                for key, (hint, entry) in keys.items()
-            },
+            "properties": {key: _described(hint, entry) for key, (hint, entry) in keys.items()},
             "required": [key for key, (_, entry) in keys.items() if entry.default is entry.default_factory is MISSING],
         }
         for name, keys in section_keys(TestSettings).items()
@@ -65,14 +62,12 @@ def _value(hint: Any) -> dict[str, Any]:
     return {"anyOf": [{"type": "array", "items": one}, one, *ranges]}
 
 
-def _limits(hint: Any, bounds: dict[str, float]) -> dict[str, Any]:
-    """Bounds of a single number; those of numbers in lists are checked when the file is read."""
-    return {_BOUNDS[name]: value for name, value in bounds.items()} if hint in (int, float) else {}
-
-
-def _default(entry: Any) -> dict[str, Any]:
-    known = entry.default not in (MISSING, None) and not is_dataclass(entry.default)
-    return {"default": plain(entry.default)} if known else {}
+def _described(hint: Any, entry: Field[Any]) -> dict[str, Any]:
+    """Describe a key; bounds are those of a single number, and in lists are checked when the file is read."""
+    known = _value(hint)
+    if hint in (int, float):
+        known |= {_BOUNDS[name]: value for name, value in entry.metadata.get("bounds", {}).items()}
+    return known if entry.default in (MISSING, None) else known | {"default": plain(entry.default)}
 
 
 if __name__ == "__main__":
