@@ -2,7 +2,7 @@
 
 from rgbmidic.fields.crack_tip import StressIntensity, Williams, stress_intensity
 from rgbmidic.fields.cracks import Jump, crack_jump
-from rgbmidic.fields.history import SIGMA, History, Nodal, Probe, Rates, Units, column, high_pass, rates
+from rgbmidic.fields.history import SIGMA, History, Nodal, Probe, Rates, high_pass, rates
 from rgbmidic.fields.measures import EQUIVALENT, MEASURES, RigidMotion, Strain, length_of, strain_of_gradient
 from rgbmidic.fields.nodal import (
     NodalCovariance,
@@ -18,6 +18,7 @@ from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.probes import PROBES, Gauge, Mean, StrainGauge, make_probe
 from rgbmidic.fields.profiles import ProfileLine
 from rgbmidic.fields.strain import StrainGauges, shortest_gauge, strain_of
+from rgbmidic.fields.units import Units, column, rounded, uncertain
 
 __all__ = [
     "EQUIVALENT",
@@ -55,8 +56,10 @@ __all__ = [
     "make_probe",
     "rates",
     "reference_fraction",
+    "rounded",
     "shortest_gauge",
     "strain_of",
     "strain_of_gradient",
     "stress_intensity",
+    "uncertain",
 ]

@@ -22,8 +22,9 @@ from scipy.linalg import cholesky, solve_triangular
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields.cracks import at_some, crack_faces, listed, lowest_copies, nearest_node
-from rgbmidic.fields.history import History, Nodal, Units
+from rgbmidic.fields.history import History, Nodal
 from rgbmidic.fields.nodal import NodalCovariance, Places
+from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 

@@ -1,4 +1,4 @@
-"""Histories of probes: displacements of nodes over the frames, physical units, rates; and the paper's high-pass filter.
+"""Histories of probes: displacements of nodes over the frames, rates; and the paper's high-pass filter.
 
 Velocity and acceleration where motion may set in at any frame come from local polynomials within the pieces of a
 series. A series is cut into pieces, each a polynomial of the times within its noise, which is known; all ways to cut it
@@ -13,10 +13,9 @@ frames have in common, cancels.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -24,6 +23,7 @@ import numpy.typing as npt
 
 from rgbmidic._kernels.rates import LOWEST, mean_rates
 from rgbmidic.errors import InputError
+from rgbmidic.fields.units import column
 from rgbmidic.typing import BoolArray, FloatArray
 
 _WIDE = 1.01
@@ -36,126 +36,6 @@ SIGMA = 40.0
 """Standard deviation (px) of the paper's Gaussian filter."""
 _KNOWN = 1e-3
 """Fraction of the filter's weight that must lie on measured pixels: single precision then holds the mean to 1e-4."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Units:
-    """Units that a result is stated in; the store keeps px and frames.
-
-    Attributes
-    ----------
-    mm_per_pixel
-        Millimetres on the specimen for a pixel; None where not known: lengths are stated in px.
-    mm_per_pixel_std
-        Its standard uncertainty. It contributes to that of every length in mm, as the same factor in all of them.
-    timed
-        Whether the frames' times are known; else a frame is the unit of time.
-    """
-
-    mm_per_pixel: float | None = None
-    mm_per_pixel_std: float = 0.0
-    timed: bool = False
-
-    @classmethod
-    def from_points(
-        cls, points: Sequence[Sequence[float]], length: float, *, length_std: float = 0.0, point_std: float = 0.5
-    ) -> Self:
-        """Find the scale from two points on an image and their distance.
-
-        Parameters
-        ----------
-        points : shape (2, 2)
-            Both points (x, y) in px.
-        length
-            Their distance in mm.
-        length_std
-            Its standard uncertainty in mm.
-        point_std
-            Standard uncertainty of a point along either axis in px: half a pixel where it is read off by eye.
-
-        Returns
-        -------
-        Units
-
-        Raises
-        ------
-        InputError
-            The points are not two different ones, the length is not positive, or an uncertainty is negative.
-        """
-        ends = np.asarray(points, dtype=np.float64)
-        distance = float(np.hypot(*(ends[1] - ends[0]))) if ends.shape == (2, 2) else 0.0
-        if not (math.isfinite(distance) and distance > 0):
-            raise InputError(f"a scale needs two different points (x, y) in px, not {np.asarray(points).tolist()}")
-        if not (math.isfinite(length) and length > 0):
-            raise InputError(f"the length between the points must be above 0 mm, not {length:g}")
-        if not (length_std >= 0 and point_std >= 0):
-            raise InputError(f"uncertainties must be at least 0, not {length_std:g} mm and {point_std:g} px")
-        scale = length / distance
-        relative = math.hypot(length_std / length, math.sqrt(2) * point_std / distance)
-        return cls(mm_per_pixel=scale, mm_per_pixel_std=scale * relative)
-
-    @property
-    def length(self) -> str:
-        """``"mm"`` or ``"px"``."""
-        return "px" if self.mm_per_pixel is None else "mm"
-
-    @property
-    def time(self) -> str:
-        """``"s"`` or ``"frame"``."""
-        return "s" if self.timed else "frame"
-
-    def per_time(self, unit: str, power: int = 1) -> str:
-        """Write a unit over the time or its square, such as ``"mm/s"``, ``"mm/s²"`` or, of no unit, ``"1/s"``.
-
-        Parameters
-        ----------
-        unit
-            What is divided; empty for a quantity without unit.
-        power
-            Power of the time.
-
-        Returns
-        -------
-        str
-        """
-        return f"{unit or '1'}/{self.time}" + ("²" if power == 2 else "")
-
-    def lengths(self, values: FloatArray, std: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Convert lengths in px (or px over time) and their standard uncertainty to mm where the scale is known.
-
-        Parameters
-        ----------
-        values, std : ndarray
-            Lengths in px and their standard uncertainty.
-
-        Returns
-        -------
-        values, std : ndarray
-            In mm, or as they were where the scale is not known.
-        """
-        if self.mm_per_pixel is None:
-            return values, std
-        return self.mm_per_pixel * values, np.hypot(self.mm_per_pixel * std, self.mm_per_pixel_std * values)
-
-
-def column(name: str, unit: str) -> str:
-    """Return the name of a column with its unit in plain letters: `u` in ``"mm/s²"`` is ``"u_mm_per_s2"``.
-
-    Parameters
-    ----------
-    name
-        Of the quantity.
-    unit
-        Its unit; empty for none.
-
-    Returns
-    -------
-    str
-    """
-    plain = unit.replace("²", "2").replace(" √", "_sqrt_")
-    over, _, below = plain.partition("/")
-    words = [part for part in ("" if over == "1" else over, f"per_{below}" if below else "") if part]
-    return "_".join([name, *words])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -19,7 +19,7 @@ from typing import Any, Self
 import numpy as np
 
 from rgbmidic.errors import CalibrationError, InputError
-from rgbmidic.fields.history import Units
+from rgbmidic.fields.units import Units
 from rgbmidic.illumination.calibration import read_document, write_document
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import ScaleSettings

@@ -17,11 +17,12 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.fields.crack_tip import CrackTip, Williams
 from rgbmidic.fields.cracks import JumpAlong
-from rgbmidic.fields.history import History, Nodal, Probe, Units
+from rgbmidic.fields.history import History, Nodal, Probe
 from rgbmidic.fields.measures import MEASURES, strain_of_gradient
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.strain import StrainGauges
+from rgbmidic.fields.units import Units
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import BoolArray, FloatArray
 

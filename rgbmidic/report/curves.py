@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rgbmidic.fields import uncertain
 from rgbmidic.report.setup import NoiseFloor, TimeHistory
 from rgbmidic.report.style import (
     GAP,
@@ -16,6 +17,7 @@ from rgbmidic.report.style import (
     LINES,
     NUMBERS,
     OKABE_ITO,
+    STATUS_COLOURS,
     add_colour_bar,
     colour_range,
     draw_figure,
@@ -38,8 +40,6 @@ logger = logging.getLogger(__name__)
 
 _COLOURS = [OKABE_ITO[name] for name in ("blue", "vermillion", "green")]
 _STATUS = QUANTITIES["node_status"].codes
-_STATUS_COLOURS = (OKABE_ITO["sky blue"], "#333333", OKABE_ITO["vermillion"], OKABE_ITO["yellow"])
-"""Colours of the codes of `node_status` in their order."""
 _MARKED, _MARKED_OF_PROBE = 40, 60
 """Points up to which each gets a marker, in a panel of half the width and of the whole width: more would touch."""
 _PANEL = 2.4
@@ -112,7 +112,7 @@ def status_figure(history: TimeHistory) -> Figure:
     def draw(axes: list[Axes]) -> None:
         (axis,), (times, label_of_times) = axes, history.axis
         shown = [code for code, part in enumerate(history.fractions.T) if code == 0 or part.any()]
-        names, colours = ([source[code] for code in shown] for source in (_STATUS, _STATUS_COLOURS))
+        names, colours = ([source[code] for code in shown] for source in (_STATUS, STATUS_COLOURS))
         axis.stackplot(times, history.fractions[:, shown].T, labels=names, colors=colours)
         axis.set_ylim(0, 1)
         axis.legend(loc="lower left", frameon=True)
@@ -264,9 +264,8 @@ def wave_text(profile: Profile, wave: Wave) -> str:
     speed, std = front.speed, front.speed_std
     if unit == "mm/s":
         speed, std, unit = speed / 1000, std / 1000, "m/s"
-    digits = max(0, 1 - int(np.floor(np.log10(std)))) if std > 0 else 3
     fit = f"chi-square {front.chi_square:.3g} of {front.freedom}"
-    return f"{wave.what} of {profile.field.name}: {speed:,.{digits}f} ± {std:,.{digits}f} {unit} ({fit})"
+    return f"{wave.what} of {profile.field.symbol}: {uncertain(speed, std, unit)} ({fit})"
 
 
 def _kind(quantity: HistoryColumn) -> str:

@@ -104,7 +104,7 @@ class _Report:
         measured = figures.spread(figures.measured_frames(result), _SHOWN)
         self.shown = tuple(sorted({*measured, self.history.farthest})) if frames is None else tuple(frames)
         self.floor = tables.noise_floor(physical)
-        self.maps = figures.MapDrawer(result, PAGE_DPI)
+        self.maps = figures.MapDrawer(Maps(result=result, physical=physical), PAGE_DPI)
 
     def page(self) -> Page:
         """Build the page, section by section."""
@@ -198,11 +198,8 @@ class _Report:
                     f"{label} in key frames, between which the field changes by equal amounts",
                 )
         for frame in self.shown:
-            values = physical.frame(frame)
-            maps = {f"{name} ({length})": (values[name], values[f"{name}_std"]) for name in ("u", "v")}
-            _show(page, self.maps.fields(frame, maps), f"displacement, {self._when(frame)}")
-            maps = {name: (values[name], values[f"{name}_std"]) for name in ("exx", "eyy", "exy")}
-            _show(page, self.maps.fields(frame, maps), f"strain, {self._when(frame)}")
+            _show(page, self.maps.fields(frame, ("u", "v")), f"displacement, {self._when(frame)}")
+            _show(page, self.maps.fields(frame, ("exx", "eyy", "exy")), f"strain, {self._when(frame)}")
         caption = "over the test: median of the nodes (line) and 5 to 95 % of them (band)"
         _show(page, field_history_figure(physical, self.history), f"displacement and strain {caption}")
 
@@ -237,7 +234,7 @@ class _Report:
         if stated := [place for kind, place in self.probes.places if kind == "line"]:
             lines, along = {f"line_{number}": place for number, place in enumerate(stated, 1)}, ""
         page.heading("Along a line")
-        maps, frames = Maps(result=physical.result, physical=physical), figures.spread(measured, _MOST)
+        maps, frames = self.maps.maps, figures.spread(measured, _MOST)
         for name, place in lines.items():
             x0, y0, x1, y1 = place
             field = "exx" if abs(x1 - x0) >= abs(y1 - y0) else "eyy"
@@ -275,10 +272,8 @@ class _Report:
         caption = "stated standard uncertainty over the test, median of the nodes"
         caption += "" if self.floor is None else "; thin lines: noise floor of the static frames"
         _show(page, uncertainty_figure(physical, self.history, self.floor), caption)
-        frame, values = self.shown[-1], physical.frame(self.shown[-1])
-        maps = {f"{name} ({length})": (values[name], values[name] * 0) for name in ("u_std", "v_std")}
-        figure = self.maps.fields(frame, maps, positive=True)
-        _show(page, figure, f"standard uncertainty, {self._when(frame)}")
+        frame = self.shown[-1]
+        _show(page, self.maps.fields(frame, ("u_std", "v_std")), f"standard uncertainty, {self._when(frame)}")
         both = self.maps.discretisation(frame)
         if both is not None:
             caption = "noise and discretisation error together; above 1 on the right a finer mesh is needed"
@@ -318,7 +313,7 @@ class _Report:
         else:
             page.text("Every node is measured in every frame.")
         _show(page, figures.convergence_figure(result), "convergence: largest motion of a node in each iteration")
-        _show(page, self.maps.of_kind(frame, "misfit"), f"misfit: 1 is ordinary, {self._when(frame)}")
+        _show(page, self.maps.fields(frame, ("misfit",)), f"misfit: 1 is ordinary, {self._when(frame)}")
 
     def _provenance(self, page: Page) -> None:
         kept = self.physical.result.provenance

@@ -11,13 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.report import style
-from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Maps, Result
-from rgbmidic.results.physical import Physical
+from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, MapField, Maps, Result
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.colors import Normalize
+    from matplotlib.colors import Colormap, Normalize
     from matplotlib.figure import Figure
 
 MAPS = {
@@ -26,8 +25,9 @@ MAPS = {
     "strain": ("exx", "eyy", "exy"),
     "misfit": ("misfit",),
 }
-"""Quantities of each kind of map."""
-_POSITIVE = ("uncertainty", "misfit")
+"""Fields of each kind of map."""
+_COLOURS = {"positive": "plasma", "fraction": "cividis", "angle": "twilight"}
+"""Colours of the kinds of fields; all others have viridis."""
 _FAILED = QUANTITIES["status"].codes.index("failed")
 _EQUAL = 1e-9
 """Fraction of the colour range by which a value may exceed it by rounding alone."""
@@ -59,9 +59,9 @@ def spread(frames: Sequence[int], most: int) -> tuple[int, ...]:
 
 
 def map_figure(result: Result, frame: int, kind: str) -> Figure:
-    """Draw maps of nodal quantities of one frame over the reference image; blank where not measured.
+    """Draw maps of nodal fields of one frame over the reference image; blank where not measured.
 
-    Displacements are in mm where the scale is known.
+    They are those of `Maps.of(result)`: in mm where the scale is known, the strain over the shortest virtual gauge.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def map_figure(result: Result, frame: int, kind: str) -> Figure:
     Returns
     -------
     Figure
-        The figure, one panel per quantity.
+        The figure, one panel per field.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def map_figure(result: Result, frame: int, kind: str) -> Figure:
     ResultError
         The frame is damaged.
     """
-    return MapDrawer(result).of_kind(frame, kind)
+    return MapDrawer(Maps.of(result)).fields(frame, MAPS[kind])
 
 
 def fraction_figure(result: Result, frame: int) -> Figure:
@@ -107,7 +107,7 @@ def fraction_figure(result: Result, frame: int) -> Figure:
     InputError, ResultError
         As `map_figure`.
     """
-    return MapDrawer(result).fractions(frame)
+    return MapDrawer(Maps.of(result)).fractions(frame)
 
 
 def mask_figure(result: Result, frame: int) -> Figure | None:
@@ -261,16 +261,17 @@ class MapDrawer:
 
     Parameters
     ----------
-    result
-        The result.
+    maps
+        The fields of the result.
     dpi
         Pixels per inch that all figures are written with; the axes are then drawn once. None: not known.
     """
 
-    def __init__(self, result: Result, dpi: int | None = None) -> None:
+    def __init__(self, maps: Maps, dpi: int | None = None) -> None:
         from matplotlib.tri import Triangulation
 
-        self.result, self._dpi, self._physical = result, dpi, Physical.untimed(result)
+        self.maps, self.result, self._dpi = maps, (result := maps.result), dpi
+        self._unit, self._factor = maps.physical.axes
         self._figures: dict[int, Figure] = {}
         self._mesh = Triangulation(result.nodes[:, 0], result.nodes[:, 1], result.elements)
         low, high = result.nodes.min(axis=0), result.nodes.max(axis=0)
@@ -283,48 +284,26 @@ class MapDrawer:
         closed = Triangulation(nodes[:, 0], nodes[:, 1], place.reshape(-1)[result.elements])
         self._element: npt.NDArray[np.int32] = np.asarray(closed.get_trifinder()(*self._places), dtype=np.int32)
 
-    def of_kind(self, frame: int, kind: str) -> Figure:
-        """Draw one of `MAPS` of a frame, as `map_figure` does."""
-        record = self.result.frame(frame)
-        physical, values = self._physical, {**record.values}
-        if physical.rectified.camera is not None:
-            values |= physical.frame(frame)
-        else:
-            for name in ("u", "v"):
-                pair = physical.units.lengths(values[name], values[f"{name}_std"])
-                values[name], values[f"{name}_std"] = pair
-        unit = physical.units.length
-        nothing, maps = np.zeros(len(record.u)), {}
-        for name in MAPS[kind]:
-            label = f"{name} ({unit})" if name.removesuffix("_std") in ("u", "v") else name
-            maps[label] = values[name], values.get(f"{name}_std", nothing)
-        return self.fields(frame, maps, positive=kind in _POSITIVE)
-
-    def discretisation(self, frame: int, maps: Maps | None = None) -> Figure | None:
+    def discretisation(self, frame: int) -> Figure | None:
         """Draw both errors together, and where a finer mesh is needed; None for a frame without the second one."""
-        maps = maps or Maps.of(self.result)
         names = ("u_total", "v_total", "finer_mesh")
-        if "finer_mesh" not in maps.all:
+        if "finer_mesh" not in self.maps.all or not np.isfinite(self.maps.read("u_total", frame).values).any():
             return None
-        values = {name: maps.read(name, frame).values for name in names}
-        if not np.isfinite(values["u_total"]).any():
-            return None
-        shown = {maps.field(name).label: (values[name], values[name] * 0) for name in names}
-        return self.fields(frame, shown, positive=True)
+        return self.fields(frame, names)
 
-    def fields(
-        self, frame: int, fields: Mapping[str, tuple[FloatArray, FloatArray]], *, positive: bool = False
-    ) -> Figure:
-        """Draw maps of nodal fields of one frame, blank where not measured.
+    def fields(self, frame: int, names: Sequence[str], *, std: bool = False, hatched: bool = False) -> Figure:
+        """Draw maps of fields of one frame, blank where not measured.
 
         Parameters
         ----------
         frame
             Index of the frame.
-        fields
-            Values (N,) and their uncertainties (N,) by their labels; nodes of large uncertainty do not set the colours.
-        positive
-            Whether the values are positive, and their colours logarithmic.
+        names
+            Names of the fields; nodes of large uncertainty do not set the colours.
+        std
+            Whether the standard uncertainty of each field that has one is shown beside it.
+        hatched
+            Whether values within two standard uncertainties of 0 are hatched.
 
         Returns
         -------
@@ -334,68 +313,20 @@ class MapDrawer:
         Raises
         ------
         InputError, ResultError
-            As `map_figure`.
-        """
-        maps = {}
-        for label, (values, std) in fields.items():
-            ordinary = style.ordinary_values(values, std)
-            norm = style.colour_scale(ordinary, positive=positive) if ordinary.size else None
-            maps[label] = values, norm, "plasma" if positive else "viridis"
-        return self._draw(frame, maps)
-
-    def of_field(self, maps: Maps, name: str, frame: int, *, hatched: bool = False) -> Figure:
-        """Draw a field of `maps` in a frame, and its standard uncertainty beside it where it has one.
-
-        Parameters
-        ----------
-        maps
-            Fields of the same result.
-        name
-            Name of the field.
-        frame
-            Index of the frame.
-        hatched
-            Whether values within two standard uncertainties of 0 are hatched.
-
-        Returns
-        -------
-        Figure
-            The figure, one or two panels.
-
-        Raises
-        ------
-        InputError, ResultError
             As `Maps.read`.
         """
-        from matplotlib.colors import Normalize
-
-        field, read = maps.field(name), maps.read(name, frame)
-        ordinary = style.ordinary_values(read.values, read.std)
-        ends = field.ends or (style.colour_range(ordinary) if ordinary.size else None)
-        colours = {"positive": "plasma", "fraction": "cividis", "angle": "twilight", "codes": "tab10"}
-        norm, unit = Normalize(*ends) if ends else None, f" ({field.unit})" if field.unit else ""
-        panels = {f"{field.symbol}{unit}": (read.values, norm, colours.get(field.kind, "viridis"))}
-        spread = read.std[np.isfinite(read.std)]
-        if spread.size:
-            panels[f"σ({field.symbol}){unit}"] = read.std, style.colour_scale(spread, positive=True), "plasma"
-        codes = ", ".join(f"{code}: {text}" for code, text in enumerate(field.codes))
-        figure = self._draw(frame, panels, codes or maps.how.get(field.group, ""), stepped=field.stepped)
-        if hatched and spread.size:
-            beyond = self._raster(np.abs(read.values) - 2 * read.std)
-            with np.errstate(invalid="ignore"):
-                axis = figure.axes[0]
-                axis.contourf(*self._places, beyond, levels=[-np.inf, 0], hatches=["////"], colors="none")
-        return figure
+        panels = []
+        for name in names:
+            read = self.maps.read(name, frame)
+            panels.append((self.maps.field(name), read.values, read.std))
+            if std and np.isfinite(read.std).any():
+                panels.append((self.maps.field(f"{name}_std"), read.std, np.full_like(read.std, np.nan)))
+        how = dict.fromkeys(self.maps.how(name) for name in names)
+        return self._draw(frame, panels, "; ".join(filter(None, how)), hatched=hatched)
 
     def fractions(self, frame: int) -> Figure:
         """Draw the fraction of each light in what determines the nodes of a frame, as `fraction_figure` does."""
-        from matplotlib.colors import Normalize
-
-        fractions = self.result.frame(frame).light_fraction
-        fractions = np.where(fractions.sum(axis=1, keepdims=True) > 0, fractions, np.nan)
-        titles = [style.literal(f"fraction of {light}") for light in self.result.lights]
-        maps = {title: (part, Normalize(0, 1), "cividis") for title, part in zip(titles, fractions.T, strict=True)}
-        return self._draw(frame, maps)
+        return self.fields(frame, [f"fraction of {light}" for light in self.result.lights])
 
     def strip(self, maps: Sequence[tuple[str, FloatArray]], label: str) -> Figure:
         """Draw small maps of one nodal field in several frames, side by side, in the same colours.
@@ -418,37 +349,40 @@ class MapDrawer:
 
         def draw(axes: list[Axes]) -> None:
             for axis, (title, values) in zip(axes, maps, strict=False):
-                self._show(axis, self._raster(values), values, norm, "viridis", bar=axis is axes[-2])
+                self._show(axis, self._raster(values), values, norm, bar=axis is axes[-2])
                 axis.set_title(title)
-                style.finish_picture(axis, x, y, first=axis is axes[0])
+                style.finish_picture(axis, x, y, first=axis is axes[0], unit=self._unit, factor=self._factor)
             axes[-1].set_axis_off()  # room for the colour bar
 
         aspect = np.ptp(y) / np.ptp(x)
         return style.draw_figure(draw, count=len(maps) + 1, aspect=max(aspect, 0.5), beside=style.GAP, title=label)
 
     def _draw(
-        self,
-        frame: int,
-        maps: Mapping[str, tuple[FloatArray, Normalize | None, str]],
-        how: str = "",
-        *,
-        stepped: bool = False,
+        self, frame: int, panels: Sequence[tuple[MapField, FloatArray, FloatArray]], how: str, *, hatched: bool
     ) -> Figure:
-        """Draw one map per nodal field, of its values, range and colours, over the reference where there is one."""
+        """Draw a map for each field, its values and uncertainties, over the reference where there is one."""
         import matplotlib as mpl
+        from matplotlib.colors import Normalize
 
-        if len(maps) not in self._figures:
-            self._figures[len(maps)] = self._panels(len(maps))
-        figure, kept = self._figures[len(maps)], int(self._dpi is None and self.result.reference is not None)
+        if len(panels) not in self._figures:
+            self._figures[len(panels)] = self._panels(len(panels))
+        figure, kept = self._figures[len(panels)], int(self._dpi is None and self.result.reference is not None)
         title = _frame_title(self.result, frame, self.result.frame(frame))
         figure.texts[0].update({"text": f"{title}\n{how}" if how else title, "fontsize": 8 if how else 10})
         with mpl.rc_context(style.STYLE):
-            for axis, (label, (values, norm, colours)) in zip(figure.axes, maps.items(), strict=True):
+            for axis, (field, values, std) in zip(figure.axes, panels, strict=True):
                 drawn = (*axis.lines, *axis.patches, *axis.texts, *axis.artists, *axis.collections)
                 for artist in (*axis.images[kept:], *drawn):
                     artist.remove()
-                self._show(axis, self._raster(values, stepped=stepped), values, norm, colours)
-                axis.set_title(label)
+                ordinary = style.ordinary_values(values, std)
+                norm = style.colour_scale(ordinary, positive=field.logarithmic) if ordinary.size else None
+                norm = Normalize(*field.ends) if field.ends else norm
+                self._show(axis, self._raster(values, stepped=field.stepped), values, norm, field)
+                axis.set_title(style.literal(field.label))
+                if hatched and np.isfinite(std).any():
+                    doubtful = self._raster(np.abs(values) - 2 * std)
+                    with np.errstate(invalid="ignore"):
+                        axis.contourf(*self._places, doubtful, levels=[-np.inf, 0], hatches=["////"], colors="none")
         return figure
 
     def _panels(self, count: int) -> Figure:
@@ -460,7 +394,7 @@ class MapDrawer:
             for axis in axes:
                 if reference is not None:
                     style.show_image(axis, reference, result.reference_origin)
-                style.finish_picture(axis, x, y, first=axis is axes[0])
+                style.finish_picture(axis, x, y, first=axis is axes[0], unit=self._unit, factor=self._factor)
 
         figure = style.draw_figure(draw, count=count, aspect=np.ptp(y) / np.ptp(x), beside=style.BAR, title=" ")
         if self._dpi is not None:
@@ -488,21 +422,31 @@ class MapDrawer:
         picture: FloatArray,
         values: FloatArray,
         norm: Normalize | None,
-        colours: str,
+        field: MapField | None = None,
         *,
         bar: bool = True,
     ) -> None:
-        """Show a picture of nodal values and their colour bar."""
+        """Show a picture of nodal values and their colour bar; a code has one colour in every picture."""
+        from matplotlib.colors import ListedColormap
+
         if norm is None or not np.isfinite(values).any():
             box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
             axis.text(0.5, 0.5, "nothing measured", transform=axis.transAxes, ha="center", va="center", bbox=box)
             return
+        colours: str | Colormap = "viridis" if field is None else field_colours(field)
+        if field is not None and field.codes:
+            colours = ListedColormap(style.STATUS_COLOURS[: len(field.codes)])
         axis.imshow(picture, extent=self._extent, cmap=colours, norm=norm, interpolation="nearest")
         if not bar:
             return
         scaled = norm(values[np.isfinite(values)])
         beyond = bool(scaled.min() < -_EQUAL), bool(scaled.max() > 1 + _EQUAL)
-        style.add_colour_bar(axis, norm, colours, beyond=beyond)
+        style.add_colour_bar(axis, norm, colours, beyond=beyond, names=() if field is None else field.codes)
+
+
+def field_colours(field: MapField) -> str:
+    """Return the name of matplotlib's colours of a field."""
+    return _COLOURS.get(field.kind, "viridis")
 
 
 def _shaded(
@@ -525,7 +469,7 @@ def _shaded(
     def draw(axes: list[Axes]) -> None:
         for axis, image, part, light in zip(axes, reference, cover, result.lights, strict=True):
             style.show_image(axis, image, origin)
-            style.shade(axis, part, step, origin)
+            style.shade(axis, part, step, origin, style.LIGHT_COLOURS.get(light))
             axis.set_title(style.literal(f"{light}: {title_of(part[rows, columns])}"))
             style.finish_picture(axis, x, y, first=axis is axes[0])
 

@@ -32,7 +32,7 @@ _OF_TEST: Mapping[str, Callable[[Result], Figure]] = {
     "brightness": figures.brightness_figure,
 }
 _OF_FRAME: Mapping[str, Callable[[figures.MapDrawer, int], Figure | None]] = {
-    **{kind: partial(figures.MapDrawer.of_kind, kind=kind) for kind in figures.MAPS},
+    **{kind: partial(figures.MapDrawer.fields, names=names) for kind, names in figures.MAPS.items()},
     "fractions": lambda maps, frame: maps.fractions(frame) if len(maps.result.lights) > 1 else None,
     "masks": lambda maps, frame: figures.mask_figure(maps.result, frame),
     "discretisation": lambda maps, frame: maps.discretisation(frame),
@@ -128,7 +128,7 @@ def write_maps(
     ResultError
         The result is damaged, or the folder cannot be written.
     """
-    folder, drawer = Path(folder), figures.MapDrawer(maps.result, DPI)
+    folder, drawer = Path(folder), figures.MapDrawer(maps, DPI)
     chosen = figures.spread(figures.measured_frames(maps.result), _FRAMES) if frames is None else frames
     for name in names:
         for frame in chosen:
@@ -139,13 +139,13 @@ def write_maps(
     for name in names:
         for frame in chosen:
             files.append(_file(folder, f"map_{name.replace(' ', '_')}", frame))
-            save_figure(drawer.of_field(maps, name, frame, hatched=hatched), files[-1])
+            save_figure(drawer.fields(frame, [name], std=True, hatched=hatched), files[-1])
     return tuple(files)
 
 
 def _draw(result: Result, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
     """Write pictures one after the other, so that only one is in memory; return the files of those that exist."""
-    files, maps = [], figures.MapDrawer(result, DPI)
+    files, maps = [], figures.MapDrawer(Maps.of(result), DPI)
     for kind, frame in pictures:
         figure = _OF_TEST[kind](result) if frame is None else _OF_FRAME[kind](maps, frame)
         if figure is not None:

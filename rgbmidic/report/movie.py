@@ -20,7 +20,7 @@ from rgbmidic._kernels.picture import paint_field
 from rgbmidic.errors import InputError, ResultError, RgbmidicError
 from rgbmidic.extras import optional
 from rgbmidic.report import style
-from rgbmidic.report.figures import picture_limits, spread
+from rgbmidic.report.figures import field_colours, picture_limits, spread
 from rgbmidic.report.movie_curve import Curve
 from rgbmidic.report.video import PALETTE, Page, gif, video
 from rgbmidic.results import QUANTITIES, MapField, Maps, frame_times
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 _SAMPLE = 4_000_000
 """Nodal values of each field that its colour range is found from: 500 frames of 8,000 nodes; of more, evenly spaced
 frames count."""
-_COLOURS = {"positive": "plasma", "fraction": "cividis", "angle": "twilight"}
 _FEW = 100
 """Frames below which another process does not pay. Measured: it starts in 2 s, a page of 1 Mpx takes 20 ms."""
 _AROUND = 235
@@ -223,7 +222,7 @@ class _Drawer:
             maps=maps,
             fields=fields,
             ends=tuple(ends),
-            colours=tuple(given or _COLOURS.get(part.kind, "viridis") for part in fields),
+            colours=tuple(given or field_colours(part) for part in fields),
             beyond=tuple(beyond),
             times=times,
             limits=picture_limits(result, np.concatenate(corners)),
@@ -249,7 +248,10 @@ class _Canvas:
         def draw(axes: list[Axes]) -> None:
             panels = zip(axes, drawer.fields, drawer.ends, drawer.colours, drawer.beyond, strict=False)
             for axis, part, ends, colours, beyond in panels:
-                style.finish_picture(axis, (left, right), (top, bottom), first=axis is axes[0])
+                unit, factor = drawer.maps.physical.axes
+                style.finish_picture(
+                    axis, (left, right), (top, bottom), first=axis is axes[0], unit=unit, factor=factor
+                )
                 axis.set_title(style.literal(part.label))
                 style.add_colour_bar(axis, Normalize(*ends), colours, beyond=beyond)
             if drawer.curve is not None:
@@ -259,8 +261,7 @@ class _Canvas:
         aspect = (bottom - top) / (right - left)
         self.figure = style.draw_figure(draw, count=count, aspect=aspect, beside=style.BAR, title=" ")
         self.figure.set_dpi(drawer.width / self.figure.get_figwidth())
-        groups = [drawer.maps.field(part.name.removesuffix("_std")).group for part in drawer.fields]
-        texts = {drawer.maps.how.get(group, "") for group in groups}
+        texts = {drawer.maps.how(part.name) for part in drawer.fields}
         self._how = "; ".join(sorted(text for text in texts if sum(text in other for other in texts) == 1))
         canvas: Any = FigureCanvasAgg(self.figure)
         self._canvas = canvas

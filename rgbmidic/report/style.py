@@ -16,8 +16,9 @@ from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.colors import Normalize
+    from matplotlib.colors import Colormap, Normalize
     from matplotlib.figure import Figure
+    from matplotlib.ticker import Locator
 
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -42,6 +43,8 @@ OKABE_ITO = {
     "grey": "#999999",
 }
 """Colours that the colour-blind distinguish (Okabe and Ito, Color Universal Design, 2008)."""
+STATUS_COLOURS = (OKABE_ITO["sky blue"], "#333333", OKABE_ITO["vermillion"], OKABE_ITO["yellow"])
+"""Colours of the codes of `node_status` in their order, in every picture."""
 LINES = ("-", "--", "-.", ":")
 """Line styles in turn: readers who do not distinguish the colours distinguish the lines by these."""
 _PNG = {"compress_level": 1}
@@ -292,9 +295,17 @@ def _extent(origin: tuple[int, int], columns: int, rows: int) -> tuple[float, fl
 
 
 def add_colour_bar(
-    axis: Axes, norm: Normalize, colour_map: str, *, label: str = "", beyond: tuple[bool, bool] = (False, False)
+    axis: Axes,
+    norm: Normalize,
+    colour_map: str | Colormap,
+    *,
+    label: str = "",
+    beyond: tuple[bool, bool] = (False, False),
+    names: tuple[str, ...] = (),
 ) -> None:
     """Add a colour bar beside a panel of `draw_figure`, pointed where there are values below or above its colours.
+
+    Where the values are codes, `names` stand in place of the numbers from 0 on.
 
     It is made of a few artists of the panel: matplotlib's own is a second set of axes, at three times the time.
     """
@@ -315,36 +326,49 @@ def add_colour_bar(
     colours.set_clip_path(bar)
     axis.add_artist(colours)
     ends = np.asarray([norm.vmin, norm.vmax], dtype=np.float64)
-    numbers = MaxNLocator(6).tick_values(*ends)
+    numbers = np.arange(len(names)) if names else MaxNLocator(6).tick_values(*ends)
     numbers = numbers[(numbers >= ends[0]) & (numbers <= ends[1])]
     heights = low + (1 - low - high) * np.asarray(norm(numbers))
     end = right + 3.5 / 72 / width  # matplotlib's length of a tick
     ticks = np.tile([right, end, np.nan], len(numbers)), np.repeat(heights, 3)
     axis.plot(*ticks, "k", linewidth=0.6, transform=axis.transAxes, clip_on=False)
     for number, height in zip(numbers, heights, strict=True):
-        axis.text(2 * end - right, height, f"{number:.4g}", transform=axis.transAxes, va="center_baseline")
+        text = names[int(number)] if names else f"{number:.4g}"
+        look: dict[str, Any] = {"va": "center_baseline", "fontsize": 6.5 if names else None}
+        axis.text(2 * end - right, height, text, transform=axis.transAxes, **look)
     if label:
         axis.text(right + 0.55 / width, 0.5, label, transform=axis.transAxes, rotation=90, va="center")
 
 
-def shade(axis: Axes, cover: FloatImage, step: int = 1, origin: tuple[int, int] = (0, 0)) -> None:
-    """Cover an image that begins at `origin` by a picture from 0 (clear) to 1.
+def shade(
+    axis: Axes, cover: FloatImage, step: int = 1, origin: tuple[int, int] = (0, 0), colour: str | None = None
+) -> None:
+    """Cover an image that begins at `origin` by a picture from 0 (clear) to 1, in the colour of a light or orange.
 
     One pixel of the picture covers `step` pixels of the image.
     """
     from matplotlib.colors import to_rgb
 
     colours = np.empty((*cover.shape, 4), dtype=np.float32)
-    colours[..., :3] = to_rgb("#e8590c")
+    colours[..., :3] = to_rgb(colour or "#e8590c")
     colours[..., 3] = 0.65 * np.clip(cover, 0, 1)
     rows, columns = (step * size for size in cover.shape)
     axis.imshow(colours, extent=_extent(origin, columns, rows), interpolation="nearest")
 
 
 def finish_picture(
-    axis: Axes, x: tuple[float, float], y: tuple[float, float], *, first: bool, unit: str = "px"
+    axis: Axes,
+    x: tuple[float, float],
+    y: tuple[float, float],
+    *,
+    first: bool,
+    unit: str = "px",
+    factor: float = 1.0,
 ) -> None:
-    """Set the limits of axes in px, or in another `unit`, at one scale in both directions: y down where y[0] < y[1]."""
+    """Set the limits of axes at one scale in both directions, y down where y[0] < y[1].
+
+    The numbers along the axes are in a `unit` of which what is drawn, such as px, has `factor`.
+    """
     axis.set_aspect("equal")
     axis.set_xlim(*x)
     axis.set_ylim(y[1], y[0])
@@ -352,8 +376,10 @@ def finish_picture(
     if first:
         axis.set_ylabel(f"y ({unit})")
     axis.tick_params(labelleft=first)
-    axis.locator_params(nbins=5)
-    _space_out(axis, 5, whole=False)
+    axis.yaxis.set_major_locator(_ticks(5, factor))
+    for one in (axis.xaxis, axis.yaxis) if factor != 1 else ():
+        one.set_major_formatter(lambda value, _: f"{factor * value:.6g}")
+    _space_out(axis, 5, whole=False, factor=factor)
 
 
 def finish_plot(axis: Axes, x: str, y: str, *, whole: bool = True) -> None:
@@ -380,16 +406,25 @@ def finish_plot(axis: Axes, x: str, y: str, *, whole: bool = True) -> None:
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def _space_out(axis: Axes, most: int, *, whole: bool) -> None:
-    """Set as many numbers along x as there is room for, at most `most`."""
+def _ticks(most: int, factor: float = 1.0, *, whole: bool = False) -> Locator:
+    """Return a locator of at most so many round numbers, of what is `factor` times the axis' own."""
     from matplotlib.ticker import MaxNLocator
 
+    class Round(MaxNLocator):
+        def tick_values(self, vmin: float, vmax: float) -> Any:
+            return np.asarray(super().tick_values(factor * vmin, factor * vmax)) / factor
+
+    return Round(most, integer=whole)
+
+
+def _space_out(axis: Axes, most: int, *, whole: bool, factor: float = 1.0) -> None:
+    """Set as many numbers along x as there is room for, at most `most`."""
     box, (width, height) = axis.get_position(), cast("Figure", axis.figure).get_size_inches()
     room = box.width * width
     if axis.get_aspect() != "auto":
         room = min(room, box.height * height * abs(np.ptp(axis.get_xlim()) / np.ptp(axis.get_ylim())))
     for count in range(most, 0, -1):
-        axis.xaxis.set_major_locator(MaxNLocator(count, integer=whole))
+        axis.xaxis.set_major_locator(_ticks(count, factor, whole=whole))
         numbers = axis.xaxis.get_major_formatter().format_ticks(list(axis.xaxis.get_majorticklocs()))
         if sum(len(number) * _LETTER + _BETWEEN for number in numbers) < room:
             break

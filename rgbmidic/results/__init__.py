@@ -4,8 +4,9 @@ from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
+from rgbmidic.results.field import MapField
 from rgbmidic.results.histories import Histories, HistoryColumn, history_rows, write_histories
-from rgbmidic.results.maps import MapField, Maps, MapValues
+from rgbmidic.results.maps import Maps, MapValues
 from rgbmidic.results.physical import (
     channels_of,
     exposure,

@@ -77,36 +77,30 @@ class _Frames(BackendArray):
 def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset:
     """Make the Dataset that `Result.to_xarray` documents."""
     physical, variables = Physical.untimed(result, scale), dict[str, xr.Variable]()
-    plane = None if physical.rectified.camera is None else physical
+    plane = "" if physical.rectified.camera is None else "on the plane of the specimen"
     for name, entry in QUANTITIES.items():
         dimension = _PARTS[name][0] if name in _PARTS else ""
         if not entry.stackable or name.removesuffix("_std") in _COMPONENTS or name == "number":
             continue
         axes = ("frame", *(axis if isinstance(axis, str) else dimension for axis in entry.axes))
-        variables[name] = xr.Variable(axes, indexing.LazilyIndexedArray(_Frames(result, (name,))), entry.attributes)
-    for end, meaning in {"": "small strain", "_std": "standard uncertainty of strain"}.items():
-        names = tuple(f"{name}{end}" for name in _COMPONENTS)
-        about = {"units": "1", "long_name": meaning}
-        if plane is not None:
-            kind = f"{plane.measure_name} strain, virtual strain gauge of {plane.in_units(plane.gauges.length)}"
-            about["description"] = f"on the plane of the specimen: {kind}"
-        elif not end:
-            about["description"] = "; ".join(f"{name}: {QUANTITIES[name].meaning}" for name in names)
-        read = indexing.LazilyIndexedArray(_Frames(result, names, plane))
+        moved = name.removesuffix("_std") in ("u", "v")
+        about = physical.quantities[name].attributes if moved else entry.attributes
+        if moved and plane:
+            about["description"] = plane
+        read = indexing.LazilyIndexedArray(_Frames(result, (name,), physical if moved else None))
+        variables[name] = xr.Variable(axes, read, about)
+    for end, meaning in {"": "strain", "_std": "standard uncertainty of strain"}.items():
+        names, how = tuple(f"{name}{end}" for name in _COMPONENTS), physical.strain_words()
+        about = {"units": "1", "long_name": meaning, "description": ": ".join(filter(None, [plane, how]))}
+        read = indexing.LazilyIndexedArray(_Frames(result, names, physical))
         variables[f"strain{end}"] = xr.Variable(("frame", "node", "component"), read, about)
-    for name in ("u", "v", "u_std", "v_std") if plane is not None else ():
-        about = QUANTITIES[name].attributes | {"units": "mm", "description": "on the plane of the specimen"}
-        read = indexing.LazilyIndexedArray(_Frames(result, (name,), plane))
-        variables[f"{name[0]}_mm{name[1:]}"] = xr.Variable(("frame", "node"), read, about)
     variables["elements"] = xr.Variable(("element", "corner"), result.elements, SHARED["elements"].attributes)
     return xr.Dataset(variables, _coordinates(physical), _provenance(physical))
 
 
 def _coordinates(physical: Physical) -> dict[str, xr.Variable]:
-    """Collect places in px and, where the scale is known, in mm; numbers, names and times of the frames."""
-    result, places = physical.result, {"px": ("the reference image", physical.result.nodes)}
-    if physical.units.length == "mm":
-        places["mm"] = physical.where("x"), physical.length * physical.mesh.nodes
+    """Collect the places of the nodes, as in exports; numbers, names and times of the frames."""
+    result = physical.result
     coordinates = {
         "frame": xr.Variable("frame", np.arange(len(result)), {"long_name": "place of the frame in the result"}),
         "number": xr.Variable("frame", result.number, QUANTITIES["number"].attributes),
@@ -115,16 +109,12 @@ def _coordinates(physical: Physical) -> dict[str, xr.Variable]:
         "component": xr.Variable("component", list(_COMPONENTS), {"long_name": "component of the strain tensor"}),
     }
     coordinates |= {dimension: xr.Variable(dimension, list(parts)) for dimension, parts in _PARTS.values()}
-    for unit, (where, nodes) in places.items():
-        for axis, way, values in zip("xy", ("to the right", "down"), nodes.T, strict=True):
-            about = {"units": unit, "long_name": f"position of the node on {where}, {way}"}
-            coordinates[axis if unit == "px" else f"{axis}_{unit}"] = xr.Variable("node", values, about)
-    if result.node_mm is not None:
-        for name, axis in {"node_number": "node", "element_number": "element"}.items():
-            coordinates[name] = xr.Variable(axis, getattr(result, name), SHARED[name].attributes)
-        for axis, values in zip("xy", result.node_mm.T, strict=True):
-            about = {"units": "mm", "long_name": SHARED["node_mm"].meaning}
-            coordinates[f"{axis}_mesh"] = xr.Variable("node", values, about)
+    for name, (unit, values) in physical.places.items():
+        about = {"units": unit, "long_name": f"position of the node on {physical.where(name)}"}
+        coordinates[name] = xr.Variable("node", values, about)
+    for name, axis in {"node_number": "node", "element_number": "element"}.items():
+        if (numbers := getattr(result, name)) is not None:
+            coordinates[name] = xr.Variable(axis, numbers, SHARED[name].attributes)
     if (times := frame_times(result, physical.scale)) is not None:
         about = {"units": "s", "long_name": "time of the frame from the trigger"}
         coordinates["time"] = xr.Variable("frame", times, about)

@@ -124,9 +124,7 @@ def _write_shared(out: h5py.File, physical: Physical) -> None:
     node, element = ("node",), ("element",)
     _add(out, "name", np.array(result.names, dtype=text), ("time",), "1", "name of the frame")
     for name, (unit, values) in physical.places.items():
-        way, where = ("to the right" if name[0] == "x" else "down"), physical.where(name)
-        way = f"along {name[0]}" if name.endswith("_mesh") else way
-        _add(out, name, values, node, unit, f"position of the node on {where}, {way}")
+        _add(out, name, values, node, unit, f"position of the node on {physical.where(name)}")
     for name, axes in {"node_number": node, "element_number": element}.items():
         if (numbers := getattr(result, name)) is not None:
             _add(out, name, numbers, axes, "1", SHARED[name].meaning)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +29,7 @@ from rgbmidic.fields import (
     Units,
     make_probe,
     rates,
+    rounded,
 )
 from rgbmidic.fields.history import rate_frames, rate_words
 from rgbmidic.results.channels import Channels
@@ -105,11 +107,13 @@ def history_rows(histories: Histories) -> tuple[list[str], list[list[str]]]:
     """
     rows = []
     for quantity in histories.quantities:
-        known = quantity.values[np.isfinite(quantity.values)]
-        std = np.array([]) if quantity.std is None else quantity.std[np.isfinite(quantity.std)]
-        ends = [f"{value:.5g}" for value in (known.min(), known.max(), known[-1])] if known.size else ["-"] * 3
-        spread = f"{np.median(std):.2g}" if std.size else "-"
-        rows.append([quantity.name, quantity.unit, *ends, spread, f"{known.size}"])
+        places = np.flatnonzero(np.isfinite(quantity.values))
+        known = quantity.values[places]
+        std = np.full(len(known), np.nan) if quantity.std is None else quantity.std[places]
+        ends = (known.argmin(), known.argmax(), len(known) - 1) if known.size else ()
+        texts = [rounded(known[end], std[end]) for end in ends] or ["-"] * 3
+        typical = float(np.median(std[np.isfinite(std)])) if np.isfinite(std).any() else math.nan
+        rows.append([quantity.name, quantity.unit, *texts, rounded(typical, typical), f"{known.size}"])
     return ["quantity", "unit", "smallest", "largest", "last", "uncertainty", "frames"], rows
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +29,18 @@ from rgbmidic.fields import (
 )
 from rgbmidic.fields.history import FEWEST, rate_frames, rate_words
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.results.field import (
+    COMPONENTS,
+    DERIVED,
+    FINER,
+    OF_LENGTHS,
+    OF_STRAINS,
+    STRAINS,
+    UV,
+    WITH_ERROR,
+    MapField,
+    map_fields,
+)
 from rgbmidic.results.physical import Physical, frame_times, reference_frames, scale_of, shared_part
 from rgbmidic.results.quantities import UNKNOWN_TIME
 from rgbmidic.results.result import Result
@@ -43,131 +55,6 @@ _AROUND = 2
 _AT_ONCE = 4096
 """Nodes whose rates are computed at once: 25 MB of results at the default window."""
 _MOVED = ("u", "v", "u_std", "v_std")
-
-Kind = Literal["displacement", "strain", "positive", "fraction", "angle", "codes"]
-
-
-@dataclass(frozen=True, slots=True)
-class _Derived:
-    """A field that follows from others: their length where there are two, the derivative by time of an order."""
-
-    symbol: str
-    group: str
-    meaning: str
-    parts: tuple[str, ...]
-    order: int = 0
-
-
-_UV = ("u", "v")
-_OF_LENGTHS = {
-    "u": _Derived("u", "Displacement", "displacement in x", ("u",)),
-    "v": _Derived("v", "Displacement", "displacement in y", ("v",)),
-    "magnitude": _Derived("|u|", "Displacement", "length of the displacement", _UV),
-    "u_velocity": _Derived("du/dt", "Rates", "velocity in x", ("u",), 1),
-    "v_velocity": _Derived("dv/dt", "Rates", "velocity in y", ("v",), 1),
-    "velocity": _Derived("|du/dt|", "Rates", "magnitude of the velocity", _UV, 1),
-    "u_acceleration": _Derived("d²u/dt²", "Rates", "acceleration in x", ("u",), 2),
-    "v_acceleration": _Derived("d²v/dt²", "Rates", "acceleration in y", ("v",), 2),
-    "acceleration": _Derived("|d²u/dt²|", "Rates", "magnitude of the acceleration", _UV, 2),
-}
-_OF_STRAINS = {
-    "exx_rate": _Derived("dεxx/dt", "Rates", "rate of the strain in x", ("exx",), 1),
-    "eyy_rate": _Derived("dεyy/dt", "Rates", "rate of the strain in y", ("eyy",), 1),
-    "exy_rate": _Derived("dεxy/dt", "Rates", "rate of the tensor shear", ("exy",), 1),
-    "equivalent_rate": _Derived("dεeq/dt", "Rates", "rate of the von Mises equivalent strain", ("equivalent",), 1),
-}
-_DERIVED = _OF_LENGTHS | _OF_STRAINS
-_SYMBOLS = {
-    "exx": "εxx", "eyy": "εyy", "exy": "εxy", "e1": "ε₁", "e2": "ε₂", "direction": "θ₁", "shear": "γmax",
-    "equivalent": "εeq",
-}  # fmt: skip
-_COMPONENTS = ("u", "v", "exx", "eyy", "exy")
-_FINER = "finer_mesh"
-_WITH_ERROR = {
-    **{
-        f"{name}_mesh_error": f"discretisation error of {name}: what mesh and recovery leave out"
-        for name in _COMPONENTS
-    },
-    **{f"{name}_total": f"noise and discretisation error of {name} together" for name in _COMPONENTS},
-    _FINER: "largest discretisation error over the noise of u, v, exx, eyy, exy: above 1 a finer mesh is needed here",
-}
-"""Fields of results whose ``mesh.error`` asks for the discretisation error."""
-_GROUPS = ("Displacement", "Strain", "Rates", "Quality", "Uncertainty")
-_POSITIVE = (_FINER, "magnitude", "velocity", "acceleration", "equivalent", "shear", "misfit")
-_KINDS: dict[str, Kind] = {"direction": "angle", "node_status": "codes", **dict.fromkeys(_POSITIVE, "positive")}
-"""Kinds of fields; other lengths and their rates are displacements, uncertainties positive, all others strains."""
-_OTHERS: dict[bool, Kind] = {True: "displacement", False: "strain"}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MapField:
-    """A nodal field that can be shown.
-
-    Attributes
-    ----------
-    name
-        As in the field table; a fraction is named by its light, an uncertainty ends in ``_std``.
-    symbol
-        How formulas and pictures write it.
-    unit, meaning
-        As in the field table, lengths in the unit of the reader.
-    group
-        Heading under which it stands in lists.
-    kind
-        Kind of the values, which sets colours and format.
-    codes
-        Meaning of each number, for a status.
-    """
-
-    name: str
-    symbol: str
-    unit: str
-    meaning: str
-    group: str
-    kind: Kind
-    codes: tuple[str, ...] = ()
-
-    @property
-    def label(self) -> str:
-        """Name and unit."""
-        return f"{self.name} ({self.unit})" if self.unit else self.name
-
-    @property
-    def signed(self) -> bool:
-        """Whether colours symmetric about 0 make sense."""
-        return self.kind in ("displacement", "strain")
-
-    @property
-    def stepped(self) -> bool:
-        """Whether values between those of two nodes mean nothing."""
-        return self.kind in ("angle", "codes")
-
-    @property
-    def ends(self) -> tuple[float, float] | None:
-        """Values of the first and last colour, where the kind of field sets them."""
-        fixed = {"codes": (-0.5, len(self.codes) - 0.5), "fraction": (0.0, 1.0), "angle": (-90.0, 90.0)}
-        return fixed.get(self.kind)
-
-    def text(self, value: float, std: float = float("nan")) -> str:
-        """Return a value with its standard uncertainty and unit as text.
-
-        Parameters
-        ----------
-        value
-            The value in the field's unit.
-        std
-            Its standard uncertainty; NaN where not known.
-
-        Returns
-        -------
-        str
-        """
-        if not np.isfinite(value):
-            return "not measured"
-        if self.codes:
-            return self.codes[int(value)]
-        unit = f" {self.unit}" if self.unit else ""
-        return f"{value:.5g}{unit}" if not np.isfinite(std) else f"{value:.5g} ± {std:.2g}{unit}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -306,36 +193,8 @@ class Maps:
     @cached_property
     def all(self) -> dict[str, MapField]:
         """Every field by its name, displacements first; each that has an uncertainty is followed by it further down."""
-        units, quantities, found = self._units, self.physical.quantities, dict[str, MapField]()
-
-        def add(name: str, symbol: str, unit: str, meaning: str, group: str, codes: tuple[str, ...] = ()) -> None:
-            kind = _KINDS.get(name, "positive" if group == "Uncertainty" else _OTHERS[name in _OF_LENGTHS])
-            kind = "fraction" if name.startswith("fraction") else kind
-            found[name] = MapField(
-                name=name, symbol=symbol, unit=unit, meaning=meaning, group=group, kind=kind, codes=codes
-            )
-
-        for name, entry in _OF_LENGTHS.items():
-            unit = units.per_time(units.length, entry.order) if entry.order else units.length
-            add(name, entry.symbol, unit, entry.meaning, entry.group)
-        for name, symbol in _SYMBOLS.items():
-            add(name, symbol, quantities[name].unit, quantities[name].meaning, "Strain")
-        for name, entry in _OF_STRAINS.items():
-            add(name, entry.symbol, units.per_time("", entry.order), entry.meaning, entry.group)
-        uncertain = tuple(found.values())
-        spread = {f"{each.name}_std" for each in uncertain}
-        for name, quantity in quantities.items():
-            if quantity.axes == ("node",) and name not in (*found, *spread):
-                add(name, name, quantity.unit, ", ".join(quantity.codes) or quantity.meaning, "Quality", quantity.codes)
-        for name, meaning in _WITH_ERROR.items() if self.result.setting("mesh", "error") else ():
-            unit = units.length if name[:2] in ("u_", "v_") else ""
-            add(name, name, unit, meaning, "Quality" if name == _FINER else "Uncertainty")
-        for light in self.result.lights:
-            add(name := f"fraction of {light}", name, "", quantities["light_fraction"].meaning, "Quality")
-        for each in uncertain:
-            meaning = f"standard uncertainty of {each.name}"
-            add(f"{each.name}_std", f"σ({each.symbol})", each.unit, meaning, "Uncertainty")
-        return {each.name: each for each in sorted(found.values(), key=lambda each: _GROUPS.index(each.group))}
+        error = bool(self.result.setting("mesh", "error"))
+        return map_fields(self._units, self.physical.quantities, self.result.lights, with_error=error)
 
     def field(self, name: str) -> MapField:
         """Return a field by its name.
@@ -358,18 +217,29 @@ class Maps:
             raise InputError(f'there is no field "{name}"; the fields are {", ".join(self.all)}')
         return self.all[name]
 
-    @property
-    def how(self) -> dict[str, str]:
-        """Describe how derived fields are made, for the texts beside them: strain, reference, rates."""
-        enough = len(self._there) >= FEWEST
+    def how(self, name: str) -> str:
+        """Describe how a field is derived, for the text beside it: measure and gauge, reference, rates; may be empty.
+
+        Parameters
+        ----------
+        name
+            Name of the field, or of its uncertainty.
+
+        Returns
+        -------
+        str
+        """
+        base = name.removesuffix("_std")
+        group = self.field(base if base in self.all else name).group
+        if group == "Rates" and len(self._there) < FEWEST:
+            return ""
         since = "" if self.since is None else f"since frame {self.since}"
-        moved = [*filter(None, [since, "rigid motion removed" if self.rigid_removed else ""])]
-        gauge = f"virtual strain gauge of {self.physical.in_units(self.physical.gauges.length)}"
-        return {
-            "Displacement": ", ".join(moved),
-            "Strain": ", ".join([self.physical.measure_name, gauge, *moved[: bool(since)]]),
-            "Rates": rate_words(self.window, len(self._there)) if enough else "",
-        }
+        rigid = "rigid motion removed" if self.rigid_removed and group == "Displacement" else ""
+        strain = self.physical.strain_words(base) if group == "Strain" or base in OF_STRAINS else ""
+        parts = {"Displacement": [since, rigid], "Strain": [strain, since]}
+        if group == "Rates":
+            parts["Rates"] = [strain, rate_words(self.window, len(self._there))]
+        return ", ".join(filter(None, parts.get(group, [])))
 
     def read(self, name: str, frame: int) -> MapValues:
         """Read a field in one frame.
@@ -397,11 +267,11 @@ class Maps:
         if not 0 <= frame < len(self.result):
             raise InputError(f"there is no frame {frame} in a result of {len(self.result)} frames")
         base = name.removesuffix("_std")
-        derived = base in _DERIVED or base in _SYMBOLS or name in _WITH_ERROR
+        derived = base in DERIVED or base in STRAINS or name in WITH_ERROR
         stored = ("light_fraction",) if kind == "fraction" else () if derived else (base,)
         read = next(self.result.table.each([*_MOVED, "node_status", *stored], [frame]))
         nothing = np.full(len(self.result.nodes), np.nan)
-        if name in _WITH_ERROR:
+        if name in WITH_ERROR:
             values, std = self._with_error(name, frame), nothing
         elif derived:
             values, std = self._derived(base, frame)
@@ -419,42 +289,42 @@ class Maps:
         )
 
     def _with_error(self, name: str, frame: int) -> FloatArray:
-        """Compute a field of `_WITH_ERROR` (N,) against the test's reference; NaN in frames without."""
+        """Compute a field of `WITH_ERROR` (N,) against the test's reference; NaN in frames without."""
         read = next(
             self.result.table.each(
-                [f"{one}{end}" for one in _COMPONENTS for end in ("_std", "_mesh_error")] + ["u", "v"], [frame]
+                [f"{one}{end}" for one in COMPONENTS for end in ("_std", "_mesh_error")] + ["u", "v"], [frame]
             )
         )
         if not read["u_mesh_error"].size:
             return np.full(len(self.result.nodes), np.nan)
         double = {key: np.asarray(values, dtype=np.float64) for key, values in read.items()}
-        if name == _FINER:
-            ratios = [double[f"{one}_mesh_error"] / double[f"{one}_std"] for one in _COMPONENTS]
+        if name == FINER:
+            ratios = [double[f"{one}_mesh_error"] / double[f"{one}_std"] for one in COMPONENTS]
             return np.asarray(np.fmax.reduce(ratios))
         one = name.removesuffix("_total").removesuffix("_mesh_error")
-        if one in _UV:
+        if one in UV:
             for end in ("_std", "_mesh_error"):
                 parts = (double[key] for key in ("u", "v", f"u{end}", f"v{end}"))
                 moved = self.physical.rectified.displacement(*parts)[2:]
-                double[f"{one}{end}"] = self._units.lengths(*[moved[_UV.index(one)]] * 2)[0]
+                double[f"{one}{end}"] = self._units.lengths(*[moved[UV.index(one)]] * 2)[0]
         error = double[f"{one}_mesh_error"]
         return error if name.endswith("_error") else np.hypot(error, double[f"{one}_std"])
 
     def _derived(self, name: str, frame: int) -> tuple[FloatArray, FloatArray]:
-        """Compute a field of `_DERIVED`, or a strain, and its uncertainty, each (N,)."""
-        entry = _DERIVED.get(name)
+        """Compute a field of `DERIVED`, or a strain, and its uncertainty, each (N,)."""
+        entry = DERIVED.get(name)
         if entry is None:
             return self._strain(frame)[name], self._strain(frame)[f"{name}_std"]
         if entry.order:
             parts = [self._rates(part, frame, entry.order) for part in entry.parts]
         else:
             moved = self.displacement(frame)
-            parts = [(moved[_UV.index(part)], moved[2 + _UV.index(part)]) for part in entry.parts]
+            parts = [(moved[UV.index(part)], moved[2 + UV.index(part)]) for part in entry.parts]
         values, std = parts[0]
         if len(parts) > 1:
             vector, error = (np.stack(each, axis=1) for each in zip(*parts, strict=True))
             values, std = length_of(vector, error[:, :, None] ** 2 * np.eye(len(parts)))
-        return self._units.lengths(values, std) if name in _OF_LENGTHS else (values, std)
+        return self._units.lengths(values, std) if name in OF_LENGTHS else (values, std)
 
     def displacement(self, frame: int) -> FloatArray:
         """Return u, v and their standard uncertainties (4, N) in rectified px, since `since`, rigid motion removed.
@@ -607,8 +477,8 @@ class Maps:
         outer = slice(max(inner.start - size, 0), inner.stop + size)
         frames, clock = self._there[outer], self._clock[outer]
         plain = replace(self, since=None, rigid_removed=False)
-        if name in _UV:
-            series = np.stack([self._measured(frame)[_UV.index(name) :: 2] for frame in frames.tolist()], axis=1)
+        if name in UV:
+            series = np.stack([self._measured(frame)[UV.index(name) :: 2] for frame in frames.tolist()], axis=1)
         else:
             series = np.stack([np.stack(plain._derived(name, frame)) for frame in frames.tolist()], axis=1)
         span = (taken - 1) * float(np.median(np.diff(self._clock)))

@@ -245,29 +245,29 @@ def shared_part(result: Result) -> float:
 
 
 _NODE, _ELEMENT = ("node",), ("element",)
-_STRAIN = (
-    ResultQuantity("exx", _NODE, "", "components.0", "strain in x"),
-    ResultQuantity("eyy", _NODE, "", "components.1", "strain in y"),
-    ResultQuantity("exy", _NODE, "", "components.2", "strain, tensor shear"),
+STRAIN = (
+    ResultQuantity("exx", _NODE, "", "components.0", "strain in x", symbol="εxx"),
+    ResultQuantity("eyy", _NODE, "", "components.1", "strain in y", symbol="εyy"),
+    ResultQuantity("exy", _NODE, "", "components.2", "strain, tensor shear", symbol="εxy"),
     ResultQuantity("exx_std", _NODE, "", "components_std.0", "standard uncertainty of exx"),
     ResultQuantity("eyy_std", _NODE, "", "components_std.1", "standard uncertainty of eyy"),
     ResultQuantity("exy_std", _NODE, "", "components_std.2", "standard uncertainty of exy"),
-    ResultQuantity("e1", _NODE, "", "principal.0", "larger principal strain in the plane"),
-    ResultQuantity("e2", _NODE, "", "principal.1", "smaller principal strain in the plane"),
+    ResultQuantity("e1", _NODE, "", "principal.0", "larger principal strain in the plane", symbol="ε₁"),
+    ResultQuantity("e2", _NODE, "", "principal.1", "smaller principal strain in the plane", symbol="ε₂"),
     ResultQuantity("e1_std", _NODE, "", "principal_std.0", "standard uncertainty of e1"),
     ResultQuantity("e2_std", _NODE, "", "principal_std.1", "standard uncertainty of e2"),
-    ResultQuantity("direction", _NODE, "deg", "direction_deg", "direction of e1, from x towards y"),
+    ResultQuantity("direction", _NODE, "deg", "direction_deg", "direction of e1, from x towards y", symbol="θ₁"),
     ResultQuantity("direction_std", _NODE, "deg", "direction_std_deg", "standard uncertainty of direction"),
-    ResultQuantity("shear", _NODE, "", "shear", "largest shear in the plane, e1 - e2 (engineering shear)"),
+    ResultQuantity("shear", _NODE, "", "shear", "largest engineering shear in the plane, e1 - e2", symbol="γmax"),
     ResultQuantity("shear_std", _NODE, "", "shear_std", "standard uncertainty of shear"),
-    ResultQuantity("equivalent", _NODE, "", "equivalent", EQUIVALENT),
+    ResultQuantity("equivalent", _NODE, "", "equivalent", EQUIVALENT, symbol="εeq (Hencky)"),
     ResultQuantity("equivalent_std", _NODE, "", "equivalent_std", "standard uncertainty of equivalent"),
 )
 _ELEMENT_STRAIN = tuple(
     replace(entry, name=f"{entry.name}_element", axes=_ELEMENT, meaning=f"{entry.meaning}, constant in an element")
-    for entry in _STRAIN[:3]
+    for entry in STRAIN[:3]
 )
-_REPLACED = ("time_ns", *(entry.name for entry in _STRAIN))
+_REPLACED = ("time_ns", *(entry.name for entry in STRAIN))
 """Quantities of the table that others replace here: times in s, finite strain over a gauge."""
 
 
@@ -321,11 +321,12 @@ class Physical:
         return self.rectified.mesh
 
     def where(self, name: str) -> str:
-        """Say what one of the `places` lies on."""
+        """Say what one of the `places` lies on, and which way it counts."""
         if name.endswith("_mesh"):
-            return "the mesh of mesh.file, in its own axes"
+            return f"the mesh of mesh.file, along its axis {name[0]}"
         plane = self.rectified.camera is not None and not name.endswith("_image")
-        return "the plane of the specimen at the reference" if plane else "the reference image"
+        on = "the plane of the specimen at the reference" if plane else "the reference image"
+        return f"{on}, {'to the right' if name[0] == 'x' else 'down'}"
 
     @property
     def places(self) -> dict[str, tuple[str, FloatArray]]:
@@ -352,6 +353,16 @@ class Physical:
         """Name of the strain measure with capitals."""
         return self.measure.title()
 
+    def strain_words(self, name: str = "") -> str:
+        """Name measure and gauge of a strain; the equivalent strain is that of the Hencky strain whatever is chosen."""
+        measure = "Hencky" if name.startswith("equivalent") else self.measure_name
+        return f"{measure}, virtual strain gauge of {self.in_units(self.gauges.length)}"
+
+    @property
+    def axes(self) -> tuple[str, float]:
+        """Unit of the axes of pictures of the image, and that unit over px: mm where each px is as long."""
+        return ("px", 1.0) if self.rectified.camera is not None else (self.units.length, self.length)
+
     def in_units(self, length: float) -> str:
         """Write a length (px) as text: in px, and in mm where the scale is known."""
         scale = self.units.mm_per_pixel
@@ -362,11 +373,11 @@ class Physical:
         """Entries of what `frame` returns: the stackable quantities of the table, and strain; lengths in `units`."""
         kept = [entry for entry in QUANTITIES.values() if entry.stackable and entry.name not in _REPLACED]
         converted = [replace(entry, unit=self.units.length) if entry.unit == "px" else entry for entry in kept]
-        return {entry.name: entry for entry in (*converted, *_STRAIN, *_ELEMENT_STRAIN)}
+        return {entry.name: entry for entry in (*converted, *STRAIN, *_ELEMENT_STRAIN)}
 
     def is_strain(self, name: str) -> bool:
         """Report whether a quantity depends on strain measure and gauge."""
-        return any(entry.name == name for entry in (*_STRAIN, *_ELEMENT_STRAIN))
+        return any(entry.name == name for entry in (*STRAIN, *_ELEMENT_STRAIN))
 
     @property
     def length(self) -> float:
@@ -392,4 +403,4 @@ class Physical:
     @staticmethod
     def named(strain: Strain) -> dict[str, FloatArray]:
         """Return the quantities of a strain by name."""
-        return {entry.name: entry.of(strain) for entry in _STRAIN}
+        return {entry.name: entry.of(strain) for entry in STRAIN}

@@ -15,8 +15,9 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.fields import ProfileLine, Units, column
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
+from rgbmidic.results.field import MapField
 from rgbmidic.results.files import check_file, write_complete
-from rgbmidic.results.maps import MapField, Maps
+from rgbmidic.results.maps import Maps
 from rgbmidic.results.physical import frame_times, shared_part
 from rgbmidic.typing import AnyArray, FloatArray
 
@@ -116,7 +117,7 @@ class Profile:
         values, std = np.full((2, len(chosen), len(line.points)), np.nan)
         profile = cls(
             field=found,
-            how=maps.how.get(found.group, ""),
+            how=maps.how(field),
             line=line,
             frames=chosen,
             numbers=result.number[chosen],

@@ -43,6 +43,8 @@ class ResultQuantity:
         What a frame holds that could not be measured at all.
     codes
         What each integer means, for a status.
+    symbol
+        How pictures write it; empty: its name.
     """
 
     name: str
@@ -54,6 +56,7 @@ class ResultQuantity:
     dtype: type[np.generic] = np.float32
     blank: float | int | str = float("nan")
     codes: tuple[str, ...] = ()
+    symbol: str = ""
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int | None, ...]:
         """Return the shape in one frame for these sizes of ``"node"`` and ``"light"``; None for an open axis.

@@ -241,14 +241,14 @@ class Result:
         xarray.Dataset
             Dimensions: `frame` (T), `node` (N), `light` (k), `element` (E), `corner` (3), `component` (exx, eyy, exy)
             and, of single variables, `brightness_part` and `stage`.
-            Coordinates: `x`, `y` of the nodes in px and, where the scale is known, `x_mm`, `y_mm`; `number`, `name`
-            and, where it is known, `time` (s) of the frames; names of lights and components.
-            Variables: every quantity of `QUANTITIES` that has one shape in all frames, in its unit there (displacements
-            in px), such as `u` (frame, node), `light_fraction` (frame, node, light) and `status` (frame); the six
-            components of the small strain and its uncertainty as `strain` and `strain_std` (frame, node, component);
-            `elements` (element, corner). Where ``[scale]`` has a camera, `u_mm`, `v_mm`, `u_mm_std`, `v_mm_std` are the
-            displacements on the plane, and `strain` is Green-Lagrange strain there. Each has the attributes ``units``
-            and ``long_name``, a status ``flag_values`` and ``flag_meanings``.
+            Coordinates: `x`, `y` of the nodes, in mm where the scale is known (with a camera also `x_image`, `y_image`
+            in px); `number`, `name` and, where it is known, `time` (s) of the frames; names of lights and components.
+            Variables: every quantity of `QUANTITIES` that has one shape in all frames, such as `u` (frame, node),
+            `light_fraction` (frame, node, light) and `status` (frame); displacements are in the unit of `x`. Strain
+            and its uncertainty are `strain` and `strain_std` (frame, node, component): Green-Lagrange strain over
+            the shortest virtual strain gauge, as in figures, viewer and exports; the description says so.
+            `elements` (element, corner). Where ``[scale]`` has a camera, all are those on its plane. Each has the
+            attributes ``units`` and ``long_name``, a status ``flag_values`` and ``flag_meanings``.
             Attributes: ``settings``, ``calibration`` and ``versions`` as JSON texts, ``references``, dates, and
             ``mm_per_pixel`` with its uncertainty where the scale is known, and ``camera``.
 

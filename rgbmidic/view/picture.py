@@ -410,8 +410,7 @@ def frame_text(maps: Maps, place: int, field: MapField, values: MapValues, remar
         lines.append(html.escape(", ".join(ends)))
     elif not np.isfinite(values.values).any():
         lines.append("Nothing is measured here: choose another frame below.")
-    base = maps.all.get(field.name.removesuffix("_std"), field)
-    lines += [html.escape(text) for text in [maps.how.get(base.group, "")] if text]
+    lines += [html.escape(text) for text in [maps.how(field.name)] if text]
     return "<br>".join([*lines, *([html.escape(remark)] if remark else [])])
 
 

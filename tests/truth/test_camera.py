@@ -202,10 +202,10 @@ def test_every_output_has_the_same_millimetres(stretched: tuple[Result, Path]) -
         assert camera.summary() in file.attrs["camera"]
         assert float(np.sum(file["area"])) == pytest.approx(physical.length**2 * physical.mesh.areas.sum())
     data = result.to_xarray()
-    assert float(data.u_mm[1, node]) == pytest.approx(u, abs=1e-6)
-    assert float(data.x_mm[node]) == pytest.approx(camera.to_mm(place[None])[0, 0])
+    assert float(data.u[1, node]) == pytest.approx(u, abs=1e-6)
+    assert float(data.x[node]) == pytest.approx(camera.to_mm(place[None])[0, 0])
     np.testing.assert_allclose(data.strain[1, :, 0], values["exx"], rtol=1e-5)
-    assert data.u_mm.units == "mm"
+    assert data.u.units == "mm"
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(data)).strain, data.strain)
     viewed = Maps.of(result)
     assert viewed.read("u", 1).values[node] == pytest.approx(u, abs=1e-6)

@@ -82,7 +82,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """No pictures: drawing them takes nearly all of the time."""
     monkeypatch.setattr(document, "embedded", lambda _: "data:image/png;base64,")
     for method in ("_draw", "strip"):
-        monkeypatch.setattr(document.figures.MapDrawer, method, lambda *_: None)
+        monkeypatch.setattr(document.figures.MapDrawer, method, lambda *_, **__: None)
     for module in (document, document.figures, style):
         for name in [name for name in vars(module) if name.endswith("_figure")]:
             monkeypatch.setattr(module, name, lambda *_, **__: None)

@@ -12,13 +12,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgba
 from matplotlib.text import Text
 from results import LIGHTS, MESH, NODES, make_origin, make_result
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.report import figures, gallery, remove_figures, save_figure, style, write_figures, write_maps
-from rgbmidic.results import FrameRecord, Maps, Origin, Result, ResultStore
+from rgbmidic.results import QUANTITIES, FrameRecord, Maps, Origin, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 from rgbmidic.typing import AnyArray
 from rgbmidic.view.picture import Pictures
@@ -102,12 +103,13 @@ def test_a_reference_that_shows_a_part_of_the_frame_lies_where_it_belongs(tmp_pa
 
 def test_axes_that_are_drawn_once_look_as_if_drawn_for_each_map(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=3, reference=np.stack([IMAGE] * 3))
-    maps = figures.MapDrawer(result, 60)
-    before = _pixels(maps.of_kind(1, "displacement"))
-    frozen, anew = _pixels(maps.of_kind(2, "displacement")), _pixels(figures.map_figure(result, 2, "displacement"))
+    maps = figures.MapDrawer(Maps.of(result), 60)
+    before = _pixels(maps.fields(1, figures.MAPS["displacement"]))
+    frozen = _pixels(maps.fields(2, figures.MAPS["displacement"]))
+    anew = _pixels(figures.map_figure(result, 2, "displacement"))
     changed = (np.abs(before - anew) > 30).mean()
     assert (np.abs(frozen - anew) > 30).mean() < 0.01 < 0.1 < changed
-    assert maps.of_kind(2, "uncertainty") is maps.of_kind(1, "displacement")
+    assert maps.fields(2, figures.MAPS["uncertainty"]) is maps.fields(1, figures.MAPS["displacement"])
 
 
 def _pixels(figure: Any) -> AnyArray:
@@ -118,14 +120,14 @@ def _pixels(figure: Any) -> AnyArray:
 
 @pytest.mark.parametrize("kind", figures.MAPS)
 def test_every_map_shows_its_quantities_around_the_mesh(tmp_path: Path, kind: str) -> None:
-    names = figures.MAPS[kind]
-    values = {name: np.linspace(1, 2, NODES) + index for index, name in enumerate(names)}
-    wide = np.ones((3, 500, 700))
-    figure = figures.map_figure(_one_frame(tmp_path / "out", wide, **values), 0, kind)
-    for axis, name in zip(figure.axes, names, strict=False):
-        assert axis.get_title().split(" ")[0] == name
-        picture = axis.images[-1].get_array()
-        assert values[name].min() <= picture.min() < picture.max() <= values[name].max()
+    ramp = np.linspace(1, 2, NODES)
+    given = {"u": 0.01 * X**2 / 60, "v": 0.02 * Y, "u_std": ramp, "v_std": 2 * ramp, "misfit": ramp}
+    result = _one_frame(tmp_path / "out", np.ones((3, 500, 700)), **given)
+    figure, maps = figures.map_figure(result, 0, kind), Maps.of(result)
+    for axis, name in zip(figure.axes, figures.MAPS[kind], strict=False):
+        assert axis.get_title() == maps.field(name).label
+        picture, values = axis.images[-1].get_array(), maps.read(name, 0).values
+        assert np.nanmin(values) <= np.nanmin(picture) <= np.nanmax(picture) <= np.nanmax(values)
         (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
         assert left < 10 < 110 < right < 150
         assert top < 5 < 75 < bottom < 100
@@ -136,8 +138,9 @@ def test_a_derived_field_has_its_uncertainty_beside_it_and_hatches_where_it_may_
 ) -> None:
     still = {"u": 0.01 * (X - 60), "v": 0 * X, "u_std": np.full(NODES, 0.01), "v_std": np.full(NODES, 0.01)}
     result = _one_frame(tmp_path / "out", np.stack([IMAGE] * 3), **still)
-    maps, drawer = Maps.of(result, gauge=70.0, measure="engineering"), figures.MapDrawer(result)
-    figure, read = drawer.of_field(maps, "exx", 0, hatched=True), maps.read("exx", 0)
+    maps = Maps.of(result, gauge=70.0, measure="engineering")
+    drawer = figures.MapDrawer(maps)
+    figure, read = drawer.fields(0, ["exx"], std=True, hatched=True), maps.read("exx", 0)
     assert [axis.get_title() for axis in figure.axes] == ["εxx", "σ(εxx)"]
     assert "Engineering, virtual strain gauge of 70 px" in figure.texts[0].get_text()
     for axis, values in zip(figure.axes, (read.values, read.std), strict=True):
@@ -145,7 +148,7 @@ def test_a_derived_field_has_its_uncertainty_beside_it_and_hatches_where_it_may_
         assert np.nanmin(picture) >= values.min() - 1e-9
         assert np.nanmax(picture) == pytest.approx(values.max(), rel=0.02)
     assert not figure.axes[0].collections[0].get_paths()[0].vertices.size, "a stretch of 10 standard uncertainties"
-    figure = drawer.of_field(maps, "eyy", 0, hatched=True)
+    figure = drawer.fields(0, ["eyy"], std=True, hatched=True)
     assert figure.axes[0].collections[0].get_paths()[0].vertices.size
     files = write_maps(maps, ["eyy", "node_status"], tmp_path / "maps", [0])
     assert [file.name for file in files] == ["map_eyy_000000.png", "map_node_status_000000.png"]
@@ -179,12 +182,12 @@ def test_outliers_at_the_edge_do_not_turn_the_bulk_of_an_uncertainty_black(tmp_p
 
 
 def test_doubtful_nodes_do_not_rule_the_colours(tmp_path: Path) -> None:
-    """A strain of .2 % in the middle shows beside border nodes that scatter by 5 %, and say so."""
+    """A step of .002 px in the middle shows beside border nodes that scatter by .05 px, and say so."""
     edge = X < 30
-    exx = np.where(edge, 0.05 * np.random.default_rng(0).normal(size=NODES), 0.002 * (X > 60))
-    result = _one_frame(tmp_path / "out", exx=exx, eyy=exx, exy=exx, exx_std=np.where(edge, 0.05, 1e-4))
-    norm = figures.map_figure(result, 0, "strain").axes[0].images[-1].norm
-    assert (norm.vmin, norm.vmax) == (0, np.float32(0.002))
+    u = np.where(edge, 0.05 * np.random.default_rng(0).normal(size=NODES), 0.002 * (X > 60))
+    result = _one_frame(tmp_path / "out", u=u, v=u, u_std=np.where(edge, 0.05, 1e-4), v_std=np.full(NODES, 1.0))
+    norm = figures.map_figure(result, 0, "displacement").axes[0].images[-1].norm
+    assert (norm.vmin, norm.vmax) == (0, 0.002)
 
 
 @pytest.fixture
@@ -254,7 +257,35 @@ def test_displacements_are_in_mm_where_the_scale_is_known(tmp_path: Path) -> Non
     assert np.ptp(u.images[-1].get_array()) == pytest.approx(0.05 * np.ptp(X), rel=0.01)
     std = figures.map_figure(result, 0, "uncertainty").axes[0].images[-1].get_array()
     assert std.max() == pytest.approx(np.hypot(0.05 * 0.01, 0.001) * X.max(), rel=0.01)
-    assert figures.map_figure(result, 0, "strain").axes[0].get_title() == "exx"
+    assert figures.map_figure(result, 0, "strain").axes[0].get_title() == "εxx"
+    assert (u.get_xlabel(), u.get_ylabel()) == ("x (mm)", "y (mm)")
+    numbers = [float(label.get_text()) for label in u.get_xticklabels()]
+    assert all(0 < number < 0.05 * 120 for number in numbers[1:-1])
+
+
+def test_a_status_has_its_names_and_one_colour_a_code(tmp_path: Path) -> None:
+    status = np.where(X > 60, 1, 0)
+    result = _one_frame(tmp_path / "out", u=X, v=Y, node_status=status)
+    axis = figures.MapDrawer(Maps.of(result)).fields(0, ["node_status"]).axes[0]
+    picture = axis.images[-1]
+    colours = {tuple(row) for row in picture.cmap(picture.norm(np.arange(4)))}
+    assert colours == {to_rgba(colour) for colour in style.STATUS_COLOURS}
+    assert [text.get_text() for text in axis.texts] == [*QUANTITIES["node_status"].codes]
+
+
+def test_run_xarray_and_maps_have_one_strain_and_say_which(tmp_path: Path) -> None:
+    """The picture of `run`, the Dataset and the maps: the same numbers, and the title has measure and gauge."""
+    stretch = {"u": 0.1 * (X - 60), "v": 0 * Y, "u_std": np.full(NODES, 0.01), "v_std": np.full(NODES, 0.01)}
+    result = _one_frame(tmp_path / "out", **stretch)
+    figure, maps = figures.map_figure(result, 0, "strain"), Maps.of(result)
+    expected = 0.1 + 0.1**2 / 2
+    assert np.nanmean(figure.axes[0].images[-1].get_array()) == pytest.approx(expected, rel=1e-3)
+    assert maps.how("exx") in figure.texts[0].get_text()
+    assert "Green-Lagrange" in maps.how("exx")
+    assert "Hencky" in maps.how("equivalent")
+    data = result.to_xarray()
+    np.testing.assert_array_equal(data.strain[0].sel(component="exx"), maps.read("exx", 0).values.astype(np.float32))
+    assert maps.how("exx") in data.strain.attrs["description"]
 
 
 NASTY = ("a$x^2$_1", "_hidden", "r$ed", "x\\alpha_{2}", "кадр", "写真", "no\udcffutf8", "two\nlines", "n" * 200)

@@ -71,7 +71,7 @@ def test_a_page_states_how_its_fields_are_derived(maps: Maps) -> None:
     canvas.page(4)
     first, how = canvas._title.get_text().splitlines()
     assert first.endswith("frame 4")
-    assert how == since.how["Strain"]
+    assert how == since.how("exx")
     assert how.endswith(", since frame 2")
     page, box = canvas.figure.bbox, canvas._title.get_window_extent()
     assert page.y0 <= box.y0 < box.y1 <= page.y1

@@ -13,6 +13,7 @@ from results import LIGHTS, MESH, NODES, corrupt, make_origin, make_result, rand
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results import QUANTITIES, FrameRecord, Result, ResultStore
+from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ScaleSettings
 
 xr = pytest.importorskip("xarray")
@@ -36,7 +37,8 @@ def test_every_stackable_quantity_is_there_in_its_unit(result: Result) -> None:
             assert data[name].dims[0] == "frame"
     for end in ("", "_std"):
         for name in ("exx", "eyy", "exy"):
-            np.testing.assert_array_equal(data[f"strain{end}"].sel(component=name), getattr(result, name + end))
+            values = [Physical.of(result).frame(frame)[name + end] for frame in range(5)]
+            np.testing.assert_array_equal(data[f"strain{end}"].sel(component=name), np.float32(values))
     np.testing.assert_array_equal(data.elements, result.elements)
     np.testing.assert_array_equal(data.x, result.nodes[:, 0])
     assert data.status.attrs["flag_meanings"].split() == ["converged", "not_converged", "failed"]
@@ -47,10 +49,11 @@ def test_every_stackable_quantity_is_there_in_its_unit(result: Result) -> None:
 
 def test_coordinates_are_in_px_mm_and_s_where_these_are_known(result: Result, tmp_path: Path) -> None:
     plain, scaled = result.to_xarray(), result.to_xarray(ScaleSettings(mm_per_pixel=0.02, mm_per_pixel_std=0.001))
-    assert "x_mm" not in plain.coords
+    assert (plain.x.units, plain.u.units) == ("px", "px")
     assert "mm_per_pixel" not in plain.attrs
-    np.testing.assert_allclose(scaled.y_mm, 0.02 * result.nodes[:, 1])
-    assert (scaled.x.units, scaled.y_mm.units, scaled.time.units) == ("px", "mm", "s")
+    np.testing.assert_allclose(scaled.y, 0.02 * result.nodes[:, 1])
+    np.testing.assert_allclose(scaled.u, 0.02 * result.u, rtol=1e-6)
+    assert (scaled.x.units, scaled.u.units, scaled.u_std.units, scaled.time.units) == ("mm", "mm", "mm", "s")
     np.testing.assert_allclose(scaled.time, np.arange(5) * 1.000003e-3)
     with ResultStore.create(tmp_path / "untimed", make_origin(1)) as store:
         store.write_frame(0, FrameRecord.of(nodes=NODES, lights=len(LIGHTS)))
@@ -69,7 +72,9 @@ def test_coordinates_are_in_px_mm_and_s_where_these_are_known(result: Result, tm
     ],
 )
 def test_a_part_is_the_part_of_the_array(result: Result, key: dict[str, object]) -> None:
-    whole = xr.Variable(("frame", "node", "component"), result.strain)
+    physical = Physical.of(result)
+    frames = [np.stack([physical.frame(frame)[name] for name in ("exx", "eyy", "exy")], axis=-1) for frame in range(5)]
+    whole = xr.Variable(("frame", "node", "component"), np.float32(frames))
     part = result.to_xarray().strain.isel(key)
     assert part.dtype == np.float32
     np.testing.assert_array_equal(part.values, whole.isel(key).values)
@@ -77,7 +82,7 @@ def test_a_part_is_the_part_of_the_array(result: Result, key: dict[str, object])
 
 def test_pairs_of_frame_and_node_are_read_point_by_point(result: Result) -> None:
     pairs = {"frame": xr.Variable("pair", [4, 0]), "node": xr.Variable("pair", [7, 2])}
-    np.testing.assert_array_equal(result.to_xarray().strain.isel(pairs), result.strain[[4, 0], [7, 2]])
+    np.testing.assert_array_equal(result.to_xarray().u.isel(pairs), result.u[[4, 0], [7, 2]])
 
 
 def test_only_the_frames_asked_for_are_read(result: Result) -> None:

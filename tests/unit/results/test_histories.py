@@ -17,7 +17,8 @@ from results import MESH, NODES, make_origin
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import ConfigurationError, InputError
-from rgbmidic.fields.history import Units, rate_words
+from rgbmidic.fields import Units
+from rgbmidic.fields.history import rate_words
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.report import history_figure
 from rgbmidic.results import (
@@ -514,7 +515,7 @@ def test_a_window_longer_than_the_test_is_one_rule_for_maps_and_histories(result
     """Rates are those of all frames that are measured, and say so, in both alike."""
     maps = Maps.of(result, window=30)
     said = "parabolas over 8 frames (a window of 30 was stated), polynomials of degree 4 over 8"
-    assert maps.how["Rates"] == said
+    assert maps.how("velocity") == said
     found = read_histories(result, ProbeSettings(points=(PLACE,), window=30))
     assert f"rates: {said}" in found.remarks
     alike = read_histories(result, ProbeSettings(points=(PLACE,), window=8))

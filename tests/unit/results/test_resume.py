@@ -57,8 +57,7 @@ def test_killed_at_any_moment_it_goes_on_to_the_same_bits(tmp_path: Path) -> Non
             finished.append(Result.open(out, partial=True).finished)
             assert finished[-1][finished[-2]].all()
     assert len({int(there.sum()) for there in finished} - {0, FRAMES}) >= KILLS // 2
-    assert len(list(out.rglob("*.part"))) <= 1
-    _write(out)
+    _write(out)  # which removes what the killed ones left, also those that were killed before they removed it
     finish_result(out)
     assert not list(out.rglob("*.part"))
     result = Result.open(out)

@@ -281,11 +281,14 @@ def test_the_label_of_a_probe_is_its_history_in_that_frame_and_the_pointer_state
         for name in "uv":
             value, std = history(kind, name)
             assert label(maps, name, kind, *PLACES[kind]) == f"{mean}: {maps.all[name].text(value, std)}"
-            assert label(maps, f"{name}_std", kind, *PLACES[kind]) == f"{mean}: {maps.all[name].text(std)}"
+            assert label(maps, f"{name}_std", kind, *PLACES[kind]) == f"{mean}: {maps.all[f'{name}_std'].text(std)}"
     for name in ("exx", "eyy", "exy", "e1", "e2", "direction", "equivalent"):
         value, std = history("strain_gauge", name)
         assert label(maps, name, "strain_gauge", *PLACES["strain_gauge"]) == f": {maps.all[name].text(value, std)}"
-        assert label(maps, f"{name}_std", "strain_gauge", *PLACES["strain_gauge"]) == f": {maps.all[name].text(std)}"
+        assert (
+            label(maps, f"{name}_std", "strain_gauge", *PLACES["strain_gauge"])
+            == f": {maps.all[f'{name}_std'].text(std)}"
+        )
     for name in ("u", "v", "u_std"):
         field, values, moved = maps.all[name], maps.read(name, 5), maps.displacement(5)
         told = pointer_text(maps, field, values, moved, result.nodes, *PLACES["point"])
