@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -329,11 +330,15 @@ def add_colour_bar(
     numbers = np.arange(len(names)) if names else MaxNLocator(6).tick_values(*ends)
     numbers = numbers[(numbers >= ends[0]) & (numbers <= ends[1])]
     heights = low + (1 - low - high) * np.asarray(norm(numbers))
+    largest = float(np.abs(numbers).max(initial=0))
+    power = 3 * math.floor(math.log10(largest) / 3) if largest and not 0.01 <= largest < 1e5 and not names else 0
+    if power:  # one for all numbers, as along an axis
+        axis.text(right, 1.03, rf"$\times 10^{{{power}}}$", transform=axis.transAxes, ha="right")
     end = right + 3.5 / 72 / width  # matplotlib's length of a tick
     ticks = np.tile([right, end, np.nan], len(numbers)), np.repeat(heights, 3)
     axis.plot(*ticks, "k", linewidth=0.6, transform=axis.transAxes, clip_on=False)
     for number, height in zip(numbers, heights, strict=True):
-        text = names[int(number)] if names else f"{number:.4g}"
+        text = names[int(number)] if names else f"{number / 10.0**power:.4g}"
         look: dict[str, Any] = {"va": "center_baseline", "fontsize": 6.5 if names else None}
         axis.text(2 * end - right, height, text, transform=axis.transAxes, **look)
     if label:
