@@ -22,6 +22,8 @@ from rgbmidic.errors import InputError, RgbmidicError, disk_reason, shortened
 
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
 REQUIRED = inspect.Parameter.empty
+HELP = {"help_option_names": ["-h", "--help"]}
+"""Context of both commands and of what they consist of."""
 
 FRAME_OPTIONS: dict[str, Any] = {
     "kind": Annotated[

@@ -22,7 +22,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings=command.HELP,
 )
 
 Out = Annotated[Path, typer.Option(help="Calibration file to write (JSON).")]

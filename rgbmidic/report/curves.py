@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic.fields import uncertain
 from rgbmidic.report.setup import NoiseFloor, TimeHistory
 from rgbmidic.report.style import (
     GAP,
@@ -27,7 +26,7 @@ from rgbmidic.report.style import (
     time_axis,
     time_unit,
 )
-from rgbmidic.results import QUANTITIES, Histories, HistoryColumn, Profile, Wave
+from rgbmidic.results import QUANTITIES, Histories, HistoryColumn, Profile, Wave, uncertain
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:

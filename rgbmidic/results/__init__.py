@@ -1,5 +1,6 @@
 """What is kept of a test: one record per frame, the folder that holds them, and other programs' formats."""
 
+from rgbmidic.fields import rounded, uncertain
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.results.channels import Channels
@@ -52,9 +53,11 @@ __all__ = [
     "probes_of",
     "read_profile",
     "reference_frames",
+    "rounded",
     "scale_of",
     "shared_part",
     "speckle_diameter",
+    "uncertain",
     "units_of",
     "write_histories",
     "write_profile",

@@ -59,12 +59,14 @@ def _replace_pipeline(monkeypatch: pytest.MonkeyPatch, measure: Callable[..., Re
 
 def test_version_and_help(command: Run) -> None:
     assert command("--version") == (0, f"rgbmidic {__version__}\n", "")
-    for arguments in ((), ("--help",)):
+    for arguments in ((), ("--help",), ("-h",)):
         status, out, _ = command(*arguments)
         assert status == 0
+        headings = [line for line in out.splitlines() if line.endswith(":") and line[0] != " "]
+        assert headings == ["Options:", "Before a test:", "A test:", "Its result:", "Fields of the result:"]
         assert all(word in out for word in ("run", "export", "report", "figures", "frames", "demo", "virtual", "plan"))
     for name in ("run", "export", "report", "figures", "frames", "demo", "virtual", "plan"):
-        assert command(name, "--help")[0] == 0
+        assert command(name, "-h") == command(name, "--help")
 
 
 @pytest.mark.parametrize(
@@ -555,6 +557,7 @@ def test_movie_and_profile_write_what_is_asked_for_or_nothing(command: Run, tmp_
         (("profile", result, "--out", table, *line, "--curves", "2,9"), "--curves 2,9: frames [9] are not among"),
         (("profile", result, "--out", table, *line, "--curves", "a"), "--curves are indices and ranges"),
         (("profile", result, "--out", tmp_path / "p.png", *line), "--out is the table, such as p.csv, not 'p.png'"),
+        (("report", result, "--out", tmp_path / "r.PDF"), "which a browser prints as PDF"),
         (("history", result, "--out", tmp_path / "h.PNG", "--point", "30,40"), "--out is the table, such as h.csv"),
     ):
         status, out, err = command(*arguments)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from results import MESH, NODES, make_origin
+from results import MESH, NODES, make_origin, make_result
 
 from rgbmidic import cli
 from rgbmidic.command import execute
@@ -540,3 +540,15 @@ def test_of_many_channels_the_first_are_drawn(tmp_path: Path, caplog: pytest.Log
     columns = [HistoryColumn(name=f"c{i}", unit=f"u{i}", values=np.arange(4.0), std=None) for i in range(40)]
     assert len(history_figure(histories_of(np.arange(4.0), *columns)).axes) == 24
     assert "the picture shows 24 of 40 kinds" in caplog.text
+
+
+def test_without_a_file_the_table_is_printed_and_nothing_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = make_result(tmp_path / "out", frames=3)
+    before = sorted(tmp_path.rglob("*"))
+    assert execute(cli.app, ["history", str(result.path), "--point", "60,40"]) == 0
+    out = capsys.readouterr().out
+    assert "point_1_u" in out
+    assert "table:" not in out
+    assert sorted(tmp_path.rglob("*")) == before

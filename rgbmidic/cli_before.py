@@ -1,0 +1,293 @@
+"""The commands of `rgbmidic` before a test: what to expect of it, and what its frames are worth."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rgbmidic import command
+from rgbmidic._version import __version__
+from rgbmidic.cli_parts import Out, Overwrite, explain_first_run, note, print_table, progress_of, read_settings
+from rgbmidic.errors import InputError
+
+if TYPE_CHECKING:
+    pass
+
+app = typer.Typer()
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", help="Output folder; must be empty or new.")] = Path("rgbmidic-demo"),
+) -> None:
+    """Make a small virtual test, calibrate and measure it, and compare the result with the exact truth."""
+    note(f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}")
+    explain_first_run()
+    from rgbmidic._kernels.threads import threads
+    from rgbmidic.lab.demo import run_demo, run_plate, write_plate
+    from rgbmidic.report import write_figures
+    from rgbmidic.results import Result
+
+    started = time.perf_counter()
+    with progress_of("demo") as progress:
+        rows = run_demo(out, note, _calibrate_demo, progress)
+    note("5 of 7: a flat plate, tilted, behind a lens that distorts, and photographs of a chessboard")
+    truth = write_plate(out / "test")
+    _calibrate_demo_camera(out / "test")
+    note(f"6 of 7: measurement on it: rgbmidic run {out / 'test' / 'plate.toml'}, with [scale] camera = camera.json")
+    plate = run_plate(out / "test", truth)
+    note(f"7 of 7: pictures of the result in {out / 'figures'}")
+    write_figures(Result.open(out / "result"), out / "figures", (len(rows),), processes=threads())
+    columns = ["angle", "three lights", "red alone", "green alone", "blue alone", "at nodes", "stated u_std"]
+    errors = [(row.rms_px, *row.single_px, row.nodal_px, row.predicted_px) for row in rows]
+    lines = [[f"{row.angle_deg:g} deg", *(f"{e:.4f}" for e in each)] for row, each in zip(rows, errors, strict=True)]
+    title = "Displacement error against the exact truth, px (a sphere turning under moving reflections)"
+    print_table(title, columns, lines)
+    columns = ["plate", "lens and plane", "one scale", "stated", "strain, lens and plane", "one scale", "stated"]
+    lines = [
+        [
+            row.motion,
+            *(f"{1e3 * value:.2f}" for value in (*row.displacement_mm, row.stated_mm)),
+            *(f"{1e6 * value:.0f}" for value in (*row.strain, row.stated_strain)),
+        ]
+        for row in plate
+    ]
+    title = (
+        "Displacement error, um, and strain error, 1e-6, against the exact truth (a flat plate, tilted by 5 degrees)"
+    )
+    print_table(title, columns, lines)
+    print(f"pictures: {out / 'figures'}   result: {out / 'result'}   {time.perf_counter() - started:.0f} s")
+
+
+def _calibrate_demo(test: Path) -> None:
+    """The crosstalk of a virtual test from its captures, as `rgbmidic-calibrate crosstalk` computes it."""
+    from rgbmidic.settings import FrameSettings
+    from rgbmidic_calibration.captures import Captures
+    from rgbmidic_calibration.jobs import calibrate_crosstalk
+
+    lights = {name: str(test / f"light_{name}") for name in ("red", "green", "blue")}
+    captures = Captures.find(lights, str(test / "dark"), FrameSettings(path=("captures",)))
+    calibration, _ = calibrate_crosstalk(captures)
+    calibration.write(test / "calibration.json")
+
+
+def _calibrate_demo_camera(test: Path) -> None:
+    """Lens and plane from the demo's photographs, as `rgbmidic-calibrate camera` computes them."""
+    from rgbmidic.settings import FrameSettings
+    from rgbmidic_calibration.jobs import calibrate_camera
+    from rgbmidic_calibration.target import Target
+
+    stated = FrameSettings(path=("photographs",), kind="monochrome", white_level=65535)
+    found = calibrate_camera(
+        stated, Target.parse("chessboard:9x7:5mm"), views=str(test / "target/*.png"), plane=str(test / "plane/*.png")
+    )
+    found.camera.write(test / "camera.json")
+
+
+@app.command()
+def sample(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a sample; without it, all are listed.")] = "",
+    folder: Annotated[Path | None, typer.Argument(metavar="FOLDER", help="New or empty folder; else NAME.")] = None,
+) -> None:
+    """Download published real files with a TEST.toml for them, or list the available samples."""
+    from rgbmidic.lab.samples import SAMPLES, write_sample
+
+    if not name:
+        columns = ["sample", "MB", "licence", "source", "shows"]
+        rows = [[s.name, f"{s.bytes / 1e6:.1f}", s.licence, s.source, s.shows] for s in SAMPLES.values()]
+        print_table("real files of others, fetched from their sources and checked by SHA-256", columns, rows)
+        return
+    out = folder or Path(name)
+    written = write_sample(name, out, note)
+    print(f"{written.shows}\nlicence: {written.licence}   source: {written.source}")
+    print(f"try: cd {out} && {written.command}")
+
+
+@app.command()
+def virtual(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Scene to render.")],
+    out: Out,
+) -> None:
+    """Render a virtual test: raw frames, calibration captures and the exact truth."""
+    from rgbmidic.lab.virtual.dataset import write_dataset
+
+    explain_first_run()
+    with progress_of("rendering") as progress:
+        write_dataset(scene, out, progress)
+
+
+@app.command()
+def plan(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Lamps, camera, paint, specimen and its states.")],
+    out: Out,
+    distance: Annotated[
+        float | None, typer.Option("--distance", metavar="MM", help="Camera to specimen; else the scene's.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Predict where each lamp is reflected, the expected uncertainty, and better positions of the lamps."""
+    from rgbmidic.lab import check_folder
+    from rgbmidic.lab import planning_report as planning
+    from rgbmidic.lab.planning import make_plan, propose_colours, propose_lamps
+    from rgbmidic.scene.scene import read_scene
+
+    check_folder(out, planning.FILES, overwrite=overwrite)
+    made = make_plan(read_scene(scene))
+    motion = planning.out_of_plane(made, distance)
+    proposals = {"colours exchanged": propose_colours(made), "lamps moved": propose_lamps(made)}
+    planning.write_plan(made, proposals, out, distance=distance, overwrite=overwrite)
+    title = "fraction of the field where lights reflect, all of them do, and only one or none is clean"
+    print_table(title, *planning.zone_rows(made), planning.ZONE_WORDS)
+    uncertainty = "standard uncertainty to expect over the field, px"
+    print_table(uncertainty, *planning.uncertainty_rows(made), planning.UNCERTAINTY_WORDS)
+    better = {name: proposal.plan for name, proposal in proposals.items() if proposal.gain > 1}
+    for name, lamps in {"lamps as they are": made, **better}.items():
+        print_table(f"{name}: {planning.summary(lamps)}", *planning.lamp_rows(lamps))
+    if not better:
+        print("no better place was found for the lamps")
+    unseen = "" if motion["unseen_mm"] is None else f"; below {motion['unseen_mm']:.2g} mm the noise hides it"
+    print(
+        f"out-of-plane motion at {motion['stand_off_mm']:g} mm reads as strain, {motion['strain_per_mm']:.2e} per mm:"
+    )
+    print(f"  {motion['edge_px_per_mm']:.2g} px per mm at the field's edge{unseen}")
+    print(f"plan: {out / 'plan.json'}   picture: {out / 'plan.png'}")
+
+
+@app.command()
+@command.frame_options
+def frames(
+    statement: dict[str, Any],
+    path: Annotated[str, typer.Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")] = "",
+    formats: Annotated[bool, typer.Option("--formats", help="List the formats that are read.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
+    save: Annotated[
+        tuple[int, Path] | None, typer.Option("--save", metavar="N OUT.tif", help="Write frame N as a 16-bit TIFF.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """List the properties of raw frames as read: number, size, levels, times, missing frames."""
+    from rgbmidic.frames import known_formats
+    from rgbmidic.frames.series import describe, save_frame
+    from rgbmidic.settings import FrameSettings
+
+    if formats:
+        for format_ in known_formats():
+            print(f"{format_.name}: {' '.join((*format_.endings, *format_.movies)) or 'by content'}")
+        return
+    if not path:
+        raise InputError("PATH must name a movie, a frame, a folder or a pattern; --formats lists what is read")
+    settings = FrameSettings(path=(path,), **statement)
+    description = describe(settings)
+    if save is not None:
+        save_frame(settings, *save, overwrite=overwrite)
+    for warning in description.warnings:
+        note(f"warning: {warning}")
+    print(description.as_json() if json else description.as_text())
+
+
+@app.command()
+@command.frame_options
+def inspect(
+    frames: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FRAME...", help="A raw frame; in succession one per light; or TEST.toml: its reference."
+        ),
+    ],
+    statement: dict[str, Any],
+    test: Annotated[Path | None, typer.Option("--test", help="TEST.toml of the test.")] = None,
+    calibration: Annotated[Path | None, typer.Option("--calibration", help="Calibration file.")] = None,
+    region: Annotated[str, typer.Option("--region", help="x0,y0,x1,y1 in px; else the test's or all.")] = "",
+    element_size: Annotated[float | None, typer.Option("--element-size", help="px; else the test's, or 25.")] = None,
+    accept: Annotated[
+        list[str] | None, typer.Option("--accept", help="Failing calibration check to accept; else the test's.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for inspection.png and inspection.json.")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Inspect one frame before a test: lights, reflections, speckle, noise, expected uncertainty."""
+    from rgbmidic.lab import check_folder
+    from rgbmidic.lab.inspection import inspect_files, report, state_frames
+
+    if out is not None:
+        check_folder(out, report.FILES, overwrite=overwrite)
+    if any(path.suffix.lower() == ".toml" for path in frames):
+        if test is not None or len(frames) > 1:
+            raise InputError("a TEST.toml stands for the frames of its reference: give it alone, or frames and --test")
+        test, frames = frames[0], []
+    settings = read_settings(test)
+    explain_first_run()
+    with progress_of("inspecting") as progress:
+        inspection = inspect_files(
+            frames,
+            test=settings,
+            calibration=calibration,
+            frame=state_frames(settings, count=max(len(frames), 1), **statement),
+            region=command.read_place(region, "--region", "X0,Y0,X1,Y1") if region else None,
+            element_size=element_size,
+            accept=tuple(accept) if accept else None,
+            progress=progress,
+        )
+    if out is not None:
+        report.write_inspection(inspection, out, overwrite=overwrite)
+    rows, columns = inspection.frame_shape
+    print(f"{inspection.name}: {inspection.kind}, {columns} x {rows} px\n")
+    print_table("samples in the region, fractions of the full scale", *report.channel_rows(inspection))
+    print_table("lights", *report.light_rows(inspection))
+    known = "" if inspection.noise_known else " (noise estimated, not calibrated)"
+    size = f"elements of {inspection.element_size:g} px"
+    print_table(f"standard uncertainty of u and v to expect{known}, px, {size}", *report.uncertainty_rows(inspection))
+    for finding in inspection.findings:
+        print(f"warning: {finding.text}")
+    if out is not None:
+        print(f"picture: {out / 'inspection.png'}   figures: {out / 'inspection.json'}")
+
+
+@app.command()
+def resolution(
+    test: Annotated[Path, typer.Argument(metavar="TEST.toml", help="Settings of the test.")],
+    sizes: Annotated[
+        str, typer.Option("--sizes", help="Element sizes in px, such as 10,16,25,40; else those that suit the speckle.")
+    ] = "",
+    gauges: Annotated[
+        str, typer.Option("--gauges", help="Lengths of virtual strain gauges in px; else three elements of each size.")
+    ] = "",
+    frames: Annotated[
+        str,
+        typer.Option("--frames", help="Frames, such as 5,10:20, among which the key frame is; else five."),
+    ] = "",
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for resolution.csv, .json and .png.")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Find the element size of a test: noise, discretisation error and strain resolution of several, on its frames."""
+    from rgbmidic.lab import check_folder
+    from rgbmidic.lab import resolution as report
+    from rgbmidic.pipeline.resolution import study_sizes
+    from rgbmidic.settings import read_test
+
+    if out is not None:
+        check_folder(out, report.FILES, overwrite=overwrite)
+    settings = read_test(test)
+    chosen = command.read_frames(frames) or []
+    lengths = command.read_lengths(gauges, "--gauges")
+    asked = command.read_lengths(sizes, "--sizes")
+    explain_first_run()
+    with progress_of("resolution") as progress:
+        study = study_sizes(settings, asked, gauges=lengths or None, frames=chosen, progress=progress)
+    static = f"{study.static} static frames" if study.static else "no static frames: noise is as stated, not measured"
+    print(f"key frame {study.frame}: {study.name}; speckle {study.speckle:.1f} px; {static}\n")
+    print_table("elements, rms over the nodes of the key frame", *report.size_rows(study), report.SIZE_WORDS)
+    print_table("virtual strain gauges", *report.gauge_rows(study), report.GAUGE_WORDS)
+    for one in study.sizes:
+        if one.reason:
+            note(f"warning: elements of {one.element_size:g} px: {one.reason}")
+    if out is not None:
+        report.write_study(study, out, overwrite=overwrite)
+        print(
+            f"table: {out / 'resolution.csv'}   figures: {out / 'resolution.json'}   picture: {out / 'resolution.png'}"
+        )
+    choice = study.choice
+    print("no recommendation: nothing is known of the errors" if choice is None else f"recommended: {choice.reason}")

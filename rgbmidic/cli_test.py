@@ -1,0 +1,227 @@
+"""The commands of `rgbmidic` that measure a test."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rgbmidic import command
+from rgbmidic.cli_parts import Out, Overwrite, explain_first_run, note, progress_of
+from rgbmidic.errors import InputError
+
+if TYPE_CHECKING:
+    from rgbmidic.results import Result
+    from rgbmidic.settings import TestSettings
+
+app = typer.Typer()
+
+
+_CONVERGED, _UNCONVERGED, _FAILED = 0, 1, 2
+
+
+_TOO_MANY = 0.5
+"""Fraction of the deformed frames beyond which those that failed or did not converge make a run a failure: a specimen
+that breaks or leaves the picture halfway through is an ordinary test, a run that measures few of its frames is not."""
+
+
+@app.command()
+def run(
+    test: Annotated[Path, typer.Argument(metavar="TEST.toml", help="Settings of the test.")],
+    out: Out,
+    overwrite: Overwrite = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the interrupted run in DIR.")] = False,
+    retry_failed: Annotated[
+        bool, typer.Option("--retry-failed", help="With --resume: measure all failed frames again.")
+    ] = False,
+    frames: Annotated[
+        str, typer.Option("--frames", help="Only these, such as 1000:2000; end with `rgbmidic finish`.")
+    ] = "",
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Frames at a time; 0: as many as cores.")] = 0,
+    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
+    timings: Annotated[bool, typer.Option("--timings", help="Store and print the time of each stage.")] = False,
+    draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
+) -> None:
+    """Measure a test: from raw frames to one displacement field per frame."""
+    from rgbmidic.pipeline import measure
+    from rgbmidic.settings import read_range, read_test
+
+    started = time.perf_counter()
+    settings = read_test(test)
+    chosen = read_range(frames, "--frames") if frames else None
+    if overwrite and (resume or frames):
+        raise InputError("--overwrite begins anew, --resume and --frames go on: state one of them")
+    explain_first_run()
+    with progress_of("measuring") as progress, _continuation_hint(test, out, frames, resume=resume):
+        result = measure(
+            settings,
+            out,
+            overwrite=overwrite,
+            resume=resume,
+            retry_failed=retry_failed,
+            frames=chosen,
+            workers=workers or None,
+            scheduler=scheduler,
+            timings=timings,
+            progress=progress,
+        )
+    if chosen is None:
+        _conclude(result, started, draw=draw, processes=workers)
+    else:
+        print(f"frames {frames} are measured; when all frames are: rgbmidic finish {out}")
+
+
+@app.command()
+def batch(
+    tests: Annotated[
+        list[Path], typer.Argument(metavar="TEST.toml...", help="Settings of the tests; one with --table.")
+    ],
+    out: Out,
+    table: Annotated[
+        Path | None, typer.Option("--table", help="CSV: a column test, and keys of TEST.toml that its values replace.")
+    ] = None,
+    elastic: Annotated[
+        str, typer.Option("--elastic", metavar="LOW:HIGH", help="Strains between which a modulus is fitted.")
+    ] = "0.0005:0.0025",
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Frames at a time; 0: as many as cores.")] = 0,
+    reports: Annotated[bool, typer.Option("--reports/--no-reports", help="Write a report of each test.")] = True,
+    overwrite: Overwrite = False,
+) -> None:
+    """Measure a series of tests, each into DIR/NAME, with one summary table and page.
+
+    A test that fails does not stop the others; a finished test is not measured again. --overwrite replaces a
+    result that was measured with other settings.
+    """
+    from rgbmidic.pipeline import batch as series
+    from rgbmidic.report import REPORT, write_batch_page, write_report
+    from rgbmidic.results.files import writing
+
+    if table is not None and len(tests) != 1:
+        raise InputError(f"--table goes with one TEST.toml, the template, not with {len(tests)}")
+    chosen = series.read_tests(tests) if table is None else series.read_table(tests[0], table)
+    limits = command.read_pair(elastic, "--elastic")
+    if not 0 <= limits[0] < limits[1]:
+        raise InputError(f"--elastic is a smaller and a larger strain, not {elastic}")
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        series.check_summary(out, overwrite=overwrite)
+
+    def conclude(result: Result, settings: TestSettings, measured: bool) -> None:
+        if reports and (measured or not (result.path / REPORT).is_file()):
+            write_report(result, result.path / REPORT, settings=settings, overwrite=True)
+
+    explain_first_run()
+    outcomes = []
+    with progress_of("batch") as progress:
+        for outcome in series.run_batch(
+            chosen,
+            out,
+            workers=workers or None,
+            elastic=limits,
+            overwrite=overwrite,
+            conclude=conclude,
+            progress=lambda name: progress,
+        ):
+            outcomes.append(outcome)
+            series.write_summary(outcomes, out / "summary.csv")
+            write_batch_page(*series.summary_rows(outcomes), out / "summary.html")
+            note(f"{outcome.name}: {outcome.reason or ('measured' if outcome.measured else 'measured before')}")
+    print(f"table: {out / 'summary.csv'}   page: {out / 'summary.html'}")
+    if failed := [outcome.name for outcome in outcomes if outcome.reason]:
+        raise typer.Exit(
+            command.fail(f"{len(failed)} of {len(outcomes)} tests failed: {', '.join(failed)}", command.FAILURE)
+        )
+
+
+@app.command()
+def finish(
+    result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder of runs with --frames.")],
+    draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
+) -> None:
+    """Finish a result that was measured in parts: check that no frame is missing, and draw it."""
+    from rgbmidic.results import Result, finish_result
+
+    started = time.perf_counter()
+    finish_result(result)
+    _conclude(Result.open(result), started, draw=draw)
+
+
+def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0) -> None:
+    """Draw a finished result and print the status of its frames.
+
+    The drawing uses as many processes as cores if no number is stated; the command fails if more than `_TOO_MANY`
+    of the frames failed or did not converge.
+    """
+    from rgbmidic._kernels.threads import threads
+    from rgbmidic.report import remove_figures, remove_report, write_figures
+
+    remove_figures(result.path / "figures")
+    remove_report(result.path)
+    if draw:
+        write_figures(result, result.path / "figures", processes=processes or threads())
+    _print_summary(result, time.perf_counter() - started)
+    failed = [index for index in result.deformed if result.status[index] != _CONVERGED]
+    if unread := int(result.unread.sum()):
+        note(f"note: frames that could not be read: {unread}; --resume tries them again")
+    if len(failed) > _TOO_MANY * len(result.deformed) or not result.deformed:
+        first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}" if failed else "there is none"
+        count = f"{len(failed)} of {len(result.deformed)} deformed frames failed or did not converge"
+        raise typer.Exit(command.fail(f"{count}; {first}", command.FAILURE))
+
+
+@contextmanager
+def _continuation_hint(test: Path, out: Path, frames: str, *, resume: bool) -> Iterator[None]:
+    """Print how to continue when the run is interrupted, by Ctrl-C or by SIGTERM, if it wrote anything."""
+    from rgbmidic.results.provenance import PROVENANCE
+
+    def begun() -> bytes:
+        return file.read_bytes() if (file := out / PROVENANCE).is_file() else b""
+
+    before_it = begun()
+    try:
+        yield
+    except KeyboardInterrupt:
+        if frames or resume or begun() != before_it:
+            part = f"--frames {frames}" if frames else "--resume"
+            note(f"go on with: rgbmidic run {test} --out {out} {part}")
+        else:
+            note("nothing was begun: run the same command again")
+        raise
+
+
+def _print_summary(result: Result, seconds: float) -> None:
+    """Print the status of the deformed frames; the reference, matched with itself, is left out."""
+    from rgbmidic.timing import STAGES
+
+    deformed = list(result.deformed)
+    ends = [int((result.status[deformed] == code).sum()) for code in (_CONVERGED, _UNCONVERGED, _FAILED)]
+    words = [f"{ends[0]} converged", *([f"{ends[1]} not converged"] if ends[1] else []), f"{ends[2]} failed"]
+    measured = [float((status == 0).mean()) for status in result.each("node_status", deformed)]
+    rows = {"frames": f"{len(deformed)} deformed: {', '.join(words)}", "nodes": f"{len(result.nodes)}"}
+    if measured:
+        rows["nodes"] += f", {sum(measured) / len(measured):.1%} measured"
+    if chosen := result.provenance.get("element_size"):
+        rows["mesh"] = f"{chosen['element_size']:g} px: {chosen['reason']}"
+    if refinement := result.provenance.get("refinement"):
+        rows["refined"] = refinement
+    if (count := len(result.setting("frames", "reference", [0]))) > 1:
+        gain = ((1 + 1 / count) / 2) ** 0.5
+        rows["mean"] = f"of {count} frames is the reference: camera noise counts {gain:.2f} of what it does with one"
+    for light, fraction in zip(result.lights, result.mean_light_fraction[deformed].T, strict=True):
+        known = fraction[fraction == fraction]
+        rows[light if light.startswith("light ") else f"light {light}"] = (
+            f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
+        )
+    timed = [seconds for seconds in result.each("seconds", deformed) if seconds[0] == seconds[0]] if measured else []
+    if timed:  # the mean time of a frame and what each stage takes of it
+        mean = sum(timed) / len(timed)
+        parts = ", ".join(f"{name} {part:.0%}" for name, part in zip(STAGES, mean / mean.sum(), strict=True))
+        rows["frame"] = f"{mean.sum():.2f} s: {parts}"
+    rows |= {"time": f"{seconds:.1f} s", "result": str(result.path)}
+    width = max(map(len, rows)) + 2
+    for name, text in rows.items():
+        print(f"{name:<{width}}{text}")
