@@ -46,7 +46,10 @@ def as_light_stack(images: npt.ArrayLike, name: str) -> FloatImage:
         raise InputError(f"{name} must be a real image (H, W) or (k, H, W), not {stack.dtype} of shape {stack.shape}")
     stack = np.atleast_3d(stack) if stack.ndim == 3 else stack[None]
     if stack.shape[0] == 0 or min(stack.shape[1:]) < 8:
-        raise InputError(f"{name} must have at least one image of at least 8 x 8 px; given is shape {stack.shape}")
+        last = "; the lights come first: np.moveaxis(images, -1, 0)" if stack.shape[2] < 8 <= stack.shape[1] else ""
+        raise InputError(
+            f"{name} must have at least one image of at least 8 x 8 px; given is shape {stack.shape}{last}"
+        )
     return np.ascontiguousarray(stack, dtype=np.float32)
 
 

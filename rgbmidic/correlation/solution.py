@@ -102,6 +102,22 @@ class Solution:
     weight_fraction: FloatArray
     history: FloatArray
 
+    def __repr__(self) -> str:
+        """Return how the solve ended and what was found, in a few lines."""
+        there = self.node_status == NodeStatus.MEASURED
+        lines = [
+            f"<rgbmidic.Solution {self.status.name.lower()}, {len(self.history)} iterations>",
+            f"mesh:   {len(self.nodes)} nodes, {len(self.elements)} elements; {there.mean():.1%} of the nodes measured",
+            f"lights: {self.light_fraction.shape[1]}",
+        ]
+        if self.reason:
+            lines.insert(1, f"reason: {self.reason}")
+        for name, values, std in zip("uv", self.displacement.T, self.displacement_std.T, strict=True):
+            if (known := values[np.isfinite(values)]).size:
+                spread = np.median(std[np.isfinite(std)]) if np.isfinite(std).any() else np.nan
+                lines.append(f"{name}:      {known.min():.4g} to {known.max():.4g} px ± {spread:.2g} px (median)")
+        return "\n".join(lines)
+
     @classmethod
     def failed(cls, mesh: Tri3Mesh, lights: int, reason: str, history: FloatArray) -> Solution:
         """Return a solution where nothing can be measured: NaN everywhere, and the reason.

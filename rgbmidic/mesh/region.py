@@ -71,7 +71,10 @@ class Region:
         RegionError
             Not four finite numbers with x0 < x1 and y0 < y1, or no overlap with the image.
         """
-        corners = np.asarray(rectangle, dtype=np.float64)
+        try:
+            corners = np.asarray(rectangle, dtype=np.float64)
+        except (TypeError, ValueError):
+            corners = np.array([])
         if corners.shape != (4,) or not np.isfinite(corners).all():
             raise RegionError(f"a rectangle is four finite numbers (x0, y0, x1, y1) in px; given is {rectangle!r}")
         x0, y0, x1, y1 = corners.tolist()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field
@@ -120,8 +121,10 @@ class Tri3Mesh:
         RegionError
             The region is too small for one element, or a crack misses it.
         """
-        if not (np.isfinite(element_size) and element_size >= 4):
-            raise InputError(f"element_size must be at least 4 px; given is {element_size!r}")
+        given: Any = element_size
+        if not (isinstance(given, int | float | np.number) and math.isfinite(given) and given >= 4):
+            chosen = ': "auto" is for rgbmidic.measure' if given == "auto" else ""
+            raise InputError(f"element_size must be a number of at least 4 px; given is {given!r}{chosen}")
         if (width := region.width) < NARROW:
             logger.warning("the region is %d px across: two or three speckles, hardly enough to measure", width)
         elif width < element_size:

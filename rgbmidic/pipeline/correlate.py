@@ -25,6 +25,7 @@ from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.images import normalise as divide_by_local_mean
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.given import check_object
 from rgbmidic.settings import ELEMENT_SIZE, SolverOptions, SolverSettings, check_names, grey_levels
 from rgbmidic.typing import FloatArray
 from rgbmidic.weights import Statistics, as_weights
@@ -107,6 +108,8 @@ def correlate(
         region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
     mesh = Tri3Mesh.from_region(region, element_size, cracks)
     cracked = len(mesh.crack_edges) > 0
+    if not (normalise in (None, "auto") or isinstance(normalise, int | float)):
+        raise InputError(f'normalise must be a width in px or "auto", not {normalise!r}')
     sigma, solver = grey_levels(0.0 if normalise is None else normalise, solver_settings(options), cracked=cracked)
     if sigma:
         f, g = (divide_by_local_mean(stack, sigma, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
@@ -114,6 +117,7 @@ def correlate(
     second = aside(Deformed.prepare, g, given[1], prefilter=solver.prefilter)
     first = Reference.prepare(f, region, given[0], mesh=mesh, prefilter=solver.prefilter)
     method = (Statistics() if statistics else None) if isinstance(statistics, bool) else statistics
+    check_object("statistics", method, "precision")
     start = initial_displacement(initial, len(mesh.nodes))
     if start is None:
         solution = track(first, second.result(), Start(displacement=None), solver, method)
@@ -160,7 +164,10 @@ def initial_displacement(initial: npt.ArrayLike | None, nodes: int) -> FloatArra
     """
     if initial is None:
         return None
-    values = np.asarray(initial, dtype=np.float64)
+    try:
+        values = np.asarray(initial, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"initial must be numbers (u, v) in px; given is {initial!r}") from None
     if values.shape not in ((2,), (nodes, 2)) or not np.isfinite(values).all():
         raise InputError(f"initial must be finite with shape (2,) or ({nodes}, 2); given is shape {values.shape}")
     return np.broadcast_to(values, (nodes, 2)).copy()

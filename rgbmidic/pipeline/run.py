@@ -17,18 +17,19 @@ from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.frame import read_state
+from rgbmidic.pipeline.given import check_object, check_type, describe
 from rgbmidic.pipeline.order import dependants
 from rgbmidic.pipeline.plan import Choice, Plan
 from rgbmidic.pipeline.resolution import choose, refine
 from rgbmidic.pipeline.schedule import Schedule
-from rgbmidic.pipeline.source import FrameSequence, describe
+from rgbmidic.pipeline.source import FrameSequence
 from rgbmidic.pipeline.suitability import light_levels
 from rgbmidic.pipeline.workers import open_workers
 from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.results.store import listed, read_mesh
-from rgbmidic.settings import TestSettings
+from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.weights import LightWeights
 
 logger = logging.getLogger(__name__)
@@ -37,7 +38,7 @@ Progress = Callable[[int, int, str], None]
 
 
 def measure(
-    settings: TestSettings,
+    settings: TestSettings | Path | str,
     out: Path | str,
     *,
     source: FrameSequence | None = None,
@@ -61,7 +62,7 @@ def measure(
     Parameters
     ----------
     settings
-        Settings, as `rgbmidic.settings.read_test` reads them from TEST.toml.
+        Settings, or the path of a TEST.toml that holds them.
     out
         Result folder; nothing is written before settings, calibration, region and reference have been checked.
     source
@@ -109,6 +110,15 @@ def measure(
     """
     if retry_failed and not resume:
         raise InputError("--retry-failed goes with --resume: it measures failed frames of a result again")
+    if isinstance(settings, str | Path):
+        settings = read_test(settings)
+    check_type("settings", settings, TestSettings, "a TestSettings or the path of a TEST.toml")
+    check_type("mesh", mesh, Tri3Mesh | None, "a Tri3Mesh")
+    check_type("frames", frames, range | None, "a range of indices")
+    check_type("workers", workers, int | None, "a whole number")
+    check_object("separation", separation, "__call__")
+    check_object("weights", weights, "reference", "deformed")
+    check_object("progress", progress, "__call__")
     given: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
     choice: Choice | None = None
     begun = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()

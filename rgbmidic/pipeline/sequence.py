@@ -23,6 +23,7 @@ from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.correlate import solver_settings
 from rgbmidic.pipeline.frame import failed_frame, next_reference, solve_frame
+from rgbmidic.pipeline.given import check_object, check_type
 from rgbmidic.pipeline.order import STRIDE, better, loses, parent
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.schedule import following
@@ -103,6 +104,7 @@ def measure_sequence(
     RgbmidicError
         The settings contradict themselves or the objects, or the reference is not usable.
     """
+    check_type("settings", settings, TestSettings | None, "a TestSettings")
     remaining = iter(states)
     own = reference is None
     if own:
@@ -130,6 +132,8 @@ def measure_sequence(
         raise InputError(f"settings are given: state in them what {told} says")
     if settings.weights.threshold == "auto":
         raise InputError('weights.threshold = "auto" looks at the first deformed frame, which a sequence has not yet')
+    check_object("separation", separation, "__call__")
+    check_type("mesh", mesh, Tri3Mesh | None, "a Tri3Mesh")
     counted: Any = weights if weights is None or hasattr(weights, "deformed") else MaskWeights(cast(Any, weights))
     frames = replace(settings.frames, reference=(0,), first=0 if own else 1, last=None, step=1)
     plan = Plan.from_settings(

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -23,12 +22,9 @@ from rgbmidic.frames.series import chosen_frames
 from rgbmidic.frames.stored import Camera, StoredFrame, raw_frame
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState
+from rgbmidic.pipeline.given import class_name, describe
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import AnyArray
-
-_LONGEST_NAME = 120
-"""Characters of a description that are kept as they are; a longer one is cut and gets its checksum. Chosen; not
-sensitive: it is read by people, the checksum by the comparison."""
 
 
 class FrameSequence(Protocol):
@@ -174,7 +170,7 @@ class SourceSeries:
             raise
         except Exception as error:  # of whatever library it is
             told = f"{type(error).__name__}: {error}"
-            raise FrameError(f"{self.name(index)} cannot be read from {_class(self.source)}: {told}") from error
+            raise FrameError(f"{self.name(index)} cannot be read from {class_name(self.source)}: {told}") from error
         return self._state(state, self.name(index))
 
     def gone(self) -> str:
@@ -203,7 +199,7 @@ class SourceSeries:
         """
         if hasattr(self.source, "describe"):
             return describe(self.source), ()
-        told, without = f"{_class(self.source)} of {len(self)} frames", []
+        told, without = f"{class_name(self.source)} of {len(self)} frames", []
         for index in (self.stated.reference[0], self.chosen[-1]):
             name, content = self.name(index), "unread"
             if name not in unread:
@@ -226,8 +222,8 @@ class SourceSeries:
         values = unmasked(state)
         if values.dtype.kind == "f" and np.asarray(state).dtype.kind in "ui":
             raise FrameError(
-                f"{name} of {_class(self.source)} has masked samples, which a raw frame cannot have: give it saturated "
-                "there, or images of the lights as floats"
+                f"{name} of {class_name(self.source)} has masked samples, which a raw frame cannot have: give it "
+                "saturated there, or images of the lights as floats"
             )
         if values.dtype.kind != "f" or values.ndim not in (2, 3):
             return (self._raw(values, name),)
@@ -235,9 +231,9 @@ class SourceSeries:
         of_raw = [key for key, value in stated.items() if value not in (None, "monochrome")]
         if of_raw:
             raise ConfigurationError(
-                f"{name} of {_class(self.source)} is {values.dtype}: arrays of floats are images of the lights, and "
-                f"{' and '.join(of_raw)} {'is' if len(of_raw) == 1 else 'are'} stated, of raw frames: give whole "
-                "numbers, which are raw frames, or leave that out"
+                f"{name} of {class_name(self.source)} is {values.dtype}: arrays of floats are images of the "
+                f"lights, and {' and '.join(of_raw)} {'is' if len(of_raw) == 1 else 'are'} stated, of raw frames: give "
+                "whole numbers, which are raw frames, or leave that out"
             )
         values = values if values.ndim == 3 else values[None]
         lights = getattr(self.source, "lights", None) or [f"light {light + 1}" for light in range(len(values))]
@@ -248,12 +244,12 @@ class SourceSeries:
         """Whole numbers (H, W) or (C, H, W) as the raw frame that ``[frames]`` says they are."""
         if values.dtype.kind not in "ui" or values.ndim not in (2, 3):
             raise FrameError(
-                f"{name} of {_class(self.source)} is {values.dtype} of shape {values.shape}; allowed are whole numbers "
-                "(H, W) or (C, H, W), floats (H, W) or (k, H, W), Mosaic, ChannelFrame and IlluminationImages"
+                f"{name} of {class_name(self.source)} is {values.dtype} of shape {values.shape}; allowed are whole "
+                "numbers (H, W) or (C, H, W), floats (H, W) or (k, H, W), Mosaic, ChannelFrame and IlluminationImages"
             )
         if values.dtype not in (np.uint8, np.uint16):
             if values.min() < 0 or values.max() > np.iinfo(np.uint16).max:
-                raise FrameError(f"{name} of {_class(self.source)} has grey levels outside 0 to 65535")
+                raise FrameError(f"{name} of {class_name(self.source)} has grey levels outside 0 to 65535")
             values = values.astype(np.uint16)
         if values.ndim == 3:
             values = np.moveaxis(values, 0, -1)
@@ -276,13 +272,13 @@ def open_sequence(source: FrameSequence | Series, stated: FrameSettings, camera:
         return cast(Series, source)
     if not (hasattr(source, "__len__") and hasattr(source, "__getitem__")):
         raise InputError(
-            f"a frame source has a length and a frame by index (__len__ and __getitem__); {_class(source)} has not. "
-            "Frames that come one after the other are for rgbmidic.measure_sequence"
+            f"a frame source has a length and a frame by index (__len__ and __getitem__); {class_name(source)} has "
+            "not. Frames that come one after the other are for rgbmidic.measure_sequence"
         )
     for name in ("names", "times_ns"):
         told = getattr(source, name, None)
         if told is not None and len(told) != len(source):
-            raise InputError(f"{name} of {_class(source)} has {len(told)} entries for {len(source)} frames")
+            raise InputError(f"{name} of {class_name(source)} has {len(told)} entries for {len(source)} frames")
     chosen, start = chosen_frames(stated, len(source)), stated.reference[0]
     series = SourceSeries(source=cast(FrameSequence, source), stated=stated, camera=camera, chosen=chosen)
     state = series.read(start)
@@ -290,29 +286,3 @@ def open_sequence(source: FrameSequence | Series, stated: FrameSettings, camera:
         return replace(series, shape=state[0].values.shape[-2:])
     white = float(np.nanmax(state.values, initial=0.0)) if stated.white_level is None else stated.white_level
     return replace(series, shape=state.shape, full_scale=white - (stated.black_level or 0.0))
-
-
-def describe(given: Any) -> str:
-    """What a result keeps of an object that a script gave: its ``describe()`` where it has one, else what it shows.
-
-    Functions and objects without a representation of their own give their name only: two of one name cannot be told
-    apart.
-    """
-    if callable(told := getattr(given, "describe", None)):
-        text = f"{_class(given)}: {told()}"
-    elif callable(given) and hasattr(given, "__qualname__"):
-        text = f"{given.__module__}.{given.__qualname__}"
-    elif isinstance(given, np.ndarray):
-        digest = hashlib.sha256(np.ascontiguousarray(given).tobytes()).hexdigest()
-        text = f"{given.dtype} array of shape {given.shape}, {digest[:16]}"
-    elif repr(given) == object.__repr__(given):
-        text = _class(given)
-    else:
-        text = f"{_class(given)}: " + re.sub(r" at 0x[0-9a-fA-F]+", "", repr(given))
-    if len(text) > _LONGEST_NAME:
-        return f"{text[:_LONGEST_NAME]} ... {hashlib.sha256(text.encode()).hexdigest()[:16]}"
-    return text
-
-
-def _class(given: object) -> str:
-    return f"{type(given).__module__}.{type(given).__qualname__}"

@@ -14,6 +14,7 @@ from rgbmidic.report.style import (
     GAP,
     LEGEND,
     LINES,
+    MARKERS,
     NUMBERS,
     OKABE_ITO,
     STATUS_COLOURS,
@@ -47,6 +48,8 @@ _PANELS = 24
 """Most panels of a picture of histories: two screens high. Chosen."""
 _NAMED = 14
 """Most quantities of a panel that its legend names: more lines of 7 pt are higher than it; a crack has one a node."""
+_KNOWN_DIRECTION = 45.0
+"""Two standard uncertainties (degrees) of a principal direction from which it is not drawn: it may be any. Chosen."""
 _KINDS = (
     "velocity",
     "acceleration",
@@ -151,15 +154,19 @@ def history_figure(histories: Histories) -> Figure:
             colours: dict[str, Any] = {}
             for number, quantity in enumerate(quantities):
                 known = np.isfinite(quantity.values).sum()
-                shown: dict[str, Any] = {"marker": "o" if known <= _MARKED_OF_PROBE else None, "markersize": 2.5}
+                marker = MARKERS[number % len(MARKERS)] if known <= _MARKED_OF_PROBE else None
+                shown: dict[str, Any] = {"marker": marker, "markersize": 3, "linestyle": LINES[number % len(LINES)]}
                 shown["label"] = "_" if number % step else literal(quantity.name)
                 of = quantity.name.removesuffix("_before").removesuffix("_after")
                 if of in colours:  # both sides of a kink are single points of the rate
                     shown |= {"label": "_", "color": colours[of], "linestyle": "none", "marker": "D", "markersize": 4}
-                (line,) = axis.plot(times, quantity.values, linewidth=1, **shown)
+                values, std = quantity.values, quantity.std
+                if std is not None and quantity.name.endswith("direction"):
+                    values = np.where(2 * std < _KNOWN_DIRECTION, values, np.nan)
+                (line,) = axis.plot(times, values, linewidth=1, **shown)
                 colours[quantity.name] = line.get_color()
-                if quantity.std is not None:
-                    low, high = quantity.values - 2 * quantity.std, quantity.values + 2 * quantity.std
+                if std is not None:
+                    low, high = values - 2 * std, values + 2 * std
                     axis.fill_between(times, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
             values = np.concatenate([quantity.values[np.isfinite(quantity.values)] for quantity in quantities])
             if values.size and np.ptp(values) > 0:  # the values set the limits, not the widest uncertainty among them

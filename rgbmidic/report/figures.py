@@ -218,14 +218,18 @@ def convergence_figure(result: Result) -> Figure:
 
     def draw(axes: list[Axes]) -> None:
         (axis,) = axes
-        colours: list[Any] = [f"C{index}" for index in range(len(frames))]
+        colours: list[Any] = [style.CURVES[index % len(style.CURVES)] for index in range(len(frames))]
         if len(frames) > _MANY_FRAMES:  # no legend, but a colour bar
             norm = Normalize(frames[0], frames[-1])
             colours = [colormaps["viridis"](norm(frame)) for frame in frames]
             style.add_colour_bar(axis, norm, "viridis", label="frame")
-        for frame, history, colour in zip(frames, result.each("history", frames), colours, strict=True):
+        looks = zip(colours, cycle(style.MARKERS), cycle(style.LINES), strict=False)
+        for frame, history, look in zip(frames, result.each("history", frames), looks, strict=False):
             steps, name = np.arange(1, len(history) + 1), style.literal(result.names[frame])
-            axis.plot(steps, history, marker="o", markersize=2.5, linewidth=1, color=colour, label=name)
+            colour, marker, line = look
+            axis.plot(
+                steps, history, marker=marker, markersize=3, linewidth=1, linestyle=line, color=colour, label=name
+            )
         if (tolerance := result.setting("solver", "tolerance")) is not None:
             axis.axhline(tolerance, color="0.4", linewidth=0.8, linestyle="--", label="tolerance")
         axis.set_yscale("log")

@@ -46,6 +46,10 @@ OKABE_ITO = {
 """Colours that the colour-blind distinguish (Okabe and Ito, Color Universal Design, 2008)."""
 STATUS_COLOURS = (OKABE_ITO["sky blue"], "#333333", OKABE_ITO["vermillion"], OKABE_ITO["yellow"])
 """Colours of the codes of `node_status` in their order, in every picture."""
+CURVES = tuple(OKABE_ITO[name] for name in ("blue", "vermillion", "green", "purple", "orange", "sky blue", "grey"))
+"""Colours of curves in turn; yellow is too pale for a line."""
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+"""Markers in turn, as many as `CURVES`."""
 LINES = ("-", "--", "-.", ":")
 """Line styles in turn: readers who do not distinguish the colours distinguish the lines by these."""
 _PNG = {"compress_level": 1}
@@ -54,7 +58,7 @@ DPI, PAGE_DPI = 150, 130
 """Pixels per inch of a file and of a picture in a page: one of 9 inches fills most screens, or the page's 64 rem."""
 _WIDTH, _TALLEST = 9.0, 9.5
 """Largest width and height of a figure in inches: with text of 9 points it stays legible on a page of A4."""
-NUMBERS, BAR, GAP, LEGEND = 0.65, 0.95, 0.15, 2.2
+NUMBERS, BAR, GAP, LEGEND = 0.75, 0.95, 0.15, 2.2
 """Inches: room left of a panel for its numbers, right of it for a colour bar, for nothing or for names of lines; the
 text's extent at 9 points."""
 _BELOW, _ABOVE = 0.52, 0.3
@@ -115,6 +119,7 @@ def draw_figure(
         There is no room for so many panels.
     """
     import matplotlib as mpl
+    from matplotlib import rcsetup
     from matplotlib.figure import Figure
 
     # placed by numbers: matplotlib's layout engines draw every text several times to find the same
@@ -129,7 +134,7 @@ def draw_figure(
     height = min(width * aspect, highest)
     heading = 2 * GAP if title else 0.0
     whole = rows * (height + _BELOW + _ABOVE) + heading
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context({**STYLE, "axes.prop_cycle": rcsetup.cycler(color=CURVES)}):
         figure = Figure(figsize=(total, whole))
         for place in range(count):
             x = NUMBERS + place % columns * (width + beside)

@@ -360,6 +360,13 @@ class FrameRecord:
         """
         return cls.of(nodes=nodes, lights=lights, reason=reason, inputs=_pairs(inputs), **given)
 
+    def __repr__(self) -> str:
+        """Return number, status and size of the frame, and the names of its quantities."""
+        end = QUANTITIES["status"].codes[self.values["status"]]
+        told = f": {self.values['reason']}" if self.values["reason"] else ""
+        about = f"<rgbmidic frame {self.values['number']}, {end}{told}; {self.sizes['node']} nodes>"
+        return f"{about}\nquantities: {', '.join(QUANTITIES)}"
+
     def __getattr__(self, name: str) -> Any:
         """Return a quantity of the table."""
         if name in QUANTITIES:

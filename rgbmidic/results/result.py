@@ -139,6 +139,18 @@ class Result:
             table = table.without_damaged(ended="finished" in provenance)
         return replace(self, table=table, provenance=provenance)
 
+    def __repr__(self) -> str:
+        """Return what the result is of, in a few lines; values are not read."""
+        done, lights = int(self.finished.sum()), ", ".join(self.lights)
+        lines = [
+            f"<rgbmidic.Result {self.path}>",
+            f"frames: {len(self)}, {done} measured" if done < len(self) else f"frames: {len(self)}",
+            f"mesh:   {len(self.nodes)} nodes, {len(self.elements)} elements",
+            f"lights: {lights}",
+            "read:   result.u (T, N), .u_std, .strain, .misfit, ...; .frame(i), .each(name), .to_xarray()",
+        ]
+        return "\n".join(lines)
+
     def __len__(self) -> int:
         """Return the number of frames T."""
         return len(self.names)
@@ -176,7 +188,7 @@ class Result:
         Parameters
         ----------
         index
-            Index of the frame.
+            Index of the frame; from the end where negative.
 
         Returns
         -------
@@ -184,12 +196,14 @@ class Result:
 
         Raises
         ------
+        InputError
+            There is no such frame.
         ResultError
             The frame is damaged, or does not fit the mesh.
         """
-        if not 0 <= index < len(self):
-            raise InputError(f"there is no frame {index} in a result of {len(self)} frames (0 to {len(self) - 1})")
-        return self.table.read(index)
+        if not isinstance(index, int | np.integer) or not -len(self) <= index < len(self):
+            raise InputError(f"there is no frame {index!r} in a result of {len(self)} frames (0 to {len(self) - 1})")
+        return self.table.read(int(index) % len(self))
 
     def each(self, name: str, frames: Iterable[int] | None = None) -> Iterator[Any]:
         """Read one quantity, frame after frame (None: all); yields arrays, or plain numbers or texts.
