@@ -32,8 +32,8 @@ app = typer.Typer()
 _PLACES = {
     "points": ("--point", "X,Y", "Displacement of a point."),
     "lines": ("--line", "X0,Y0:X1,Y1", "Mean displacement along a line."),
-    "circles": ("--circle", "X,Y:R", "Mean displacement over a circle."),
-    "regions": ("--region", "X0,Y0:X1,Y1", "Mean displacement over a rectangle."),
+    "circles": ("--circle", "X,Y:R", "Mean displacement and strain over a circle."),
+    "regions": ("--region", "X0,Y0:X1,Y1", "Mean displacement and strain over a rectangle."),
     "gauges": ("--gauge", "X0,Y0:X1,Y1", "Extensometer between two points, deformed state."),
     "straight_gauges": ("--straight-gauge", "X0,Y0:X1,Y1", "Extensometer along the reference line."),
     "strain_gauges": ("--strain-gauge", "X,Y:LENGTH", "Virtual strain gauge."),

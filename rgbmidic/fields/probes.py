@@ -18,7 +18,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.crack_tip import CrackTip, Williams
 from rgbmidic.fields.cracks import JumpAlong
 from rgbmidic.fields.history import History, Nodal, Probe
-from rgbmidic.fields.measures import MEASURES, strain_of_gradient
+from rgbmidic.fields.measures import MEASURES, Strain, strain_of_gradient
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.strain import StrainGauges
@@ -363,25 +363,123 @@ class StrainGauge:
         """
         rows = zip(nodal.u, nodal.v, nodal.u_std, nodal.v_std, strict=True)
         gradients, covariances = zip(*(self.gauges.gradient(*row) for row in rows), strict=True)
-        s = strain_of_gradient(np.concatenate(gradients), np.concatenate(covariances), self.measure)
-        values = [*s.components.T, *s.principal.T, s.direction_deg, s.equivalent]
-        stds = [*s.components_std.T, *s.principal_std.T, s.direction_std_deg, s.equivalent_std]
-        units = {"exx": "", "eyy": "", "exy": "", "e1": "", "e2": "", "direction": "deg", "equivalent": ""}
+        strain = strain_of_gradient(np.concatenate(gradients), np.concatenate(covariances), self.measure)
         weights = self.gauges.fractions / self.gauges.fractions.sum()
-        used = np.where(np.isfinite(values[0]), _known(nodal)[:, self.gauges.nodes] @ weights, 1.0)
-        note = _cut(self.name, "strain", self.inside * used)
-        return [
-            History(name=f"{self.name}_{name}", unit=unit, values=value, std=std, note=note)
-            for (name, unit), value, std in zip(units.items(), values, stds, strict=True)
-        ]
+        measured = np.isfinite(strain.components[:, 0])
+        used = np.where(measured, _known(nodal)[:, self.gauges.nodes] @ weights, 1.0)
+        return _strain_histories(self.name, strain, _cut(self.name, "strain", self.inside * used))
+
+
+def _strain_histories(name: str, strain: Strain, note: str) -> list[History]:
+    """Return every quantity of a strain (T,) as a history."""
+    values = [*strain.components.T, *strain.principal.T, strain.direction_deg, strain.equivalent]
+    stds = [*strain.components_std.T, *strain.principal_std.T, strain.direction_std_deg, strain.equivalent_std]
+    units = {"exx": "", "eyy": "", "exy": "", "e1": "", "e2": "", "direction": "deg", "equivalent": ""}
+    return [
+        History(name=f"{name}_{quantity}", unit=unit, values=value, std=std, note=note)
+        for (quantity, unit), value, std in zip(units.items(), values, stds, strict=True)
+    ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Area(Mean):
+    """Mean displacement over an area, and the strain of the mean displacement gradient over it.
+
+    The gradient of a linear displacement is constant in an element, so that its mean over the area is one of the
+    elements, each by the part of the area that it holds. It is that of the nodes around the area alone (Gauss).
+
+    Attributes
+    ----------
+    elements : ndarray, shape (E, 3), int
+        Indices in `nodes` of the corners of the elements that the area touches.
+    parts : ndarray, shape (E,)
+        Fraction of the area within each; their sum is 1.
+    slopes : ndarray, shape (E, 3, 2)
+        Gradient of the shape functions, per px.
+    measure
+        One of `rgbmidic.fields.MEASURES`.
+    """
+
+    elements: npt.NDArray[np.int64]
+    parts: FloatArray
+    slopes: FloatArray
+    measure: str
+
+    @classmethod
+    def of(cls, covariance: NodalCovariance, name: str, points: FloatArray, measure: str = MEASURES[0]) -> Area:
+        """Average over the area that points (P, 2) stand for, px; errors as `Mean.over`.
+
+        Parameters
+        ----------
+        covariance
+            Of the mesh.
+        name
+            Name of the probe.
+        points : ndarray, shape (P, 2)
+            Middles of equal parts of the area on the reference, px.
+        measure
+            Strain measure, as of `strain_of`.
+
+        Returns
+        -------
+        Area
+        """
+        mean, mesh = Mean.over(covariance, name, points, _LEAST, inside=False), covariance.mesh
+        places = Places.of(mesh, points)
+        elements, count = np.unique(places.element[places.inside], return_counts=True)
+        nodes = np.unique(mesh.elements[elements]).astype(np.int64)
+        weights = np.zeros(len(mesh.nodes))
+        weights[mean.nodes] = mean.weights
+        return cls(
+            name=name,
+            nodes=nodes,
+            weights=weights[nodes],
+            correlation=covariance.part(nodes),
+            least=mean.least,
+            inside=mean.inside,
+            elements=np.searchsorted(nodes, mesh.elements[elements]),
+            parts=count / count.sum(),
+            slopes=mesh.shape_gradients()[elements],
+            measure=measure,
+        )
+
+    def histories(self, nodal: Nodal) -> list[History]:
+        """Compute u and v in px, then strain, principal strains and equivalent strain.
+
+        Parameters
+        ----------
+        nodal
+            Displacements of its `nodes` in every frame.
+
+        Returns
+        -------
+        list of History
+        """
+        moved, known = Mean.histories(self, nodal), _known(nodal)
+        gradient, covariance = np.full((len(known), 2, 2), np.nan), np.full((len(known), 4, 4), np.nan)
+        whole: BoolArray = np.asarray(known[:, self.elements].all(axis=2))
+        for frame, there in enumerate(whole):
+            if (measured := self.parts[there].sum()) < self.least:
+                continue
+            weights = np.zeros((2, len(self.nodes)))
+            parts = (self.parts[there] / measured)[:, None, None] * self.slopes[there]
+            np.add.at(weights.T, self.elements[there], parts)
+            covariance[frame] = 0
+            for row, (value, std) in enumerate(((nodal.u, nodal.u_std), (nodal.v, nodal.v_std))):
+                gradient[frame, row] = weights @ np.where(known[frame], value[frame], 0)
+                errors = weights * np.where(known[frame], std[frame], 0)
+                own = slice(2 * row, 2 * row + 2)
+                covariance[frame, own, own] = errors @ self.correlation @ errors.T
+        strain = strain_of_gradient(gradient, covariance, self.measure)
+        return [*moved, *_strain_histories(self.name, strain, moved[0].note)]
 
 
 _Make = Callable[..., Probe]
 PROBES: dict[str, tuple[int, int, _Make]] = {
     "point": (1, 0, lambda c, name, *place: Mean.over(c, name, [place])),
     "line": (2, 0, lambda c, name, *place: Mean.over(c, name, _line(*place), _LEAST)),
-    "circle": (1, 1, lambda c, name, *place: Mean.over(c, name, _circle(*place), _LEAST, inside=False)),
-    "region": (2, 0, lambda c, name, *place: Mean.over(c, name, _rectangle(*place), _LEAST, inside=False)),
+    "circle": (1, 1, lambda c, name, *place, **more: Area.of(c, name, _circle(*place), **more)),
+    "region": (2, 0, lambda c, name, *place, **more: Area.of(c, name, _rectangle(*place), **more)),
     "gauge": (2, 0, Gauge.between),
     "straight_gauge": (2, 0, lambda *a, **k: Gauge.between(*a, **k, moving=False)),
     "strain_gauge": (1, 1, StrainGauge.around),
@@ -389,6 +487,8 @@ PROBES: dict[str, tuple[int, int, _Make]] = {
     "tip": (1, 2, CrackTip.at),
 }
 """Every kind of probe with how many points and lengths (px) place it, and what makes it."""
+_STRAINED = ("circle", "region", "strain_gauge")
+"""Those that measure a strain of a stated measure."""
 
 
 def make_probe(
@@ -429,7 +529,7 @@ def make_probe(
     name = dict(settings.names).get(f"{kind}_{number}", f"{kind}_{number}")
     if len(place) != 2 * points + lengths:
         raise InputError(f"{name} is placed by {2 * points + lengths} numbers, not by {list(place)}")
-    more: dict[str, Any] = {"measure": settings.measure} if kind == "strain_gauge" else {}
+    more: dict[str, Any] = {"measure": settings.measure} if kind in _STRAINED else {}
     if kind == "tip":
         assert settings.youngs_modulus is not None  # as [probes] with tips checks
         assert settings.poissons_ratio is not None

@@ -52,7 +52,7 @@ def test_every_probe_is_covered_by_what_it_states(kind):
 
 def test_a_mean_over_neighbours_is_less_certain_than_their_number_says():
     probe = make_probe(COVARIANCE, "region", 1, (20, 30, 150, 160))
-    (mean, _) = probe.histories(nodal(probe.nodes, NOISE))
+    mean, *_ = probe.histories(nodal(probe.nodes, NOISE))
     parts = probe.weights * STD[probe.nodes]
     together = dense_correlation(MESH)[np.ix_(probe.nodes, probe.nodes)]
     assert mean.std[0] == pytest.approx(np.sqrt(parts @ together @ parts), rel=0.01)
