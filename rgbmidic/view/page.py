@@ -352,7 +352,8 @@ class ResultPage:
 
         They take the place of the curves too where there are none.
         """
-        self.maps.css_classes = ["alone"] if count > 1 and not self.view.marks else []
+        alone = count > 1 and not self.view.marks
+        self.maps.css_classes = [*(["several"] if count > 1 else []), *(["alone"] if alone else [])]
         if count == sum(canvas.plot.visible for canvas in (self.canvas, *self.beside)):
             return
         while len(self.beside) < count - 1:
@@ -460,10 +461,12 @@ class ResultPage:
         text = ""
         if self.values is not None and self._pointer is not None:
             place = self._displacement, self._nodes(self.values), *self._pointer
-            text = " &nbsp; ".join(
+            told = dict.fromkeys(
                 pointer_text(self.fields, self.fields.all[name], self._values(name), *place)
                 for name in (self.view.field, *self._others)
             )
+            x, y = self._pointer
+            text = " &nbsp; ".join([f"x {x:.1f}, y {y:.1f} px:", *told])
         self.parts.under.text = text
 
     def _marked(self) -> None:

@@ -427,16 +427,16 @@ def pointer_text(
     """Return the value at a place over nodes (N, 2), as HTML; where there is none, why. `moved` is as of `mean_of`."""
     found = element_at(nodes, maps.result.elements, x, y)
     if found is None:
-        return f"x {x:.1f}, y {y:.1f} px: outside the mesh"
+        return "outside the mesh"
     corners, weights = found
     there = corners.astype(np.int64)
     mean = Mean(name="", nodes=there, weights=weights, correlation=maps.physical.covariance.part(there), least=_WHOLE)
     value, std = mean_of(maps, field, values, moved, mean)
-    text = f"{field.name} = {field.text(value, std)}"
+    text = f"{field.symbol} = {field.text(value, std)}"
     blank = values.status[corners].max()
     if not np.isfinite(value):
         text += f" ({_REASONS[blank] if blank else 'a node beside it has no data'})"
-    return f"x {x:.1f}, y {y:.1f} px: <b>{html.escape(text)}</b>"
+    return f"<b>{html.escape(text)}</b>"
 
 
 def probe_text(

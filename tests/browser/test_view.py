@@ -97,8 +97,9 @@ def test_the_value_stays_that_of_what_is_shown(driver, address, result):
     fields = Maps.of(result)
 
     def check(frame, name):
-        page.until(f"model('state').shown === {frame} && model('plot').title.text.startsWith({name + ' '!r})")
-        text = page.until(f"model('under').text.includes('{name} = ') && model('under').text")
+        field = fields.all[name]
+        page.until(f"model('state').shown === {frame} && model('plot').title.text === {field.label!r}")
+        text = page.until(f"model('under').text.includes('{field.symbol} = ') && model('under').text")
         x, y, value = (float(n) for n in re.findall(r"-?[\d.]+(?:e-?\d+)?", text)[:3])
         values = fields.read(name, frame)
         corners, weights = element_at(result.nodes, result.elements, x, y)
@@ -169,7 +170,7 @@ def test_a_derived_field_and_its_uncertainty_are_those_of_the_library(driver, ad
     for name, value in {"gauge": 80, "measure": "'hencky'", "since": 2, "second": "'uncertainty'"}.items():
         page.do(f"model('{name}').value = {value}")
     page.do("model('rigid').active = true; model('third').value = 'velocity'")
-    page.until("model('plot_3') && model('plot_3').title.text === 'velocity (px/frame)'")
+    page.until("model('plot_3') && model('plot_3').title.text === '|du/dt| (px/frame)'")
     page.until("model('description').text.includes('since frame 2')")
     assert "Hencky, virtual strain gauge of 80 px" in page.run("model('description').text")
     maps = Maps.of(result, gauge=80.0, measure="hencky", since=2, rigid_removed=True)
@@ -177,13 +178,13 @@ def test_a_derived_field_and_its_uncertainty_are_those_of_the_library(driver, ad
     node = int(np.argmin(np.hypot(*(result.nodes - [70, 45]).T)))
     for _ in range(30):  # while the plots take their new sizes the pointer is elsewhere
         page.pointer(("move", *result.nodes[node]))
-        told = page.until("model('under').text.includes('exx = ') && model('under').text")
+        told = page.until("model('under').text.includes('εxx = ') && model('under').text")
         if np.abs(numbers(told)[:2] - result.nodes[node]).max() < 1:
             break
         time.sleep(0.1)
-    exx, std = numbers(told.partition("exx = ")[2])[:2]
+    exx, std = numbers(told.partition("εxx = ")[2])[:2]
     assert (exx, std) == pytest.approx((read.values[node], read.std[node]), rel=0.02)
-    assert numbers(told.partition("velocity = ")[2])[0] == pytest.approx(speed.values[node], rel=0.05)
+    assert numbers(told.partition("|du/dt| = ")[2])[0] == pytest.approx(speed.values[node], rel=0.05)
     for plot, values in (("plot", read), ("plot_2", maps.read("exx_std", 5)), ("plot_3", speed)):
         ends = page.run(f"[model('{plot}').right[0].color_mapper.low, model('{plot}').right[0].color_mapper.high]")
         assert ends == pytest.approx(robust_range(values), rel=1e-6)
@@ -481,6 +482,23 @@ def test_the_line_s_panel_is_whole_on_a_small_dark_screen(driver, wave):
             assert box[4] > (20 if name in ("beside_map", "movie") else 150), name
         assert page.run("Bokeh.index.get_one(model('beside_map')).el.getAttribute('aria-label')")
     driver.set_window_size(1280, 940)
+
+
+def test_several_fields_without_curves_leave_room_for_the_pointer_s_text_and_stay_where_they_are(
+    driver, address, result
+):
+    page = Page(driver, f"{address}?frame=5&field=u&second=v&third=exx")
+    shown(page, 5)
+    page.until("model('plot_3') && model('plot_3').inner_width > 100")
+    box = "JSON.stringify(Bokeh.index.get_one(model('plot')).el.getBoundingClientRect())"
+    time.sleep(0.5)
+    before, told = page.run(box), "Bokeh.index.get_one(model('under')).el"
+    page.pointer(("move", 70, 45))
+    text = page.until("model('under').text.includes('εxx = ') && model('under').text")
+    assert text.count("px:") == 1, "the place is said once"
+    assert page.run(f"{told}.getBoundingClientRect().width") > 800
+    assert page.run(f"{told}.getBoundingClientRect().height") < 45
+    assert page.run(box) == before
 
 
 def test_a_movie_of_what_is_in_view_is_written_beside_the_others(driver, wave, tmp_path, monkeypatch):

@@ -292,7 +292,7 @@ def test_the_label_of_a_probe_is_its_history_in_that_frame_and_the_pointer_state
     for name in ("u", "v", "u_std"):
         field, values, moved = maps.all[name], maps.read(name, 5), maps.displacement(5)
         told = pointer_text(maps, field, values, moved, result.nodes, *PLACES["point"])
-        assert told.endswith(f"<b>{name} = {label(maps, name, 'point', *PLACES['point'])[2:]}</b>")
+        assert told.endswith(f"<b>{field.symbol} = {label(maps, name, 'point', *PLACES['point'])[2:]}</b>")
     assert label(maps, "u", "strain_gauge", *PLACES["strain_gauge"]) == label(maps, "u", "point", *PLACES["point"])
 
 
@@ -529,7 +529,11 @@ class Walk:
         nodes = values.moved if view.over == "deformed" else result.nodes
         pointer = page._pointer
         moved = fields.displacement(view.frame)
-        told = "" if pointer is None else pointer_text(fields, field, values, moved, nodes, *pointer)
+        told = ""
+        if pointer is not None:
+            told = " &nbsp; ".join(
+                ["x {:.1f}, y {:.1f} px:".format(*pointer), pointer_text(fields, field, values, moved, nodes, *pointer)]
+            )
         assert page.parts.under.text == told
         remark = page.pictures.frame(view.frame)[1] if view.over == "deformed" else ""
         assert page.parts.description.text == frame_text(fields, view.frame, field, values, remark)
