@@ -15,7 +15,7 @@ from rgbmidic.fields.nodal import (
     reference_fraction,
 )
 from rgbmidic.fields.plane import CameraCalibration, Rectification
-from rgbmidic.fields.probes import PROBES, Gauge, Mean, StrainGauge, make_probe
+from rgbmidic.fields.probes import PROBES, Area, Gauge, Mean, StrainGauge, make_probe
 from rgbmidic.fields.profiles import ProfileLine
 from rgbmidic.fields.strain import StrainGauges, shortest_gauge, strain_of
 from rgbmidic.fields.units import Units, column, rounded, uncertain
@@ -25,6 +25,7 @@ __all__ = [
     "MEASURES",
     "PROBES",
     "SIGMA",
+    "Area",
     "CameraCalibration",
     "Gauge",
     "History",

@@ -103,7 +103,9 @@ class Canvas:
         self.colours = bk.LinearColorMapper(
             palette=["#000000"], low=0, high=1, name="colours" if like is None else None
         )
-        self.bar = bk.ColorBar(color_mapper=self.colours, width=14, major_label_text_font_size="12px")
+        numbers = bk.BasicTickFormatter(power_limit_low=-6)  # else each number has a power of ten of its own
+        look = {"width": 14, "major_label_text_font_size": "12px", "formatter": numbers}
+        self.bar = bk.ColorBar(color_mapper=self.colours, **look)
         self.plot.add_layout(self.bar, "right")
         self.marks = bk.ColumnDataSource(columns("x y kind name 0"), name="marks" if like is None else None)
         self._states, self.set = {0: list[Mark]()}, list[Mark]()
@@ -142,9 +144,14 @@ class Canvas:
         self._image.data = columns(_IMAGE)
         self.plot.title.text, self.bar.visible = " ", False
 
-    def colour(self, ends: tuple[float, float], colours: Sequence[str], title: str) -> None:
-        """Set the colour bar: values of its ends, its colours and its title."""
+    def colour(self, ends: tuple[float, float], colours: Sequence[str], title: str, codes: Sequence[str] = ()) -> None:
+        """Set the colour bar: values of its ends, colours and title; names of `codes` as numbers."""
         self.plot.title.text, self.bar.visible = title, True
+        names = dict(enumerate(codes))
+        if self.bar.major_label_overrides != names:
+            ticker = bk.FixedTicker(ticks=list(names)) if codes else "auto"
+            size = "10px" if codes else "12px"  # the plot keeps its size
+            self.bar.update(major_label_overrides=names, ticker=ticker, major_label_text_font_size=size)
         self.colours.update(low=ends[0], high=ends[1])
         if self.colours.palette != list(colours):  # which takes as long to check as a frame to paint
             self.colours.palette = list(colours)
@@ -216,16 +223,20 @@ class Canvas:
 
 _ACROSS = 24
 """Lines across the view: each then has some 30 px of a screen of 800, longer than wide and apart from the next."""
-_ENDS, _LABEL = "x0 y0 x1 y1", "x y text colour"
+_ENDS, _LABEL = "x0 y0 x1 y1", "x y text colour side along down"
 LETTERS = {
-    "x_offset": 8,
-    "y_offset": -4,
+    "text_color": "#ffffff",
+    "text_align": "side",
+    "x_offset": "along",
+    "y_offset": "down",
     "background_fill_color": "#15181c",
     "background_fill_alpha": 0.75,
     "text_font_size": "12px",
     "padding": 2,
 }
-"""Look of a text over the image."""
+"""Look of a text over the image, where `beside` places it."""
+_AWAY, _LETTER, _LINE = 8, 7, 20
+"""Pixels of the screen: from a place to its text; width of a letter and height of a line of 12 px."""
 
 
 class LineLayer:
@@ -264,14 +275,30 @@ class LabelLayer:
     """
 
     def __init__(self, canvas: Canvas, name: str, **look: Any) -> None:
-        self._points = bk.ColumnDataSource(columns(_LABEL), name=name)
+        self._canvas, self._points = canvas, bk.ColumnDataSource(columns(_LABEL), name=name)
         canvas.plot.scatter("x", "y", source=self._points, line_color="#15181c", fill_color="colour", **look)
-        canvas.plot.text("x", "y", "text", source=self._points, text_color="#ffffff", **LETTERS)
+        canvas.plot.text("x", "y", "text", source=self._points, **LETTERS)
 
     def show(self, points: Sequence[tuple[float, float, str, str]] = ()) -> None:
         """Show points with their texts and colours."""
         if points or len(self._points.data["x"]):
-            self._points.data = columns(_LABEL, points)
+            placed = beside([(x, y, text) for x, y, text, _ in points], self._canvas.window)
+            self._points.data = columns(_LABEL, [(*one, *place) for one, place in zip(points, placed, strict=True)])
+
+
+def beside(texts: Sequence[tuple[float, float, str]], window: Window) -> list[tuple[str, int, int]]:
+    """Return alignment and offsets of texts at (x, y) that end within a window and do not lie on each other."""
+    step = (window.right - window.left) / window.width  # px of the image to one of the screen
+    placed, taken = [], list[tuple[float, float, float]]()
+    for x, y, text in texts:
+        left, wide, top = (x - window.left) / step + _AWAY, _LETTER * len(text), (y - window.top) / step
+        turned = left + wide > window.width
+        left, low = left - (wide + 2 * _AWAY if turned else 0), top
+        while any(abs(low - other) < _LINE and left < end and begin < left + wide for begin, end, other in taken):
+            low += _LINE
+        taken.append((left, left + wide, low))
+        placed.append(("right" if turned else "left", -_AWAY if turned else _AWAY, round(low - top)))
+    return placed
 
 
 def _thinned(window: Window, nodes: FloatArray, known: Any) -> tuple[npt.NDArray[np.int64], float]:

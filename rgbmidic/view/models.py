@@ -18,7 +18,7 @@ from rgbmidic.fields import MEASURES
 from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import PALETTES, SCALE, Mark, probe_marks
-from rgbmidic.view.canvas import LETTERS, Canvas, columns
+from rgbmidic.view.canvas import LETTERS, Canvas, beside, columns
 from rgbmidic.view.picture import element_at
 
 _SHORT = 150
@@ -218,7 +218,7 @@ class ResultControls(Controls):
 
 
 _COLOURS = tuple(OKABE_ITO.values())
-_PROBE = "xs ys colour x y text"
+_PROBE = "xs ys colour x y text side along down"
 
 _TURN = np.linspace(0, 2 * np.pi, 49)
 
@@ -256,7 +256,7 @@ class MarkLayer:
         self._drawn: object = None
         self._joined = bk.ColumnDataSource(columns(_PROBE), name="probes")
         canvas.plot.multi_line("xs", "ys", source=self._joined, line_color="colour", line_width=3)
-        canvas.plot.text("x", "y", "text", source=self._joined, text_color="colour", **LETTERS)
+        canvas.plot.text("x", "y", "text", source=self._joined, border_line_color="colour", **LETTERS)
 
     def place(
         self,
@@ -273,7 +273,7 @@ class MarkLayer:
         at = [self._carried(mark, reference, nodes) for mark in marks]
         self._shown = {mark.key: (mark, own) for mark, own in zip(at, marks, strict=True)}
         self._canvas.place(at)
-        drawn = (at, dict(values), gauge)
+        drawn = (at, dict(values), gauge, self._canvas.window)
         if drawn == self._drawn:
             return
         self._drawn = drawn
@@ -284,8 +284,9 @@ class MarkLayer:
         texts = [
             (ends[0].x, ends[0].y, f"{name.replace('_', ' ')}{values.get(name, '')}") for name, ends in probes.items()
         ]
-        parts = zip(lines, self.colours.values(), texts, strict=True)
-        self._joined.data = columns(_PROBE, [(*line, colour, *text) for line, colour, text in parts])
+        placed = beside(texts, self._canvas.window)
+        parts = zip(lines, self.colours.values(), texts, placed, strict=True)
+        self._joined.data = columns(_PROBE, [(*line, colour, *text, *side) for line, colour, text, side in parts])
 
     def taken(self, nodes: FloatArray, reference: FloatArray) -> tuple[Mark, ...] | None:
         """Return the marks, set over nodes (N, 2), on the `reference` (N, 2); None where none has changed."""

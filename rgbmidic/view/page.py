@@ -366,6 +366,8 @@ class ResultPage:
         wide = count == 2 and np.ptp(self.result.nodes[:, 0]) > np.ptp(self.result.nodes[:, 1])
         across = 1 if wide or count == 1 else 2
         rows = [bk.Row(children=plots[at : at + across], sizing_mode="stretch_both") for at in range(0, count, across)]
+        if count % across:  # a plot of another shape would distort what all show of the image
+            rows[-1].children = [*rows[-1].children, bk.Spacer(sizing_mode="stretch_both")]
         self.maps.children = rows if count > 1 else plots
 
     def _paint(self, canvas: Canvas, name: str, nodes: FloatArray, picture: Picture) -> None:
@@ -385,7 +387,7 @@ class ResultPage:
             beyond=np.abs(values.values) - 2 * values.std if view.hatched else None,
         )
         canvas.show(paint(self.canvas.window, picture, over, AROUND[self.dark]), self.canvas.window)
-        canvas.colour(over.ends, colours, field.label)
+        canvas.colour(over.ends, colours, field.label, field.codes)
 
     def _draw_layers(self, field: MapField, values: MapValues, nodes: FloatArray) -> None:
         """Draw what lies over the first field: lines, arrows, extremes, nodes without data, marks."""
@@ -409,7 +411,7 @@ class ResultPage:
         names = zip(("smallest", "largest"), ("#56b4e9", "#e69f00"), ends, strict=False)
         self.ends.show(
             [
-                (*nodes[node].tolist(), f"{name} {field.text(values.values[node])}", colour)
+                (*nodes[node].tolist(), f"{name} {field.text(values.values[node], values.std[node])}", colour)
                 for name, colour, node in names
             ]
         )

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import cv2
 import numpy as np
@@ -20,13 +20,13 @@ from bokeh.document import Document
 
 from rgbmidic._kernels.picture import paint_field
 from rgbmidic.errors import FrameError, InputError, RgbmidicError
-from rgbmidic.fields import Mean, make_probe
+from rgbmidic.fields import Area, Mean, Nodal, make_probe
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.report.figures import spread
-from rgbmidic.report.style import colour_range, ordinary_values, time_text
+from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, time_text
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, MapField, Maps, MapValues, Result
-from rgbmidic.settings import TestSettings
+from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.typing import AnyArray, FloatArray
 
 logger = logging.getLogger(__name__)
@@ -46,8 +46,6 @@ _PALETTES = {
 }  # fmt: skip
 _SIDES, _APART = ("#010203", "#ffffff"), 8
 """Colours of what lies below and above 0, of which the first is no grey, and pixels from one hatch to the next."""
-_STATUS = ("#2c7fb8", "#bdbdbd", "#d95f0e", "#fec44f")
-"""Measured, not seen, decorrelated, filled: distinct without distinguishing red from green."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,7 +204,7 @@ def palette(name: str, levels: int = _COLOURS) -> tuple[str, ...]:
     from matplotlib.colors import to_hex
 
     places = np.linspace(0, 1, min(max(levels, 2), _COLOURS))
-    return _STATUS if name == "codes" else tuple(map(to_hex, colormaps[name](places)))
+    return STATUS_COLOURS if name == "codes" else tuple(map(to_hex, colormaps[name](places)))
 
 
 def grey_picture(frame: Mosaic | ChannelFrame) -> Picture:
@@ -394,7 +392,7 @@ def frame_text(maps: Maps, place: int, field: MapField, values: MapValues, remar
     seconds = read["time_ns"] * 1e-9
     time = "" if read["time_ns"] == UNKNOWN_TIME else f", {time_text(seconds, np.array([seconds]))}"
     without = f", {missing:.1%} of the nodes not measured" if missing and read["status"] != _FAILED else ""
-    lines = [f"Frame {place} of {len(result) - 1}: {html.escape(result.names[place])}{time}", f"{end}{without}"]
+    lines = [f"Frame {place} of 0 to {len(result) - 1}: {html.escape(result.names[place])}{time}", f"{end}{without}"]
     if read["reason"] and measured:
         first, rest = read["reason"][:_REASON], read["reason"][_REASON:]
         lines[1] = warning(f"{end}: {first}")
@@ -404,8 +402,8 @@ def frame_text(maps: Maps, place: int, field: MapField, values: MapValues, remar
     found = extremes(field, values)
     if found:
         ends = [
-            f"{name} {field.text(values.values[node])} at ({result.nodes[node, 0]:.0f}, {result.nodes[node, 1]:.0f}) px"
-            for name, node in zip(("smallest", "largest"), found, strict=True)
+            f"{name} {field.text(values.values[node], values.std[node])} at ({x:.0f}, {y:.0f}) px"
+            for name, node, (x, y) in zip(("smallest", "largest"), found, result.nodes[[*found]], strict=True)
         ]
         lines.append(html.escape(", ".join(ends)))
     elif not np.isfinite(values.values).any():
@@ -456,10 +454,17 @@ def probe_text(
             value, std = float(strain[name][0]), float(strain[f"{name}_std"][0])
             return f": {field.text(value, std) if name == field.name else field.text(std)}"
         kind, place = ("point", place[:2]) if kind == "strain_gauge" else (kind, place)
-        probe = make_probe(maps.physical.covariance, kind, 1, place, rectified=maps.physical.rectified)
+        stated = ProbeSettings(measure=cast(Any, maps.physical.measure))
+        probe = make_probe(maps.physical.covariance, kind, 1, place, stated, maps.physical.rectified)
     except InputError:
         return ""
     assert isinstance(probe, Mean)
+    if isinstance(probe, Area) and maps.since is None and not maps.rigid_removed:
+        part = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), moved[:, None, probe.nodes], strict=True)))
+        for one in probe.histories(part) if maps.field(name).group == "Strain" else ():
+            if one.name == f"{probe.name}_{name}" and one.std is not None:
+                value, std = float(one.values[0]), float(one.std[0])
+                return f" mean: {field.text(value, std) if name == field.name else field.text(std)}"
     value, std = mean_of(maps, field, values, moved, probe)
     most = " at most" if kind != "point" and name not in ("u", "v") and np.isfinite(std) else ""
     return f"{' mean' if kind != 'point' else ''}: {field.text(value, std)}{most}"

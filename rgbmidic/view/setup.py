@@ -135,7 +135,7 @@ class SetupPage:
     def _draw(self) -> None:
         index = min(self.state.asked, len(self.source.series) - 1)
         name = html.escape(self.source.series.name(index))
-        self.parts.description.text = f"Frame {index} of {len(self.source.series) - 1}: {name}"
+        self.parts.description.text = f"Frame {index} of 0 to {len(self.source.series) - 1}: {name}"
         raw, full = self.source.raw(index)
         chosen = self.parts.picture.value
         picture = self.pictures.get(chosen, raw)

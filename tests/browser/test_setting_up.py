@@ -43,7 +43,7 @@ def test_file(tmp_path):
 def test_a_region_with_a_hole_is_drawn_written_run_and_watched(test_file, tmp_path):
     with chromium() as driver, serving(test_file) as address:
         page = Page(driver, address)
-        assert "Frame 0 of 2: frame_0.tif" in page.run("model('description').text")
+        assert "Frame 0 of 0 to 2: frame_0.tif" in page.run("model('description').text")
         page.do("model('frame').value = 2")
         page.until("model('description').text.includes('frame_2.tif')")
         page.do("model('mode').active = 2")

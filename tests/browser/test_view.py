@@ -227,7 +227,7 @@ def test_extremes_arrows_contours_and_colours(driver, address, result):
     nodes = [int(np.argmin(values)), int(np.argmax(values))]
     np.testing.assert_allclose(np.transpose([x, y]), result.nodes[nodes])
     assert [numbers(text)[0] for text in texts] == pytest.approx(values[nodes], rel=1e-4)
-    assert f"largest {values.max():.5g} px" in page.run("model('description').text")
+    assert f"largest {values.max():.3f} ± 0.010 px" in page.run("model('description').text")
     low, high = robust_range(Maps.of(result).read("u", 5))
     at = np.array(page.run("Array.from(model('contour lines').data.x0)"))
     levels = np.unique(np.round(0.01 * (at - 60), 9))

@@ -25,7 +25,7 @@ from rgbmidic.results.histories import read_histories, write_histories
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, TestSettings
 from rgbmidic.view import curves
 from rgbmidic.view.address import CLOCKS, MARKS, PALETTES, UNCERTAINTY, Mark, Steps, ViewState, probe_marks
-from rgbmidic.view.canvas import arrow_lines, contour_lines
+from rgbmidic.view.canvas import arrow_lines, beside, contour_lines
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import (
@@ -282,6 +282,9 @@ def test_the_label_of_a_probe_is_its_history_in_that_frame_and_the_pointer_state
             value, std = history(kind, name)
             assert label(maps, name, kind, *PLACES[kind]) == f"{mean}: {maps.all[name].text(value, std)}"
             assert label(maps, f"{name}_std", kind, *PLACES[kind]) == f"{mean}: {maps.all[f'{name}_std'].text(std)}"
+    for name in ("exx", "eyy", "exy", "e1", "e2", "equivalent"):
+        for kind in ("region", "circle"):
+            assert label(maps, name, kind, *PLACES[kind]) == f" mean: {maps.all[name].text(*history(kind, name))}"
     for name in ("exx", "eyy", "exy", "e1", "e2", "direction", "equivalent"):
         value, std = history("strain_gauge", name)
         assert label(maps, name, "strain_gauge", *PLACES["strain_gauge"]) == f": {maps.all[name].text(value, std)}"
@@ -303,7 +306,7 @@ def test_what_a_history_does_not_have_is_not_stated_too_exactly(tmp_path):
     assert (
         0.97 * std[around].min() < spread_of(label(maps, "exx", "point", *PLACES["point"])) < 1.03 * std[around].max()
     )
-    told = label(maps, "exx", "region", *PLACES["region"])
+    std, told = maps.read("shear", 5).std, label(maps, "shear", "region", *PLACES["region"])
     assert told.endswith(" at most")
     assert 0.97 * std.min() < spread_of(told) < 1.03 * std.max()
     assert label(maps, "misfit", "point", 50.0, 40.0) == ": 1"
@@ -569,7 +572,7 @@ def test_nothing_is_shown_of_a_frame_that_cannot_be_read(tmp_path):
     assert not len(page.canvas._image.data["image"])
     assert not page.canvas.bar.visible
     page.state.asked = 2
-    assert page.parts.description.text.startswith("Frame 2 of 2")
+    assert page.parts.description.text.startswith("Frame 2 of 0 to 2")
     assert "u = " in page.parts.under.text
     assert page.canvas.bar.visible
 
@@ -648,3 +651,14 @@ def test_a_page_whose_browser_has_gone_is_not_watched():
         return SimpleNamespace(session_context=SimpleNamespace(session=session))
 
     assert [watched(document(connections)) for connections in (None, 0, 1)] == [True, False, True]
+
+
+def test_texts_end_in_the_window_and_do_not_lie_on_each_other():
+    window = Window(left=0, top=0, right=500, bottom=400, width=500, height=400)
+    texts = [(10, 50, "left"), (480, 50, "at the right edge"), (12, 55, "beside the first"), (14, 52, "and a third")]
+    placed = beside(texts, window)
+    assert [side for side, *_ in placed] == ["left", "right", "left", "left"]
+    lows = [y + down for (_, y, _), (_, _, down) in zip(texts, placed, strict=True)]
+    near = sorted(lows[at] for at in (0, 2, 3))
+    assert min(np.diff(near)) >= 20
+    assert lows[1] == 50
