@@ -60,6 +60,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = "rgbmidic"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_search_scorer = str(Path(__file__).parent / "_static" / "scorer.js")
 html_favicon = "_static/logo.svg"
 html_copy_source = html_show_sourcelink = False
 html_sidebars = {"index": []}
