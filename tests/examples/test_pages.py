@@ -26,7 +26,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 from textures import Texture
 
-from rgbmidic import CameraCalibration, TestSettings, cli, measure, read_test
+from rgbmidic import CameraCalibration, TestSettings, cli, cli_before, measure, read_test
 from rgbmidic.command import execute
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.demo import run_demo, run_plate, write_plate
@@ -79,12 +79,12 @@ def demo(tmp_path_factory, request):
 
 def make_demo(folder):
     out, lines = folder / "files", []
-    rows = run_demo(out, lines.append, cli._calibrate_demo, size=320, angles=(0.33, 1.0, 2.0, 4.0))
+    rows = run_demo(out, lines.append, cli_before._calibrate_demo, size=320, angles=(0.33, 1.0, 2.0, 4.0))
     assert [row.angle_deg for row in rows] == [0.33, 1.0, 2.0, 4.0]
     assert all(row.rms_px < min(row.single_px) for row in rows)
     assert len(lines) == 4
     truth = write_plate(out / "test")
-    cli._calibrate_demo_camera(out / "test")
+    cli_before._calibrate_demo_camera(out / "test")
     plate = run_plate(out / "test", truth)
     assert all(row.strain[0] < 1.5 * row.stated_strain < 0.1 * row.strain[1] for row in plate)
     assert all(row.displacement_mm[0] < 1.5 * row.stated_mm < 0.1 * row.displacement_mm[1] for row in plate)
