@@ -243,12 +243,11 @@ class _Canvas:
         from matplotlib.colors import Normalize
 
         self._drawer, self._curve = drawer, drawer.curve
-        (left, right), (top, bottom) = drawer.limits
+        ((left, right), (top, bottom)), (unit, factor) = drawer.limits, drawer.maps.physical.axes
 
         def draw(axes: list[Axes]) -> None:
             panels = zip(axes, drawer.fields, drawer.ends, drawer.colours, drawer.beyond, strict=False)
             for axis, part, ends, colours, beyond in panels:
-                unit, factor = drawer.maps.physical.axes
                 style.finish_picture(
                     axis, (left, right), (top, bottom), first=axis is axes[0], unit=unit, factor=factor
                 )

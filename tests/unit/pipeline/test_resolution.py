@@ -162,7 +162,12 @@ def test_a_run_takes_the_recommended_size_and_goes_on_with_it(tmp_path, monkeypa
     ("sections", "given", "error", "text"),
     [
         ({"frames": {"path": [], "last": 0}}, {}, FrameError, "no deformed frame.*state a number"),
-        ({}, {"mesh": Plan}, ConfigurationError, "a mesh is given"),
+        (
+            {},
+            {"mesh": Tri3Mesh.from_region(Region.from_rectangle((8, 8, 135, 135), (144, 144)), 20)},
+            ConfigurationError,
+            "a mesh is given",
+        ),
         ({"frames": {"path": [], "reference": [0, 1], "last": 1}}, {}, FrameError, "no deformed frame"),
     ],
 )

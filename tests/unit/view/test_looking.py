@@ -509,11 +509,11 @@ class Walk:
         page, parts = self.page, self.page.parts
         if what == "point":
             x, y = choose.uniform(0, 120), choose.uniform(0, 80)
-            page.canvas.plot._trigger_event(MouseMove(page.canvas.plot, sx=1, sy=1, x=x, y=y))
+            page.maps.canvas.plot._trigger_event(MouseMove(page.maps.canvas.plot, sx=1, sy=1, x=x, y=y))
         elif what == "frame":
             page.state.asked = choose.randrange(8)
         elif what == "field":
-            still = [name for name in page.fields.all if not any(word in name for word in TIMED)]
+            still = [name for name in page.shown.maps.all if not any(word in name for word in TIMED)]
             parts.of["field"].value = choose.choice(still)
         elif what == "over":
             parts.over.active = choose.randrange(2)
@@ -538,13 +538,13 @@ class Walk:
                 ["x {:.1f}, y {:.1f} px:".format(*pointer), pointer_text(fields, field, values, moved, nodes, *pointer)]
             )
         assert page.parts.under.text == told
-        remark = page.pictures.frame(view.frame)[1] if view.over == "deformed" else ""
+        remark = page.shown.pictures.frame(view.frame)[1] if view.over == "deformed" else ""
         assert page.parts.description.text == frame_text(fields, view.frame, field, values, remark)
-        assert page.canvas.plot.title.text == field.label
+        assert page.maps.canvas.plot.title.text == field.label
         if field.ends is None:
             whole = range_of_test(fields, view.field)
             ends = whole if view.range == "test" else robust_range(values) or (0.0, 1.0)
-            assert (page.canvas.colours.low, page.canvas.colours.high) == ends
+            assert (page.maps.canvas.colours.low, page.maps.canvas.colours.high) == ends
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -564,17 +564,17 @@ def test_nothing_is_shown_of_a_frame_that_cannot_be_read(tmp_path):
     made = make_result(tmp_path / "result", frames=3, record=smooth_record)
     page = ResultPage(Document(), made, ViewState(frame=0), Progress(3))
     page.show()
-    page.canvas.plot._trigger_event(MouseMove(page.canvas.plot, sx=1, sy=1, x=50, y=40))
+    page.maps.canvas.plot._trigger_event(MouseMove(page.maps.canvas.plot, sx=1, sy=1, x=50, y=40))
     corrupt(made, 1)
     page.state.asked = 1
     assert "damaged in frame 1" in page.parts.description.text
     assert page.parts.under.text == ""
-    assert not len(page.canvas._image.data["image"])
-    assert not page.canvas.bar.visible
+    assert not len(page.maps.canvas._image.data["image"])
+    assert not page.maps.canvas.bar.visible
     page.state.asked = 2
     assert page.parts.description.text.startswith("Frame 2 of 0 to 2")
     assert "u = " in page.parts.under.text
-    assert page.canvas.bar.visible
+    assert page.maps.canvas.bar.visible
 
 
 def test_curves_that_are_being_read_are_not_saved(tmp_path):
@@ -592,21 +592,21 @@ def test_curves_that_are_being_read_are_not_saved(tmp_path):
 def test_a_range_by_hand_that_makes_no_sense_is_told(tmp_path):
     page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), Progress(2))
     page.show()
-    present = page.canvas.colours.low, page.canvas.colours.high
+    present = page.maps.canvas.colours.low, page.maps.canvas.colours.high
     page.parts.of["range"].value = "hand"
     assert (page.view.low, page.view.high) == present
     page.parts.of["low"].value = 5.0
     assert f"The colours go from {present[0]:g} to {present[1]:g}" in page.parts.description.text
     page.parts.of["high"].value = 9.0
     assert "The colours go" not in page.parts.description.text
-    assert (page.canvas.colours.low, page.canvas.colours.high) == (5, 9)
+    assert (page.maps.canvas.colours.low, page.maps.canvas.colours.high) == (5, 9)
 
 
 def test_a_choice_that_cannot_be_is_told_and_the_next_one_counts(tmp_path):
     page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), Progress(2))
     page.parts.of["gauge"].value = 5.0
     assert "at least 56.12 px long" in page.parts.description.text
-    assert page.values is None
+    assert not page._told
     page.parts.of["gauge"].value = 70.0
     page.parts.of["field"].value = "exx"
     assert "virtual strain gauge of 70 px" in page.parts.description.text
@@ -633,16 +633,16 @@ def test_a_camera_s_plane_is_that_of_the_page_and_a_wrong_file_changes_nothing(t
     CameraCalibration(shape=(80, 120), homography=np.diag([0.5, 0.5, 1])).write(tmp_path / "camera.json")
     page = ResultPage(Document(), made, ViewState(frame=1), Progress(2))
     page.show()
-    before = page.values.values
+    before = page.shown.values("u").values
     page.parts.of["camera"].value = "camera.json"
-    assert page.canvas.plot.title.text == "u (mm)"
+    assert page.maps.canvas.plot.title.text == "u (mm)"
     assert ("u", "u (mm)") in [tuple(pair) for group in page.parts.of["field"].options.values() for pair in group]
-    np.testing.assert_allclose(page.values.values, 0.5 * before, atol=1e-9)
+    np.testing.assert_allclose(page.shown.values("u").values, 0.5 * before, atol=1e-9)
     page.parts.of["camera"].value = "none.json"
     assert "none.json" in page.parts.scaled.text
-    assert page.canvas.plot.title.text == "u (mm)"
+    assert page.maps.canvas.plot.title.text == "u (mm)"
     page.parts.of["camera"].value = ""
-    assert page.canvas.plot.title.text == "u (px)"
+    assert page.maps.canvas.plot.title.text == "u (px)"
 
 
 def test_a_page_whose_browser_has_gone_is_not_watched():
