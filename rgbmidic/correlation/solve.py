@@ -149,24 +149,11 @@ def next_weighting(
     precision = last.precision if number or method is None else method.precision(residual)
     matched = _matched(problem, residual, estimate, precision)
     if not matched.all() or estimate.longest > FIRST_PASS:
-        std = standard_uncertainty(residual, equations, last.precision)
-        # a node that its own pixels do not hold leaves the next pass, but not for a one-sided texture: that matches
-        one_sided = one_sided_texture(equations, residual)
-        lost = ~one_sided & (std.max(axis=1) > LOST)
-        if number >= _RETURNS and len(estimate.increments) < problem.options.max_iterations:
-            before, motion = estimate.increments[-2:]
-            lost |= ~one_sided & (motion > np.maximum(_WANDERING, before / 2))
+        lost = _lost_nodes(problem, last, equations, residual, estimate, number)
         matched &= ~lost[problem.reference.mesh.elements].any(axis=1)
     if number >= _RETURNS:
         matched &= last.matched
-    # where elements take part again, what was learnt from their wrong match must be learnt anew, and once more: in
-    # the pass in which they do the residual is still that of a wrong match; and once where it was learnt elsewhere
-    motion = np.hypot(*(estimate.displacement - last.learnt_at).T)[equations.textured]
-    returned = last.returned
-    if (matched & ~last.matched).any():
-        returned = number + 1
-    elif number == 1 < len(residual.values) and (motion > _ELSEWHERE).mean() > _SWINGING:
-        returned = max(returned, number)
+    returned = _learnt_anew(last, matched, equations, estimate, number)
     weighting = replace(last, residual=residual, matched=matched, returned=returned)
     if not refining(problem, weighting, number + 1):
         return weighting
@@ -176,6 +163,32 @@ def next_weighting(
         precision=precision if number == 0 or method is None else method.precision(residual),
         learnt_at=estimate.displacement,
     )
+
+
+def _lost_nodes(
+    problem: Problem, last: Weighting, equations: Equations, residual: Residual, estimate: Estimate, number: int
+) -> BoolArray:
+    """Find the nodes (N,) that leave the next pass; a one-sided texture does not hold a node either, but matches."""
+    std = standard_uncertainty(residual, equations, last.precision)
+    unheld = std.max(axis=1) > LOST
+    wanders = np.zeros(len(unheld), dtype=bool)
+    if number >= _RETURNS and len(estimate.increments) < problem.options.max_iterations:
+        before, motion = estimate.increments[-2:]
+        wanders = motion > np.maximum(_WANDERING, before / 2)
+    return np.asarray((unheld | wanders) & ~one_sided_texture(equations, residual))
+
+
+def _learnt_anew(last: Weighting, matched: BoolArray, equations: Equations, estimate: Estimate, number: int) -> int:
+    """Return the pass up to which the weights are learnt anew.
+
+    Where elements take part again, what was learnt from their wrong match must be learnt anew, and once more: in the
+    pass in which they do the residual is still that of a wrong match. It is learnt once more where it was elsewhere.
+    """
+    if (matched & ~last.matched).any():
+        return number + 1
+    motion = np.hypot(*(estimate.displacement - last.learnt_at).T)[equations.textured]
+    elsewhere = number == 1 < len(last.residual.values) and (motion > _ELSEWHERE).mean() > _SWINGING
+    return max(last.returned, number) if elsewhere else last.returned
 
 
 def _matched(
