@@ -17,7 +17,7 @@ from rgbmidic.report.curves import field_history_figure, history_figure, status_
 from rgbmidic.report.gallery import REPORT
 from rgbmidic.report.page import Page
 from rgbmidic.report.style import PAGE_DPI, embedded, time_text
-from rgbmidic.results import QUANTITIES, Maps, Result, channels_of, probes_of
+from rgbmidic.results import QUANTITIES, Maps, Result, channels_of, probes_of, rounded, uncertain
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ChannelSettings, ProbeSettings, SetupSettings, TestSettings, read_section
@@ -138,8 +138,8 @@ class _Report:
         text = f"{len(result.deformed)} deformed frames against {tables.reference_text(self.physical)}; "
         text += f"{len(result.nodes)} nodes, {history.fractions[:, 0].mean():.1%} of them measured. "
         if np.isfinite(x + y):
-            text += f"The median node moves by up to {x:.4g} {length} in x and {y:.4g} {length} in y, known to "
-            text += f"{x_std:.2g} and {y_std:.2g} {length} (standard uncertainty, median). "
+            moved = uncertain(abs(x), x_std, length), uncertain(abs(y), y_std, length)
+            text += f"The median node moves by up to {moved[0]} in x and {moved[1]} in y. "
         return text + "x is to the right and y down, on the reference image; blank means not measured."
 
     def _warnings(self) -> Iterator[str]:
@@ -266,7 +266,7 @@ class _Report:
         for name in ("u_std", "v_std", "exx_std", "eyy_std", "exy_std"):
             known = self.history.quantiles[name]
             known = known[np.isfinite(known).all(axis=1)]
-            numbers = [f"{value:.3g}" for value in np.median(known, axis=0)] if len(known) else "---"
+            numbers = [rounded(value, value) for value in np.median(known, axis=0)] if len(known) else "---"
             rows.append((name, length if name[0] in "uv" else "1", *numbers))
         page.table(("standard uncertainty", "unit", "5 % of the nodes below", "median", "95 % below"), rows)
         caption = "stated standard uncertainty over the test, median of the nodes"
