@@ -70,11 +70,15 @@ def write_report(
     Raises
     ------
     InputError
-        There is no such frame.
+        There is no such frame, or the file is named as something else than HTML.
     ResultError
         The file exists, its folder does not, or a frame of the result is damaged.
     """
     out = Path(out)
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise InputError(
+            f"a report is a page, .html or .htm, not {out.name}; for a PDF open the page in a browser and print it"
+        )
     check_file(out, overwrite=overwrite)
     kept = result.provenance.get("settings", {}).get("setup", {})
     setup = read_section(SetupSettings, "setup", kept) if settings is None else settings.setup

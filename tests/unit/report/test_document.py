@@ -166,7 +166,8 @@ def test_it_says_what_is_stated_and_what_is_not(tmp_path: Path) -> None:
     assert page.rows["u_std"].startswith("mm | ")
     assert "by number or time: 2" in page.words
     assert "no image scale" not in page.words
-    methods = next(text for text in page.texts if text.startswith("The surface was patterned"))
+    methods = page.words[page.words.index("The surface was patterned") :]
+    assert "<mark>[camera]</mark> with 50 mm" in (tmp_path / "a.html").read_text(encoding="utf-8")
     assert '[camera] with 50 mm, "f/2" <script> recorded 120 x 80 px at 50000 frames per second' in methods
     assert "exposure 1.5 µs" in methods
     assert f"triangles of {stated.element_size:.4g} px ({0.05 * stated.element_size:.3g} mm)" in methods
@@ -259,6 +260,8 @@ def test_nothing_is_overwritten_or_left_behind(tmp_path: Path) -> None:
         write_report(result, tmp_path / "none" / "a.html")
     with pytest.raises(InputError, match="no frame 9"):
         write_report(result, tmp_path / "b.html", frames=[9])
+    with pytest.raises(InputError, match=r"\.html or \.htm, not r\.pdf.*print it"):
+        write_report(result, tmp_path / "r.pdf")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.html", "r"]
     assert page.read_text() == "mine"
 
