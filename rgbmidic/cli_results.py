@@ -91,9 +91,7 @@ def report(
     from rgbmidic.results import Result
 
     file, chosen, settings = out or result / REPORT, command.read_frames(frames), read_settings(test)
-    if file.suffix.lower() == ".pdf":
-        raise InputError(f"the report is a page, such as {file.stem}.html, which a browser prints as PDF; not {file}")
-    if file.suffix.lower() not in (".html", ".htm"):  # which browsers do not open as a page
+    if not file.suffix:
         file = file.with_name(f"{file.name}.html")
     opened = Result.open(result, partial=partial)
     write_report(opened, file, settings=settings, frames=chosen, overwrite=overwrite)

@@ -13,9 +13,10 @@ from causes import RADIUS, Cause
 from claims import Claim, judge
 from figures import draw_figures
 from measurement import METHODS, PaperStudy, SceneStudy
+from page import Page
 from rgbmidic import __version__
 from rgbmidic.errors import ResultError
-from rgbmidic.report import Page, save_figure
+from rgbmidic.report import save_figure
 
 _SCENES = {
     "sequential": "two white lamps in succession, monochrome camera",

@@ -1,7 +1,7 @@
 """Factors of the matrices of a mesh: order and structure are found once, the numbers for every matrix.
 
-scipy's SuperLU finds both for every matrix: with 1,764 nodes it takes 9.0 ms for what takes 2.2 ms here (factors and one
-solution, one thread, equal to 2e-15; measured 2026-11-24).
+scipy's SuperLU finds both for every matrix: with 1,764 nodes it takes 9.0 ms for what takes 2.2 ms here (factors and
+one solution, one thread, equal to 2e-15; measured 2026-11-24).
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from rgbmidic.report.figures import (
 from rgbmidic.report.gallery import REPORT, remove_figures, remove_report, write_figures, write_maps
 from rgbmidic.report.movie import MOVIES, write_movie
 from rgbmidic.report.movie_curve import Curve
-from rgbmidic.report.page import Page
+from rgbmidic.report.page import render
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
 
 __all__ = [
@@ -24,7 +24,6 @@ __all__ = [
     "REPORT",
     "STYLE",
     "Curve",
-    "Page",
     "brightness_figure",
     "convergence_figure",
     "finish_plot",
@@ -36,6 +35,7 @@ __all__ = [
     "reflection_figure",
     "remove_figures",
     "remove_report",
+    "render",
     "residual_figure",
     "save_figure",
     "wave_text",

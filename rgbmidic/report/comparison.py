@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ import numpy as np
 from rgbmidic.extras import optional
 from rgbmidic.report import style
 from rgbmidic.report.figures import spread
-from rgbmidic.report.page import Page
+from rgbmidic.report.page import render
 from rgbmidic.results.comparison import QUANTITIES, WAYS, Comparison, FrameComparison
 from rgbmidic.results.files import write_complete, writing
 from rgbmidic.typing import FloatArray
@@ -96,7 +96,7 @@ def write_comparison(
         TABLE: _table([row for made in done for row in _agreement_rows(comparison, made)]),
         SCALE: _table([_scale_row(comparison, made) for made in done]),
         INDEX: index,
-        PAGE: _page(comparison, done).html,
+        PAGE: _page(comparison, done),
     }
     for name, text in texts.items():
         write_complete(out / name, methodcaller("write", text.encode()))
@@ -262,53 +262,27 @@ def scale_text(comparison: Comparison, done: Sequence[FrameComparison]) -> str:
     return text
 
 
-def _page(comparison: Comparison, done: Sequence[FrameComparison]) -> Page:
-    page = Page(f"Comparison: {comparison.result.path.resolve().name} with {Path(comparison.simulation.name).name}")
-    page.text(f"Best-fitting scale: {scale_text(comparison, done)}.")
-    page.text(
-        "Differences are measured minus simulated, at the simulation's nodes and along its axes: displacement, mm, and "
-        f"Green-Lagrange strain over the shortest virtual strain gauge ({comparison.gauge:.3g} mm). At the nodes the "
-        "simulation stands as it is; levelled, it has gone through the measurement's mesh, recovery and strain gauges, "
-        "so that a lack of resolution does not count as difference. Chi-square, per degree of freedom, is 1 where the "
-        "simulation is right and the stated uncertainty is all there is."
+def _page(comparison: Comparison, done: Sequence[FrameComparison]) -> str:
+    return render(
+        "comparison.html",
+        comparison=comparison,
+        done=done,
+        simulation=Path(comparison.simulation.name).name,
+        scale=scale_text(comparison, done),
+        warnings=list(_warnings(comparison, done)),
+        heads=[entry.name.replace("_", " ") for entry in fields(next(iter(done[0].agreement.values())))],
+        rows=_agreement_cells,
+        groups=_GROUPS.values(),
+        titles=_TITLES,
+        scale_figure=scale_figure,
+        histogram_figure=histogram_figure,
+        difference_figure=difference_figure,
     )
-    page.heading("Warnings")
-    page.bullets(list(_warnings(comparison, done)) or ["none"])
-    page.heading("Where the mesh lies")
-    page.text(f"{comparison.placement.summary()}.")
-    if comparison.relative_std:
-        page.text(
-            f"The scale of the image is known to {comparison.relative_std:.2g} of itself, which counts in the "
-            "uncertainty of displacements and of the best-fitting scale."
-        )
-    if len(done) > 1:
-        page.heading("Over the frames")
-        caption = "best-fitting scale with two standard uncertainties, and chi-square"
-        page.picture(style.embedded(scale_figure(comparison, done)), caption)
-    for made in done:
-        if made.measured:
-            _frame_part(page, comparison, made)
-    return page
 
 
-def _frame_part(page: Page, comparison: Comparison, made: FrameComparison) -> None:
-    """Add what is shown of one frame."""
-    page.heading(f"Frame {made.frame} ({comparison.result.names[made.frame]})")
-    fit = made.fit
-    u, v, rotation = (f"{value:.2g} ± {std:.1g}" for value, std in zip(fit.rigid, fit.rigid_std, strict=True))
-    page.text(
-        f"Scale {fit.scale:.4f} ± {fit.scale_std:.2g}; what it leaves has a chi-square of {fit.chi_square:.3g}. Rigid "
-        f"motion, measured minus simulated{' (taken off)' if comparison.remove_rigid else ''}: {u} mm along x, {v} mm "
-        f"along y, {rotation} degrees."
-    )
-    rows = [(*key, *(f"{value:.3g}" for value in asdict(one).values())) for key, one in made.agreement.items()]
-    names = asdict(next(iter(made.agreement.values())))
-    page.table(["way", "quantity", *(name.replace("_", " ") for name in names)], rows)
-    page.picture(style.embedded(histogram_figure(made)), "ratios of difference to standard uncertainty")
-    for group in _GROUPS.values():
-        for way, ratio in (("levelled", False), ("levelled", True), ("nodes", True)):
-            caption = f"measured minus simulated, {_TITLES[way]}{', in standard uncertainties' if ratio else ''}"
-            page.picture(style.embedded(difference_figure(comparison, made, group, way, ratio=ratio)), caption)
+def _agreement_cells(made: FrameComparison) -> Iterator[tuple[str, ...]]:
+    for key, one in made.agreement.items():
+        yield *key, *(f"{value:.3g}" for value in asdict(one).values())
 
 
 def _warnings(comparison: Comparison, done: Sequence[FrameComparison]) -> Iterator[str]:

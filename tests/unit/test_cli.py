@@ -557,7 +557,7 @@ def test_movie_and_profile_write_what_is_asked_for_or_nothing(command: Run, tmp_
         (("profile", result, "--out", table, *line, "--curves", "2,9"), "--curves 2,9: frames [9] are not among"),
         (("profile", result, "--out", table, *line, "--curves", "a"), "--curves are indices and ranges"),
         (("profile", result, "--out", tmp_path / "p.png", *line), "--out is the table, such as p.csv, not 'p.png'"),
-        (("report", result, "--out", tmp_path / "r.PDF"), "which a browser prints as PDF"),
+        (("report", result, "--out", tmp_path / "r.PDF"), "for a PDF open the page in a browser and print it"),
         (("history", result, "--out", tmp_path / "h.PNG", "--point", "30,40"), "--out is the table, such as h.csv"),
     ):
         status, out, err = command(*arguments)

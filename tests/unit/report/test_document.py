@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.report import curves, document, remove_report, setup, style, write_report
+from rgbmidic.report import curves, document, remove_report, setup, style, write_batch_page, write_report
 from rgbmidic.results import FrameRecord, Maps, Result, ResultStore, read_profile
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import (
@@ -64,7 +65,7 @@ class Reader(HTMLParser):
             self.rows[self._cells[0]] = " | ".join(self._cells[1:])
 
     def handle_data(self, text: str) -> None:
-        if self.open and self.open[-1] in ("td", "th", "code") and self._cells:
+        if self.open and self.open[-1] in ("td", "th", "code", "a") and self._cells:
             self._cells[-1] += text
         self.texts.append(text)
 
@@ -80,10 +81,10 @@ def settings(**sections: Any) -> TestSettings:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """No pictures: drawing them takes nearly all of the time."""
-    monkeypatch.setattr(document, "embedded", lambda _: "data:image/png;base64,")
+    monkeypatch.setattr(style, "embedded", lambda _: "data:image/png;base64,")
     for method in ("_draw", "strip"):
         monkeypatch.setattr(document.figures.MapDrawer, method, lambda *_, **__: None)
-    for module in (document, document.figures, style):
+    for module in (curves, document.figures, style):
         for name in [name for name in vars(module) if name.endswith("_figure")]:
             monkeypatch.setattr(module, name, lambda *_, **__: None)
 
@@ -104,7 +105,7 @@ def still(index: int, noise: float, **values: Any) -> FrameRecord:
 
 
 def test_the_page_is_whole_and_needs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(document, "embedded", lambda figure: style.embedded(figure, dpi=40))  # coarse: for the time
+    monkeypatch.setattr(style, "embedded", partial(style.embedded, dpi=40))  # coarse: for the time
     for name in ("brightness", "convergence", "map", "residual", "fraction"):  # have tests of their own
         monkeypatch.setattr(document.figures, f"{name}_figure", lambda *_: Figure(facecolor="red"))
     image = np.random.default_rng(0).normal(1000, 100, (3, 80, 120))
@@ -165,7 +166,8 @@ def test_it_says_what_is_stated_and_what_is_not(tmp_path: Path) -> None:
     assert page.rows["u_std"].startswith("mm | ")
     assert "by number or time: 2" in page.words
     assert "no image scale" not in page.words
-    methods = next(text for text in page.texts if text.startswith("The surface was patterned"))
+    methods = page.words[page.words.index("The surface was patterned") :]
+    assert "<mark>[camera]</mark> with 50 mm" in (tmp_path / "a.html").read_text(encoding="utf-8")
     assert '[camera] with 50 mm, "f/2" <script> recorded 120 x 80 px at 50000 frames per second' in methods
     assert "exposure 1.5 µs" in methods
     assert f"triangles of {stated.element_size:.4g} px ({0.05 * stated.element_size:.3g} mm)" in methods
@@ -186,7 +188,7 @@ def test_calibration_exposure_and_stress_are_in_the_report(tmp_path: Path, monke
     notes = {"calibration_figures": figures, "reference_exposure": exposure}
     result = make(tmp_path / "r", [still(index, 0.01) for index in range(3)], notes=notes, settings=stated)
     seen: list[Any] = []
-    monkeypatch.setattr(document, "history_figure", seen.append)
+    monkeypatch.setattr(curves, "history_figure", seen.append)
     write_report(result, tmp_path / "a.html")
     page = Reader(tmp_path / "a.html")
     assert page.rows["channel 2"] == "0.20000 ± 0.0002 | 1.00000 | 0.30000 ± 0.0002"
@@ -258,8 +260,26 @@ def test_nothing_is_overwritten_or_left_behind(tmp_path: Path) -> None:
         write_report(result, tmp_path / "none" / "a.html")
     with pytest.raises(InputError, match="no frame 9"):
         write_report(result, tmp_path / "b.html", frames=[9])
+    with pytest.raises(InputError, match=r"\.html or \.htm, not r\.pdf.*print it"):
+        write_report(result, tmp_path / "r.pdf")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.html", "r"]
     assert page.read_text() == "mine"
+
+
+def test_the_page_of_a_batch_links_its_reports_and_escapes_what_it_is_given(tmp_path: Path) -> None:
+    (tmp_path / "a & b").mkdir()
+    (tmp_path / "a & b" / "report.html").touch()
+    rows = [
+        ["a & b", "measured", "", str(tmp_path / "a & b"), "3 < 4"],
+        ["c", "failed", "no <b> of `d`", "", ""],
+        ["later", "", "", "", ""],
+    ]
+    write_batch_page(["test", "ended", "reason", "folder", "modulus"], rows, tmp_path / "summary.html")
+    page = Reader(tmp_path / "summary.html")
+    assert page.rows == {"": "a & b | c | later", "ended": "measured | failed | ", "modulus": "3 < 4 |  | "}
+    assert "2 tests, 1 failed" in page.words
+    assert "c: no <b> of d" in page.words
+    assert '<a href="a%20%26%20b/report.html">a &amp; b</a>' in (tmp_path / "summary.html").read_text(encoding="utf-8")
 
 
 def test_the_report_of_an_earlier_run_is_removed_and_nothing_else(tmp_path: Path) -> None:
