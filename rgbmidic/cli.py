@@ -7,12 +7,12 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from rgbmidic import cli_before, cli_fields, cli_results, cli_test, command
+from rgbmidic import cli_before, cli_fields, cli_measure, cli_results, command
 from rgbmidic._version import __version__
 
 _GROUPS = {
     "Before a test": cli_before,
-    "A test": cli_test,
+    "A test": cli_measure,
     "Its result": cli_results,
     "Fields of the result": cli_fields,
 }

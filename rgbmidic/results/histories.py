@@ -232,6 +232,11 @@ def read_histories(
         units=units,
         remarks=(
             *_remarks(rectified, speed, exposure(result), there, by_probe),
+            *(
+                [f"exx, eyy, exy, e1, e2: {probes.measure.title()} strain"]
+                if any(one.name.endswith("_exx") for one in quantities)
+                else []
+            ),
             *([f"rates: {rate_words(probes.window, len(there))}"] if window else ()),
         ),
     )

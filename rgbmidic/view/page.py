@@ -32,6 +32,7 @@ from rgbmidic.view.address import (
 from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.channel_controls import ChannelControls
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv
+from rgbmidic.view.file_buttons import FileButtons
 from rgbmidic.view.film import FilmButton
 from rgbmidic.view.line_panel import LinePanel
 from rgbmidic.view.map_panel import MapPanel
@@ -39,7 +40,6 @@ from rgbmidic.view.models import CONTROLS, ResultControls, SharedState, script
 from rgbmidic.view.picture import every, frame_text, guarded, warning
 from rgbmidic.view.probe_names import ProbeNames
 from rgbmidic.view.shown import ShownFields
-from rgbmidic.view.test_file import TestFileButtons
 
 _TICK, _IDLE = 200, 1000
 """Ms between two parts of the time line; between two checks whether a result has grown, and pictures of that."""
@@ -83,7 +83,7 @@ class ResultPage:
         self.parts = p = ResultControls(len(result) - 1, view.frame, dark=self.dark)
         self.maps = MapPanel(document, self.shown, self._redraw, self._hover, dark=self.dark)
         self.names = ProbeNames(p, self._take_marks)
-        self.film, self.file = FilmButton(p, self.shown), TestFileButtons(p, self.shown, self._base)
+        self.film, self.file = FilmButton(p, self.shown), FileButtons(p, self.shown, self._base)
         self.timeline = TimeLine(len(result), view.frame)
         texts: dict[str, Any] = {"message": p.message, "told": p.told, "hint": _HELP}
         self.curves = CurvePanel(document, chosen=view.curve, select=p.curve, **texts)

@@ -19,7 +19,7 @@ from rgbmidic.view.picture import warning
 from rgbmidic.view.shown import ShownFields
 
 
-class TestFileButtons:
+class FileButtons:
     """Sections of a TEST.toml for what is in view.
 
     Parameters
@@ -31,8 +31,6 @@ class TestFileButtons:
     base
         Folder that the paths of the view are relative to.
     """
-
-    __test__ = False  # of a laboratory, not of pytest
 
     def __init__(self, parts: ResultControls, shown: ShownFields, base: Path) -> None:
         self._parts, self._shown, self._base, self._confirmation = parts, shown, base, Confirmation()
