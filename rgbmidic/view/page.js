@@ -59,8 +59,12 @@ const rgbmidic = {
     state.csv = "";
   },
 
-  keepPng({plot}) {
-    Bokeh.index.get_one(plot).export("png").to_blob().then((blob) => rgbmidic.keep(blob, "history.png"));
+  // Of plots that take each other's place those that are there: one that is hidden has no size.
+  keepPng({plots}) {
+    for (const plot of plots.filter((one) => one.visible)) {
+      const name = plot.name.replace("curves_plot", "history").replace("_plot", "") + ".png";
+      Bokeh.index.get_one(plot).export("png").to_blob().then((blob) => rgbmidic.keep(blob, name));
+    }
   },
 };
 window.rgbmidic = rgbmidic;

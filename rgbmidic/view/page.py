@@ -92,7 +92,9 @@ class ResultPage:
         panels = [self.line.choice, self.curves.plot, *self.line.parts]
         self.panel = bk.Column(children=panels, sizing_mode="stretch_both")
         self._begin()
-        p.wire(self.state, self.maps.canvas.tools, self.timeline.now, self.curves.plot)
+        p.wire(
+            self.state, self.maps.canvas.tools, self.timeline.now, (self.curves.plot, self.line.wave, self.line.profile)
+        )
         self._listen()
 
     @property

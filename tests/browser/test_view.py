@@ -501,6 +501,23 @@ def test_several_fields_without_curves_leave_room_for_the_pointer_s_text_and_sta
     assert page.run(box) == before
 
 
+def test_the_picture_that_is_saved_is_of_the_plot_that_is_there(driver, wave):
+    with serving(wave.path) as told:
+        page = Page(driver, f"{told}?frame=5&field=exx")
+        shown(page, 5)
+        page.do("model('mode').active = 3")
+        page.pointer(("click", *ALONG[:2]), ("click", *ALONG[2:]))
+        page.until("model('beside_map').visible")
+        page.driver.execute_script(*click("along line 1"))
+        page.until("model('wave').data.image.length && !model('told_of_line').visible")
+        driver.execute_script("window.kept = []; rgbmidic.keep = (blob, name) => window.kept.push([name, blob.size])")
+        page.driver.execute_script(*click("Save PNG"))
+        page.until("window.kept.length === 2")
+        kept = dict(page.run("window.kept"))
+        assert kept.keys() == {"wave.png", "profile.png"}
+        assert min(kept.values()) > 3000, "an empty picture has 300 x 150 px"
+
+
 def test_a_movie_of_what_is_in_view_is_written_beside_the_others(driver, wave, tmp_path, monkeypatch):
     """Without the extra it is a .gif, whose bytes are those of the library."""
     names = [f"movie_exx_u{number}{ending}" for number, ending in (("", ".gif"), ("_2", ".gif"), ("", ".mp4"))]
