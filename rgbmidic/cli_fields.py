@@ -118,8 +118,7 @@ def history(
     from rgbmidic.results.files import check_file
     from rgbmidic.results.histories import read_histories
 
-    files = () if out is None else (out, command.picture_beside(out))
-    for file in files:
+    for file in (out, command.picture_beside(out)) if out else ():
         check_file(file, overwrite=overwrite)
     result = Result.open(folder, partial=partial)
     settings = read_settings(test)
@@ -136,14 +135,14 @@ def history(
         scale=None if settings is None else settings.scale,
         channels=replace(channels_of(result) if settings is None else settings.channels, **channels),
     )
-    for table, picture in [files] if files else []:
-        write_histories(histories, table, overwrite=overwrite)
-        save_figure(history_figure(histories), picture)
+    if out is not None:
+        write_histories(histories, out, overwrite=overwrite)
+        save_figure(history_figure(histories), command.picture_beside(out))
     for remark in histories.remarks:
         note(f"note: {remark}")
     print_table(f"{len(histories.frames)} frames", *history_rows(histories))
-    if files:
-        print(f"table: {files[0]}   picture: {files[1]}")
+    if out is not None:
+        print(f"table: {out}   picture: {command.picture_beside(out)}")
 
 
 @app.command()

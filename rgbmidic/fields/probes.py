@@ -30,6 +30,8 @@ _LEAST = 0.5
 """Least part of an area that must be measured for its mean to be stated: the larger part represents the whole."""
 _WHOLE = 0.995
 """Part of a place from which nothing is said of the rest, which is rounding of its points. Chosen."""
+_ROUNDING = 1e-9
+"""Of a sum of weights."""
 _STEP = 1.0
 """Distance in px of the points that stand for a line or an area: an element of 10 px holds some 40."""
 
@@ -60,9 +62,7 @@ class Mean:
     inside: float = 1.0
 
     @classmethod
-    def over(
-        cls, covariance: NodalCovariance, name: str, points: npt.ArrayLike, least: float = 1.0, *, inside: bool = True
-    ) -> Mean:
+    def over(cls, covariance: NodalCovariance, name: str, points: npt.ArrayLike, least: float = 1.0) -> Mean:
         """Average over points (P, 2) that stand for a place, px.
 
         Parameters
@@ -75,8 +75,6 @@ class Mean:
             Points (x, y) on the reference, px.
         least
             Fraction of the weight that nodes with data must have in a frame.
-        inside
-            Whether all points must lie in the region; else half of them.
 
         Returns
         -------
@@ -85,13 +83,10 @@ class Mean:
         Raises
         ------
         InputError
-            A point is outside the region; where not all need be `inside`, half of them are.
+            A point is outside the region.
         """
         places = Places.of(covariance.mesh, points)
-        if inside:
-            places.check(name)
-        elif places.inside.mean() < _LEAST:
-            raise InputError(f"half or more of {name} is outside {places.where}")
+        places.check(name)
         weights = places.mean()
         nodes = np.flatnonzero(weights).astype(np.int64)
         return cls(
@@ -99,8 +94,7 @@ class Mean:
             nodes=nodes,
             weights=weights[nodes],
             correlation=covariance.part(nodes),
-            least=least - 1e-9,
-            inside=float(places.inside.mean()),
+            least=least - _ROUNDING,
         )
 
     def histories(self, nodal: Nodal) -> list[History]:
@@ -407,7 +401,7 @@ class Area(Mean):
 
     @classmethod
     def of(cls, covariance: NodalCovariance, name: str, points: FloatArray, measure: str = MEASURES[0]) -> Area:
-        """Average over the area that points (P, 2) stand for, px; errors as `Mean.over`.
+        """Average over the area that points (P, 2) stand for, px.
 
         Parameters
         ----------
@@ -423,20 +417,24 @@ class Area(Mean):
         Returns
         -------
         Area
+
+        Raises
+        ------
+        InputError
+            Half of the area or more is outside the region.
         """
-        mean, mesh = Mean.over(covariance, name, points, _LEAST, inside=False), covariance.mesh
-        places = Places.of(mesh, points)
+        mesh, places = covariance.mesh, Places.of(covariance.mesh, points)
+        if (inside := float(places.inside.mean())) < _LEAST:
+            raise InputError(f"half or more of {name} is outside {places.where}")
         elements, count = np.unique(places.element[places.inside], return_counts=True)
         nodes = np.unique(mesh.elements[elements]).astype(np.int64)
-        weights = np.zeros(len(mesh.nodes))
-        weights[mean.nodes] = mean.weights
         return cls(
             name=name,
             nodes=nodes,
-            weights=weights[nodes],
+            weights=places.mean()[nodes],
             correlation=covariance.part(nodes),
-            least=mean.least,
-            inside=mean.inside,
+            least=_LEAST - _ROUNDING,
+            inside=inside,
             elements=np.searchsorted(nodes, mesh.elements[elements]),
             parts=count / count.sum(),
             slopes=mesh.shape_gradients()[elements],
@@ -457,19 +455,18 @@ class Area(Mean):
         """
         moved, known = Mean.histories(self, nodal), _known(nodal)
         gradient, covariance = np.full((len(known), 2, 2), np.nan), np.full((len(known), 4, 4), np.nan)
-        whole: BoolArray = np.asarray(known[:, self.elements].all(axis=2))
-        for frame, there in enumerate(whole):
+        patterns, of_frame = np.unique(known[:, self.elements].all(axis=2), axis=0, return_inverse=True)
+        for place, there in enumerate(patterns):
             if (measured := self.parts[there].sum()) < self.least:
                 continue
-            weights = np.zeros((2, len(self.nodes)))
-            parts = (self.parts[there] / measured)[:, None, None] * self.slopes[there]
-            np.add.at(weights.T, self.elements[there], parts)
-            covariance[frame] = 0
+            weights, frames = np.zeros((len(self.nodes), 2)), np.flatnonzero(of_frame.ravel() == place)
+            np.add.at(weights, self.elements[there], (self.parts[there] / measured)[:, None, None] * self.slopes[there])
+            covariance[frames] = 0
             for row, (value, std) in enumerate(((nodal.u, nodal.u_std), (nodal.v, nodal.v_std))):
-                gradient[frame, row] = weights @ np.where(known[frame], value[frame], 0)
-                errors = weights * np.where(known[frame], std[frame], 0)
+                gradient[frames, row] = np.where(known, value, 0)[frames] @ weights
+                errors = np.where(known, std, 0)[frames, None] * weights.T
                 own = slice(2 * row, 2 * row + 2)
-                covariance[frame, own, own] = errors @ self.correlation @ errors.T
+                covariance[frames, own, own] = errors @ self.correlation @ errors.swapaxes(1, 2)
         strain = strain_of_gradient(gradient, covariance, self.measure)
         return [*moved, *_strain_histories(self.name, strain, moved[0].note)]
 

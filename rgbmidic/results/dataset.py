@@ -16,6 +16,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from rgbmidic._version import __version__
+from rgbmidic.results.maps import Maps
 from rgbmidic.results.physical import Physical, frame_times
 from rgbmidic.results.quantities import QUANTITIES, SHARED
 from rgbmidic.results.result import Result
@@ -37,12 +38,12 @@ class _Frames(BackendArray):
         It is read when the array is indexed.
     names
         Of one shape and type.
-    physical
-        Where they are read in the reader's units, not as the table has them.
+    maps
+        Where they are fields in the reader's units, not as the table has them.
     """
 
-    def __init__(self, result: Result, names: tuple[str, ...], physical: Physical | None = None) -> None:
-        self.result, self.names, self.physical = result, names, physical
+    def __init__(self, result: Result, names: tuple[str, ...], maps: Maps | None = None) -> None:
+        self.result, self.names, self.maps = result, names, maps
         blank = QUANTITIES[names[0]].unmeasured(result.table.sizes)
         self.dtype = blank.dtype
         self.shape = (len(result), *blank.shape, *([len(names)] if len(names) > 1 else []))
@@ -68,15 +69,16 @@ class _Frames(BackendArray):
         return read.reshape((*frames.shape, *read.shape[1:]))
 
     def _each(self, frames: list[int], blank: Any) -> Iterable[Mapping[str, Any]]:
-        if self.physical is None:
+        if self.maps is None:
             return self.result.table.each(self.names, frames)
-        nothing, there = dict.fromkeys(self.names, blank), self.result.finished
-        return (self.physical.frame(frame) if there[frame] else nothing for frame in frames)
+        read, nothing, there = self.maps.read, dict.fromkeys(self.names, blank), self.result.finished
+        return ({name: read(name, at).values for name in self.names} if there[at] else nothing for at in frames)
 
 
 def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset:
     """Make the Dataset that `Result.to_xarray` documents."""
-    physical, variables = Physical.untimed(result, scale), dict[str, xr.Variable]()
+    maps, variables = Maps.of(result, scale), dict[str, xr.Variable]()
+    physical = maps.physical
     plane = "" if physical.rectified.camera is None else "on the plane of the specimen"
     for name, entry in QUANTITIES.items():
         dimension = _PARTS[name][0] if name in _PARTS else ""
@@ -84,15 +86,15 @@ def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset
             continue
         axes = ("frame", *(axis if isinstance(axis, str) else dimension for axis in entry.axes))
         moved = name.removesuffix("_std") in ("u", "v")
-        about = physical.quantities[name].attributes if moved else entry.attributes
+        about = entry.attributes | ({"units": maps.field(name).unit} if moved else {})
         if moved and plane:
             about["description"] = plane
-        read = indexing.LazilyIndexedArray(_Frames(result, (name,), physical if moved else None))
+        read = indexing.LazilyIndexedArray(_Frames(result, (name,), maps if moved else None))
         variables[name] = xr.Variable(axes, read, about)
     for end, meaning in {"": "strain", "_std": "standard uncertainty of strain"}.items():
-        names, how = tuple(f"{name}{end}" for name in _COMPONENTS), physical.strain_words()
+        names, how = tuple(f"{name}{end}" for name in _COMPONENTS), maps.how("exx")
         about = {"units": "1", "long_name": meaning, "description": ": ".join(filter(None, [plane, how]))}
-        read = indexing.LazilyIndexedArray(_Frames(result, names, physical))
+        read = indexing.LazilyIndexedArray(_Frames(result, names, maps))
         variables[f"strain{end}"] = xr.Variable(("frame", "node", "component"), read, about)
     variables["elements"] = xr.Variable(("element", "corner"), result.elements, SHARED["elements"].attributes)
     return xr.Dataset(variables, _coordinates(physical), _provenance(physical))

@@ -20,29 +20,33 @@ class Derived:
     """A field that follows from others: their length where there are two, the derivative by time of an order."""
 
     symbol: str
-    group: str
     meaning: str
     parts: tuple[str, ...]
     order: int = 0
 
+    @property
+    def group(self) -> str:
+        """Heading under which it stands."""
+        return "Rates" if self.order else "Displacement"
+
 
 UV = ("u", "v")
 OF_LENGTHS = {
-    "u": Derived("u", "Displacement", "displacement in x", ("u",)),
-    "v": Derived("v", "Displacement", "displacement in y", ("v",)),
-    "magnitude": Derived("|u|", "Displacement", "length of the displacement", UV),
-    "u_velocity": Derived("du/dt", "Rates", "velocity in x", ("u",), 1),
-    "v_velocity": Derived("dv/dt", "Rates", "velocity in y", ("v",), 1),
-    "velocity": Derived("|du/dt|", "Rates", "magnitude of the velocity", UV, 1),
-    "u_acceleration": Derived("d²u/dt²", "Rates", "acceleration in x", ("u",), 2),
-    "v_acceleration": Derived("d²v/dt²", "Rates", "acceleration in y", ("v",), 2),
-    "acceleration": Derived("|d²u/dt²|", "Rates", "magnitude of the acceleration", UV, 2),
+    "u": Derived("u", "displacement in x", ("u",)),
+    "v": Derived("v", "displacement in y", ("v",)),
+    "magnitude": Derived("|u|", "length of the displacement", UV),
+    "u_velocity": Derived("du/dt", "velocity in x", ("u",), 1),
+    "v_velocity": Derived("dv/dt", "velocity in y", ("v",), 1),
+    "velocity": Derived("|du/dt|", "magnitude of the velocity", UV, 1),
+    "u_acceleration": Derived("d²u/dt²", "acceleration in x", ("u",), 2),
+    "v_acceleration": Derived("d²v/dt²", "acceleration in y", ("v",), 2),
+    "acceleration": Derived("|d²u/dt²|", "magnitude of the acceleration", UV, 2),
 }
 OF_STRAINS = {
-    "exx_rate": Derived("dεxx/dt", "Rates", "rate of the strain in x", ("exx",), 1),
-    "eyy_rate": Derived("dεyy/dt", "Rates", "rate of the strain in y", ("eyy",), 1),
-    "exy_rate": Derived("dεxy/dt", "Rates", "rate of the tensor shear", ("exy",), 1),
-    "equivalent_rate": Derived("dεeq/dt", "Rates", "rate of the von Mises equivalent strain", ("equivalent",), 1),
+    "exx_rate": Derived("dεxx/dt", "rate of the strain in x", ("exx",), 1),
+    "eyy_rate": Derived("dεyy/dt", "rate of the strain in y", ("eyy",), 1),
+    "exy_rate": Derived("dεxy/dt", "rate of the tensor shear", ("exy",), 1),
+    "equivalent_rate": Derived("dεeq/dt", "rate of the von Mises equivalent strain", ("equivalent",), 1),
 }
 DERIVED = OF_LENGTHS | OF_STRAINS
 STRAINS = {entry.name: entry for entry in STRAIN if not entry.name.endswith("_std")}
@@ -62,7 +66,6 @@ _GROUPS = ("Displacement", "Strain", "Rates", "Quality", "Uncertainty")
 _POSITIVE = (FINER, "magnitude", "velocity", "acceleration", "equivalent", "shear", "misfit")
 _KINDS: dict[str, Kind] = {"direction": "angle", "node_status": "codes", **dict.fromkeys(_POSITIVE, "positive")}
 """Kinds of fields; other lengths and their rates are displacements, uncertainties positive, all others strains."""
-_OTHERS: dict[bool, Kind] = {True: "displacement", False: "strain"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,10 +140,9 @@ class MapField:
             return "not measured"
         if self.codes:
             return self.codes[int(value)]
-        uncertainty = value if self.group == "Uncertainty" else std
-        return (
-            uncertain(value, std, self.unit) if uncertainty is std else f"{rounded(value, value)} {self.unit}".rstrip()
-        )
+        if self.group == "Uncertainty":
+            return f"{rounded(value, value)} {self.unit}".rstrip()
+        return uncertain(value, std, self.unit)
 
 
 def map_fields(
@@ -196,6 +198,7 @@ def map_fields(
 
 
 def _field(name: str, symbol: str, unit: str, meaning: str, group: str, codes: tuple[str, ...] = ()) -> MapField:
-    kind = _KINDS.get(name, "positive" if group == "Uncertainty" else _OTHERS[name in OF_LENGTHS])
+    usual: Kind = "displacement" if name in OF_LENGTHS else "strain"
+    kind = _KINDS.get(name, "positive" if group == "Uncertainty" else usual)
     kind = "fraction" if name.startswith("fraction") else kind
     return MapField(name=name, symbol=symbol, unit=unit, meaning=meaning, group=group, kind=kind, codes=codes)

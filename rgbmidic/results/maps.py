@@ -7,9 +7,9 @@ accelerations and strain rates are those of `rgbmidic.fields.rates` at every nod
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -189,6 +189,10 @@ class Maps:
             strain_of_gradient(np.zeros((1, 2, 2)), np.zeros((1, 4, 4)), measure)
             _ = gauge is not None and physical.gauges
         return replace(self, physical=physical, since=since, rigid_removed=rigid_removed, window=window)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what was read, which each process reads for itself."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
     @cached_property
     def all(self) -> dict[str, MapField]:

@@ -388,7 +388,8 @@ class Physical:
         """Return the `quantities` of one frame, each in its type; errors as `Result.frame`."""
         record = self.result.frame(index)
         values = {name: record.values[name] for name in self.quantities if name in record.values}
-        u, v, u_std, v_std = self.rectified.displacement(record.u, record.v, record.u_std, record.v_std)
+        moved = (np.asarray(record.values[name], dtype=np.float64) for name in ("u", "v", "u_std", "v_std"))
+        u, v, u_std, v_std = self.rectified.displacement(*moved)
         for component, pair in {"u": (u, u_std), "v": (v, v_std)}.items():
             values |= zip((component, f"{component}_std"), self.units.lengths(*pair), strict=True)
         values |= self.strain(u, v, u_std, v_std)

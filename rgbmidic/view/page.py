@@ -69,16 +69,14 @@ class ResultPage:
     """
 
     def __init__(self, document: Document, result: Result, view: ViewState, progress: Progress) -> None:
-        self.document, self.result, self.view = document, result, view
-        self.progress, self.shown = progress, ShownFields(result, view)
+        view = view.with_channels(channels_of(result))
+        self.document, self.progress, self.shown = document, progress, ShownFields(result, view)
         self._told = False
         self._pointer: tuple[float, float] | None = None
         self._grown = 0
         self._scale_read: ScaleSettings | None = None
         self.state, self.dark = SharedState(name="state", asked=view.frame, shown=view.frame), view.theme == "dark"
         self._base = Path(result.provenance.get("base", result.path.parent))
-        self.view = view = view.with_channels(channels_of(result))
-        self.shown.view = view
         self.steps = Steps(view.marks)
         self.parts = p = ResultControls(len(result) - 1, view.frame, dark=self.dark)
         self.maps = MapPanel(document, self.shown, self._redraw, self._hover, dark=self.dark)
@@ -96,6 +94,16 @@ class ResultPage:
             self.state, self.maps.canvas.tools, self.timeline.now, (self.curves.plot, self.line.wave, self.line.profile)
         )
         self._listen()
+
+    @property
+    def view(self) -> ViewState:
+        """What is looked at."""
+        return self.shown.view
+
+    @property
+    def result(self) -> Result:
+        """The result with the frames that there are."""
+        return self.shown.result
 
     @property
     def roots(self) -> dict[str, Any]:
@@ -148,7 +156,7 @@ class ResultPage:
             low, high = of["low"].value, of["high"].value
             self.show(**({"low": low, "high": high} if None not in (low, high) and low < high else {}))
         elif entry == "range" and new == "hand":
-            self.view = replace(self.view, range="hand")
+            self.shown.view = replace(self.view, range="hand")
             of["low"].value, of["high"].value = (
                 float(end) for end in (self.maps.canvas.colours.low, self.maps.canvas.colours.high)
             )
@@ -195,7 +203,7 @@ class ResultPage:
 
     def show(self, **changes: Any) -> None:
         """Draw the page with other values of some entries of the view."""
-        self.view = self.shown.view = replace(self.view, **changes)
+        self.shown.view = replace(self.view, **changes)
         self.document.hold("combine")
         try:
             guarded(self._draw, self._blank)
@@ -353,7 +361,6 @@ class ResultPage:
         if np.array_equal(new.table.written, self.result.table.written):
             return
         before, after = np.flatnonzero(self.result.finished), np.flatnonzero(new.finished)
-        self.result = new
         self.shown.grow(new)
         self._read_curves()
         follows = not len(before) or self.view.frame == before[-1]

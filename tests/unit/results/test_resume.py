@@ -57,6 +57,8 @@ def test_killed_at_any_moment_it_goes_on_to_the_same_bits(tmp_path: Path) -> Non
             finished.append(Result.open(out, partial=True).finished)
             assert finished[-1][finished[-2]].all()
     assert len({int(there.sum()) for there in finished} - {0, FRAMES}) >= KILLS // 2
+    left = [part.name.split(".")[-2] for part in out.rglob("*.npz.*.part")]
+    assert len(set(left)) == len(left), "a process writes one frame at a time"
     _write(out)  # which removes what the killed ones left, also those that were killed before they removed it
     finish_result(out)
     assert not list(out.rglob("*.part"))
