@@ -158,6 +158,11 @@ class ProbeSettings(Checked):
         for key in ("circles", "strain_gauges"):
             sizes = [size for *_, size in getattr(self, key)]
             require(all(size > 0 for size in sizes), f"probes.{key} are [x, y, size] with a size above 0, not {sizes}")
+        for x0, y0, x1, y1 in self.regions:
+            require(
+                x0 != x1 and y0 != y1,
+                f"probes.regions are [x0, y0, x1, y1] of a rectangle with an area, not {[x0, y0, x1, y1]}",
+            )
         for *_, inner, outer in self.tips:
             require(
                 0 < inner < outer,

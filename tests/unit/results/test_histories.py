@@ -340,6 +340,7 @@ def command(*arguments: object) -> int:
             ["--circle", "500,40:9"],
             "half or more of circle_1 is outside the region that was measured, which lies within x 10 to 110",
         ),
+        (["--region", "40,20:40,60"], "probes.regions are [x0, y0, x1, y1] of a rectangle with an area"),
         (["--window", "3"], "probes.window must be 0 or at least 4 frames, not 3"),
         (["--window", "2"], "probes.window must be 0 or at least 4 frames, not 2"),
         (["--measure", "euler"], "probes.measure must be one of"),
