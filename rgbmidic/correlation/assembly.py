@@ -21,6 +21,7 @@ import scipy.sparse as sp
 from scipy.linalg import eigh
 
 from rgbmidic._kernels.correlation import element_block_products, element_hessian
+from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.elimination import Elimination
 from rgbmidic.mesh import PixelMap, Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
@@ -119,16 +120,6 @@ class Assembly:
 
 _RIGID_FUNCTIONS = {"none": 0, "translation": 2, "translation+rotation": 3}
 """Number of rigid functions of a light."""
-_SHOWN = 0.5
-"""Fraction of its Schur complement that the images have of a rigid motion that is measured. The rest is the hold's,
-which holds no data. Lights that see within one element of one another leave .998 or more to the images, lights
-an element further apart .02 or less (measured)."""
-_ROUNDING = 1e-9
-"""Fraction of ``R^T M_j R`` under which a Schur complement is rounding (1e-13), or the hold of a constant where there
-is nothing else between two bodies (1e-9)."""
-_NAMED = 0.1
-"""Least part of a light in a motion that the images do not show, by which the light is named: the parts of the lights
-add up to 1 (derived), so that one of up to ten is named at least."""
 
 
 def rigid_functions(nodes: FloatArray, rigid: str) -> FloatArray:
@@ -174,6 +165,7 @@ class RigidMotions:
         hold: sp.csc_matrix,
         solve: Callable[[FloatArray], FloatArray],
         textured: BoolArray,
+        constants: SolverConstants,
     ) -> RigidMotions:
         """Find the equations of the rigid unknowns that are left when the displacement is eliminated.
 
@@ -191,6 +183,8 @@ class RigidMotions:
             Solves with ``M + H`` for (2 N, K).
         textured : ndarray, shape (E,), bool
             Elements with texture enough: what noise alone shows elsewhere counts for nothing.
+        constants
+            Of the solve.
         """
         lights, count = len(per_light), functions.shape[1]
         each = np.zeros((lights, lights - 1, len(functions), count))
@@ -210,9 +204,11 @@ class RigidMotions:
         unit = np.sqrt(np.where(alone > 0, alone, 1.0))
         scale = unit[:, None] * unit
         whole = (everywhere + follows.T @ held) / scale
-        shown, directions = eigh(energy(textured) / scale, whole + _ROUNDING * np.eye(len(unit)))
-        known = directions[:, shown > _SHOWN] / unit[:, None]
-        unknown = directions[:, shown <= _SHOWN] * (alone > 0)[:, None]
+        # a complement under it is rounding (1e-13), or the hold of a constant between two bodies (1e-9)
+        rounding = 1e-9
+        shown, directions = eigh(energy(textured) / scale, whole + rounding * np.eye(len(unit)))
+        known = directions[:, shown > constants.shown] / unit[:, None]
+        unknown = directions[:, shown <= constants.shown] * (alone > 0)[:, None]
         unknown = unknown / np.maximum(np.linalg.norm(unknown, axis=0), 1e-300)
         part = (unknown**2).sum(axis=1).reshape(lights - 1, count).sum(axis=1)
         return cls(
@@ -220,7 +216,7 @@ class RigidMotions:
             moves=moves,
             pull=border + held,
             inverse=known @ np.linalg.inv(known.T @ everywhere @ known) @ known.T,
-            hidden=np.append(False, part > _NAMED),
+            hidden=np.append(False, part > constants.named),
         )
 
     def increment(self, free: FloatArray, held_side: FloatArray, rigid_side: FloatArray) -> FloatArray:
@@ -241,36 +237,18 @@ class RigidMotions:
         return np.asarray(self.inverse @ (rigid_side - self.pull.T @ free + self.follows.T @ held_side))
 
 
-BLOCK = 13
-"""Least side (px) of the blocks whose sums give the covariance of the scores: wider than a speckle and any filter."""
-OF_ELEMENT = 0.75
-"""Side of a block in sides of an element: what elements cannot follow is alike over about that. With 13 px the error of
-40 px elements on waves of 3 to 5 elements was 1.5 to 2.3 times the stated one, so 0.8 to 1.2 times (DIC Challenge)."""
-_ACROSS = 4
-"""Blocks across a region from which they grow with the element: two of 19 px stated 1.8 times too much."""
-_MANY = 700
-"""Blocks, every other one in both directions, whose projections the random signs keep apart to half
-a per cent of the fraction; where a region has fewer, those further apart are projected together, every fourth at
-most."""
-_ANCHOR = 1e-6
-"""Multiple of the identity, over the texture of an unknown, that holds nodes without: it takes 1e-6 of the projection
-of the others (derived)."""
-SCORE_RANGE = 30.0
-"""Standard deviation (px) of the window over which block sums are averaged: 67 blocks of 13 px give a variance to 12 %
-(derived). With half or twice of it lights differ by 2e-3 px at most, beside a gap by 1e-2, their uncertainty by 10 %
-(benchmarks/constants.py)."""
-_LEAST = 0.05
-"""Fraction below which the residual holds no information on the noise: a region of one block (elements of 4 px leave
-0.1)."""
-
-
-def block_side(pixels: PixelMap, element: float) -> int:
-    """Side (px) of the blocks for elements of side `element` (px); a small region has `_ACROSS` of them across."""
-    return max(BLOCK, min(round(OF_ELEMENT * element), min(pixels.bounds[2:]) // _ACROSS))
+def block_side(pixels: PixelMap, element: float, constants: SolverConstants) -> int:
+    """Side (px) of the blocks for elements of side `element` (px); a small region has a few of them across."""
+    return max(constants.block, min(round(constants.of_element * element), min(pixels.bounds[2:]) // constants.across))
 
 
 def unfitted_fraction(
-    mesh: Tri3Mesh, pixels: PixelMap, assembly: Assembly, gradient: FloatImage, weights: FloatImage, side: int
+    mesh: Tri3Mesh,
+    pixels: PixelMap,
+    assembly: Assembly,
+    gradient: FloatImage,
+    weights: FloatImage,
+    constants: SolverConstants,
 ) -> float | FloatArray:
     """Return the fraction of the variance of a block's score that a fit of the displacement to white noise leaves.
 
@@ -289,11 +267,12 @@ def unfitted_fraction(
         The mesh, its pixels and equations.
     gradient, weights : ndarray, shape (2, k, P), (k, P), float32
         Of the reference images.
-    side
-        Of the blocks, px.
+    constants
+        Of the solve.
     """
+    side = block_side(pixels, mesh.size, constants)
     rows, columns = pixels.grid(side)
-    apart = int(np.clip(np.ceil(2 * np.sqrt(_MANY / (rows * columns))), 2, 4))
+    apart = int(np.clip(np.ceil(2 * np.sqrt(constants.projected / (rows * columns))), 2, 4))
     sign = np.random.default_rng(0).choice(np.array([-1, 1], dtype=np.float32), (rows, columns))
     top, left, _, _ = pixels.bounds
     place = pixels.runs, pixels.run_offsets, pixels.origin - (left, top), pixels.barycentric
@@ -309,11 +288,11 @@ def unfitted_fraction(
     projected = []
     for xx_to_yy in map(assembly.at_nodes, products):
         projected += [xx_to_yy[:, :2].ravel(), xx_to_yy[:, 1:].ravel()]
-    sides, anchor = np.stack(projected, axis=1), _ANCHOR * total / assembly.size
+    sides, anchor = np.stack(projected, axis=1), constants.anchor * total / assembly.size
     solve = assembly.factorise(assembly.matrix(hessian, anchor * assembly.diagonal))
     if not mesh.is_graded:
         fraction = 1 - float((sides * solve(sides)).sum()) / total
-        return fraction if fraction > _LEAST else float("nan")
+        return fraction if fraction > constants.least_unfitted else float("nan")
     fitted = (sides * solve(sides)).reshape(len(mesh.nodes), -1).sum(axis=1)
     parts = np.ascontiguousarray(hessian[..., (0, 2)].sum(axis=(2, 3)).ravel())
     whole = np.bincount(mesh.elements.ravel(), weights=parts, minlength=len(mesh.nodes))
@@ -322,9 +301,11 @@ def unfitted_fraction(
     here = [np.zeros((rows, columns)), np.zeros((rows, columns))]
     for grid, values in zip(here, (fitted, whole), strict=True):
         np.add.at(grid, (row, column), values)
-    around = [cv2.GaussianBlur(grid, (0, 0), SCORE_RANGE / side, borderType=cv2.BORDER_CONSTANT) for grid in here]
+    around = [
+        cv2.GaussianBlur(grid, (0, 0), constants.score_range / side, borderType=cv2.BORDER_CONSTANT) for grid in here
+    ]
     centre = mesh.nodes[mesh.elements].mean(axis=1)[:, ::-1] - (top, left)
     row, column = (np.clip(centre, 0, limits) // side).astype(int).T
     known = np.maximum(around[1][row, column], np.finfo(float).tiny)
     local = 1 - around[0][row, column] / known
-    return np.where(local > _LEAST, local, np.nan)
+    return np.where(local > constants.least_unfitted, local, np.nan)

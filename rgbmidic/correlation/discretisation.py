@@ -23,7 +23,7 @@ from scipy.sparse.linalg import splu
 from rgbmidic._kernels.patches import interpolate_nodal
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic._kernels.weights import scores
-from rgbmidic.correlation.assembly import SCORE_RANGE, block_side, rigid_functions
+from rgbmidic.correlation.assembly import block_side, rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.recovery import Recovery, mass_matrix
@@ -58,8 +58,8 @@ _UNEVEN = np.array([1.15, 1.15, 1.4, 1.4, 1.4])
 unevenly (measured on affine fields)."""
 _CHANCE = 0.8
 """Noise by what the finer mesh leaves, over the stated one, from which it is less by chance: both are known to 6 to
-12 % (67 blocks, `SCORE_RANGE`), and nothing is taken off. Of values below it the mean is too small by about half of
-what is missing (measured: .9)."""
+12 % (67 blocks, `SolverConstants.score_range`), and nothing is taken off. Of values below it the mean is too small by
+about half of what is missing (measured: .9)."""
 _HELD = 1e-6
 """Fraction of the mean texture that is added to that of an element, so that its square root exists (derived)."""
 
@@ -168,13 +168,13 @@ def _weighed(method: PrecisionMethod | None, residual: Residual, given: FloatIma
 
 def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:
     """Variance of the scores in x and y (N, 2) over the square of their information, per pixel, around each node."""
-    pixels, mesh = residual.reference.pixels, residual.reference.mesh
-    side = block_side(pixels, mesh.size)
+    pixels, mesh, constants = residual.reference.pixels, residual.reference.mesh, residual.reference.constants
+    side = block_side(pixels, mesh.size, constants)
     sums = np.empty((4, weights.shape[1]), dtype=np.float32)
     scores(residual.difference, weights, *residual.reference.gradient, sums)
     x, y, information, count = pixels.block_sums(sums, side).astype(np.float64)
     xx, yy, information, count = (
-        cv2.GaussianBlur(grid, (0, 0), SCORE_RANGE / side, borderType=cv2.BORDER_CONSTANT)
+        cv2.GaussianBlur(grid, (0, 0), constants.score_range / side, borderType=cv2.BORDER_CONSTANT)
         for grid in (x * x, y * y, information, count)
     )
     scale = np.divide(count, information**2, out=np.zeros_like(count), where=information > 0)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic.correlation.assembly import RigidMotions
+from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.mesh import Tri3Mesh
@@ -19,31 +20,6 @@ from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
-
-_SMOOTHNESS = 1e-4
-"""Weight of the smoothness that carries nodes without data along, relative to the texture's median Hessian. Chosen;
-with a tenth or ten times of it three lights under a moving reflection differ by 4e-5 and 4e-4 px at most, beside a gap
-by 7e-4 and 6e-3 (benchmarks/constants.py)."""
-_CONSTANT = 1e-9
-"""Multiple of the identity, relative to the same, that fixes the constant which the smoothness leaves free where
-nothing is seen: 1e5 times less than the smoothness, 1e7 times more than rounding (derived)."""
-_ROUNDING = 1e-4
-"""Fraction of a node's texture below which that in its worse direction may be rounding: sums of some 1000 products in
-single precision are uncertain by 1000 * 6e-8 at most (derived)."""
-SEEN = 0.05
-"""A node counts as measured if it has this fraction of the median texture around a node of its area..."""
-_INFORMED = 0.01
-"""...and this fraction of the median information, its texture over the variance of the residual: its noise is then 10
-times the median node's (derived)."""
-_SILENT = 1e-3
-"""Fraction of the largest texture below which a node has no part in that median: it is seen by no light, or blank."""
-_LONGEST_STEP = 4.0
-"""Longest motion of a node in one iteration, px: a speckle (3 to 5 px), beyond which the gradient is another's."""
-_PASS_ITERATIONS = 12
-"""Most iterations of a pass: from within half a speckle 4 to 5 do (measured on the truth tests)."""
-_PATIENCE = 3
-"""Iterations of a pass after which a tenth of the nodes may still move: they wander where nothing matches, or faster
-with the weights of the next pass. Chosen; 1 to 3 give the same, with 5 a fragment that has turned takes one more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,17 +92,18 @@ class Equations:
         LinAlgError
             The matrix is singular in double precision.
         """
-        assembly = reference.assembly
+        assembly, constants = reference.assembly, reference.constants
         per_light = reference.hessians(weights)
         blocks = np.sum(per_light, axis=0)
         rotation = _rotation(reference.mesh, displacement, blocks)
         functions = _turned_back(rotation, functions)
         own = assembly.node_blocks(blocks)
-        textured, scale = _observability(own, assembly.nodal_area, SEEN if given is None else _INFORMED)
+        least = constants.seen if given is None else constants.informed
+        textured, scale = _observability(own, assembly.nodal_area, least, constants)
         if given is not None:
             texture = assembly.node_blocks(np.sum(reference.hessians(given), axis=0))
-            textured &= _observability(texture, assembly.nodal_area, SEEN)[0]
-        held = scale * (_SMOOTHNESS * assembly.smoothness.data + _CONSTANT * assembly.diagonal)
+            textured &= _observability(texture, assembly.nodal_area, constants.seen, constants)[0]
+        held = scale * (constants.smoothness * assembly.smoothness.data + constants.constant * assembly.diagonal)
         solve = assembly.factorise(assembly.matrix(blocks, held))
         light = np.stack([xx + yy for xx, _, yy in map(assembly.node_blocks, per_light)], axis=1)
         total = light.sum(axis=1, keepdims=True)
@@ -134,14 +111,14 @@ class Equations:
         if functions.shape[1] and len(per_light) > 1:
             shown = np.asarray(textured[reference.mesh.elements].all(axis=1))
             hold = with_data(assembly.smoothness, held)
-            rigid = RigidMotions.eliminate(assembly, per_light, functions, hold, solve, shown)
+            rigid = RigidMotions.eliminate(assembly, per_light, functions, hold, solve, shown, constants)
         return cls(
             weights=weights,
             rotation=rotation,
             functions=functions,
             blocks=blocks,
             node_blocks=own,
-            smoothness=_SMOOTHNESS * scale,
+            smoothness=constants.smoothness * scale,
             solve=solve,
             rigid=rigid,
             textured=textured,
@@ -201,7 +178,9 @@ def _turned_back(rotation: FloatArray, columns: FloatArray) -> FloatArray:
     return np.asarray(turned.reshape(columns.shape))
 
 
-def _observability(own: FloatArray, area: FloatArray, least: float) -> tuple[BoolArray, float]:
+def _observability(
+    own: FloatArray, area: FloatArray, least: float, constants: SolverConstants
+) -> tuple[BoolArray, float]:
     """Find the nodes that see at least a fraction of the median texture, and the typical diagonal entry of the Hessian.
 
     The texture a node sees in its worse direction is the smaller eigenvalue of its own 2 x 2 block.
@@ -209,9 +188,9 @@ def _observability(own: FloatArray, area: FloatArray, least: float) -> tuple[Boo
     xx, xy, yy = own
     half = (xx + yy) / 2
     smallest = half - np.hypot((xx - yy) / 2, xy)
-    smallest[smallest < _ROUNDING * half] = 0  # texture in one direction only
+    smallest[smallest < constants.rounding * half] = 0  # texture in one direction only
     density = smallest / area
-    typical = np.median(density[density > _SILENT * density.max()]) if density.max() > 0 else 0.0
+    typical = np.median(density[density > constants.silent * density.max()]) if density.max() > 0 else 0.0
     seen = density > least * typical if typical > 0 else np.zeros(len(density), dtype=bool)
     return seen, float(np.median(half[seen]) if seen.any() else half.max(initial=0.0)) or 1.0
 
@@ -225,6 +204,11 @@ class Problem:
     options: SolverSettings
     method: PrecisionMethod | None
     functions: FloatArray
+
+    @property
+    def constants(self) -> SolverConstants:
+        """Those that the reference was prepared with."""
+        return self.reference.constants
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -302,13 +286,15 @@ def iterate(
         The iteration diverged.
     """
     known: FloatImage | None = residual.difference_from(values)
-    for turn in range(min(_PASS_ITERATIONS, problem.options.max_iterations - len(estimate.increments))):
+    constants, left = problem.constants, problem.options.max_iterations - len(estimate.increments)
+    for turn in range(min(constants.pass_iterations, left)):
         estimate = stepped(problem, equations, values, estimate, known)
         known = None
         if not np.isfinite(estimate.displacement).all():
             raise UnsolvableError("the iteration diverged", estimate)
         # a few nodes that wander where nothing matches must not keep the others waiting
-        most = turn >= _PATIENCE and np.quantile(estimate.increments[-1][equations.textured], 0.9) <= tolerance
+        moved = estimate.increments[-1][equations.textured]
+        most = turn >= constants.patience and np.quantile(moved, 0.9) <= tolerance
         if estimate.longest <= tolerance or most:
             break
     return estimate
@@ -330,7 +316,7 @@ def stepped(
         shifts = shifts.reshape(rigid[1:].shape)
         rigid[1:] += shifts
         longest = max(longest, float(np.abs(problem.functions @ shifts.T).max()))
-    bounded = motion * np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-30))[:, None]
+    bounded = motion * np.minimum(1.0, problem.constants.longest_step / np.maximum(length, 1e-30))[:, None]
     return Estimate(
         displacement=estimate.displacement + bounded,
         rigid=rigid,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -105,51 +106,59 @@ def spline_values(coefficients: FloatImage) -> FloatImage:
     return np.stack([cv2.sepFilter2D(one, -1, mean, mean)[PAD:-PAD, PAD:-PAD] for one in coefficients])
 
 
-_RANGE = 8.0
-"""Standard deviation (px) of the window: its 800 px, 4 pi times the square, give a variance to 5 % (derived), and it is
-narrow beside a reflection. Chosen; with half or twice of it lights under one differ by 4e-3 px at most, beside a gap by
-.1 px, their uncertainty by 7 % (benchmarks/constants.py)."""
-_COARSE = 4
-"""Reduction of the grid on which that window is applied: half its standard deviation, to which it adds 1 %."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlidingWindow:
+    """Gaussian window for means of fields around the owned pixels, applied on a grid of blocks.
 
-
-def window_means(pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
-    """Weighted means (n, h, w) of fields (n, P) around each block of the grid, for weights (n, P)."""
-    return _means(pixels.block_sums(fields * weights, _COARSE), pixels.block_sums(weights, _COARSE))
-
-
-def window_ratios(pixels: PixelMap, fields: FloatImage) -> FloatImage:
-    """Sums of fields (n, P) around each block of the grid over that of the last one, (n - 1, h, w)."""
-    sums = pixels.block_sums(fields, _COARSE)
-    return _means(sums[:-1], sums[-1:])
-
-
-def window_covariance(pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
-    """Average the products of each two fields (k, P) around each block of the grid, (k, k, h, w).
-
-    Their weight is the geometric mean of the fields' weights (k, P).
+    Attributes
+    ----------
+    sigma
+        Its standard deviation, px: its 800 px, 4 pi times the square, give a variance to 5 % (derived), and it is
+        narrow beside a reflection. Chosen; with half or twice of it lights under one differ by 4e-3 px at most, beside
+        a gap by .1 px, their uncertainty by 7 % (benchmarks/constants.py).
+    step
+        Side of the blocks, px: half the standard deviation, to which it adds 1 %.
     """
-    count = len(fields)
-    sums = np.empty((count, count, 2, *pixels.grid(_COARSE)), dtype=np.float32)
-    product_sums(fields, weights, pixels.lines, pixels.line_offsets, _COARSE, sums)
-    means = np.empty((count, count, *sums.shape[3:]), dtype=np.float32)
-    for a in range(count):
-        means[a, : a + 1] = means[: a + 1, a] = _means(sums[a, : a + 1, 0], sums[a, : a + 1, 1])
-    return means
+
+    sigma: float = 8.0
+    step: int = 4
+
+    def means(self, pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
+        """Weighted means (n, h, w) of fields (n, P) around each block of the grid, for weights (n, P)."""
+        return self._means(pixels.block_sums(fields * weights, self.step), pixels.block_sums(weights, self.step))
+
+    def ratios(self, pixels: PixelMap, fields: FloatImage) -> FloatImage:
+        """Sums of fields (n, P) around each block of the grid over that of the last one, (n - 1, h, w)."""
+        sums = pixels.block_sums(fields, self.step)
+        return self._means(sums[:-1], sums[-1:])
+
+    def covariance(self, pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
+        """Average the products of each two fields (k, P) around each block of the grid, (k, k, h, w).
+
+        Their weight is the geometric mean of the fields' weights (k, P).
+        """
+        count = len(fields)
+        sums = np.empty((count, count, 2, *pixels.grid(self.step)), dtype=np.float32)
+        product_sums(fields, weights, pixels.lines, pixels.line_offsets, self.step, sums)
+        means = np.empty((count, count, *sums.shape[3:]), dtype=np.float32)
+        for a in range(count):
+            means[a, : a + 1] = means[: a + 1, a] = self._means(sums[a, : a + 1, 0], sums[a, : a + 1, 1])
+        return means
+
+    def spread(self, pixels: PixelMap, grids: FloatImage) -> FloatImage:
+        """Interpolate such means (n, h, w) at the pixels (n, P)."""
+        return pixels.from_blocks(grids, self.step)
+
+    def _means(self, totals: FloatImage, weights: FloatImage) -> FloatImage:
+        """Divide sums (n, h, w) by those of their weights (n, h, w) or (1, h, w), both blurred."""
+        sigma = self.sigma / self.step
+        means, around = (
+            np.stack([cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT) for grid in grids])
+            for grids in (totals, weights)
+        )
+        means /= np.maximum(around, np.float32(1e-6), out=around)
+        return np.asarray(means, dtype=np.float32)
 
 
-def _means(totals: FloatImage, weights: FloatImage) -> FloatImage:
-    """Divide sums (n, h, w) by those of their weights (n, h, w) or (1, h, w), both blurred."""
-    means, around = (np.stack([_blur(grid) for grid in grids]) for grids in (totals, weights))
-    means /= np.maximum(around, np.float32(1e-6), out=around)
-    return means
-
-
-def spread(pixels: PixelMap, grids: FloatImage) -> FloatImage:
-    """Interpolate such means (n, h, w) at the pixels (n, P)."""
-    return pixels.from_blocks(grids, _COARSE)
-
-
-def _blur(grid: FloatImage) -> FloatImage:
-    sigma = _RANGE / _COARSE
-    return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT), dtype=np.float32)
+WINDOW = SlidingWindow()
+"""The window as it is used where nobody states another."""

@@ -16,14 +16,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from rgbmidic._kernels.weights import scores
-from rgbmidic.correlation.assembly import BLOCK
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.illumination.displacement import agreement
 from rgbmidic.typing import FloatArray, FloatImage
-
-RANGE = 24.0
-"""Standard deviation (px) of the window: a light's bias changes over some 50 px, and the mean of the lights that agree
-is known the better the wider it is. Half of it and 16 px give errors up to 5 % larger on raised droplets."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,33 +30,37 @@ class LightBias:
     values : ndarray, shape (N, 2)
         What is to be added to the displacement, px.
     std : ndarray, shape (N, 2)
-        Standard uncertainty that is left, px; alike over some `RANGE` px.
+        Standard uncertainty that is left, px.
+    reach : float
+        Distance over which it is alike, px.
     """
 
     values: FloatArray
     std: FloatArray
+    reach: float
 
     @classmethod
     def of(cls, residual: Residual, weights: FloatImage) -> LightBias:
         """From the residual at a solution with these pixel weights (k, P); none with one light."""
         reference = residual.reference
         mesh, pixels, count = reference.mesh, reference.pixels, len(weights)
+        block, reach = reference.constants.block, reference.constants.bias_range
         if count == 1:
-            return cls(values=np.zeros_like(mesh.nodes), std=np.zeros_like(mesh.nodes))
+            return cls(values=np.zeros_like(mesh.nodes), std=np.zeros_like(mesh.nodes), reach=reach)
         sums = np.empty((4, weights.shape[1]), dtype=np.float32)
         moments = []
         lights = zip(residual.difference, weights, *reference.gradient, strict=True)
         for light in lights:
             scores(*(field[None] for field in light), sums)
-            moments.append(pixels.block_sums(sums[:3], BLOCK).astype(np.float64))
+            moments.append(pixels.block_sums(sums[:3], block).astype(np.float64))
         blocks = np.stack(moments)  # (k, 3, h, w)
-        sigma = (0, 0, RANGE / BLOCK, RANGE / BLOCK)
+        sigma = (0, 0, reach / block, reach / block)
         around = gaussian_filter(blocks, sigma, mode="constant", truncate=3)
         half = np.maximum(around[:, 2] / 2, 1e-30)
         displacement = around[:, :2] / half[:, None]
         # scatter of the blocks' scores about the window's displacement, a window holding so many blocks
         scatter = ((blocks[:, :2] - displacement * blocks[:, 2:] / 2) ** 2).mean(axis=1)
-        held = 4 * np.pi * (RANGE / BLOCK) ** 2
+        held = 4 * np.pi * (reach / block) ** 2
         variance = gaussian_filter(scatter, sigma[1:], mode="constant", truncate=3) / half**2 / held
         precision = half / np.maximum(half.sum(axis=0), 1e-30)
         believed, agree = agreement(displacement, variance, precision)
@@ -71,12 +70,12 @@ class LightBias:
         left = count / (count - 1) * (part[:, None] ** 2 * apart).sum(axis=0)
         off = mean - (precision[:, None] * displacement).sum(axis=0)
         top, left_edge = pixels.bounds[:2]
-        place = (mesh.nodes[:, ::-1] - (top, left_edge)).T / BLOCK - 0.5
+        place = (mesh.nodes[:, ::-1] - (top, left_edge)).T / block - 0.5
         at_nodes = [map_coordinates(one, place, order=1, mode="nearest") for one in (*off, *left)]
         values, rest = np.stack(at_nodes, axis=1).reshape(-1, 2, 2).swapaxes(0, 1)
-        return cls(values=values, std=np.sqrt(rest))
+        return cls(values=values, std=np.sqrt(rest), reach=reach)
 
     def of_recovered(self) -> FloatArray:
-        """Standard uncertainty (N, 5) of u, v, exx, eyy and exy: a bias alike over `RANGE` changes so much over it."""
+        """Standard uncertainty (N, 5) of u, v, exx, eyy and exy: a bias alike over `reach` changes so much over it."""
         x, y = self.std.T
-        return np.stack([x, y, x / RANGE, y / RANGE, np.hypot(x, y) / (2 * RANGE)], axis=1)
+        return np.stack([x, y, x / self.reach, y / self.reach, np.hypot(x, y) / (2 * self.reach)], axis=1)

@@ -14,19 +14,12 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import element_hessian
+from rgbmidic.correlation.constants import USUAL, SolverConstants
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.residual import Precision, Residual
 from rgbmidic.correlation.solution import NodeStatus
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
-
-LOST = 0.5
-"""Uncertainty (px) from which a node is decorrelated: a position uncertain by half a pixel is no match."""
-_ONE_SIDED = 0.3
-"""Texture in the worse direction over that in the better one under which the former may be noise...
-Chosen; half or twice of it matters in a deep shadow only (benchmarks/constants.py)."""
-_NOISY = 0.3
-"""...and is, if noise alone would give this fraction of it: displacements along it are 30 % too small (derived)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,12 +36,15 @@ class Evidence:
         An element around the node does not match.
     std : ndarray, shape (N, 2)
         Standard uncertainty of u and v, px.
+    lost : float
+        That from which a node is decorrelated, px.
     """
 
     textured: BoolArray
     one_sided: BoolArray
     mismatched: BoolArray
     std: FloatArray
+    lost: float
 
 
 RULES: tuple[tuple[NodeStatus, Callable[[Evidence], BoolArray]], ...] = (
@@ -59,7 +55,7 @@ RULES: tuple[tuple[NodeStatus, Callable[[Evidence], BoolArray]], ...] = (
     # the texture runs in one direction only: what lies along it cannot be measured
     (NodeStatus.NOT_SEEN, lambda nodes: nodes.one_sided),
     # its displacement is uncertain by half a pixel or more
-    (NodeStatus.DECORRELATED, lambda nodes: nodes.std.max(axis=1) > LOST),
+    (NodeStatus.DECORRELATED, lambda nodes: nodes.std.max(axis=1) > nodes.lost),
 )
 """Status of a node to which a rule applies, in this order; one to which none does is measured."""
 
@@ -73,17 +69,17 @@ def judge(evidence: Evidence) -> npt.NDArray[np.uint8]:
 
 def one_sided_texture(equations: Equations, residual: Residual) -> BoolArray:
     """Nodes (N,) whose texture runs in one direction only: along the other, the gradient is that of the noise."""
-    xx, xy, yy = equations.node_blocks
+    (xx, xy, yy), constants = equations.node_blocks, residual.reference.constants
     half, difference = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     weak = half - difference
-    one_sided = np.asarray(equations.textured & (weak < _ONE_SIDED * (half + difference)))
+    one_sided = np.asarray(equations.textured & (weak < constants.one_sided * (half + difference)))
     if not one_sided.any():
         return one_sided
     angle = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2  # of the weaker direction
     x, y = np.cos(angle), np.sin(angle)
     noise_xx, noise_xy, noise_yy = _noise_blocks(residual, equations.weights, one_sided)
     along = noise_xx * x * x + 2 * noise_xy * x * y + noise_yy * y * y
-    return np.asarray(one_sided & (along > _NOISY * weak))
+    return np.asarray(one_sided & (along > constants.noisy * weak))
 
 
 def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> FloatArray:
@@ -109,17 +105,6 @@ def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> 
     return reference.assembly.node_blocks(total)
 
 
-_MATCHED = (0.4, 0.6)
-"""Correlation coefficient under which the images of an element do not match: for poor images and for good ones."""
-_MATCHED_PRECISE = (0.4, 0.9)
-"""The same where the lights count by their precision, so that a reflection in one of them is no mismatch."""
-_WORSE = 8.0
-"""In between: how many times farther from 1 than the median of the elements around. Chosen; with half or twice of it
-lights do not change (benchmarks/constants.py)."""
-_AROUND = 61
-"""Elements around: a square of some 5.5 elements a side, of which a crack takes a third."""
-
-
 def matching_elements(
     residual: Residual, precision: Precision | None = None, *, least: float | None = None
 ) -> BoolArray:
@@ -140,7 +125,7 @@ def matching_elements(
     -------
     ndarray, shape (E,), bool
     """
-    mesh = residual.reference.mesh
+    mesh, constants = residual.reference.mesh, residual.reference.constants
     fg, ff, gg = _centred_products(residual, _light_precision(residual, precision))
     own = correlation(fg, ff, gg)
     # a few speckles can match by chance; those of all elements around a node hardly
@@ -148,37 +133,32 @@ def matching_elements(
     coefficient = np.minimum(own, np.sort(around[mesh.elements], axis=1)[:, 1])
     if least is not None:
         return np.asarray(coefficient >= least)
-    poor, good = _MATCHED if precision is None else _MATCHED_PRECISE
+    poor, good = constants.matched if precision is None else constants.matched_precise
     matched = np.asarray(coefficient >= good)
     between = ~matched & (coefficient >= poor)
     typical, textured = 1.0, ff > 0
     if textured.any() and between.any():
         centre = mesh.nodes[mesh.elements].mean(axis=1)
-        ranks = [*range(1, min(_AROUND, int(textured.sum())) + 1)]
+        ranks = [*range(1, min(constants.around, int(textured.sum())) + 1)]
         nearest = cKDTree(centre[textured]).query(centre[between], k=ranks)[1]
         typical = np.median(coefficient[textured][nearest], axis=1)
-    matched[between] = coefficient[between] >= 1 - _WORSE * (1 - typical)
+    matched[between] = coefficient[between] >= 1 - constants.worse * (1 - typical)
     return matched
 
 
-_TORN = 0.5
-"""Stretch (norm of C) beyond that of the elements around from which an element is torn, not strained: a strain of 20 %
-in both directions more than theirs gives .6."""
-
-
-def torn_elements(mesh: Tri3Mesh, displacement: FloatArray) -> BoolArray:
+def torn_elements(mesh: Tri3Mesh, displacement: FloatArray, constants: SolverConstants = USUAL) -> BoolArray:
     """Find the elements (E,) whose nodes have gone with different bodies, as a displacement (N, 2) has it.
 
     Their stretch C, the right Cauchy-Green tensor, differs from the median of the elements around.
     """
     deformation = np.eye(2) + mesh.element_gradient(displacement)
     stretch = np.swapaxes(deformation, 1, 2) @ deformation - np.eye(2)
-    torn = np.asarray(np.linalg.norm(stretch, axis=(1, 2)) > _TORN)
+    torn = np.asarray(np.linalg.norm(stretch, axis=(1, 2)) > constants.torn)
     if torn.any():
         centre = mesh.nodes[mesh.elements].mean(axis=1)
-        around = cKDTree(centre).query(centre[torn], k=[*range(1, min(_AROUND, len(centre)) + 1)])[1]
+        around = cKDTree(centre).query(centre[torn], k=[*range(1, min(constants.around, len(centre)) + 1)])[1]
         beyond = stretch[torn] - np.median(stretch[around], axis=1)
-        torn[torn] = np.linalg.norm(beyond, axis=(1, 2)) > _TORN
+        torn[torn] = np.linalg.norm(beyond, axis=(1, 2)) > constants.torn
     return torn
 
 

@@ -14,14 +14,14 @@ from rgbmidic._kernels.patches import interpolate_nodal
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
 from rgbmidic._kernels.weights import gradient_of_others
-from rgbmidic.correlation.assembly import Assembly, block_side, unfitted_fraction
+from rgbmidic.correlation.assembly import Assembly, unfitted_fraction
+from rgbmidic.correlation.constants import USUAL, SolverConstants
 from rgbmidic.correlation.images import (
+    WINDOW,
     spline_coefficients,
     spline_values,
-    spread,
     usable_pixels,
     usable_reach,
-    window_ratios,
 )
 from rgbmidic.correlation.recovery import NodeColouring, linear_fit_offset
 from rgbmidic.errors import InputError
@@ -30,11 +30,6 @@ from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
 _WARP = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-
-_SHARED = 0.85
-"""Correlation of a light's gradient with the mean of the others', median over the region, from which theirs takes its
-place. Lights of one paint reach .95 to 1. At .85 the error of two lights with noise grows by an eighth so (derived),
-that of three whose paint is their own by 18 % of the variance by a tenth (measured); below it they would lose more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -199,6 +194,8 @@ class Reference:
         What each light's own gradient has beyond that of the common texture; of no light where there is but one.
     prefilter : str
         One of `PREFILTERS`.
+    constants : SolverConstants
+        Of the solve.
     """
 
     geometry: ReferenceGeometry
@@ -212,6 +209,7 @@ class Reference:
     channel_specific: FloatImage
     prefilter: str
     registration: Registration | None = None
+    constants: SolverConstants = USUAL
 
     @classmethod
     def prepare(
@@ -225,6 +223,7 @@ class Reference:
         origin: tuple[int, int] = (0, 0),
         first: ReferenceGeometry | None = None,
         registration: Registration | None = None,
+        constants: SolverConstants = USUAL,
     ) -> Reference:
         """Prepare the reference state.
 
@@ -246,6 +245,8 @@ class Reference:
             Geometry of the first frame, where this is a later one; its nodes are those of `mesh`.
         registration
             Of the lights, where their images do not lie on one grid; the region is then that of the first light.
+        constants
+            Of the solve.
 
         Returns
         -------
@@ -272,12 +273,10 @@ class Reference:
         else:
             values, weighted, own = _where_they_lie(state, geometry, pixels.gather(inside), registration)
         del state  # before what needs most memory
-        gradient = _common_gradient(own, weighted, pixels)
+        gradient = _common_gradient(own, weighted, pixels, constants.shared)
         return cls(
             geometry=geometry,
-            unfitted=unfitted_fraction(
-                geometry.mesh, pixels, geometry.assembly, gradient, weighted, block_side(pixels, mesh.size)
-            ),
+            unfitted=unfitted_fraction(mesh, pixels, geometry.assembly, gradient, weighted, constants),
             images=ready,
             weights=usable,
             values=values,
@@ -287,6 +286,7 @@ class Reference:
             channel_specific=own[:, :0] if gradient is own else np.subtract(own, gradient, out=own),
             prefilter=prefilter,
             registration=registration,
+            constants=constants,
         )
 
     @property
@@ -540,7 +540,7 @@ def _gradient(coefficients: FloatImage, pixels: PixelMap) -> FloatImage:
     return gradient
 
 
-def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap) -> FloatImage:
+def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap, shared: float) -> FloatImage:
     """Gradient (2, k, P) of the texture that each light has in common with the others, times its contrast in it.
 
     The mean of the *other* lights' `gradient`. What one light alone shows (the sparkle of its reflection, what the
@@ -560,7 +560,7 @@ def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap
         for fewest in (2, len(weights)):  # others; there are never so many
             gradient_of_others(gradient, weights, light, fewest, mean, products)
             contrast, correlation = _regression(products, pixels)
-            if correlation >= _SHARED:
+            if correlation >= shared:
                 break
         np.multiply(mean, contrast, out=out[:, light])
     return out
@@ -574,8 +574,9 @@ def _regression(products: FloatImage, pixels: PixelMap) -> tuple[FloatImage, flo
     tuple
         The coefficient (P,), at least 0, and the median of the correlation coefficient.
     """
-    along, square, power = window_ratios(pixels, products)
+    along, square, power = WINDOW.ratios(pixels, products)
     known = (square > 0) & (power > 0)
     correlation = along[known] / np.sqrt(square[known] * power[known])
     contrast = np.divide(along, square, out=np.zeros_like(along), where=known)
-    return spread(pixels, np.maximum(contrast, 0)[None])[0], float(np.median(correlation)) if known.any() else 0.0
+    around = WINDOW.spread(pixels, np.maximum(contrast, 0)[None])[0]
+    return around, float(np.median(correlation)) if known.any() else 0.0

@@ -21,12 +21,6 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-_LEAST_BEND = 0.1
-"""Least bend of the loss around a node, over that of its weights: the quotient exists. Any value up to twice of it
-gives the same."""
-_ROUNDING = 2e-7
-"""Fraction of the sum of squares below which that beyond the mean is rounding: three units of single precision."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Residual:
@@ -130,9 +124,9 @@ class Residual:
         fg, ff, gg : ndarray, shape (k, E)
         """
         total, f, g, ff, fg, gg = np.moveaxis(self.moments, -1, 0)
-        total = np.maximum(total, 1e-30)
+        total, rounding = np.maximum(total, 1e-30), 2e-7  # three units of single precision
         beyond_f, beyond_g = (
-            np.where(beyond > _ROUNDING * square, beyond, 0.0)
+            np.where(beyond > rounding * square, beyond, 0.0)
             for beyond, square in ((ff - f * f / total, ff), (gg - g * g / total, gg))
         )
         return fg - f * g / total, beyond_f, beyond_g
@@ -188,7 +182,8 @@ class Precision:
         ndarray, shape (N,)
         """
         total, bent = (reference.mesh.to_nodes(part) for part in reference.sums(weights, self.bend).sum(axis=0).T)
-        return np.divide(total, np.maximum(bent, _LEAST_BEND * total), out=np.ones_like(total), where=total > 0)
+        # 0.1, so that the quotient exists: up to twice of it nothing changes
+        return np.divide(total, np.maximum(bent, 0.1 * total), out=np.ones_like(total), where=total > 0)
 
 
 class PrecisionMethod(Protocol):
@@ -241,13 +236,6 @@ def curved_deviation(mesh: Tri3Mesh, barycentric: FloatArray, carried: FloatArra
     return np.asarray(deviation, dtype=np.float32)
 
 
-_LEAST_GAIN = 0.05
-"""Least gain of the local correction: a light that has lost 95 % of its contrast is not amplified any further."""
-_SMOOTHNESS = 1e-3
-"""Weight of the smoothness of gain and offset over the mean entry of their matrix: carries them over gaps. Chosen;
-with half or twice of it lights differ by 4e-4 px at most (benchmarks/constants.py)."""
-
-
 def corrected_values(residual: Residual, kind: Literal["auto", "none", "global", "local", "mean"]) -> FloatImage:
     """Bring the reference to the brightness and contrast of the deformed images (paper, section 2.2).
 
@@ -298,7 +286,7 @@ def _gain_of_means(reference: Reference, f: FloatImage, weight: FloatImage, sum_
     ratio = np.divide(around_g, around_f, out=np.ones_like(around_f), where=(around_f > 0) & (around_g > 0))
     fields = np.empty((2, f.size), dtype=np.float32)
     interpolate_nodal(np.stack([ratio, ratio], axis=1), mesh.elements, *reference.pixels.positions, fields)
-    return np.asarray(f * np.maximum(fields[0], np.float32(_LEAST_GAIN)))
+    return np.asarray(f * np.maximum(fields[0], np.float32(reference.constants.least_gain)))
 
 
 def _gain_field(reference: Reference, f: FloatImage, g: FloatImage, weight: FloatImage) -> FloatImage:
@@ -310,21 +298,17 @@ def _gain_field(reference: Reference, f: FloatImage, g: FloatImage, weight: Floa
     g = g / np.float32(scale)
     basis = g, np.ones_like(g)
     system = assembly.matrix(reference.blocks(weight, basis))
-    smooth = _SMOOTHNESS * system.diagonal().mean() * assembly.smoothness.data
+    smooth = reference.constants.gain_smoothness * system.diagonal().mean() * assembly.smoothness.data
     right_side = assembly.vector(reference.projected(weight, f, basis))
     nodal = assembly.factorise(with_data(system, system.data + smooth))(right_side).reshape(-1, 2)
     fields = np.empty((2, f.size), dtype=np.float32)
     interpolate_nodal(nodal, reference.mesh.elements, *reference.pixels.positions, fields)
-    gain = np.maximum(fields[0] / np.float32(scale), np.float32(_LEAST_GAIN))
+    gain = np.maximum(fields[0] / np.float32(scale), np.float32(reference.constants.least_gain))
     return np.asarray((f - fields[1]) / gain, dtype=np.float32)
 
 
-_LEAST = 12
+_KNOWN = 12
 """Pixels of an element that must be known in both states: a contrast of 12 values is known to 20 % (derived)."""
-_ENOUGH = 36
-"""Pixels of an element that are looked at, about: a contrast of 36 values is known to 12 % (derived)."""
-_MANY = 400
-"""Elements that are looked at, about: the median over them is known to 6 % of their scatter."""
 
 
 def brightness_change(
@@ -351,11 +335,12 @@ def brightness_change(
         Gain and offset (grey levels); NaN where no element is seen in both states.
     """
     mesh, pixels = reference.mesh, reference.pixels
-    chosen = np.arange(0, len(mesh.elements), max(1, len(mesh.elements) // _MANY))
+    many, enough = 400, 36  # elements: their median is known to 6 % of the scatter; pixels: a contrast to 12 %
+    chosen = np.arange(0, len(mesh.elements), max(1, len(mesh.elements) // many))
     motion, size = displacement[mesh.elements[chosen]].mean(axis=1), np.diff(pixels.offsets)[chosen]
-    seen = np.isfinite(motion).all(axis=1) & (size >= _LEAST)
+    seen = np.isfinite(motion).all(axis=1) & (size >= _KNOWN)
     chosen, step, size = chosen[seen], np.round(motion[seen]).astype(np.int64), size[seen]
-    slots = pixels.offsets[chosen, None] + np.arange(_ENOUGH) * size[:, None] // _ENOUGH
+    slots = pixels.offsets[chosen, None] + np.arange(enough) * size[:, None] // enough
     columns = pixels.local_x[slots].astype(np.int64) + pixels.origin[chosen, :1]
     rows = pixels.local_y[slots].astype(np.int64) + pixels.origin[chosen, 1:]
     height, width = second.shape[1:]
@@ -372,7 +357,7 @@ def brightness_change(
 def _gain_and_offset(f: FloatImage, g: FloatImage, inside: BoolArray) -> tuple[float, float]:
     """From the samples (E, n) of elements."""
     known = inside & np.isfinite(f) & np.isfinite(g)
-    known &= known.sum(axis=1, keepdims=True) >= _LEAST
+    known &= known.sum(axis=1, keepdims=True) >= _KNOWN
     seen = np.asarray(known.any(axis=1))
     known, number = known[seen], known[seen].sum(axis=1)
 
@@ -391,16 +376,14 @@ def _gain_and_offset(f: FloatImage, g: FloatImage, inside: BoolArray) -> tuple[f
 
 _FITTED = 12
 """Pairs to which the motion around a node is fitted: four times the three that determine an affine motion. With half or
-twice of it results differ by 5e-6 px at most (benchmarks/constants.py)."""
-_TURNS = 5
-"""Robust fits until the weights have settled: twice as many change results by 1e-11 px (benchmarks/constants.py)."""
+twice of it results differ by 5e-6 px at most (measured)."""
 
 
 def follow(points: FloatArray, motion: FloatArray, mesh: Tri3Mesh, scale: float) -> FloatArray:
     """Follow the motion (P, 2) of points (P, 2) at the nodes (N, 2): one affine field, and what a local one adds to it.
 
-    Both are robust fits, with Cauchy weights of `scale` px. Around the nodes at a crack the points on their own side
-    count.
+    Both are robust fits, with Cauchy weights of `scale` px. Around a node it is that of the nearest `_FITTED` points,
+    around the nodes at a crack of those on their own side.
     """
     nodes = mesh.nodes
     middle, size = points.mean(axis=0), np.ptp(points, axis=0).max() + 1.0
@@ -420,7 +403,7 @@ def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: floa
     """
     basis, motion = (np.ascontiguousarray(part.T) for part in (basis, motion))  # one fit beside the other in memory
     weight, held = np.ones(basis.shape[1:]), np.diag([1e-6, ridge, ridge])
-    for _ in range(_TURNS):
+    for _ in range(5):  # until the weights have settled: twice as many change results by 1e-11 px
         # no BLAS, whose sums may depend on the number of threads
         sums = np.array([[(part * side).sum(axis=0) for side in (*basis, *motion)] for part in basis * weight])
         found = np.linalg.solve(sums[:, :3].T + held, sums[:, 3:].transpose(2, 0, 1))

@@ -23,7 +23,6 @@ from rgbmidic.correlation.assembly import rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, UnsolvableError, compare, iterate
 from rgbmidic.correlation.light_bias import LightBias
 from rgbmidic.correlation.nodes import (
-    LOST,
     Evidence,
     judge,
     matching_elements,
@@ -41,36 +40,8 @@ from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-FIRST_PASS = 0.01
-"""Increment (px) at which the first pass hands over to the pass with weights warped anew. At .05 an iteration
-less is needed, but from another start the result differs by up to 2.3e-4 px."""
 _REFINED = {"none": 1, "auto": 1, "global": 1, "local": 4, "mean": 2}
 """Passes whose residual still changes weights and grey levels, for each grey-level correction."""
-_STARTED = 0.25
-"""Correlation coefficient at the initial guess under which an element waits until its neighbours have brought it
-nearer. Chosen; half or twice of it matters beside a hole and in a deep shadow (benchmarks/constants.py)."""
-_RETURNS = 2
-"""Passes after which elements may take part again. Chosen: at a fragment's edge some come and go with every pass, which
-costs iterations; after a single pass what a crack or another body pulls at first is left out for good."""
-_WANDERING = 0.1
-"""Motion (px) in the last iteration of a pass, and more than half of that in the one before, from which the elements
-around a node are left out after `_RETURNS` passes: its own pixels match nothing. Chosen: ten times what ends the first
-pass."""
-_ELSEWHERE = 0.05
-"""Motion (px) of more than `_SWINGING` of the nodes from where weights and grey levels were learnt, after which those
-of several lights are learnt once more: what all lights alike show of the motion hides which of them is the precise one.
-Chosen: a hundredth of a speckle, which a residual still shows."""
-_SETTLED = 1e-3
-"""Fraction of the weight that may still change for the passes to end. Chosen; a hundredth or a hundred times of it
-matter in a deep shadow only (benchmarks/constants.py)."""
-_LOOKED_AT = 10_000
-"""That change is the sum over about so many pixels: a change of all weights by that fraction is known to 1 % of it
-(derived)."""
-_SWINGING = 0.02
-"""Fraction of the nodes that may be left out at the end because they still move: a few at the rim of a fragment, half
-of whose pixels match nothing, swing for good; where more do the frame has not converged. Chosen."""
-_PASSES = 8
-"""Most passes: each warps the weights with the latest displacement; `_RETURNS`, and the `_REFINED` ones after."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,7 +105,7 @@ def first_weighting(problem: Problem, estimate: Estimate) -> Weighting:
     return Weighting(
         residual=residual,
         values=corrected_values(residual, "global" if kind == "local" else kind),
-        matched=_matched(problem, residual, estimate, least=_STARTED),
+        matched=_matched(problem, residual, estimate, least=problem.constants.begun),
         learnt_at=estimate.displacement,
     )
 
@@ -148,10 +119,10 @@ def next_weighting(
     # without the precision of the lights, which the first pass has not, an element half on another body may match
     precision = last.precision if number or method is None else method.precision(residual)
     matched = _matched(problem, residual, estimate, precision)
-    if not matched.all() or estimate.longest > FIRST_PASS:
+    if not matched.all() or estimate.longest > problem.constants.first_pass:
         lost = _lost_nodes(problem, last, equations, residual, estimate, number)
         matched &= ~lost[problem.reference.mesh.elements].any(axis=1)
-    if number >= _RETURNS:
+    if number >= problem.constants.returns:
         matched &= last.matched
     returned = _learnt_anew(last, matched, equations, estimate, number)
     weighting = replace(last, residual=residual, matched=matched, returned=returned)
@@ -170,11 +141,11 @@ def _lost_nodes(
 ) -> BoolArray:
     """Find the nodes (N,) that leave the next pass; a one-sided texture does not hold a node either, but matches."""
     std = standard_uncertainty(residual, equations, last.precision)
-    unheld = std.max(axis=1) > LOST
+    unheld = std.max(axis=1) > problem.constants.lost
     wanders = np.zeros(len(unheld), dtype=bool)
-    if number >= _RETURNS and len(estimate.increments) < problem.options.max_iterations:
+    if number >= problem.constants.returns and len(estimate.increments) < problem.options.max_iterations:
         before, motion = estimate.increments[-2:]
-        wanders = motion > np.maximum(_WANDERING, before / 2)
+        wanders = motion > np.maximum(problem.constants.wandering, before / 2)
     return np.asarray((unheld | wanders) & ~one_sided_texture(equations, residual))
 
 
@@ -186,8 +157,9 @@ def _learnt_anew(last: Weighting, matched: BoolArray, equations: Equations, esti
     """
     if (matched & ~last.matched).any():
         return number + 1
+    constants = last.residual.reference.constants
     motion = np.hypot(*(estimate.displacement - last.learnt_at).T)[equations.textured]
-    elsewhere = number == 1 < len(last.residual.values) and (motion > _ELSEWHERE).mean() > _SWINGING
+    elsewhere = number == 1 < len(last.residual.values) and (motion > constants.elsewhere).mean() > constants.swinging
     return max(last.returned, number) if elsewhere else last.returned
 
 
@@ -200,16 +172,17 @@ def _matched(
     least: float | None = None,
 ) -> BoolArray:
     """Elements (E,) that match and are whole."""
-    torn = torn_elements(problem.reference.mesh, estimate.displacement)
+    torn = torn_elements(problem.reference.mesh, estimate.displacement, problem.constants)
     return matching_elements(residual, precision, least=least) & ~torn
 
 
 def settled(weighting: Weighting, equations: Equations) -> bool:
     """Whether the next pass would have the weights of the last one."""
-    some = slice(None, None, equations.weights.shape[1] // _LOOKED_AT + 1)
+    constants = weighting.residual.reference.constants
+    some = slice(None, None, equations.weights.shape[1] // constants.looked_at + 1)
     weights = weighting.of(some)
     total = float(weights.sum())
-    return total > 0 and float(np.abs(weights - equations.weights[:, some]).sum()) <= _SETTLED * total
+    return total > 0 and float(np.abs(weights - equations.weights[:, some]).sum()) <= constants.settled * total
 
 
 def refining(problem: Problem, weighting: Weighting, number: int) -> bool:
@@ -275,11 +248,11 @@ def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, 
     tolerance = problem.options.tolerance
     estimate, weighting = _begin(problem, estimate)
     equations: Equations | None = None
-    for number in range(_PASSES):
+    for number in range(problem.constants.passes):
         if equations is not None and not refining(problem, weighting, number) and settled(weighting, equations):
             break
         equations = _equations(problem, weighting, estimate)
-        reached = max(tolerance, FIRST_PASS) if number == 0 else tolerance
+        reached = max(tolerance, problem.constants.first_pass) if number == 0 else tolerance
         estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, reached)
         weighting = next_weighting(problem, weighting, equations, estimate, number)
     assert equations is not None
@@ -287,7 +260,7 @@ def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, 
         estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance)
         swinging = equations.textured & (estimate.increments[-1] > tolerance)
         matched = weighting.matched & ~swinging[problem.reference.mesh.elements].any(axis=1)
-        few = 0 < swinging.mean() < _SWINGING and matched.any()
+        few = 0 < swinging.mean() < problem.constants.swinging and matched.any()
         if few and len(estimate.increments) < problem.options.max_iterations:
             residual = compare(problem, weighting.values, estimate)
             weighting = replace(weighting, residual=residual, matched=matched)
@@ -419,6 +392,7 @@ def _judged(
         one_sided=one_sided_texture(equations, weighting.residual),
         mismatched=mismatched,
         std=std[:, :2],
+        lost=weighting.residual.reference.constants.lost,
     )
     node_status = judge(evidence)
     if not (node_status == NodeStatus.MEASURED).any():

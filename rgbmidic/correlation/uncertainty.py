@@ -8,34 +8,20 @@ the long-run variance).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import cv2
 import numpy as np
 
 from rgbmidic._kernels.weights import scores
-from rgbmidic.correlation.assembly import BLOCK, RigidMotions, block_side
-from rgbmidic.correlation.assembly import SCORE_RANGE as _SCORE_RANGE
+from rgbmidic.correlation.assembly import RigidMotions, block_side
+from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.recovery import Functional, Recovery, displacement_functionals, functional_std
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Precision, Residual
-from rgbmidic.mesh import PixelMap
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
-
-_LEAST_RATIO = 1e-2
-"""Least fraction of a residual's variance that is taken to displace: that of images without noise is not 0. Any value
-up to twice of it gives the same."""
-_LEAST_FRACTION = 0.05
-"""Least fraction of a direction in the texture: nodes with less of the median are not measured (`SEEN`)."""
-_EVEN = 0.6
-"""Standard deviation (blocks) of the window in which the information of a block is taken. Chosen; with half or twice of
-it lights differ by 1e-4 px at most, beside a gap by 4e-3, their uncertainty by 4 % (benchmarks/constants.py)."""
-_LEAST_FREEDOM = 0.25
-"""Least number of blocks, less one, that is taken, where a region has one block: the variance is stated 4 times larger
-then, for it is hardly known (derived)."""
-_PRIOR = 0.1
-"""Blocks for which the region's typical score counts in that window: beside a hole there are few."""
 
 
 def displacing_fraction(reference: Reference, difference: FloatImage, weight: FloatImage) -> FloatImage:
@@ -50,10 +36,11 @@ def displacing_fraction(reference: Reference, difference: FloatImage, weight: Fl
     weight : ndarray, shape (P,), float32
         Its inverse variance.
     """
-    pixels, (gx, gy) = reference.pixels, reference.texture
-    xx, _, yy = _averaged_ratios(*_unit_scores(pixels, BLOCK, difference, weight, gx, gy), BLOCK)
-    fraction = np.maximum(xx + yy, _LEAST_RATIO)
-    return np.asarray(pixels.from_blocks(fraction[None], BLOCK)[0])
+    block = reference.constants.block
+    xx, _, yy = BlockScores.of(reference, block, difference, weight, *reference.texture).products()
+    # at least 0.01: of images without noise it is not 0 (up to twice of it nothing changes)
+    fraction = np.maximum(xx + yy, 0.01)
+    return np.asarray(reference.pixels.from_blocks(fraction[None], block)[0])
 
 
 def score_covariance(residual: Residual, weights: FloatImage, texture: FloatArray) -> FloatArray:
@@ -69,9 +56,9 @@ def score_covariance(residual: Residual, weights: FloatImage, texture: FloatArra
         Element blocks of its Hessian.
     """
     reference = residual.reference
-    side = block_side(reference.pixels, reference.mesh.size)
-    own = _unit_scores(reference.pixels, side, residual.difference, weights, *reference.gradient)
-    along_x, along_y = _axis_ratios(reference, own, texture, side) / reference.unfitted
+    side = block_side(reference.pixels, reference.mesh.size, reference.constants)
+    own = BlockScores.of(reference, side, residual.difference, weights, *reference.gradient)
+    along_x, along_y = _axis_ratios(reference, own, texture) / reference.unfitted
     scale = np.stack([along_x, np.sqrt(along_x * along_y), along_y], axis=-1)
     return np.asarray(texture * scale[:, None, None])
 
@@ -96,7 +83,7 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
         Numbers of the two lights, and the element blocks (E, 3, 3, 3).
     """
     reference = residual.reference
-    side, slopes = block_side(reference.pixels, reference.mesh.size), reference.gradient
+    side, slopes = block_side(reference.pixels, reference.mesh.size, reference.constants), reference.gradient
     fields = np.empty((4, weights.shape[1]), dtype=np.float32)
     scores(residual.difference, weights, *slopes, fields)
     common = np.divide(fields[:2], fields[2], out=np.zeros_like(fields[:2]), where=fields[2] > 0)
@@ -106,8 +93,8 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
     own, roots = [], []
     for difference, weight, gx, gy in zip(residual.difference, weights, *slopes, strict=True):
         whole = difference + lost * (gx * common[0] + gy * common[1])
-        own.append(_unit_scores(reference.pixels, side, whole, weight, gx, gy))
-        roots.append(np.sqrt(_axis_ratios(reference, own[-1], reference.blocks(weight, (gx, gy)), side)))
+        own.append(BlockScores.of(reference, side, whole, weight, gx, gy))
+        roots.append(np.sqrt(_axis_ratios(reference, own[-1], reference.blocks(weight, (gx, gy)))))
     for a, b in combinations_with_replacement(range(len(weights)), 2):
         # the gradients of two lights are parallel
         slope = (np.copysign(np.sqrt(np.maximum(axis[a] * axis[b], 0)), axis[a]) for axis in slopes)
@@ -115,82 +102,99 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
         (x, y), (other_x, other_y) = roots[a], roots[b]
         scale = np.stack([x * other_x, (x * other_y + y * other_x) / 2, y * other_y], axis=-1)
         if a != b:
-            scale *= _per_element(reference, _correlation(own[a], own[b], side)[None], side)[0, :, None]
+            scale *= _per_element(reference, own[a].correlation(own[b])[None], side)[0, :, None]
         yield a, b, texture * scale[:, None, None]
 
 
-def _axis_ratios(
-    reference: Reference, own: tuple[FloatArray, FloatArray, FloatArray], texture: FloatArray, side: int
-) -> FloatArray:
+def _axis_ratios(reference: Reference, own: BlockScores, texture: FloatArray) -> FloatArray:
     """Variance of the scores in x and y over their information in that axis, (2, E).
 
     The information is divided by the gradients along x and y in the `texture` (E, 3, 3, 3) around each element.
     """
     mesh = reference.mesh
-    along_x, _, along_y = _per_element(reference, _averaged_ratios(*own, side), side)
+    along_x, _, along_y = _per_element(reference, own.products(), own.side)
     xx, _, yy = texture.sum(axis=(1, 2)).T
     x, y = (mesh.to_nodes(part)[mesh.elements].sum(axis=1) for part in (xx, yy))
     fraction = np.divide(x, x + y, out=np.full_like(x, 0.5), where=x + y > 0)
-    fraction = np.clip(fraction, _LEAST_FRACTION, 1 - _LEAST_FRACTION)
+    least = reference.constants.seen  # nodes with less of the texture are not measured
+    fraction = np.clip(fraction, least, 1 - least)
     return np.stack([along_x / fraction, along_y / (1 - fraction)])
 
 
-def _unit_scores(pixels: PixelMap, side: int, *fields: FloatImage) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Scores in x and y of blocks over the root of their information, and their pixels; shape (rows, columns).
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BlockScores:
+    """Scores of blocks in x and y over the root of their information, and the pixels of the blocks.
 
-    The scores are those of all lights together; the `fields` are difference, weights and gradient in x and y, (k, P) or
-    (P,). A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
-    smooth, and averaged, is its ratio to the information.
+    A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is smooth,
+    and averaged, is its ratio to the information.
+
+    Attributes
+    ----------
+    x, y, count : ndarray, shape (rows, columns)
+    side : int
+        Of the blocks, px.
+    constants : SolverConstants
     """
-    sums = np.empty((4, pixels.local_x.size), dtype=np.float32)
-    scores(*(np.atleast_2d(field) for field in fields), sums)
-    x, y, information, count = pixels.block_sums(sums, side).astype(np.float64)
-    level = _blur(information, _EVEN) / np.maximum(_blur(count, _EVEN), 1e-6)
-    scale = np.divide(1, np.sqrt(level), out=np.zeros_like(level), where=(level > 0) & (count > 0))
-    return x * scale, y * scale, count
 
+    x: FloatArray
+    y: FloatArray
+    count: FloatArray
+    side: int
+    constants: SolverConstants
 
-def _averaged_ratios(x: FloatArray, y: FloatArray, count: FloatArray, side: int) -> FloatArray:
-    """Products xx, xy, yy of such scores per pixel, averaged; shape (3, rows, columns).
+    @classmethod
+    def of(cls, reference: Reference, side: int, *fields: FloatImage) -> BlockScores:
+        """Scores of all lights together; `fields` are difference, weights, gradient in x and y, (k, P) or (P,)."""
+        pixels, even = reference.pixels, reference.constants.even
+        sums = np.empty((4, pixels.local_x.size), dtype=np.float32)
+        scores(*(np.atleast_2d(field) for field in fields), sums)
+        x, y, information, count = pixels.block_sums(sums, side).astype(np.float64)
+        level = _blur(information, even) / np.maximum(_blur(count, even), 1e-6)
+        scale = np.divide(1, np.sqrt(level), out=np.zeros_like(level), where=(level > 0) & (count > 0))
+        return cls(x=x * scale, y=y * scale, count=count, side=side, constants=reference.constants)
 
-    xx + yy is 1 for white noise and ideal weights. They are raised where blocks are few, so that an error over its
-    stated uncertainty has the variance 1.
-    """
-    typical = _typical_square(x, y, count)
-    around = _blur(count, _SCORE_RANGE / side)
-    prior = _PRIOR * side**2
-    # an estimate from n blocks has 2 n degrees of freedom; the mean of its inverse is n / (n - 1) times too large
-    number = np.minimum(4 * np.pi * (_SCORE_RANGE / side) ** 2 * around, count.sum()) / side**2
-    ratios = [
-        (_blur(product, _SCORE_RANGE / side) + prior * expected) / (around + prior)
-        for product, expected in ((x * x, typical), (x * y, 0.0), (y * y, typical))
-    ]
-    return np.asarray(np.stack(ratios) * (number / np.maximum(number - 1, _LEAST_FREEDOM)))
+    @property
+    def typical_square(self) -> float:
+        """Square of a score in one direction, per pixel, typical of the region's blocks.
 
+        A median, so that what does not match has no part in it: ``x^2 + y^2`` of two independent Gaussian scores is
+        distributed exponentially, with a median of 2 ln 2 variances.
+        """
+        whole = self.count >= 0.5 * self.count.max(initial=0.0)
+        square = (self.x**2 + self.y**2)[whole] / np.maximum(self.count[whole], 1.0)
+        return float(np.median(square)) / (2 * np.log(2)) if square.size else 0.0
 
-def _correlation(first: tuple[FloatArray, ...], second: tuple[FloatArray, ...], side: int) -> FloatArray:
-    """Correlation (rows, columns) of the scores of two lights over the blocks around that both see."""
-    (x, y, count), (other_x, other_y, other_count) = first, second
-    both = (count > 0) & (other_count > 0)
-    squares = (x * x + y * y, other_x * other_x + other_y * other_y)
-    prior = [2 * _PRIOR * side**2 * _typical_square(*scores) for scores in (first, second)]
-    product = _blur(both * (x * other_x + y * other_y), _SCORE_RANGE / side)
-    first_square, second_square = (
-        _blur(both * square, _SCORE_RANGE / side) + held for square, held in zip(squares, prior, strict=True)
-    )
-    scale = np.sqrt(first_square * second_square)
-    return np.divide(product, scale, out=np.zeros_like(product), where=scale > 0)
+    def around(self, grid: AnyArray) -> AnyArray:
+        """Sums of a grid over the window in which scores are averaged, up to a factor."""
+        return _blur(grid, self.constants.score_range / self.side)
 
+    def products(self) -> FloatArray:
+        """Products xx, xy, yy of the scores per pixel, averaged; shape (3, rows, columns).
 
-def _typical_square(x: FloatArray, y: FloatArray, count: FloatArray) -> float:
-    """Square of a score in one direction, per pixel, typical of the region's blocks.
+        xx + yy is 1 for white noise and ideal weights. They are raised where blocks are few, so that an error over its
+        stated uncertainty has the variance 1.
+        """
+        typical, around, prior = self.typical_square, self.around(self.count), self.constants.prior * self.side**2
+        # an estimate from n blocks has 2 n degrees of freedom; the mean of its inverse is n / (n - 1) times too large
+        window = 4 * np.pi * (self.constants.score_range / self.side) ** 2
+        number = np.minimum(window * around, self.count.sum()) / self.side**2
+        ratios = [
+            (self.around(product) + prior * expected) / (around + prior)
+            for product, expected in ((self.x * self.x, typical), (self.x * self.y, 0.0), (self.y * self.y, typical))
+        ]
+        # of one block, less one, a quarter: the variance is hardly known, and stated 4 times larger
+        return np.asarray(np.stack(ratios) * (number / np.maximum(number - 1, 0.25)))
 
-    A median, so that what does not match has no part in it: ``x^2 + y^2`` of two independent Gaussian scores is
-    distributed exponentially, with a median of 2 ln 2 variances.
-    """
-    whole = count >= 0.5 * count.max(initial=0.0)
-    square = (x**2 + y**2)[whole] / np.maximum(count[whole], 1.0)
-    return float(np.median(square)) / (2 * np.log(2)) if square.size else 0.0
+    def correlation(self, other: BlockScores) -> FloatArray:
+        """Correlation (rows, columns) with the scores of another light over the blocks around that both see."""
+        both = (self.count > 0) & (other.count > 0)
+        product = self.around(both * (self.x * other.x + self.y * other.y))
+        first, second = (
+            self.around(both * (one.x**2 + one.y**2)) + 2 * self.constants.prior * self.side**2 * one.typical_square
+            for one in (self, other)
+        )
+        scale = np.sqrt(first * second)
+        return np.divide(product, scale, out=np.zeros_like(product), where=scale > 0)
 
 
 def _per_element(reference: Reference, grid: FloatArray, side: int) -> FloatArray:

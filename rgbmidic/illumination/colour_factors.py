@@ -24,14 +24,8 @@ MEAN_BLOCK, BLOCK = 4, 8
 """Side of the blocks (px) of the local means and of the moments."""
 MEAN_WIDTH, MOMENT_WIDTH = 8.0, 14.0
 """Standard deviation (px) of the windows over which means and moments are taken: several speckles wide."""
-ALIASING = 0.05
-"""Own moment beyond the common one, relative to it, that the aliasing of the coarse colour lattices may cause."""
-UNCERTAIN = 0.003
-"""Variance of e_c, relative to alpha_c^2, that the window cannot tell from none."""
 LEAST = 0.001
 """Least such variance: how well two colours can agree."""
-DIAGONAL_LACK = 1.9
-"""How much less planes that are diagonal neighbours agree than those along a row or column (1.85 to 1.95)."""
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
@@ -215,10 +209,10 @@ def learn_texture(moments: Moments, *, samples: int = 80_000) -> TextureModel:
     root = np.sqrt(moments.own)
     padded = scaled(moments, (1 / root).astype(np.float32), pad=0)
     local = np.stack([moments.shared[n] / (root[a] * root[b]) for n, (a, b) in enumerate(_PAIRS)])
-    # red and blue, diagonal neighbours as the two greens, lack about twice as much; the best pair of each place is free
-    # of reflections, and of the specimen's colour where it is the greens
+    # red and blue, diagonal neighbours as the two greens, lack 1.85 to 1.95 times as much; the best pair of each place
+    # is free of reflections, and of the specimen's colour where it is the greens
     greens = moments.greens / moments.own[1]
-    lacking = np.min([1 - local[0], (1 - local[1]) / DIAGONAL_LACK, 1 - local[2], (1 - greens) / DIAGONAL_LACK], axis=0)
+    lacking = np.min([1 - local[0], (1 - local[1]) / 1.9, 1 - local[2], (1 - greens) / 1.9], axis=0)
     sums, counts = np.zeros((len(LAGS), 6)), np.zeros((len(LAGS), 6))
     step = max(1, padded.size // samples)
     kernels.lag_products(padded, *moments.red, LAGS, step, sums, counts)
@@ -257,7 +251,8 @@ def colour_factors(
     energy = np.array([band.adjacent, band.diagonal, band.adjacent])[:, None, None]
     own = moments.own / band.own
     sparkle = np.zeros_like(own)
-    allowed = ALIASING * (1 - coloured)
+    # own moment beyond the common one, relative to it, that the aliasing of the coarse colour lattices may cause
+    allowed = 0.05 * (1 - coloured)
     least_shared = 1e-4 * own.min(axis=0)
     to_lights, to_pairs = np.linalg.pinv(crosstalk**2), np.stack([crosstalk[a] * crosstalk[b] for a, b in _PAIRS])
     for _ in range(2):  # the correction is small and settles at once
@@ -273,8 +268,9 @@ def colour_factors(
         # at least one channel is free of reflections at each place, unless it shows too much of its own for that
         specific = excess - least + np.maximum(least - 1 - allowed, 0)
         sparkle = specific * square * band.own
-    # as if all of it were sparkle: a specimen's colour lies within the band and is trusted too little, the safe side
-    variance = np.maximum(specific * (band.own / WHITE_ENERGY) - UNCERTAIN, 0)
+    # as if all of it were sparkle: a specimen's colour lies within the band and is trusted too little, the safe side;
+    # the window cannot tell .003 from none
+    variance = np.maximum(specific * (band.own / WHITE_ENERGY) - 0.003, 0)
     # every channel sees at least what its crosstalk lets through of the lights that sparkle
     lights = np.maximum(np.tensordot(to_lights, variance * square, axes=1), 0)
     variance = np.maximum(variance, np.tensordot(crosstalk**2, lights, axes=1) / square) + LEAST

@@ -391,17 +391,6 @@ NEGLIGIBLE = 0.25
 light's own channel does, a neighbour's crosstalk of some 10 % does not. Two lights of three see on where the third
 saturates; what leaks from beyond full scale is smooth or judged by the residual like the rest of a reflection."""
 
-_ALIGNED = 0.002
-"""A light that is nowhere farther than this (px) from the first is left as it is.
-
-Chosen: a fifth of the noise floor of DIC in good images, .01 px.
-"""
-
-GRID = 32
-"""Largest distance (px) of the points between which a matrix that varies over the field is interpolated."""
-_ROWS = 64
-"""Rows that are warped at a time: their positions take less memory than an image."""
-
 
 def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float = NEGLIGIBLE) -> IlluminationImages:
     """Return one image per light from camera channels: ``lights = A^-1 channels`` (pseudo-inverse for k < C).
@@ -440,7 +429,8 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
             f"{shape[0]} px: calibrate with frames of the size of the test"
         )
     # A^-1 at every `step`-th pixel and beyond the last ones, (GY, GX, k, C); one cell of the grid where it is constant
-    step = max(shape) if crosstalk.field is None else max(min(GRID, min(shape) // 16), 2)
+    # interpolated over 32 px at most
+    step = max(shape) if crosstalk.field is None else max(min(32, min(shape) // 16), 2)
     y, x = (step * np.arange((side - 1) // step + 2) for side in shape)
     grid = crosstalk.unmixing_at(np.stack(np.meshgrid(x, y), axis=-1)).astype(np.float32)
     values = np.empty((len(crosstalk.lights), *shape), dtype=np.float32)
@@ -492,15 +482,16 @@ def align(images: IlluminationImages) -> IlluminationImages:
     if (registration := images.registration) is None:
         return images
     height, width = images.shape
+    rows = 64  # warped at a time: their positions take less memory than an image
     values, spline = images.values.copy(), np.empty((height + 2 * PAD, width + 2 * PAD), dtype=np.float32)
     for light, image in enumerate(images.values):
         bspline_coefficients(fill_holes(image), spline)
         near_hole = cv2.dilate(np.isnan(image).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-        for top in range(0, height, _ROWS):
-            part = values[light, top : top + _ROWS]
+        for top in range(0, height, rows):
+            part = values[light, top : top + rows]
             y, x = np.mgrid[top : top + len(part), :width].reshape(2, -1).astype(np.float64)
             shift = registration.displacement(np.stack([x, y], axis=1) + images.origin)[light].T
-            if np.abs(shift).max() > _ALIGNED:
+            if np.abs(shift).max() > 0.002:  # px: a fifth of the noise floor of DIC in good images, .01 px
                 x, y = x + shift[0], y + shift[1]
                 sampled = np.empty((3, x.size), dtype=np.float32)
                 sample_with_gradient(spline, x, y, *sampled)

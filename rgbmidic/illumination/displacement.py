@@ -26,25 +26,8 @@ from rgbmidic.illumination.colour_factors import BLOCK, ColourFactors, Moments, 
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import FloatArray, FloatImage
 
-HARMLESS = 0.03
-"""Distance (px) of two lights at which each counts half for the other. Half and twice of it change the error of raised
-droplets by 2 % at most (benchmarks/reflections.py)."""
-ALONE = 0.1
-"""What a light with which no other agrees counts: the square of it is its weight against lights that agree."""
-WINDOW = 20.0
-"""Standard deviation (px) of the window in which a displacement is taken: glints change their place over some 50 px."""
-SIGNIFICANT = 1.25
-"""Standard deviations of a displacement that chance may make in each direction."""
-NEIGHBOURS = 0.02
-"""Variance, over the texture's, by which the other colours' prediction may be wrong."""
-STEP = 0.25
-"""Distance (px) over which the derivative of the autocorrelation is taken."""
 SIZE, REACH = 5, 8
 """Side of the square of samples of a prediction, px; rows and columns over which predictions are correlated."""
-_STRIP = 256
-"""Columns that the kernel takes at a time: what a core's fastest cache holds of their filters."""
-UNKNOWN = 10.0
-"""Variance of an unknown constant under the texture, over the texture's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,12 +48,20 @@ class LightDisplacement:
     @property
     def significant(self) -> FloatArray:
         """The displacement shrunk towards 0 by what chance explains of it (James and Stein 1961), (k, 2, h, w)."""
-        chance = 2 * SIGNIFICANT**2 * (self.std**2).sum(axis=0)
+        most = 1.25  # standard deviations that chance may make in each direction
+        chance = 2 * most**2 * (self.std**2).sum(axis=0)
         gain = 1 - chance / np.maximum((self.values**2).sum(axis=(0, 1)), 1e-12)
         return np.asarray(self.values * np.maximum(gain, 0))
 
 
-def agreement(displacement: FloatArray, variance: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
+def agreement(
+    displacement: FloatArray,
+    variance: FloatArray,
+    precision: FloatArray,
+    *,
+    harmless: float = 0.03,
+    alone: float = 0.1,
+) -> tuple[FloatArray, FloatArray]:
     """How far lights are to be believed about a place, and how far those that are agree with another one.
 
     Parameters
@@ -81,6 +72,11 @@ def agreement(displacement: FloatArray, variance: FloatArray, precision: FloatAr
         Of chance in each direction, px².
     precision : ndarray, shape (k, h, w)
         Of each light's displacement; in any unit.
+    harmless
+        Distance (px) of two lights at which each counts half for the other. Half and twice of it change the error of
+        raised droplets by 2 % at most (benchmarks/reflections.py).
+    alone
+        What a light with which no other agrees counts: the square of it is its weight against lights that agree.
 
     Returns
     -------
@@ -95,17 +91,23 @@ def agreement(displacement: FloatArray, variance: FloatArray, precision: FloatAr
             if other != light:
                 apart = ((displacement[light] - displacement[other]) ** 2).sum(axis=0)
                 beyond = np.maximum(apart - 2 * (variance[light] + variance[other]), 0)
-                near = 1 / (1 + beyond / HARMLESS**2)
+                near = 1 / (1 + beyond / harmless**2)
                 alike[light] += believed[other] * near
                 nearest[light] = np.maximum(nearest[light], near)
         alike[light] /= np.maximum(1 - believed[light], 1e-6)
-    weights = believed * (ALONE + alike) ** 2
+    weights = believed * (alone + alike) ** 2
     weights /= np.maximum(weights.sum(axis=0), 1e-30)
     return weights, (weights * nearest).sum(axis=0)
 
 
 def light_displacement(
-    moments: Moments, factors: ColourFactors, texture: TextureModel, matrix: FloatArray, cfa: str
+    moments: Moments,
+    factors: ColourFactors,
+    texture: TextureModel,
+    matrix: FloatArray,
+    cfa: str,
+    *,
+    window: float = 20.0,
 ) -> LightDisplacement:
     """Displacement of the lights' textures against each other.
 
@@ -117,6 +119,9 @@ def light_displacement(
         Crosstalk.
     cfa
         Bayer pattern.
+    window
+        Standard deviation (px) of the window in which a displacement is taken: glints change their place over some
+        50 px.
 
     Returns
     -------
@@ -128,13 +133,13 @@ def light_displacement(
     padded = scaled(moments, (1 / factors.slope).astype(np.float32), pad=SIZE // 2)
     sums = np.empty((3, 5, *(-(-side // BLOCK) for side in moments.contrast.shape)), dtype=np.float32)
     displacement_sums(padded, taps, BLOCK, *moments.red, sums)
-    around = [_smooth(one).astype(np.float64) for one in sums.swapaxes(0, 1)]
+    around = [_smooth(one, window / BLOCK).astype(np.float64) for one in sums.swapaxes(0, 1)]
     square = around[2] + 1e-12
     shift = np.stack(around[:2], axis=1) / square[:, None]
     back = pinv(response @ seen_lights(matrix, slope), rtol=0.05)
     back -= back.mean(axis=0)
     # standard deviation of as many independent products: a window holds so many blocks
-    alone = np.sqrt(around[3] / (square * np.maximum(around[4], 1e-6) * (4 * np.pi * (WINDOW / BLOCK) ** 2)))
+    alone = np.sqrt(around[3] / (square * np.maximum(around[4], 1e-6) * (4 * np.pi * (window / BLOCK) ** 2)))
     values = np.tensordot(back, shift, axes=1)
     variance = np.maximum(np.einsum("lc,ld,cd,cyx,dyx->lyx", back, back, chance, alone, alone), 1e-12)
     return LightDisplacement(values=values, std=np.sqrt(variance))
@@ -148,10 +153,10 @@ def seen_lights(matrix: FloatArray, slope: FloatArray) -> FloatArray:
     return np.asarray(parts / parts.sum(axis=1, keepdims=True))
 
 
-def _smooth(grids: FloatArray) -> FloatArray:
+def _smooth(grids: FloatArray, sigma: float) -> FloatArray:
     """Windows on grids (..., h, w) of blocks."""
     flat = grids.reshape(-1, *grids.shape[-2:])
-    blurred = [cv2.GaussianBlur(one, (0, 0), WINDOW / BLOCK, borderType=cv2.BORDER_REFLECT) for one in flat]
+    blurred = [cv2.GaussianBlur(one, (0, 0), sigma, borderType=cv2.BORDER_REFLECT) for one in flat]
     return np.reshape(blurred, grids.shape)
 
 
@@ -169,16 +174,19 @@ def _filters(texture: TextureModel, noise: tuple[float, ...], cfa: str) -> tuple
     cell, offset, middle = cfa_channels(cfa), np.arange(SIZE) - SIZE // 2, SIZE**2 // 2
     places = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)  # x, y
     apart = places[:, None] - places
-    covariance = texture(np.linalg.norm(apart, axis=-1)) + UNKNOWN
-    ends = [[texture(np.linalg.norm(apart + s * STEP * e, axis=-1)) for s in (1, -1)] for e in np.eye(2)]
-    derivative = [(after - before) / (2 * STEP) for after, before in ends]  # of the texture at a, with that at b
+    # over the texture's variance: that of an unknown constant under it, that by which the other colours' prediction may
+    # be wrong; the distance (px) over which the derivative of the autocorrelation is taken
+    constant, wrong, step = 10.0, 0.02, 0.25
+    covariance = texture(np.linalg.norm(apart, axis=-1)) + constant
+    ends = [[texture(np.linalg.norm(apart + s * step * e, axis=-1)) for s in (1, -1)] for e in np.eye(2)]
+    derivative = [(after - before) / (2 * step) for after, before in ends]  # of the texture at a, with that at b
     taps = np.zeros((2, 2, 3, SIZE**2))
     moved, unit = np.zeros((3, 3)), np.zeros(3)
     phases = list(np.ndindex(2, 2))
     colours = [cell[np.ix_((offset + p) % 2, (offset + q) % 2)].ravel() for p, q in phases]
     for phase, channel in zip(phases, colours, strict=True):
         own, others = channel[middle], channel != channel[middle]
-        system = covariance[np.ix_(others, others)] + np.diag(np.take(noise, channel[others]) + NEIGHBOURS)
+        system = covariance[np.ix_(others, others)] + np.diag(np.take(noise, channel[others]) + wrong)
         wanted = np.stack([covariance[middle, others], *(one[middle, others] for one in derivative)], axis=1)
         taps[phase][:, others] = np.linalg.solve(system, wanted).T
         taps[phase][0] *= -1
@@ -209,5 +217,6 @@ def _filters(texture: TextureModel, noise: tuple[float, ...], cfa: str) -> tuple
             total[own, other] += (square + cross)[met].sum()
             if first == second:
                 alone[own] += square[REACH, REACH]
-    lanes: FloatImage = np.tile(taps.transpose(0, 2, 3, 1), _STRIP // 2).astype(np.float32)
+    # 256 columns at a time: what a core's fastest cache holds of their filters
+    lanes: FloatImage = np.tile(taps.transpose(0, 2, 3, 1), 128).astype(np.float32)
     return lanes, moved / unit[:, None], total / np.sqrt(alone[:, None] * alone)

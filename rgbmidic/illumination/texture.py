@@ -18,23 +18,13 @@ from scipy.optimize import nnls
 from rgbmidic.errors import InputError
 from rgbmidic.typing import FloatArray
 
-FARTHEST = 4.3
-"""Products farther apart (px) do not enter: they depend on the spacing of the speckles, not on their edges."""
 LAGS = np.array(
-    [(i, j) for i in range(5) for j in range(-4, 5) if (i, j) > (0, 0) and np.hypot(i, j) <= FARTHEST], dtype=np.int64
+    [(i, j) for i in range(5) for j in range(-4, 5) if (i, j) > (0, 0) and np.hypot(i, j) <= 4.3], dtype=np.int64
 )
-"""Distances (rows, columns) at which products of samples are taken."""
-_BACKGROUND = 20.0
-"""Standard deviation (px) of the local mean over which speckle stands out."""
-NARROWEST = 0.6
-"""Standard deviation (px) of the narrowest Gaussian: what a square pixel lets through."""
-OFFSET_PENALTY = 0.05
-"""Least-squares error (of products) that an offset of 1 costs; the true one is -0.02 to -0.15."""
-INDISTINCT = 0.02
-"""Channel-specific fraction of a colour's variance under which products do not show whether it is coarse."""
-WIDTHS: FloatArray = np.asarray(NARROWEST * 1.3 ** np.arange(12), dtype=np.float64)
-COLOURED = 0.5
-"""Below this mean correlation of any two colours they do not show the same texture."""
+"""Distances (rows, columns) at which products of samples are taken: those farther apart (px) depend on the spacing of
+the speckles, not on their edges."""
+WIDTHS: FloatArray = np.asarray(0.6 * 1.3 ** np.arange(12), dtype=np.float64)
+"""Standard deviations (px) of the Gaussians: the narrowest is what a square pixel lets through."""
 
 _BINOMIAL = np.array([1, 5, 10, 10, 5, 1]) / 16
 _OFFSETS = np.array([-2, -1, 0, 1, 2, 3])
@@ -100,7 +90,7 @@ class TextureModel:
         """Return a texture of dark discs whose autocorrelation has about this full width at half maximum (px)."""
         if not diameter > 0:
             raise InputError(f"the diameter of a speckle must be positive, not {diameter!r}")
-        widths = np.maximum(np.array([0.26, 0.36, 0.51]) * diameter, NARROWEST)
+        widths = np.maximum(np.array([0.26, 0.36, 0.51]) * diameter, WIDTHS[0])
         return cls(weights=(0.1, 0.3, 0.6), widths=tuple(widths.tolist()))
 
     def __call__(self, distance: npt.ArrayLike) -> FloatArray:
@@ -166,7 +156,7 @@ def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, 
     """
     best = float(np.max(correlations))
     distance = np.hypot(*LAGS.T)
-    if best < COLOURED:
+    if best < 0.5:  # no two colours show the same texture
         met = counts[:, :3] > 0
         r = np.broadcast_to(distance[:, None], met.shape)[met]
         # one colour's samples are two pixels apart and show nothing of what is finer
@@ -211,8 +201,9 @@ def _mixture(
         unit, fine = band
         system = np.column_stack([gaussians - product[:, None] * unit, product - 1]) * importance[:, None]
         sum_to_one = np.append(np.ones(len(widths)), -1.0)
-        # short distances hardly distinguish a constant from a wide Gaussian
-        small_offset = np.append(np.zeros(len(widths)), OFFSET_PENALTY)
+        # short distances hardly distinguish a constant from a wide Gaussian: an offset of 1 costs an error (of
+        # products) of .05; the true one is -0.02 to -0.15
+        small_offset = np.append(np.zeros(len(widths)), 0.05)
         system = np.vstack([system, 1e3 * sum_to_one, 1e3 * fine, small_offset])
         wanted = np.concatenate([np.zeros(r.size), [1e3, 0.0, 0.0]])
     solution = nnls(system, wanted)[0]
@@ -239,27 +230,30 @@ def _coarse_fraction(model: TextureModel, sums: FloatArray, counts: FloatArray, 
     band = model.band
     measured = (sums[two, :3].sum(axis=0) / counts[two, :3].sum(axis=0)).mean()
     common = np.clip(correlations / (np.array([band.adjacent, band.diagonal, band.adjacent]) / band.own), 0, 1).mean()
-    # what of the channel-specific fraction is still seen two pixels away, shrunk to 0 where that is nearly nothing
+    # what of the channel-specific fraction is still seen two pixels away, shrunk to 0 where that fraction is nearly
+    # nothing: under .02 products do not show whether it is coarse
     coarse = measured / max(float(model(2.0)) / band.own, 1e-3) - common
-    return float(np.clip(coarse * (1 - common) / ((1 - common) ** 2 + INDISTINCT**2), 0, 1))
+    return float(np.clip(coarse * (1 - common) / ((1 - common) ** 2 + 0.02**2), 0, 1))
 
 
-def speckle_diameter(picture: FloatArray) -> float | None:
+def speckle_diameter(picture: FloatArray, *, background: float = 20.0) -> float | None:
     """Return the size of the speckle in a picture, without the peak that white noise has at distance 0.
 
     Parameters
     ----------
     picture : ndarray, shape (H, W)
         Finite at all pixels.
+    background
+        Standard deviation (px) of the local mean over which speckle stands out.
 
     Returns
     -------
     float or None
         Full width at half maximum of the autocorrelation, averaged over all directions, px; None without a texture.
     """
-    texture = picture - cv2.GaussianBlur(picture, (0, 0), _BACKGROUND)
+    texture = picture - cv2.GaussianBlur(picture, (0, 0), background)
     power = np.abs(np.fft.rfft2(texture, s=[2 * side for side in texture.shape])) ** 2
-    reach = min(int(2 * _BACKGROUND), *(side - 1 for side in texture.shape))
+    reach = min(int(2 * background), *(side - 1 for side in texture.shape))
     lag = np.arange(-reach, reach + 1)
     pairs = np.multiply.outer(*(1 - np.abs(lag) / side for side in texture.shape))
     mean, away = np.fft.irfft2(power)[np.ix_(lag, lag)] / pairs, np.hypot(lag[:, None], lag)

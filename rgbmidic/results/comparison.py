@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from rgbmidic.correlation.assembly import BLOCK, OF_ELEMENT
+from rgbmidic.correlation.constants import USUAL
 from rgbmidic.errors import InputError
 from rgbmidic.fields import NodalCovariance, StrainGauges, strain_of_gradient
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh
@@ -145,7 +145,7 @@ class Comparison:
         units = placement if placement.camera is None else rectification_of(result, scale).units
         self.relative_std = units.mm_per_pixel_std / units.mm_per_pixel if units.mm_per_pixel else 0.0
         image = Tri3Mesh(nodes=result.nodes, elements=result.elements)
-        self._blocks = image.areas.sum() / max(BLOCK, OF_ELEMENT * image.size) ** 2
+        self._blocks = image.areas.sum() / max(USUAL.block, USUAL.of_element * image.size) ** 2
 
     @property
     def gauge(self) -> float:

@@ -30,8 +30,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.correlation.assembly import Assembly
-from rgbmidic.correlation.equations import SEEN
-from rgbmidic.correlation.nodes import LOST
+from rgbmidic.correlation.constants import USUAL
 from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std, linear_fit_offset, mass_matrix
 from rgbmidic.illumination.crosstalk import NEGLIGIBLE
 from rgbmidic.illumination.linear import QUANTISATION
@@ -96,7 +95,8 @@ def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -
     """
     area = mesh.to_nodes(mesh.areas)
     density = mesh.to_nodes(information * mesh.areas) / area
-    seen = density > SEEN * np.median(density[density > 0]) if (density > 0).any() else np.zeros(len(density), bool)
+    known = density[density > 0]
+    seen = density > USUAL.seen * np.median(known) if known.size else np.zeros(len(density), bool)
     if not seen.any():
         return np.full((len(scores), len(density)), np.nan)
     assembly = Assembly.from_mesh(mesh)
@@ -106,12 +106,12 @@ def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -
         return assembly.matrix((values * mesh.areas)[:, None, None, None] * mass)
 
     # elements that no light sees must not make the system singular
-    solve = assembly.factorise(assembled(np.maximum(information, 1e-3 * SEEN * np.median(density[seen]))))
+    solve = assembly.factorise(assembled(np.maximum(information, 1e-3 * USUAL.seen * np.median(density[seen]))))
     used = np.asarray(seen[mesh.elements].all(axis=1))
     recovery = Recovery.over(mesh, used, density, linear_fit_offset(mesh))
     along_x, colouring = [(recovery.displacement_functionals[0], seen)], NodeColouring.from_mesh(mesh)
     std = np.stack([functional_std(solve, assembled(score), colouring, along_x)[:, 0] for score in scores])
-    return np.where(seen & (std < LOST), std, np.nan)
+    return np.where(seen & (std < USUAL.lost), std, np.nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

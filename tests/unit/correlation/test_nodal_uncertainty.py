@@ -10,7 +10,7 @@ from textures import Affine, Texture
 
 from rgbmidic import Region, Tri3Mesh, correlate
 from rgbmidic.correlation import Deformed, Reference
-from rgbmidic.correlation.assembly import BLOCK
+from rgbmidic.correlation.constants import USUAL
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std
 from rgbmidic.correlation.residual import Residual
@@ -37,8 +37,8 @@ def test_the_unfitted_share_is_that_of_the_projection(size):
         for node, (constant, in_x, in_y) in zip(corners, pixels.barycentric[element], strict=True):
             values = constant + in_x * pixels.local_x[own] + in_y * pixels.local_y[own]
             columns[own, node] = values[:, None] * np.stack([slope[own] for slope in slopes], axis=1)
-    (top, left, _, _), grid = pixels.bounds, pixels.grid(BLOCK)
-    index = (pixels.rows - top) // BLOCK * grid[1] + (pixels.columns - left) // BLOCK
+    (top, left, _, _), grid = pixels.bounds, pixels.grid(USUAL.block)
+    index = (pixels.rows - top) // USUAL.block * grid[1] + (pixels.columns - left) // USUAL.block
     used = reference.pixel_weights[0] > 0
     inside = (index[:, None] == np.arange(grid[0] * grid[1])) & used[:, None]
     scores = np.concatenate([slope[:, None] * inside for slope in slopes], axis=1).astype(float)
