@@ -1,5 +1,6 @@
 """The MIDIC solve: one displacement field from k weighted image pairs (paper, section 3.2)."""
 
+from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.discretisation import discretisation_error
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.reference_update import ReferenceUpdate
@@ -17,6 +18,7 @@ __all__ = [
     "ReferenceUpdate",
     "Residual",
     "Solution",
+    "SolverConstants",
     "Start",
     "Status",
     "discretisation_error",

@@ -125,10 +125,9 @@ class NormalisedMosaic:
 
 SIZE, WIDE = 5, 7
 """Side of the square of samples that a value is predicted from, and where the colours have nothing in common."""
-LEVELS_PER_OCTAVE = 1
-"""Fineness in which a channel's own variance is rounded; twice as fine measures the same."""
 LARGEST, SMALLEST = 10, -10
-"""Range (powers of two) of the channel-specific variance relative to the common one: beyond it weights are 0 or 1."""
+"""Range (powers of two, to which it is rounded) of the channel-specific variance relative to the common one: beyond it
+weights are 0 or 1, and twice as fine measures the same."""
 OFFSET_VARIANCE = 10.0
 """Variance of an unknown constant under the texture: makes the filter's coefficients sum to one."""
 SPARKLE_VARIANCE = 0.29
@@ -195,7 +194,7 @@ def prediction_filters(
         With one output for each channel.
     """
     tiles = specific.shape[1:]
-    level = np.round(LEVELS_PER_OCTAVE * np.log2(np.clip(specific, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
+    level = np.round(np.log2(np.clip(specific, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
     seen = np.eye(3) if seen is None else seen
     if displacement is None:
         displacement = np.zeros((seen.shape[1], 2, *tiles))
@@ -206,7 +205,7 @@ def prediction_filters(
     _, first, index, number = np.unique(code, return_index=True, return_inverse=True, return_counts=True)
     index = index.ravel()
 
-    variance = 2.0 ** (level.reshape(3, -1).T[first] / LEVELS_PER_OCTAVE)
+    variance = 2.0 ** level.reshape(3, -1).T[first]
     moved = DISPLACEMENT_STEP * np.moveaxis(steps.reshape(*steps.shape[:2], -1)[..., first], -1, 0)
     # a specimen's colour has no slope on the common texture that could tell how the channels see it
     together = texture.specific * np.eye(3) + (1 - texture.specific) * _correlations(variance, seen)
