@@ -1,10 +1,8 @@
-"""Values at the pixels of elements and patches: nodal interpolation, quadratic trends, correlation of two patches."""
+"""Values at the pixels of elements: nodal interpolation and quadratic trends."""
 
 import numpy as np
 
 from rgbmidic._kernels.threads import FAST, compiled, over_ranges
-
-_ZERO = np.float32(0.0)
 
 
 @over_ranges("elements")
@@ -44,33 +42,3 @@ def subtract_quadratic(
                 dx = u0 + x * (u1 + u3 * x + u4 * y) + y * (u2 + u5 * y)
                 dy = v0 + x * (v1 + v3 * x + v4 * y) + y * (v2 + v5 * y)
                 less[i] = given[i] - gx[i] * dx - gy[i] * dy
-
-
-@over_ranges("out", least=1 << 12)
-@compiled(fastmath=FAST)
-def patch_correlations(start, stop, first, second, centres, half, out):
-    """Correlation coefficients of the patch (2 half + 1)^2 of `first` around each centre with those of `second`.
-
-    `centres` (n, 2) are rows and columns; ``out`` (n, 2 m + 1, 2 m + 1) receives the zero-mean coefficient for shifts
-    of up to m rows and columns, 0 where a patch is blank. The patches lie within the images.
-    """
-    side, most = 2 * half + 1, out.shape[1] // 2
-    patch, area = np.empty((side, side), dtype=np.float32), side * side
-    for n in range(start, stop):
-        top, left = centres[n, 0] - half, centres[n, 1] - half
-        level, power = first[top : top + side, left : left + side].mean(), 0.0
-        for i in range(side):
-            for j in range(side):
-                patch[i, j] = first[top + i, left + j] - level
-                power += patch[i, j] * patch[i, j]
-        for down in range(out.shape[1]):
-            for along in range(out.shape[2]):
-                product = total = square = _ZERO
-                for i in range(side):
-                    line = second[top + down - most + i, left + along - most :]
-                    for j in range(np.uint64(side)):
-                        product += patch[i, j] * line[j]
-                        total += line[j]
-                        square += line[j] * line[j]
-                spread = power * (square - total * total / area)
-                out[n, down, along] = product / np.sqrt(spread) if spread > 0.0 else _ZERO

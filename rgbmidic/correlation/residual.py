@@ -11,11 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
+import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import element_squares
-from rgbmidic._kernels.patches import interpolate_nodal, patch_correlations, subtract_quadratic
+from rgbmidic._kernels.patches import interpolate_nodal, subtract_quadratic
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
@@ -412,18 +413,15 @@ def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: floa
     return found
 
 
-_REDUCTION = 2
-"""Reduction of the pictures in which patches are matched: a speckle of 4 px keeps 2, and they cost 16 times less."""
-_PATCH = 6
-"""Pixels of a patch to each side of its node there: 26 px hold some 40 speckles, of which chance reaches a correlation
-of .3 in 81 places (derived)."""
-_SHIFT = 4
-"""Largest shift of a patch, px there: 8 px of the image, two speckles. Twice as many cost 3 times as much."""
-_AGREES = 0.5
-"""Correlation coefficient from which a patch has been found, as in `confidence`."""
-
-
-def brought_nearer(residual: Residual, displacement: FloatArray) -> FloatArray:
+def brought_nearer(
+    residual: Residual,
+    displacement: FloatArray,
+    *,
+    reduction: int = 2,
+    half: int = 6,
+    most: int = 4,
+    least: float = 0.5,
+) -> FloatArray:
     """Bring an initial guess to within some tenths of a pixel by matching patches around the nodes.
 
     Both states are compared as the residual holds them, in the reference's axes, so that turn and strain of the guess
@@ -436,21 +434,34 @@ def brought_nearer(residual: Residual, displacement: FloatArray) -> FloatArray:
         At the initial guess.
     displacement : ndarray, shape (N, 2)
         The guess, at most 8 px away in x and y.
+    reduction
+        Of the pictures in which patches are matched: a speckle of 4 px keeps 2, and they cost 16 times less.
+    half
+        Pixels of a patch to each side of its node there: 26 px hold some 40 speckles, of which chance reaches a
+        correlation of .3 in 81 places (derived).
+    most
+        Largest shift of a patch, px there: 8 px of the image, two speckles. Twice as many cost 3 times as much.
+    least
+        Correlation coefficient from which a patch has been found, as in `confidence`.
 
     Returns
     -------
     ndarray, shape (N, 2)
         px; the guess itself where too few patches are found.
     """
-    mesh, pixels, reach = residual.reference.mesh, residual.reference.pixels, _PATCH + _SHIFT
-    f, g = _reduced(residual)
+    mesh, pixels, reach = residual.reference.mesh, residual.reference.pixels, half + most
+    f, g = _reduced(residual, reduction, reach)
     top, left = pixels.bounds[:2]
-    at = np.round((mesh.nodes - (left, top) - (_REDUCTION - 1) / 2) / _REDUCTION).astype(int) + reach
+    at = np.round((mesh.nodes - (left, top) - (reduction - 1) / 2) / reduction).astype(int) + reach
     at = np.clip(at, reach, np.array(f.shape)[::-1] - reach - 1)
-    found = np.empty((len(at), 2 * _SHIFT + 1, 2 * _SHIFT + 1), dtype=np.float32)
-    patch_correlations(f, g, at[:, ::-1], _PATCH, found)
-    i, j = np.divmod(found.reshape(len(at), -1).argmax(axis=1), 2 * _SHIFT + 1)
-    node = np.flatnonzero((i > 0) & (i < 2 * _SHIFT) & (j > 0) & (j < 2 * _SHIFT))
+    found = np.zeros((len(at), 2 * most + 1, 2 * most + 1), dtype=np.float32)
+    for out, (x, y) in zip(found, at, strict=True):
+        patch = f[y - half : y + half + 1, x - half : x + half + 1]
+        if patch.min() < patch.max():  # of a blank patch OpenCV says that it is everywhere
+            around = g[y - reach : y + reach + 1, x - reach : x + reach + 1]
+            out[:] = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
+    i, j = np.divmod(found.reshape(len(at), -1).argmax(axis=1), 2 * most + 1)
+    node = np.flatnonzero((i > 0) & (i < 2 * most) & (j > 0) & (j < 2 * most))
     i, j, (shift, score) = i[node], j[node], (np.zeros((len(at), 2)), np.zeros(len(at)))
     score[node] = here = found[node, i, j]
     for axis, (di, dj) in enumerate(((0, 1), (1, 0))):
@@ -458,24 +469,24 @@ def brought_nearer(residual: Residual, displacement: FloatArray) -> FloatArray:
         bend = before - 2 * here + after
         # the crest of the parabola through three values, of which the middle one is the largest
         shift[node, axis] = np.divide((before - after) / 2, bend, out=np.zeros_like(bend), where=bend < 0)
-    shift[node] += np.stack([j, i], axis=1) - _SHIFT
-    agrees = score >= _AGREES
+    shift[node] += np.stack([j, i], axis=1) - most
+    agrees = score >= least
     if agrees.sum() < _FITTED:
         return displacement
-    shift *= _REDUCTION
+    shift *= reduction
     beyond = shift + np.einsum("nij,nj->ni", mesh.nodal_gradient(displacement), shift)
     return displacement + follow(mesh.nodes[agrees], beyond[agrees], mesh, 1.0)
 
 
-def _reduced(residual: Residual) -> FloatImage:
+def _reduced(residual: Residual, side: int, border: int) -> FloatImage:
     """Return reduced pictures (2, h, w) of both states: the lights' deviations from their means, added; 0 around."""
     pixels, weights = residual.reference.pixels, residual.weights
-    count = pixels.block_sums(weights, _REDUCTION)
+    count = pixels.block_sums(weights, side)
     level = count.sum(axis=(1, 2), dtype=np.float64)[:, None, None]
     pictures = []
     for values in (residual.values, residual.warped):
-        sums = pixels.block_sums(values * weights, _REDUCTION)
+        sums = pixels.block_sums(values * weights, side)
         mean = sums.sum(axis=(1, 2), dtype=np.float64)[:, None, None] / np.maximum(level, 1e-30)
         total = (sums - mean.astype(np.float32) * count).sum(axis=0)
-        pictures.append(np.pad(total / np.maximum(count.sum(axis=0), np.float32(1e-6)), _PATCH + _SHIFT))
+        pictures.append(np.pad(total / np.maximum(count.sum(axis=0), np.float32(1e-6)), border))
     return np.stack(pictures)

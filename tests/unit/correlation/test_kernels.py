@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-import cv2
 import naive_correlation as naive
 import numpy as np
 import pytest
@@ -238,25 +237,6 @@ def less_curved(case, carried, bend):
     return out
 
 
-def correlated_patches(random):
-    """Two images, patches of the first one of which is blank, and their coefficients for shifts of up to 3 px."""
-    first, second = random.normal(size=(2, 60, 70)).astype(np.float32)
-    first[:14, :14] = 5
-    centres = np.concatenate([[[8, 8]], random.integers(8, 51, (99, 2))])
-    out = np.full((100, 7, 7), 7, dtype=np.float32)
-    patches.patch_correlations(first, second, centres, 5, out)
-    return first, second, centres, out
-
-
-def test_correlations_of_patches_equal_opencvs():
-    first, second, centres, out = correlated_patches(np.random.default_rng(12))
-    assert not out[0].any()
-    for (row, column), found in zip(centres[1:], out[1:], strict=True):
-        patch, around = first[row - 5 : row + 6, column - 5 : column + 6], second[row - 8 : row + 9]
-        expected = cv2.matchTemplate(around[:, column - 8 : column + 9], patch, cv2.TM_CCOEFF_NORMED)
-        np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
 def all_outputs():
     """What every parallel kernel writes."""
     case = scene(11, "over the edge", shape=(151, 173))
@@ -273,7 +253,7 @@ def all_outputs():
     curved = less_curved(case, case.displacement, case.random.normal(size=(len(case.mesh.nodes), 2, 3)))
     blocks = block_products(case, np.ones(case.pixels.grid(7), dtype=np.float32), 7, 2)
     found = right, hessian, difference, weights, moments, squares, sums, vector, fields, curved, blocks
-    return [case.coefficients, *found, correlated_patches(case.random)[3]]
+    return [case.coefficients, *found]
 
 
 def test_the_same_bits_on_one_and_three_threads():
