@@ -102,7 +102,7 @@ class SolverConstants:
         Least gain of the local correction: a light that has lost 95 % of its contrast is not amplified any further.
     gain_smoothness
         Weight of the smoothness of gain and offset over the mean entry of their matrix: carries them over gaps. Chosen;
-        with a tenth or ten times of it lights differ by 4e-4 px at most.
+        with half or twice of it lights differ by 4e-4 px at most.
     block
         Least side (px) of the blocks whose sums give the covariance of the scores: wider than a speckle and any filter.
     of_element
