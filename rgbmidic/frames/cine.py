@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.data import Recording
-from rgbmidic.frames.source import Movie, remembered
+from rgbmidic.frames.data import SECOND, Recording
+from rgbmidic.frames.source import Movie, MovieHeader, remembered
 from rgbmidic.frames.stored import StoredFrame, check_size, cut_short, damaged, unpack_bits
 from rgbmidic.settings import FrameKind
 from rgbmidic.typing import AnyArray, FloatArray
@@ -54,12 +54,7 @@ _MOST_BLOCKS, _MOST_FRAMES = 100, 2**25
 _LEAD, _UNINTERPOLATED = 1, 2
 _PACKED_BITS = {256: 10, 1024: 12}
 """Bits of a sample that each code of packed frames means."""
-_CODED_BITS = 10
-"""Bits of the samples that are not linear but codes (`_LINEAR`)."""
 _PATTERNS = {3: "GBRG", 4: "RGGB"}
-_OLD_PATTERNS = (1, 2)
-_GREY_HEADS = 0xF0000000
-_SECOND = 10**9
 
 _STEPS = (
     "311111111111101111111111111111011111111111111101111111111111110111111111111111101111111111111110111111111111"
@@ -89,13 +84,11 @@ class CineFile(Movie):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Header:
+class _Header(MovieHeader):
     """What a movie's header states, levels of codes made linear.
 
     Attributes
     ----------
-    shape
-        Rows and columns.
     bits
         Bits that a sample is stored in: 8, 16, or packed 10 or 12.
     bottom_up
@@ -104,22 +97,18 @@ class _Header:
         Pattern of the frame's first pixels; None where the header does not state it.
     black_level, white_level
         Grey levels (DN) as the header states them, (2, 2) and one; no black level where that cannot be.
-    recording
-        How the frames were recorded.
     pointers : ndarray, shape (count,), int64
         Where each frame begins in the file.
     size
         Bytes of the file.
     """
 
-    shape: tuple[int, int]
     bits: int
     bottom_up: bool
     kind: FrameKind | None
     cfa: str | None
     black_level: FloatArray | None
     white_level: float
-    recording: Recording
     pointers: npt.NDArray[np.int64]
     size: int
 
@@ -145,7 +134,7 @@ class _Header:
         else:
             samples = unpack_bits(lines, self.bits)
         values = samples[:, : columns * len(rows) // len(lines)].reshape(len(rows), columns)
-        if self.bits == _CODED_BITS:
+        if self.bits == 10:  # packed samples of 10 bit are codes
             values = _LINEAR[values]
         return StoredFrame(
             values=values[::-1] if self.bottom_up else values,
@@ -215,7 +204,7 @@ def _header(path: Path) -> _Header:
         times, exposures = _stamps(path, file, (end, places[2]), count)
     depth = _depth(bits, setup.get("bits", 0), levels)
     black, white, remarks = _levels(setup, depth)
-    if bits == _CODED_BITS and white < len(_LINEAR):  # levels of 10 bit are codes as the samples are
+    if bits == 10 and white < len(_LINEAR):  # levels of 10 bit are codes as the samples are
         black, white = None if black is None else int(_LINEAR[black]), int(_LINEAR[white])
     return _Header(
         shape=shape,
@@ -280,9 +269,9 @@ def _colours(path: Path, compression: int, bit_count: int, code: int) -> tuple[F
         )
     if compression not in (0, _UNINTERPOLATED):
         raise damaged(path, f"its header announces the kind of compression {compression}, which is unknown")
-    if code & _GREY_HEADS:
+    if code & 0xF0000000:
         raise FrameError(f"{path} joins the pictures of grey and colour heads (code {code:#x}), which is not read")
-    if compression == _UNINTERPOLATED and code in _OLD_PATTERNS:
+    if compression == _UNINTERPOLATED and code in (1, 2):
         raise FrameError(f"{path} has the colour filter array {code} of old cameras, which is no Bayer pattern")
     if compression == _UNINTERPOLATED and code in _PATTERNS:
         return "bayer", _PATTERNS[code]
@@ -331,7 +320,7 @@ def _since(times: npt.NDArray[np.uint64], trigger: int) -> npt.NDArray[np.int64]
     """Convert to ns from the trigger; both are seconds in fixed point 32.32, whose last two bits are flags."""
     flags = np.uint64(3)
     ticks = ((times & ~flags) - (np.uint64(trigger) & ~flags)).astype(np.int64)
-    return np.asarray((ticks >> 32) * _SECOND + (((ticks & 0xFFFFFFFF) * _SECOND + 2**31) >> 32))
+    return np.asarray((ticks >> 32) * SECOND + (((ticks & 0xFFFFFFFF) * SECOND + 2**31) >> 32))
 
 
 def _settings(
@@ -339,7 +328,7 @@ def _settings(
 ) -> dict[str, Any]:
     """Return frame rate, exposure and remarks: the exposure as stamped (0.32 fixed point seconds), else as set."""
     rates = (setup.get(name, 0.0) for name in ("frame_rate", "frame_rate_32", "frame_rate_16"))
-    stamped = 0 if exposures is None else (int(np.sort(exposures)[len(exposures) // 2]) * _SECOND + 2**31) >> 32
+    stamped = 0 if exposures is None else (int(np.sort(exposures)[len(exposures) // 2]) * SECOND + 2**31) >> 32
     us = setup.get("shutter_us", 0) or setup.get("shutter_us_16", 0)
     turned = [name for name in ("flip_horizontally", "flip_vertically", "rotate") if setup.get(name, 0)]
     if turned:

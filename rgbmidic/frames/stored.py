@@ -314,10 +314,6 @@ _T = TypeVar("_T")
 _Statement = tuple[Path | str | None, _T | None]
 """Who states something, None for the user (in TEST.toml or an option), and what; None: nothing."""
 
-_BLACK_TOLERANCE = 1.0
-"""DN: a file's black levels differ by position, and LibRaw rounds some; less than a grey level is no contradiction.
-Between two files that both round, captures and frames, a whole one is none."""
-
 
 def raw_frame(
     stored: StoredFrame,
@@ -420,13 +416,15 @@ def _white_level(stored: StoredFrame, stated: FrameSettings, path: Path, camera:
 
 
 def _black_level(stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None) -> FloatArray:
+    # a file's black levels differ by position, and LibRaw rounds some; less than a grey level (DN) is no contradiction
+    tolerance = 1.0
     in_file, user, known = stored.black_level, stated.black_level, camera.black_level if camera else None
-    if in_file is not None and user is not None and not (np.abs(in_file - user) < _BLACK_TOLERANCE).all():
+    if in_file is not None and user is not None and not (np.abs(in_file - user) < tolerance).all():
         raise _differ("black_level", (None, user), (path, in_file))
     if camera and known is not None:
-        if user is not None and abs(user - known) >= _BLACK_TOLERANCE:
+        if user is not None and abs(user - known) >= tolerance:
             raise _differ("black_level", (None, user), (camera.name, known))
-        if in_file is not None and abs(in_file.mean() - known) > _BLACK_TOLERANCE:  # whole numbers both, rounded apart
+        if in_file is not None and abs(in_file.mean() - known) > tolerance:  # captures and frames may be rounded apart
             raise _differ("black_level", (path, in_file), (camera.name, known))
     level = next((value for value in (user, known) if value is not None), 0.0)
     return np.full((1, 1), level) if in_file is None else in_file
