@@ -134,11 +134,6 @@ def known_formats() -> tuple[FrameFormat, ...]:
     return (*FORMATS, *_added_formats())
 
 
-def frame_endings() -> tuple[str, ...]:
-    """Endings (lower case) of the files that count as frames when a folder is listed."""
-    return tuple(ending for known in known_formats() for ending in known.endings)
-
-
 _ADVICE = (
     (
         (".mp4", ".avi", ".mov", ".mkv", ".wmv"),

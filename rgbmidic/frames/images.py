@@ -100,10 +100,8 @@ def _check_chunks(content: bytes, path: Path) -> None:
     """Refuse a file with a wrong checksum up to IEND, or that ends before it."""
     start, name, whole = len(_SIGNATURE), b"", memoryview(content)
     while name != b"IEND":
-        if start + 12 > len(content):
-            raise damaged(path, "it ends before its end mark")
-        length, name = struct.unpack(">I4s", whole[start : start + 8])
-        end = start + 8 + length
+        name = content[start + 4 : start + 8]
+        end = start + 8 + int.from_bytes(whole[start : start + 4], "big")
         if end + 4 > len(content):
             raise damaged(path, "it ends before its end mark")
         if zlib.crc32(whole[start + 4 : end]) != int.from_bytes(whole[end : end + 4], "big"):

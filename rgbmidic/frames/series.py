@@ -21,7 +21,7 @@ from typing import Any
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.formats import advice, frame_endings, open_source, reader_name
+from rgbmidic.frames.formats import advice, known_formats, open_source, reader_name
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.frames.source import FrameSource, file_fingerprint
 from rgbmidic.frames.stacks import split_dataset
@@ -393,7 +393,8 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
     with disk_faults(FrameError, f"the frames {pattern} cannot be looked for"):
         if place.is_dir():
             found = sorted(file for file in place.iterdir() if file.name[0] != ".")
-            files = [file for file in found if file.suffix.lower() in frame_endings()]
+            endings = {ending for known in known_formats() for ending in known.endings}
+            files = [file for file in found if file.suffix.lower() in endings]
         else:
             found = files = _matching(Path(text), Path(base))
         files = [file for file in files if not file.is_dir()]  # what else is no file is reported when it is read

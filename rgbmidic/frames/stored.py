@@ -135,10 +135,6 @@ class Layout:
         check_size(path, needed=size, stored=size)
         return cls(count=count, start=start, size=size, stride=size if stride is None else stride)
 
-    def whole(self, file_size: int) -> int:
-        """Return the number of frames that are all in a file of so many bytes."""
-        return min(max((file_size - self.start - self.size) // self.stride + 1, 0), self.count)
-
     def read(self, path: Path, index: int, rows: range, of: int) -> bytes:
         """Read the bytes of some `rows` of frame `index`, which has `of` rows of one length.
 
@@ -150,7 +146,8 @@ class Layout:
         with path.open("rb") as file:
             begin, size = self.start + index * self.stride, file.seek(0, 2)
             if size < begin + self.size:
-                raise cut_short(path, whole=self.whole(size), count=self.count)
+                whole = min(max((size - self.start - self.size) // self.stride + 1, 0), self.count)
+                raise cut_short(path, whole=whole, count=self.count)
             first, last = (self.size * row // of for row in (rows.start, rows.stop))
             file.seek(begin + first)
             return file.read(last - first)

@@ -7,7 +7,7 @@ import math
 import operator
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path, PurePath
@@ -325,16 +325,12 @@ class Checked:
             where = f"{self.section}.{entry.name}".lstrip(".")
             value = converted(entry, getattr(self, entry.name), hints[entry.name], where)
             object.__setattr__(self, entry.name, value)
-        self._check()
+        for problem in self._problems():
+            raise ConfigurationError(problem)
 
-    def _check(self) -> None:
-        """Raise a `ConfigurationError` where keys contradict each other."""
-
-
-def require(kept: object, message: str) -> None:
-    """Refuse settings of which a condition is not kept."""
-    if not kept:
-        raise ConfigurationError(message)
+    def _problems(self) -> Iterator[str]:
+        """Normalise what depends on other keys, and yield what contradicts them, a sentence each."""
+        return iter(())
 
 
 def read_section(

@@ -8,7 +8,7 @@ and a single entry in place of a list of one are what they stand for, in a file 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +23,6 @@ from rgbmidic.settings.conversion import (
     read_section,
     read_table,
     read_toml,
-    require,
 )
 from rgbmidic.settings.sections import (
     CalibrationSettings,
@@ -59,15 +58,11 @@ class ScaleSettings(Checked):
     camera: Path | None = None
     frame_rate: float | None = bounded(None, above=0)
 
-    def _check(self) -> None:
-        require(
-            self.camera is None or self.mm_per_pixel is None,
-            f"scale.camera ({self.camera}) holds the scale, scale.mm_per_pixel states another: leave one of them out",
-        )
-        require(
-            not self.mm_per_pixel_std or self.mm_per_pixel is not None,
-            "scale.mm_per_pixel_std is the uncertainty of scale.mm_per_pixel, which is missing",
-        )
+    def _problems(self) -> Iterator[str]:
+        if self.camera is not None and self.mm_per_pixel is not None:
+            yield f"scale.camera ({self.camera}) and scale.mm_per_pixel both state the scale: leave one of them out"
+        if self.mm_per_pixel_std and self.mm_per_pixel is None:
+            yield "scale.mm_per_pixel_std is the uncertainty of scale.mm_per_pixel, which is missing"
 
 
 _Place2 = tuple[tuple[float, float], ...]
@@ -141,39 +136,33 @@ class ProbeSettings(Checked):
     rigid_motion: Literal["none", "tell", "remove"] = "none"
     names: tuple[tuple[str, str], ...] = ()
 
-    def _check(self) -> None:
-        require(
-            self.window == 0 or self.window >= 4, f"probes.window must be 0 or at least 4 frames, not {self.window}"
-        )
+    def _problems(self) -> Iterator[str]:
+        if 0 < self.window < 4:
+            yield f"probes.window must be 0 or at least 4 frames, not {self.window}"
         for key in ("circles", "strain_gauges"):
             sizes = [size for *_, size in getattr(self, key)]
-            require(all(size > 0 for size in sizes), f"probes.{key} are [x, y, size] with a size above 0, not {sizes}")
+            if not all(size > 0 for size in sizes):
+                yield f"probes.{key} are [x, y, size] with a size above 0, not {sizes}"
         for x0, y0, x1, y1 in self.regions:
-            require(
-                x0 != x1 and y0 != y1,
-                f"probes.regions are [x0, y0, x1, y1] of a rectangle with an area, not {[x0, y0, x1, y1]}",
-            )
+            if x0 == x1 or y0 == y1:
+                yield f"probes.regions are [x0, y0, x1, y1] of a rectangle with an area, not {[x0, y0, x1, y1]}"
         for *_, inner, outer in self.tips:
-            require(
-                0 < inner < outer,
-                f"probes.tips are [x, y, r0, r1] with radii 0 < r0 < r1 in px, not {inner:g} and {outer:g}",
-            )
+            if not 0 < inner < outer:
+                yield f"probes.tips are [x, y, r0, r1] with radii 0 < r0 < r1 in px, not {inner:g} and {outer:g}"
         missing = [key for key in ("youngs_modulus", "poissons_ratio", "plane") if getattr(self, key) is None]
-        require(
-            not (self.tips and missing),
-            'probes.tips need probes.youngs_modulus (MPa), probes.poissons_ratio and probes.plane ("stress" or '
-            f'"strain"), as options --youngs-modulus, --poissons-ratio, --plane; missing: {", ".join(missing)}',
-        )
-        require(self.terms != 1, "probes.terms must be 0 (chosen by a test) or at least 2, not 1")
+        if self.tips and missing:
+            yield (
+                'probes.tips need probes.youngs_modulus (MPa), probes.poissons_ratio and probes.plane ("stress" or '
+                f'"strain"), as options --youngs-modulus, --poissons-ratio, --plane; missing: {", ".join(missing)}'
+            )
+        if self.terms == 1:
+            yield "probes.terms must be 0 (chosen by a test) or at least 2, not 1"
         check_names((probe for probe, _ in self.names), self.numbered, "probe", "probes.names")
         given = [name for _, name in self.names]
         for name in given:
-            require(
-                PROBE_NAME.fullmatch(name) and given.count(name) == 1,
-                'probes.names must be different, of letters, digits, spaces, "." and "-" (60 at most), not "'
-                + name
-                + '"',
-            )
+            if not PROBE_NAME.fullmatch(name) or given.count(name) > 1:
+                allowed = 'different, of letters, digits, spaces, "." and "-" (60 at most)'
+                yield f'probes.names must be {allowed}, not "{name}"'
 
     @property
     def numbered(self) -> list[str]:
@@ -223,14 +212,13 @@ class ChannelSettings(Checked):
     area: float | None = bounded(None, above=0)
     force: str | None = None
 
-    def _check(self) -> None:
+    def _problems(self) -> Iterator[str]:
         stated = [name for name in ("offset", "trigger", "align") if getattr(self, name)]
-        require(len(stated) < 2, f"channels.{' and channels.'.join(stated)} both relate the clocks: state one of them")
+        if len(stated) > 1:
+            yield f"channels.{' and channels.'.join(stated)} both relate the clocks: state one of them"
         others = [entry.name for entry in fields(self) if getattr(self, entry.name) and entry.name != "file"]
-        require(
-            self.file is not None or not others,
-            f"channels.{(others or ['file'])[0]} is of channels, whose file (channels.file) is not stated",
-        )
+        if self.file is None and others:
+            yield f"channels.{others[0]} is of channels, whose file (channels.file) is not stated"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -301,19 +289,13 @@ class TestSettings(Checked):
     channels: ChannelSettings = field(default_factory=ChannelSettings)
     base: Path = field(default_factory=Path)
 
-    def _check(self) -> None:
-        require(
-            not (self.mesh.error and self.frames.update_reference),
-            "mesh.error is for one reference, and frames.update_reference makes others: leave one of them out",
-        )
-        require(
-            self.mesh.file is not None or self.region.is_stated,
-            "[region] is missing or empty: it needs exactly one of rectangle, polygon, mask; given are 0",
-        )
-        require(
-            self.mesh.file is None or self.scale.mm_per_pixel is None,
-            f"scale.mm_per_pixel ({self.scale.mm_per_pixel}) states a scale, mesh.points hold another: leave it out",
-        )
+    def _problems(self) -> Iterator[str]:
+        if self.mesh.error and self.frames.update_reference:
+            yield "mesh.error is for one reference, and frames.update_reference makes others: leave one of them out"
+        if self.mesh.file is None and not self.region.is_stated:
+            yield "[region] is missing or empty: it needs exactly one of rectangle, polygon, mask; given are 0"
+        if self.mesh.file is not None and (scale := self.scale.mm_per_pixel) is not None:
+            yield f"scale.mm_per_pixel ({scale}) states a scale, mesh.points hold another: leave it out"
 
     @classmethod
     def from_mapping(cls, document: Mapping[str, Any], base: Path | str = ".") -> TestSettings:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypedDict
 
-from rgbmidic.settings.conversion import Checked, bounded, require
+from rgbmidic.settings.conversion import Checked, bounded
 
 FrameKind = Literal["bayer", "rgb", "monochrome"]
 
@@ -64,34 +65,29 @@ class FrameSettings(Checked):
     dtype: Literal["uint8", "uint16", ">u2"] | None = None
     crop_origin: tuple[int, int] | None = bounded(None, at_least=0)
 
-    def _check(self) -> None:
-        require(all(self.path), "frames.path must name the frame files")
-        require(
-            len(self.path) <= 1 or self.kind == "monochrome",
-            f"frames.path with {len(self.path)} entries means as many lights fired in succession before a monochrome "
-            'camera: state kind = "monochrome", or give a single path',
-        )
-        require(
-            self.lights == 1 or (len(self.path) == 1 and self.kind == "monochrome"),
-            f"frames.lights = {self.lights} means lights that fire in turn before a monochrome camera that records "
-            f'them in one series: state kind = "monochrome" and a single path, not {len(self.path)}',
-        )
-        require(
-            self.last is None or self.last >= self.first,
-            f"frames.last must be at least frames.first ({self.first}), not {self.last}",
-        )
-        require(
-            self.reference and len(set(self.reference)) == len(self.reference),
-            f"frames.reference must name different frames, not {list(self.reference)}",
-        )
+    def _problems(self) -> Iterator[str]:
+        if not all(self.path):
+            yield "frames.path must name the frame files"
+        if len(self.path) > 1 and self.kind != "monochrome":
+            yield (
+                f"frames.path with {len(self.path)} entries means as many lights fired in succession before a "
+                'monochrome camera: state kind = "monochrome", or give a single path'
+            )
+        if self.lights > 1 and (len(self.path) != 1 or self.kind != "monochrome"):
+            yield (
+                f"frames.lights = {self.lights} means lights that fire in turn before a monochrome camera that records "
+                f'them in one series: state kind = "monochrome" and a single path, not {len(self.path)}'
+            )
+        if self.last is not None and self.last < self.first:
+            yield f"frames.last must be at least frames.first ({self.first}), not {self.last}"
+        if not self.reference or len(set(self.reference)) < len(self.reference):
+            yield f"frames.reference must name different frames, not {list(self.reference)}"
         if self.cfa is not None:
             object.__setattr__(self, "cfa", self.cfa.upper())
-            allowed = ", ".join(BAYER_PATTERNS)
-            require(self.cfa in BAYER_PATTERNS, f'frames.cfa must be one of {allowed}, not "{self.cfa}"')
-        require(
-            self.black_level is None or self.white_level is None or self.white_level > self.black_level,
-            f"frames.white_level must be above black_level {self.black_level}, not {self.white_level}",
-        )
+            if self.cfa not in BAYER_PATTERNS:
+                yield f'frames.cfa must be one of {", ".join(BAYER_PATTERNS)}, not "{self.cfa}"'
+        if self.black_level is not None and self.white_level is not None and self.white_level <= self.black_level:
+            yield f"frames.white_level must be above black_level {self.black_level}, not {self.white_level}"
 
 
 LOCAL_MEAN = 10.0
@@ -189,30 +185,30 @@ class MeshSettings(Checked):
     error: bool | Literal["key"] = False
     refine: int | Literal[True, False] = False
 
-    def _check(self) -> None:
+    def _problems(self) -> Iterator[str]:
         refining = self.refine is not False
         for key, asked in (("error", self.error), ("refine", refining)):
-            require(
-                not asked or self.file is not None or self.side >= SMALLEST_HALVED,
-                f"mesh.{key} halves the elements: mesh.element_size must be {SMALLEST_HALVED:g} px or more for it, not "
-                f"{self.side:g}",
-            )
-        require(
-            not refining or self.element_size != "auto",
-            'mesh.refine and mesh.element_size = "auto" both choose the elements: state a number, or leave refine out',
-        )
+            if asked and self.file is None and self.side < SMALLEST_HALVED:
+                yield (
+                    f"mesh.{key} halves the elements: mesh.element_size must be {SMALLEST_HALVED:g} px or more for it, "
+                    f"not {self.side:g}"
+                )
+        if refining and self.element_size == "auto":
+            yield 'mesh.refine and mesh.element_size = "auto" both choose the elements: state a number or leave one out'
         for number, crack in enumerate(self.cracks):
-            _require_corners(f"mesh.cracks[{number}]", crack, 2, "two")
+            yield from _few_corners(f"mesh.cracks[{number}]", crack, 2, "two")
         if self.file is None:
             for key in ("points", "unit", "part"):
-                require(getattr(self, key) is None, f"mesh.{key} is for mesh.file, which is missing")
+                if getattr(self, key) is not None:
+                    yield f"mesh.{key} is for mesh.file, which is missing"
             if self.element_size is None:
                 object.__setattr__(self, "element_size", ELEMENT_SIZE)
             return
         for key, value in {"element_size": self.element_size, "cracks": self.cracks, "refine": refining}.items():
-            require(not value, f"mesh.{key} is for a mesh made here, and mesh.file names one: leave one out")
-        count = len(self.points or ())
-        require(count >= 2, f"mesh.file needs mesh.points, two or more [x_mm, y_mm, x_px, y_px], not {count}")
+            if value:
+                yield f"mesh.{key} is for a mesh made here, and mesh.file names one: leave one out"
+        if (count := len(self.points or ())) < 2:
+            yield f"mesh.file needs mesh.points, two or more [x_mm, y_mm, x_px, y_px], not {count}"
 
     @property
     def side(self) -> float:
@@ -245,19 +241,18 @@ class RegionSettings(Checked):
     mask: Path | None = None
     holes: tuple[tuple[tuple[float, float], ...], ...] = ()
 
-    def _check(self) -> None:
+    def _problems(self) -> Iterator[str]:
         stated = sum(getattr(self, kind) is not None for kind in ("rectangle", "polygon", "mask"))
-        require(stated <= 1, f"[region] needs exactly one of rectangle, polygon, mask; given are {stated}")
+        if stated > 1:
+            yield f"[region] needs exactly one of rectangle, polygon, mask; given are {stated}"
         if self.rectangle is not None:
             x0, y0, x1, y1 = self.rectangle
-            require(
-                x0 < x1 and y0 < y1,
-                f"region.rectangle is [x0, y0, x1, y1] with x0 < x1 and y0 < y1, not {list(self.rectangle)}",
-            )
+            if x0 >= x1 or y0 >= y1:
+                yield f"region.rectangle is [x0, y0, x1, y1] with x0 < x1 and y0 < y1, not {list(self.rectangle)}"
         if self.polygon is not None:
-            _require_corners("region.polygon", self.polygon, 3, "three")
+            yield from _few_corners("region.polygon", self.polygon, 3, "three")
         for number, hole in enumerate(self.holes):
-            _require_corners(f"region.holes[{number}]", hole, 3, "three")
+            yield from _few_corners(f"region.holes[{number}]", hole, 3, "three")
 
     @property
     def is_stated(self) -> bool:
@@ -303,18 +298,15 @@ class WeightSettings(Checked):
     images: tuple[Path, ...] = ()
     limit_deg: float | None = bounded(None, above=0, below=180)
 
-    def _check(self) -> None:
+    def _problems(self) -> Iterator[str]:
         geometric = self.method == "geometry"
-        require(
-            geometric == (self.geometry is not None),
-            'weights.method = "geometry" and weights.geometry = "SCENE.toml" go together',
-        )
-        require(
-            (self.method == "images") == bool(self.images),
-            'weights.method = "images" and weights.images = ["MASK.png", ...] go together',
-        )
+        if geometric != (self.geometry is not None):
+            yield 'weights.method = "geometry" and weights.geometry = "SCENE.toml" go together'
+        if (self.method == "images") != bool(self.images):
+            yield 'weights.method = "images" and weights.images = ["MASK.png", ...] go together'
         for key in ("height_map", "limit_deg"):
-            require(geometric or getattr(self, key) is None, f'weights.{key} is for weights.method = "geometry"')
+            if not geometric and getattr(self, key) is not None:
+                yield f'weights.{key} is for weights.method = "geometry"'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -396,6 +388,7 @@ def grey_levels(
     return normalise, solver
 
 
-def _require_corners(where: str, corners: tuple[Any, ...], least: int, words: str) -> None:
-    """Refuse a path or polygon of too few corners."""
-    require(len(corners) >= least, f"{where} needs at least {words} corners [x, y], not {len(corners)}")
+def _few_corners(where: str, corners: tuple[Any, ...], least: int, words: str) -> Iterator[str]:
+    """What is wrong with a path or polygon of too few corners."""
+    if len(corners) < least:
+        yield f"{where} needs at least {words} corners [x, y], not {len(corners)}"
