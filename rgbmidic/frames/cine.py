@@ -112,19 +112,6 @@ class _Header(MovieHeader):
     pointers: npt.NDArray[np.int64]
     size: int
 
-    @property
-    def whole(self) -> int:
-        """Number of frames before the first that the file does not hold whole."""
-        begun = (self.pointers >= _FILE.size) & (self.pointers <= self.size - 8 - _needed(self.shape, self.bits))
-        return int(np.argmin(np.append(begun, False)))
-
-    def row_bits(self, size: int) -> int | None:
-        """Return the bits from one row to the next of a frame of `size` bytes; None where its size cannot be."""
-        rows, columns = self.shape
-        tight = columns * self.bits
-        filled = math.ceil(tight / 32) * 32  # as in Windows bitmaps
-        return {rows * filled // 8: filled, _needed(self.shape, self.bits): tight}.get(size)
-
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame."""
         height, columns = self.shape
@@ -146,8 +133,11 @@ class _Header(MovieHeader):
 
     def _lines(self, path: Path, index: int, rows: range) -> npt.NDArray[np.uint8]:
         """Read the bytes of some rows of a frame, (n, bytes), or (1, bytes) where a row ends within a byte."""
-        start = int(self.pointers[index])
-        ends = cut_short(path, whole=min(self.whole, index), count=self.recording.count)
+        start, needed, tight = int(self.pointers[index]), _needed(self.shape, self.bits), self.shape[1] * self.bits
+        filled = math.ceil(tight / 32) * 32  # bits from one row to the next, as in Windows bitmaps
+        is_whole = (self.pointers >= _FILE.size) & (self.pointers <= self.size - 8 - needed)
+        before = int(np.argmin(np.append(is_whole, False)))
+        ends = cut_short(path, whole=min(before, index), count=self.recording.count)
         with path.open("rb") as file:
             if start < _FILE.size or start + 8 > self.size:
                 raise ends
@@ -157,7 +147,7 @@ class _Header(MovieHeader):
                 raise damaged(path, f"the annotation of frame {index} has {annotation} bytes")
             file.seek(start + annotation - 4)
             size = int.from_bytes(file.read(4), "little")
-            if (row_bits := self.row_bits(size)) is None:
+            if (row_bits := {self.shape[0] * filled // 8: filled, needed: tight}.get(size)) is None:
                 raise damaged(path, f"frame {index} has not the size that its header announces")
             if start + annotation + size > self.size:
                 raise ends
@@ -202,7 +192,9 @@ def _header(path: Path) -> _Header:
         place = np.dtype("<i8" if version else "<u4")
         pointers = np.frombuffer(_piece(path, file, places[2], count * place.itemsize), place)
         times, exposures = _stamps(path, file, (end, places[2]), count)
-    depth = _depth(bits, setup.get("bits", 0), levels)
+    # of the code of 10 bit, 12; else the header's number, or as its number of levels needs
+    stated = next((one for one in (setup.get("bits", 0), (levels - 1).bit_length()) if 8 <= one <= bits), bits)
+    depth = 12 if bits in (10, 12) else stated
     black, white, remarks = _levels(setup, depth)
     if bits == 10 and white < len(_LINEAR):  # levels of 10 bit are codes as the samples are
         black, white = None if black is None else int(_LINEAR[black]), int(_LINEAR[white])
@@ -276,13 +268,6 @@ def _colours(path: Path, compression: int, bit_count: int, code: int) -> tuple[F
     if compression == _UNINTERPOLATED and code in _PATTERNS:
         return "bayer", _PATTERNS[code]
     return ("monochrome" if code == compression == 0 else None), None
-
-
-def _depth(bits: int, real: int, levels: int) -> int:
-    """Return the bits of a sample, 12 for the code of 10: the header's number, else as its number of levels needs."""
-    if bits in (10, 12):
-        return 12
-    return next((depth for depth in (real, (levels - 1).bit_length()) if 8 <= depth <= bits), bits)
 
 
 def _levels(setup: Mapping[str, int], depth: int) -> tuple[int | None, int, tuple[str, ...]]:

@@ -290,42 +290,26 @@ class Recording:
 
     @property
     def numbered(self) -> Integers:
-        """Number (count,) of every frame from the first, which has 0; with gaps where frames are lost."""
+        """Number (count,) of every frame from the first, which has 0; with gaps where frames are lost.
+
+        They are the camera's, else whole periods between even time stamps. Frames that are not taken at even intervals
+        are numbered through: a gap between them means nothing.
+        """
         if self.numbers is not None:
             return np.asarray(self.numbers - self.numbers[0])
-        if self.times_ns is not None:
-            return frame_numbers(self.times_ns)
+        if self.times_ns is not None and self.count > 2:
+            steps = np.diff(self.times_ns)
+            period = float(np.median(steps))
+            periods = np.round(steps / max(period, 1.0))
+            even = 0.1 * period * np.sqrt(periods)  # a clock of 1 MHz at 100,000 frames a second
+            if (periods >= 1).all() and (np.abs(steps - periods * period) <= even).all():
+                return np.concatenate([[0], np.cumsum(periods)]).astype(np.int64)
         return np.arange(self.count)
 
     @property
     def lost(self) -> int:
         """Number of frames lost between the first and the last."""
         return int(self.numbered[-1]) + 1 - self.count
-
-
-def frame_numbers(times_ns: Integers) -> Integers:
-    """Return the number of each frame from the first, from when they were taken: whole periods between even stamps.
-
-    Frames that are not taken at even intervals are numbered through: a gap between them means nothing.
-
-    Parameters
-    ----------
-    times_ns : ndarray, shape (count,), int64
-        When each frame was taken.
-
-    Returns
-    -------
-    ndarray, shape (count,), int64
-    """
-    if len(times_ns) < 3:
-        return np.arange(len(times_ns))
-    steps = np.diff(times_ns)
-    period = float(np.median(steps))
-    periods = np.round(steps / max(period, 1.0))
-    even = 0.1 * period * np.sqrt(periods)  # as a clock of 1 MHz misses whole periods at 100,000 frames a second
-    if (periods < 1).any() or (np.abs(steps - periods * period) > even).any():
-        return np.arange(len(times_ns))
-    return np.concatenate([[0], np.cumsum(periods)]).astype(np.int64)
 
 
 def even_times(numbers: range, interval: Fraction) -> Integers:

@@ -198,11 +198,6 @@ def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None =
     return source(path=path, stated=stated, camera=camera)
 
 
-def reader_name(source: FrameSource) -> str:
-    """Name of the format that a source is read as."""
-    return next((known.name for known in known_formats() if known.source is type(source)), "unknown")
-
-
 class Statements(TypedDict, total=False):
     """What the caller of `read_frame` states of a file; None: what the file states."""
 

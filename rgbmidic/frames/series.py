@@ -21,7 +21,7 @@ from typing import Any
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.formats import advice, known_formats, open_source, reader_name
+from rgbmidic.frames.formats import advice, known_formats, open_source
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.frames.source import FrameSource, file_fingerprint
 from rgbmidic.frames.stacks import split_dataset
@@ -458,7 +458,7 @@ def describe(settings: FrameSettings) -> dict[str, Any]:
         warnings.append(str(error))
     numbered = recording.times_ns is not None or recording.numbers is not None or len(series.lights[0]) > 1
     return {
-        "reader": reader_name(source),
+        "reader": next((known.name for known in known_formats() if known.source is type(source)), "unknown"),
         "count": len(series),
         "shape": frame.values.shape[-2:],
         "kind": "bayer" if cfa else settings.kind or stored.kind,

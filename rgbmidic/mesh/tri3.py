@@ -40,7 +40,9 @@ class Tri3Mesh:
         Typical leg of an element in px: that of a right isosceles triangle of the median area.
     sizes : ndarray, shape (N,), float64
         Typical leg of the elements around each node in px, by their mean area; `size` everywhere unless the mesh is
-        graded: elements around one node in ten more than twice as large as those around another one in ten.
+        graded.
+    is_graded : bool
+        Whether the elements around one node in ten are more than twice as large as those around another one in ten.
     """
 
     nodes: FloatArray
@@ -48,6 +50,7 @@ class Tri3Mesh:
     areas: FloatArray = field(init=False)
     size: float = field(init=False)
     sizes: FloatArray = field(init=False)
+    is_graded: bool = field(init=False)
 
     def __post_init__(self) -> None:
         """Check nodes and elements, order the corners and derive the areas."""
@@ -63,7 +66,8 @@ class Tri3Mesh:
         small, large = np.quantile(sizes[number > 0], [0.1, 0.9])
         # sizes of `from_region`, for which one serves, differ by 1.53 at most (8 to 40 px over rectangles, discs, rings
         # and polygons, with a crack; measured)
-        sizes[(number == 0) | (large <= 2.0 * small)] = self.size
+        object.__setattr__(self, "is_graded", bool(large > 2.0 * small))
+        sizes[(number == 0) | (not self.is_graded)] = self.size
         sizes.setflags(write=False)
         object.__setattr__(self, "sizes", sizes)
 
