@@ -12,7 +12,7 @@ import math
 import os
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -24,7 +24,7 @@ from rgbmidic.frames.data import SECOND, Recording
 from rgbmidic.frames.source import Movie, MovieHeader, remembered
 from rgbmidic.frames.stored import StoredFrame, check_size, cut_short, damaged, unpack_bits
 from rgbmidic.settings import FrameKind
-from rgbmidic.typing import AnyArray, FloatArray
+from rgbmidic.typing import AnyArray
 
 CINE_ENDINGS = (".cine", ".cin", ".cci")
 
@@ -93,10 +93,8 @@ class _Header(MovieHeader):
         Bits that a sample is stored in: 8, 16, or packed 10 or 12.
     bottom_up
         Whether the last row is stored first.
-    kind, cfa
-        Pattern of the frame's first pixels; None where the header does not state it.
-    black_level, white_level
-        Grey levels (DN) as the header states them, (2, 2) and one; no black level where that cannot be.
+    stated
+        Pattern and grey levels (DN), without samples; no black level where that of the header cannot be.
     pointers : ndarray, shape (count,), int64
         Where each frame begins in the file.
     size
@@ -105,10 +103,7 @@ class _Header(MovieHeader):
 
     bits: int
     bottom_up: bool
-    kind: FrameKind | None
-    cfa: str | None
-    black_level: FloatArray | None
-    white_level: float
+    stated: StoredFrame
     pointers: npt.NDArray[np.int64]
     size: int
 
@@ -123,13 +118,7 @@ class _Header(MovieHeader):
         values = samples[:, : columns * len(rows) // len(lines)].reshape(len(rows), columns)
         if self.bits == 10:  # packed samples of 10 bit are codes
             values = _LINEAR[values]
-        return StoredFrame(
-            values=values[::-1] if self.bottom_up else values,
-            kind=self.kind,
-            cfa=self.cfa,
-            black_level=self.black_level,
-            white_level=self.white_level,
-        )
+        return replace(self.stated, values=values[::-1] if self.bottom_up else values)
 
     def _lines(self, path: Path, index: int, rows: range) -> npt.NDArray[np.uint8]:
         """Read the bytes of some rows of a frame, (n, bytes), or (1, bytes) where a row ends within a byte."""
@@ -202,10 +191,12 @@ def _header(path: Path) -> _Header:
         shape=shape,
         bits=bits,
         bottom_up=height > 0 and bits in (8, 16),
-        kind=kind,
-        cfa=cfa,
-        black_level=None if black is None else np.full((2, 2), float(black)),
-        white_level=float(white),
+        stated=StoredFrame(
+            kind=kind,
+            cfa=cfa,
+            black_level=None if black is None else np.full((2, 2), float(black)),
+            white_level=float(white),
+        ),
         recording=Recording(
             count=count,
             bit_depth=depth,
@@ -285,9 +276,9 @@ def _stamps(
 ) -> tuple[npt.NDArray[np.uint64] | None, npt.NDArray[np.uint32] | None]:
     """Read times and exposures (count,) of the frames from the tagged blocks; None where there are none."""
     found: dict[int, npt.NDArray[Any]] = {}
-    place, end = between
+    (place, end), length = between, 8
     for _ in range(_MOST_BLOCKS):
-        if place + 8 > end:
+        if place + 8 > end or length < 8:
             break
         length, kind = struct.unpack("<IH", _piece(path, file, place, 6))
         if kind in _STAMPS:
@@ -295,8 +286,6 @@ def _stamps(
             if length - 8 < count * stored.itemsize:
                 raise damaged(path, f"block {kind} of its header has {length} bytes, too few for {count} frames")
             found[kind] = np.frombuffer(_piece(path, file, place + 8, count * stored.itemsize), stored)
-        if length < 8:
-            break
         place += length
     return found.get(_TIMES), found.get(_EXPOSURES)
 

@@ -16,7 +16,7 @@ import math
 import re
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -36,15 +36,14 @@ logger = logging.getLogger(__name__)
 class _Header(MovieHeader):
     """What is known of the frames of a movie.
 
-    `bits` of a sample are stored `shift` above the lowest of `stored_bits`, in the byte `order` of numpy; `oldest` is
-    the place in the file of the frame that was recorded first.
+    A sample is stored `shift` above the lowest of `stored_bits`, in the byte `order` of numpy; `stated` has its bits
+    and the pattern, without samples; `oldest` is the place in the file of the frame that was recorded first.
     """
 
     stored_bits: int
     order: Literal["<", ">"] = "<"
-    bits: int
     shift: int
-    cfa: str | None = None
+    stated: StoredFrame
     oldest: int = 0
     layout: Layout
 
@@ -57,9 +56,7 @@ class _Header(MovieHeader):
         else:
             packed = self.layout.read(path, index, rows, self.shape[0])
             values = unpack_bits(packed, self.stored_bits).reshape(len(rows), -1)
-        return StoredFrame(
-            values=values >> self.shift, kind="bayer" if self.cfa else None, cfa=self.cfa, bits=self.bits
-        )
+        return replace(self.stated, values=values >> self.shift)
 
 
 # Photron .mraw
@@ -127,7 +124,7 @@ def _mraw_header(path: Path) -> _Header:
     return _Header(
         shape=(rows, columns),
         stored_bits=stored_bits,
-        bits=min(stored_bits, depth),
+        stated=StoredFrame(bits=min(stored_bits, depth)),
         shift=0 if side == "lower" else max(stored_bits - depth, 0),
         layout=Layout.checked(path, count=count, start=0, size=size),
         recording=_recording(entries, count, depth),
@@ -255,13 +252,13 @@ def _seq_header(path: Path) -> _Header:
         layout = Layout.checked(path, count=count, start=8192 if version >= 5 else 1024, size=size, stride=stride)
         times = _stamps_ns(file, layout, oldest, "<iHH" if version >= 5 else "<iH")
     order, upper = _RAW[form]
+    cfa = _PATTERNS.get(pattern) if form % 2 else None
     return _Header(
         shape=(rows, columns),
         stored_bits=stored_bits,
         order=order,
-        bits=bits,
         shift=stored_bits - bits if upper else 0,
-        cfa=_PATTERNS.get(pattern) if form % 2 else None,
+        stated=StoredFrame(kind="bayer" if cfa else None, cfa=cfa, bits=bits),
         oldest=oldest,
         layout=layout,
         recording=Recording(

@@ -12,7 +12,7 @@ import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -226,7 +226,7 @@ class StoredFrame:
     Attributes
     ----------
     values : ndarray, shape (H, W) or (H, W, 3), uint8 or uint16
-        Raw grey levels (DN); three channels are R, G, B.
+        Raw grey levels (DN); three channels are R, G, B. Empty in a header, which states the rest of all frames.
     kind
         ``"rgb"`` where the file has three channels; ``"bayer"`` or ``"monochrome"`` only where the file states it.
     cfa
@@ -239,7 +239,7 @@ class StoredFrame:
         Bits of a sample where they are fewer than those of its type.
     """
 
-    values: AnyArray
+    values: AnyArray = field(default_factory=lambda: np.empty((0, 0), dtype=np.uint16))
     kind: FrameKind | None = None
     cfa: str | None = None
     black_level: FloatArray | None = None
