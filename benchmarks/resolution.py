@@ -14,7 +14,7 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import resolution
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.resolution import SPECKLES, study_sizes
-from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
+from rgbmidic.settings import FrameSettings, MeshSettings, RegionSettings, TestSettings
 
 from .tables import Row, table
 
@@ -213,7 +213,7 @@ def refined_mesh(quick: bool) -> Iterator[Row]:
             drawn = replace(scene, seed=seed)
             states, field = drawn.images()
             plan = Plan.from_settings(
-                replace(drawn.settings(), element_size=start), source=list(states.astype(np.float32))
+                replace(drawn.settings(), mesh=MeshSettings(element_size=start)), source=list(states.astype(np.float32))
             )
             finer = resolution.refine(plan)
             count, mesh = len(finer.reference.mesh.nodes), plan.reference.mesh

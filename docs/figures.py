@@ -159,7 +159,7 @@ class Demo:
         self.raw = read_frame(files[-1])
         self.before, self.after = (separate(read_frame(file), calibration).values for file in (files[0], files[-1]))
         self.result = Result.open(folder / "result")
-        options = {"region": settings.region.rectangle, "element_size": settings.element_size, "normalise": 10.0}
+        options = {"region": settings.region.rectangle, "element_size": settings.mesh.element_size, "normalise": 10.0}
         self.alone = correlate(self.before[0], self.after[0], **options)
         with np.load(folder / "test" / "truth.npz") as archive:
             self.truth = archive["displacement"][-1]

@@ -169,8 +169,10 @@ def frames(
     overwrite: Overwrite = False,
 ) -> None:
     """List the properties of raw frames as read: number, size, levels, times, missing frames."""
+    from json import dumps
+
     from rgbmidic.frames import known_formats
-    from rgbmidic.frames.series import describe, save_frame
+    from rgbmidic.frames.series import describe, description_text, save_frame
     from rgbmidic.settings import FrameSettings
 
     if formats:
@@ -183,9 +185,9 @@ def frames(
     description = describe(settings)
     if save is not None:
         save_frame(settings, *save, overwrite=overwrite)
-    for warning in description.warnings:
+    for warning in description["warnings"]:
         note(f"warning: {warning}")
-    print(description.as_json() if json else description.as_text())
+    print(dumps(description, indent=2) if json else description_text(description))
 
 
 @app.command()

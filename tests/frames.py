@@ -11,7 +11,7 @@ import tifffile
 from hypothesis import strategies as st
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.images import _cfa_tags, _colour_tags
+from rgbmidic.frames.images import _dng_tags
 from rgbmidic.settings import BAYER_PATTERNS
 
 _ACTIVE_AREA = 50829
@@ -60,7 +60,7 @@ def write_cropped_dng(path: Path, active: npt.NDArray[np.uint16], *, top: int, l
     full[top : top + rows, left : left + columns] = active
     mosaic = Mosaic(values=full, cfa=cfa, black_level=black, white_level=4095)
     area = (_ACTIVE_AREA, "I", 4, (top, left, top + rows, left + columns), True)
-    tags = [*_cfa_tags(mosaic, path), *_colour_tags((1, 1, 1)), area]
+    tags = [*_dng_tags(mosaic, (1, 1, 1), path), area]
     tifffile.imwrite(path, full, photometric=32803, extratags=tags, metadata=None, rowsperstrip=len(full))
 
 

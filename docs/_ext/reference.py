@@ -148,22 +148,18 @@ def _several(hint: Any) -> str:
 
 def test_keys() -> dict[str, dict[str, tuple[str, str]]]:
     """Type and default of every key of TEST.toml, by section and key."""
-    from rgbmidic.settings import TestSettings
+    from rgbmidic.settings.schema import section_kinds
 
-    sections: dict[str, dict[str, tuple[str, str]]] = {}
-    hints = get_type_hints(TestSettings)
-    for entry in fields(TestSettings):
-        section, _, key = entry.metadata.get("key", entry.name).partition(".")
-        hint = hints[entry.name]
-        if key:
-            sections.setdefault(section, {})[key] = type_words(hint, entry.metadata.get("bounds")), default(entry)
-        elif section:
-            inner = get_type_hints(hint)
-            sections[section] = {
-                part.name: (type_words(inner[part.name], part.metadata.get("bounds")), default(part))
-                for part in fields(hint)
-            }
-    return sections
+    return {
+        name: {
+            entry.name: (
+                type_words(get_type_hints(kind)[entry.name], entry.metadata.get("bounds")),
+                default(entry),
+            )
+            for entry in fields(kind)
+        }
+        for name, kind in section_kinds().items()
+    }
 
 
 def with_types(text: str) -> str:

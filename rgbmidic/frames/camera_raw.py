@@ -16,7 +16,7 @@ import numpy.typing as npt
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stored import StoredFrame, check_size, complaints, damaged
-from rgbmidic.frames.tiff_pages import is_stored_as_is, missing_data, tag, tiff_pages
+from rgbmidic.frames.tiff_pages import Tag, is_stored_as_is, missing_data, tag, tiff_pages
 from rgbmidic.settings import BAYER_PATTERNS, regular
 from rgbmidic.typing import AnyArray, FloatArray
 
@@ -29,9 +29,6 @@ logger = logging.getLogger(__name__)
 _NAMES = "3fr arw cr2 cr3 dcr dng erf fff iiq kdc mef mos mrw nef nrw orf pef raf rw2 rwl sr2 srf srw x3f"
 CAMERA_RAW_ENDINGS = tuple(f".{name}" for name in _NAMES.split())
 
-MAXIMUM_FLAT_ROWS = 0.01
-"""Fraction of rows without any noise above which a camera raw counts as not decoded: defective rows may exist."""
-
 _CAMERA_HEADERS = (
     *(b"II*\0", b"MM\0*"),  # TIFF: DNG, NEF, CR2, ARW, PEF, KDC, ...
     *(b"IIU\0", b"IIRO", b"IIRS", b"MMOR"),  # Panasonic, Olympus
@@ -39,8 +36,6 @@ _CAMERA_HEADERS = (
     *(b"\0MRM", b"FUJIFILM", b"FOVb"),  # Minolta, Fujifilm, Sigma
 )
 _CR3_HEADER = b"ftypcrx "
-_RAW_PHOTOMETRIC = (32803, 34892)
-_ACTIVE_AREA, _BLACK_REPEAT, _BLACK, _BLACK_DELTAS = 50829, 50713, 50714, (50715, 50716)
 _BROKEN_JPEG = ("Corrupt JPEG data", "Premature end of JPEG file", "Inconsistent progression sequence")
 """How libjpeg's warnings begin (JWRN in its jerror.h) after which it goes on with invented samples."""
 _ODD_JPEG = ("Invalid SOS parameters", "Unknown Adobe color transform code", "Warning: unknown JFIF revision")
@@ -101,9 +96,9 @@ def _tags(path: Path) -> tuple[bool, FloatArray | None]:
     """
     try:
         with tiff_pages(path) as pages:
-            raw = [page for page in pages if page.photometric in _RAW_PHOTOMETRIC] or pages
+            raw = [page for page in pages if page.photometric in (32803, 34892)] or pages  # CFA, linear raw
             page = max(raw, key=lambda page: page.imagewidth * page.imagelength)
-            top, left, *_ = tag(page, _ACTIVE_AREA) or (0, 0)
+            top, left, *_ = tag(page, Tag.ACTIVE_AREA) or (0, 0)
             stored_as_is, black = is_stored_as_is(page), _black_cell(page)
             missing = [reason for page in raw if (reason := missing_data(page, path.stat().st_size))]
             black = None if black is None else np.roll(black, (top, left), axis=(0, 1))
@@ -115,8 +110,9 @@ def _tags(path: Path) -> tuple[bool, FloatArray | None]:
 
 
 def _black_cell(page: TiffPage) -> FloatArray | None:
-    levels, repeat = tag(page, _BLACK), tag(page, _BLACK_REPEAT) or (1, 1)
-    if levels is None or any(delta in page.tags for delta in _BLACK_DELTAS) or not set(repeat) <= {1, 2}:
+    levels, repeat = tag(page, Tag.BLACK), tag(page, Tag.BLACK_REPEAT) or (1, 1)
+    varies = Tag.BLACK_DELTA_H in page.tags or Tag.BLACK_DELTA_V in page.tags
+    if levels is None or varies or not set(repeat) <= {1, 2}:
         return None
     numbers = np.array(levels, dtype=np.float64)
     if len(numbers) == 2 * math.prod(repeat):  # rationals come as numerator, denominator
@@ -208,5 +204,5 @@ def _check_filled(
     if stored_as_is:
         flat &= (highest == 0) & (black.min() > 0)
     fraction = float(flat.mean())
-    if flat[-1] or fraction > MAXIMUM_FLAT_ROWS:
+    if flat[-1] or fraction > 0.01:  # defective rows may exist
         raise damaged(path, f"{fraction:.1%} of its rows are empty (one single value, {highest[flat][-1]} in the last)")

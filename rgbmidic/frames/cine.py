@@ -12,7 +12,7 @@ import math
 import os
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -20,11 +20,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.data import Recording
-from rgbmidic.frames.source import Movie, remembered
+from rgbmidic.frames.data import SECOND, Recording
+from rgbmidic.frames.source import Movie, MovieHeader, remembered
 from rgbmidic.frames.stored import StoredFrame, check_size, cut_short, damaged, unpack_bits
 from rgbmidic.settings import FrameKind
-from rgbmidic.typing import AnyArray, FloatArray
+from rgbmidic.typing import AnyArray
 
 CINE_ENDINGS = (".cine", ".cin", ".cci")
 
@@ -54,12 +54,7 @@ _MOST_BLOCKS, _MOST_FRAMES = 100, 2**25
 _LEAD, _UNINTERPOLATED = 1, 2
 _PACKED_BITS = {256: 10, 1024: 12}
 """Bits of a sample that each code of packed frames means."""
-_CODED_BITS = 10
-"""Bits of the samples that are not linear but codes (`_LINEAR`)."""
 _PATTERNS = {3: "GBRG", 4: "RGGB"}
-_OLD_PATTERNS = (1, 2)
-_GREY_HEADS = 0xF0000000
-_SECOND = 10**9
 
 _STEPS = (
     "311111111111101111111111111111011111111111111101111111111111110111111111111111101111111111111110111111111111"
@@ -89,52 +84,28 @@ class CineFile(Movie):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Header:
+class _Header(MovieHeader):
     """What a movie's header states, levels of codes made linear.
 
     Attributes
     ----------
-    shape
-        Rows and columns.
     bits
         Bits that a sample is stored in: 8, 16, or packed 10 or 12.
     bottom_up
         Whether the last row is stored first.
-    kind, cfa
-        Pattern of the frame's first pixels; None where the header does not state it.
-    black_level, white_level
-        Grey levels (DN) as the header states them, (2, 2) and one; no black level where that cannot be.
-    recording
-        How the frames were recorded.
+    stated
+        Pattern and grey levels (DN), without samples; no black level where that of the header cannot be.
     pointers : ndarray, shape (count,), int64
         Where each frame begins in the file.
     size
         Bytes of the file.
     """
 
-    shape: tuple[int, int]
     bits: int
     bottom_up: bool
-    kind: FrameKind | None
-    cfa: str | None
-    black_level: FloatArray | None
-    white_level: float
-    recording: Recording
+    stated: StoredFrame
     pointers: npt.NDArray[np.int64]
     size: int
-
-    @property
-    def whole(self) -> int:
-        """Number of frames before the first that the file does not hold whole."""
-        begun = (self.pointers >= _FILE.size) & (self.pointers <= self.size - 8 - _needed(self.shape, self.bits))
-        return int(np.argmin(np.append(begun, False)))
-
-    def row_bits(self, size: int) -> int | None:
-        """Return the bits from one row to the next of a frame of `size` bytes; None where its size cannot be."""
-        rows, columns = self.shape
-        tight = columns * self.bits
-        filled = math.ceil(tight / 32) * 32  # as in Windows bitmaps
-        return {rows * filled // 8: filled, _needed(self.shape, self.bits): tight}.get(size)
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame."""
@@ -145,20 +116,17 @@ class _Header:
         else:
             samples = unpack_bits(lines, self.bits)
         values = samples[:, : columns * len(rows) // len(lines)].reshape(len(rows), columns)
-        if self.bits == _CODED_BITS:
+        if self.bits == 10:  # packed samples of 10 bit are codes
             values = _LINEAR[values]
-        return StoredFrame(
-            values=values[::-1] if self.bottom_up else values,
-            kind=self.kind,
-            cfa=self.cfa,
-            black_level=self.black_level,
-            white_level=self.white_level,
-        )
+        return replace(self.stated, values=values[::-1] if self.bottom_up else values)
 
     def _lines(self, path: Path, index: int, rows: range) -> npt.NDArray[np.uint8]:
         """Read the bytes of some rows of a frame, (n, bytes), or (1, bytes) where a row ends within a byte."""
-        start = int(self.pointers[index])
-        ends = cut_short(path, whole=min(self.whole, index), count=self.recording.count)
+        start, needed, tight = int(self.pointers[index]), _needed(self.shape, self.bits), self.shape[1] * self.bits
+        filled = math.ceil(tight / 32) * 32  # bits from one row to the next, as in Windows bitmaps
+        is_whole = (self.pointers >= _FILE.size) & (self.pointers <= self.size - 8 - needed)
+        before = int(np.argmin(np.append(is_whole, False)))
+        ends = cut_short(path, whole=min(before, index), count=self.recording.count)
         with path.open("rb") as file:
             if start < _FILE.size or start + 8 > self.size:
                 raise ends
@@ -168,7 +136,7 @@ class _Header:
                 raise damaged(path, f"the annotation of frame {index} has {annotation} bytes")
             file.seek(start + annotation - 4)
             size = int.from_bytes(file.read(4), "little")
-            if (row_bits := self.row_bits(size)) is None:
+            if (row_bits := {self.shape[0] * filled // 8: filled, needed: tight}.get(size)) is None:
                 raise damaged(path, f"frame {index} has not the size that its header announces")
             if start + annotation + size > self.size:
                 raise ends
@@ -213,18 +181,22 @@ def _header(path: Path) -> _Header:
         place = np.dtype("<i8" if version else "<u4")
         pointers = np.frombuffer(_piece(path, file, places[2], count * place.itemsize), place)
         times, exposures = _stamps(path, file, (end, places[2]), count)
-    depth = _depth(bits, setup.get("bits", 0), levels)
+    # of the code of 10 bit, 12; else the header's number, or as its number of levels needs
+    stated = next((one for one in (setup.get("bits", 0), (levels - 1).bit_length()) if 8 <= one <= bits), bits)
+    depth = 12 if bits in (10, 12) else stated
     black, white, remarks = _levels(setup, depth)
-    if bits == _CODED_BITS and white < len(_LINEAR):  # levels of 10 bit are codes as the samples are
+    if bits == 10 and white < len(_LINEAR):  # levels of 10 bit are codes as the samples are
         black, white = None if black is None else int(_LINEAR[black]), int(_LINEAR[white])
     return _Header(
         shape=shape,
         bits=bits,
         bottom_up=height > 0 and bits in (8, 16),
-        kind=kind,
-        cfa=cfa,
-        black_level=None if black is None else np.full((2, 2), float(black)),
-        white_level=float(white),
+        stated=StoredFrame(
+            kind=kind,
+            cfa=cfa,
+            black_level=None if black is None else np.full((2, 2), float(black)),
+            white_level=float(white),
+        ),
         recording=Recording(
             count=count,
             bit_depth=depth,
@@ -280,20 +252,13 @@ def _colours(path: Path, compression: int, bit_count: int, code: int) -> tuple[F
         )
     if compression not in (0, _UNINTERPOLATED):
         raise damaged(path, f"its header announces the kind of compression {compression}, which is unknown")
-    if code & _GREY_HEADS:
+    if code & 0xF0000000:
         raise FrameError(f"{path} joins the pictures of grey and colour heads (code {code:#x}), which is not read")
-    if compression == _UNINTERPOLATED and code in _OLD_PATTERNS:
+    if compression == _UNINTERPOLATED and code in (1, 2):
         raise FrameError(f"{path} has the colour filter array {code} of old cameras, which is no Bayer pattern")
     if compression == _UNINTERPOLATED and code in _PATTERNS:
         return "bayer", _PATTERNS[code]
     return ("monochrome" if code == compression == 0 else None), None
-
-
-def _depth(bits: int, real: int, levels: int) -> int:
-    """Return the bits of a sample, 12 for the code of 10: the header's number, else as its number of levels needs."""
-    if bits in (10, 12):
-        return 12
-    return next((depth for depth in (real, (levels - 1).bit_length()) if 8 <= depth <= bits), bits)
 
 
 def _levels(setup: Mapping[str, int], depth: int) -> tuple[int | None, int, tuple[str, ...]]:
@@ -311,9 +276,9 @@ def _stamps(
 ) -> tuple[npt.NDArray[np.uint64] | None, npt.NDArray[np.uint32] | None]:
     """Read times and exposures (count,) of the frames from the tagged blocks; None where there are none."""
     found: dict[int, npt.NDArray[Any]] = {}
-    place, end = between
+    (place, end), length = between, 8
     for _ in range(_MOST_BLOCKS):
-        if place + 8 > end:
+        if place + 8 > end or length < 8:
             break
         length, kind = struct.unpack("<IH", _piece(path, file, place, 6))
         if kind in _STAMPS:
@@ -321,8 +286,6 @@ def _stamps(
             if length - 8 < count * stored.itemsize:
                 raise damaged(path, f"block {kind} of its header has {length} bytes, too few for {count} frames")
             found[kind] = np.frombuffer(_piece(path, file, place + 8, count * stored.itemsize), stored)
-        if length < 8:
-            break
         place += length
     return found.get(_TIMES), found.get(_EXPOSURES)
 
@@ -331,7 +294,7 @@ def _since(times: npt.NDArray[np.uint64], trigger: int) -> npt.NDArray[np.int64]
     """Convert to ns from the trigger; both are seconds in fixed point 32.32, whose last two bits are flags."""
     flags = np.uint64(3)
     ticks = ((times & ~flags) - (np.uint64(trigger) & ~flags)).astype(np.int64)
-    return np.asarray((ticks >> 32) * _SECOND + (((ticks & 0xFFFFFFFF) * _SECOND + 2**31) >> 32))
+    return np.asarray((ticks >> 32) * SECOND + (((ticks & 0xFFFFFFFF) * SECOND + 2**31) >> 32))
 
 
 def _settings(
@@ -339,7 +302,7 @@ def _settings(
 ) -> dict[str, Any]:
     """Return frame rate, exposure and remarks: the exposure as stamped (0.32 fixed point seconds), else as set."""
     rates = (setup.get(name, 0.0) for name in ("frame_rate", "frame_rate_32", "frame_rate_16"))
-    stamped = 0 if exposures is None else (int(np.sort(exposures)[len(exposures) // 2]) * _SECOND + 2**31) >> 32
+    stamped = 0 if exposures is None else (int(np.sort(exposures)[len(exposures) // 2]) * SECOND + 2**31) >> 32
     us = setup.get("shutter_us", 0) or setup.get("shutter_us_16", 0)
     turned = [name for name in ("flip_horizontally", "flip_vertically", "rotate") if setup.get(name, 0)]
     if turned:

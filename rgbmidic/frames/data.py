@@ -13,9 +13,8 @@ from rgbmidic.errors import InputError
 from rgbmidic.settings import BAYER_PATTERNS
 from rgbmidic.typing import FloatArray
 
-_GRID = 32
-"""Windows begin and, within the frame, end at whole multiples of this (px): a mosaic's pattern, packed samples of
-10 bit (4 rows) and the blocks of the separation (at most 16 px) then lie as in the whole frame."""
+SECOND = 10**9
+"""Nanoseconds in a second."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,10 +67,12 @@ class Window:
         -------
         Window
         """
-        size = np.array(frame[::-1])
-        low = np.clip(np.floor(points.min(axis=0) - margin), 0, size - 1).astype(int) // _GRID * _GRID
+        # of whole multiples: a mosaic's pattern, packed samples of 10 bit (4 rows) and the blocks of the separation (at
+        # most 16 px) then lie as in the whole frame
+        size, grid = np.array(frame[::-1]), 32
+        low = np.clip(np.floor(points.min(axis=0) - margin), 0, size - 1).astype(int) // grid * grid
         last = np.clip(np.ceil(points.max(axis=0) + margin), low, size - 1).astype(int)
-        high = np.minimum((last // _GRID + 1) * _GRID, size)
+        high = np.minimum((last // grid + 1) * grid, size)
         (left, top), (columns, rows) = low.tolist(), (high - low).tolist()
         return cls(origin=(left, top), shape=(rows, columns), frame=frame)
 
@@ -250,9 +251,6 @@ def planes_of(frame: Mosaic | ChannelFrame) -> tuple[tuple[str, ...], list[npt.N
     return ("R", "G1", "G2", "B"), planes, frame.black_level.ravel()[order]
 
 
-_EVEN = 0.1
-"""Fraction of a period by which stamps may miss whole periods: a clock of 1 MHz does at 100,000 frames a second."""
-
 Integers = npt.NDArray[np.int64]
 
 
@@ -292,41 +290,26 @@ class Recording:
 
     @property
     def numbered(self) -> Integers:
-        """Number (count,) of every frame from the first, which has 0; with gaps where frames are lost."""
+        """Number (count,) of every frame from the first, which has 0; with gaps where frames are lost.
+
+        They are the camera's, else whole periods between even time stamps. Frames that are not taken at even intervals
+        are numbered through: a gap between them means nothing.
+        """
         if self.numbers is not None:
             return np.asarray(self.numbers - self.numbers[0])
-        if self.times_ns is not None:
-            return frame_numbers(self.times_ns)
+        if self.times_ns is not None and self.count > 2:
+            steps = np.diff(self.times_ns)
+            period = float(np.median(steps))
+            periods = np.round(steps / max(period, 1.0))
+            even = 0.1 * period * np.sqrt(periods)  # a clock of 1 MHz at 100,000 frames a second
+            if (periods >= 1).all() and (np.abs(steps - periods * period) <= even).all():
+                return np.concatenate([[0], np.cumsum(periods)]).astype(np.int64)
         return np.arange(self.count)
 
     @property
     def lost(self) -> int:
         """Number of frames lost between the first and the last."""
         return int(self.numbered[-1]) + 1 - self.count
-
-
-def frame_numbers(times_ns: Integers) -> Integers:
-    """Return the number of each frame from the first, from when they were taken: whole periods between even stamps.
-
-    Frames that are not taken at even intervals are numbered through: a gap between them means nothing.
-
-    Parameters
-    ----------
-    times_ns : ndarray, shape (count,), int64
-        When each frame was taken.
-
-    Returns
-    -------
-    ndarray, shape (count,), int64
-    """
-    if len(times_ns) < 3:
-        return np.arange(len(times_ns))
-    steps = np.diff(times_ns)
-    period = float(np.median(steps))
-    periods = np.round(steps / max(period, 1.0))
-    if (periods < 1).any() or (np.abs(steps - periods * period) > _EVEN * period * np.sqrt(periods)).any():
-        return np.arange(len(times_ns))
-    return np.concatenate([[0], np.cumsum(periods)]).astype(np.int64)
 
 
 def even_times(numbers: range, interval: Fraction) -> Integers:
@@ -337,7 +320,7 @@ def even_times(numbers: range, interval: Fraction) -> Integers:
     OverflowError
         More than 292 years lie between them.
     """
-    above, below = 10**9 * interval.numerator, interval.denominator
+    above, below = SECOND * interval.numerator, interval.denominator
     return np.fromiter(((2 * number * above + below) // (2 * below) for number in numbers), np.int64, len(numbers))
 
 

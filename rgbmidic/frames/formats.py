@@ -134,11 +134,6 @@ def known_formats() -> tuple[FrameFormat, ...]:
     return (*FORMATS, *_added_formats())
 
 
-def frame_endings() -> tuple[str, ...]:
-    """Endings (lower case) of the files that count as frames when a folder is listed."""
-    return tuple(ending for known in known_formats() for ending in known.endings)
-
-
 _ADVICE = (
     (
         (".mp4", ".avi", ".mov", ".mkv", ".wmv"),
@@ -201,11 +196,6 @@ def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None =
     path = Path(path)
     source = next((known.source for known in known_formats() if known.reads(path, stated)), _UnknownFile)
     return source(path=path, stated=stated, camera=camera)
-
-
-def reader_name(source: FrameSource) -> str:
-    """Name of the format that a source is read as."""
-    return next((known.name for known in known_formats() if known.source is type(source)), "unknown")
 
 
 class Statements(TypedDict, total=False):

@@ -100,10 +100,8 @@ def _check_chunks(content: bytes, path: Path) -> None:
     """Refuse a file with a wrong checksum up to IEND, or that ends before it."""
     start, name, whole = len(_SIGNATURE), b"", memoryview(content)
     while name != b"IEND":
-        if start + 12 > len(content):
-            raise damaged(path, "it ends before its end mark")
-        length, name = struct.unpack(">I4s", whole[start : start + 8])
-        end = start + 8 + length
+        name = content[start + 4 : start + 8]
+        end = start + 8 + int.from_bytes(whole[start : start + 4], "big")
         if end + 4 > len(content):
             raise damaged(path, "it ends before its end mark")
         if zlib.crc32(whole[start + 4 : end]) != int.from_bytes(whole[end : end + 4], "big"):
@@ -141,14 +139,6 @@ class HeaderlessFile(FrameSource):
         return StoredFrame.plain(values.reshape(len(rows), shape[1], channels), self.path)
 
 
-MINIMUM_DNG_SIZE = 22
-"""Rows and columns below which LibRaw refuses a raw image."""
-
-_XYZ_TO_SRGB = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
-_ILLUMINANT_D65 = 21
-_PHOTOMETRIC_CFA = 32803
-
-
 def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float] | None = None) -> None:
     """Write a raw Bayer frame as an uncompressed DNG.
 
@@ -169,14 +159,12 @@ def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float
     InputError
         The frame is too small, a level is not a whole number, or a factor is not positive.
     """
-    if min(mosaic.values.shape) < MINIMUM_DNG_SIZE:
+    if min(mosaic.values.shape) < 22:
         raise InputError(
-            f"a DNG needs at least {MINIMUM_DNG_SIZE} rows and columns (LibRaw refuses smaller ones), "
-            f"not {mosaic.values.shape}: {path}"
+            f"a DNG needs at least 22 rows and columns (LibRaw refuses smaller ones), not {mosaic.values.shape}: {path}"
         )
-    balance = (1.0, 1.0, 1.0) if white_balance is None else white_balance
-    tags = [*_cfa_tags(mosaic, path), *_colour_tags(balance)]
-    _write(path, mosaic.values, photometric=_PHOTOMETRIC_CFA, extratags=tags, rowsperstrip=mosaic.values.shape[0])
+    tags = _dng_tags(mosaic, (1.0, 1.0, 1.0) if white_balance is None else white_balance, path)
+    _write(path, mosaic.values, photometric="cfa", extratags=tags, rowsperstrip=mosaic.values.shape[0])
 
 
 def write_tiff(path: Path | str, frame: Mosaic | ChannelFrame) -> None:
@@ -210,7 +198,10 @@ def _write(path: Path | str, values: np.ndarray[Any, np.dtype[np.uint16]], **opt
         temporary.unlink(missing_ok=True)
 
 
-def _cfa_tags(mosaic: Mosaic, path: Path | str) -> list[tuple[Any, ...]]:
+def _dng_tags(mosaic: Mosaic, white_balance: Sequence[float], path: Path | str) -> list[tuple[Any, ...]]:
+    if len(white_balance) != 3 or not all(np.isfinite(factor) and factor > 0 for factor in white_balance):
+        raise InputError(f"white_balance is three positive factors (R, G, B), not {white_balance!r}")
+    xyz_to_srgb = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
     black = [_whole(level, "black", path) for level in mosaic.black_level.ravel()]
     channels = bytes(int(channel) for channel in cfa_channels(mosaic.cfa).ravel())
     return [
@@ -224,17 +215,9 @@ def _cfa_tags(mosaic: Mosaic, path: Path | str) -> list[tuple[Any, ...]]:
         (50713, "H", 2, (2, 2), True),  # BlackLevelRepeatDim
         (50714, "I", 4, black, True),  # BlackLevel, by position
         (50717, "I", 1, _whole(mosaic.white_level, "white", path), True),  # WhiteLevel
-    ]
-
-
-def _colour_tags(white_balance: Sequence[float]) -> list[tuple[Any, ...]]:
-    if len(white_balance) != 3 or not all(np.isfinite(factor) and factor > 0 for factor in white_balance):
-        raise InputError(f"white_balance is three positive factors (R, G, B), not {white_balance!r}")
-    neutral = [min(white_balance) / factor for factor in white_balance]
-    return [
-        (50721, "2i", 9, _rationals(_XYZ_TO_SRGB), True),  # ColorMatrix1
-        (50728, "2I", 3, _rationals(neutral), True),  # AsShotNeutral
-        (50778, "H", 1, _ILLUMINANT_D65, True),  # CalibrationIlluminant1
+        (50721, "2i", 9, _rationals(xyz_to_srgb), True),  # ColorMatrix1
+        (50728, "2I", 3, _rationals(min(white_balance) / factor for factor in white_balance), True),  # AsShotNeutral
+        (50778, "H", 1, 21, True),  # CalibrationIlluminant1: D65
     ]
 
 

@@ -16,7 +16,7 @@ import math
 import re
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -25,30 +25,27 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.data import Integers, Recording, even_times, fraction
-from rgbmidic.frames.source import Movie, remembered
+from rgbmidic.frames.data import SECOND, Integers, Recording, even_times, fraction
+from rgbmidic.frames.source import Movie, MovieHeader, remembered
 from rgbmidic.frames.stored import Layout, StoredFrame, damaged, unpack_bits
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Header:
+class _Header(MovieHeader):
     """What is known of the frames of a movie.
 
-    `bits` of a sample are stored `shift` above the lowest of `stored_bits`, in the byte `order` of numpy; `oldest` is
-    the place in the file of the frame that was recorded first.
+    A sample is stored `shift` above the lowest of `stored_bits`, in the byte `order` of numpy; `stated` has its bits
+    and the pattern, without samples; `oldest` is the place in the file of the frame that was recorded first.
     """
 
-    shape: tuple[int, int]
     stored_bits: int
     order: Literal["<", ">"] = "<"
-    bits: int
     shift: int
-    cfa: str | None = None
+    stated: StoredFrame
     oldest: int = 0
     layout: Layout
-    recording: Recording
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame."""
@@ -59,9 +56,7 @@ class _Header:
         else:
             packed = self.layout.read(path, index, rows, self.shape[0])
             values = unpack_bits(packed, self.stored_bits).reshape(len(rows), -1)
-        return StoredFrame(
-            values=values >> self.shift, kind="bayer" if self.cfa else None, cfa=self.cfa, bits=self.bits
-        )
+        return replace(self.stated, values=values >> self.shift)
 
 
 # Photron .mraw
@@ -83,12 +78,6 @@ _NAMES = {
     "Shutter Type2(nsec)": "recordInfo/shutterSpeedNsec",
 }
 """Names in .cih, and where .cihx holds the same."""
-
-_HEADER_BYTES = 4 * 2**20
-"""Most bytes that are read of a header; those seen have 9 and 19 kB."""
-
-_LARGEST = 2**40
-"""Largest frame number: 12 days at a million frames a second."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,7 +108,7 @@ def _beside(path: Path, *endings: str) -> Path | None:
 @remembered
 def _mraw_header(path: Path) -> _Header:
     with path.open("rb") as file:
-        content = file.read(_HEADER_BYTES)
+        content = file.read(4 * 2**20)  # those seen have 9 and 19 kB
     entries = _Entries(path=path, found=_xml(content, path) if path.suffix.lower() == ".cihx" else _lines(content))
     rows, columns = entries.whole("Image Height"), entries.whole("Image Width")
     stored_bits = _stored_bits(entries)
@@ -135,7 +124,7 @@ def _mraw_header(path: Path) -> _Header:
     return _Header(
         shape=(rows, columns),
         stored_bits=stored_bits,
-        bits=min(stored_bits, depth),
+        stated=StoredFrame(bits=min(stored_bits, depth)),
         shift=0 if side == "lower" else max(stored_bits - depth, 0),
         layout=Layout.checked(path, count=count, start=0, size=size),
         recording=_recording(entries, count, depth),
@@ -154,7 +143,8 @@ class _Entries:
 
     def whole(self, name: str, default: int | None = None) -> int:
         text = self.text(name, "" if default is None else str(default))
-        if not re.fullmatch(r"-?[0-9]{1,13}", text) or abs(int(text)) > _LARGEST:
+        largest = 2**40  # the number of a frame after 12 days at a million a second
+        if not re.fullmatch(r"-?[0-9]{1,13}", text) or abs(int(text)) > largest:
             raise damaged(self.path, f'its "{name}" is "{text}"' if text else f'it does not state "{name}"')
         return int(text)
 
@@ -204,7 +194,7 @@ def _recording(entries: _Entries, count: int, depth: int) -> Recording:
     first = entries.whole("Start Frame", 0) - entries.whole("Correct Trigger Frame", 0)
     numbers = range(first, first + count * step, step)
     rate, shutter = entries.number("Record Rate(fps)"), entries.number("Shutter Speed(s)")
-    exposure = entries.number("Shutter Type2(nsec)") or (10**9 * shutter if shutter else None)
+    exposure = entries.number("Shutter Type2(nsec)") or (SECOND * shutter if shutter else None)
     try:
         times = None if rate is None else even_times(numbers, 1 / rate)
     except OverflowError:
@@ -222,15 +212,13 @@ def _recording(entries: _Entries, count: int, depth: int) -> Recording:
 
 # NorPix .seq
 
-_SEQ_MAGIC = 0xFEED
 _SEQ_FIELDS = struct.Struct("<I24xi4x512x6I3Id16xi8xI32xI364x")
 """Magic; version; width, height, bits stored, bits used, bytes, format; frames, origin, distance; rate; pattern;
 compression; oldest frame."""
 
 _RAW: dict[int, tuple[Literal["<", ">"], bool]] = dict.fromkeys((100, 101), ("<", False))
 _RAW |= dict.fromkeys((112, 113), ("<", True)) | dict.fromkeys((114, 115), (">", True))
-"""Monochrome and raw Bayer formats: byte order, and whether a sample's highest bit is the highest of its type."""
-_BAYER = (101, 113, 115)
+"""Monochrome (even) and raw Bayer (odd) formats: byte order, and whether a sample's highest bit is its type's."""
 _PACKED = range(131, 135)
 _PATTERNS = {1: "GRBG", 2: "BGGR", 3: "RGGB"}
 """By NorPix's `eHBayerPatternOrigin`; 0, green beside blue, is also what a header holds that states no pattern."""
@@ -247,7 +235,7 @@ class SeqFile(Movie):
 def _seq_header(path: Path) -> _Header:
     with path.open("rb") as file:
         content = file.read(_SEQ_FIELDS.size)
-        if len(content) < _SEQ_FIELDS.size or int.from_bytes(content[:4], "little") != _SEQ_MAGIC:
+        if len(content) < _SEQ_FIELDS.size or int.from_bytes(content[:4], "little") != 0xFEED:
             raise damaged(path, "it does not begin as a NorPix sequence")
         _, version, columns, rows, stored_bits, bits, size, form, *others = _SEQ_FIELDS.unpack(content)
         count, _, stride, rate, pattern, compression, oldest = others
@@ -264,13 +252,13 @@ def _seq_header(path: Path) -> _Header:
         layout = Layout.checked(path, count=count, start=8192 if version >= 5 else 1024, size=size, stride=stride)
         times = _stamps_ns(file, layout, oldest, "<iHH" if version >= 5 else "<iH")
     order, upper = _RAW[form]
+    cfa = _PATTERNS.get(pattern) if form % 2 else None
     return _Header(
         shape=(rows, columns),
         stored_bits=stored_bits,
         order=order,
-        bits=bits,
         shift=stored_bits - bits if upper else 0,
-        cfa=_PATTERNS.get(pattern) if form in _BAYER else None,
+        stated=StoredFrame(kind="bayer" if cfa else None, cfa=cfa, bits=bits),
         oldest=oldest,
         layout=layout,
         recording=Recording(
@@ -292,6 +280,6 @@ def _stamps_ns(file: BinaryIO, layout: Layout, oldest: int, stamp: str) -> Integ
     for index in range(layout.count):
         file.seek(behind + (index + oldest) % layout.count * layout.stride)
         seconds, *parts = struct.unpack(stamp, file.read(size))
-        times[index] = seconds * 10**9 + sum(part * 10**power for part, power in zip(parts, (6, 3), strict=False))
+        times[index] = seconds * SECOND + sum(part * 10**power for part, power in zip(parts, (6, 3), strict=False))
     times -= times[0]
     return times if (np.diff(times) > 0).all() else None

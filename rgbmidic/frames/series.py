@@ -7,21 +7,21 @@ from __future__ import annotations
 
 import glob
 import hashlib
-import json
 import logging
 import math
 import os
 import re
 from bisect import bisect_right
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
+from typing import Any
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.formats import advice, frame_endings, open_source, reader_name
+from rgbmidic.frames.formats import advice, known_formats, open_source
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.frames.source import FrameSource, file_fingerprint
 from rgbmidic.frames.stacks import split_dataset
@@ -393,7 +393,8 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
     with disk_faults(FrameError, f"the frames {pattern} cannot be looked for"):
         if place.is_dir():
             found = sorted(file for file in place.iterdir() if file.name[0] != ".")
-            files = [file for file in found if file.suffix.lower() in frame_endings()]
+            endings = {ending for known in known_formats() for ending in known.endings}
+            files = [file for file in found if file.suffix.lower() in endings]
         else:
             found = files = _matching(Path(text), Path(base))
         files = [file for file in files if not file.is_dir()]  # what else is no file is reported when it is read
@@ -419,67 +420,8 @@ def _matching(pattern: Path, base: Path) -> list[Path]:
     return [base / match for match in glob.glob(str(Path(*parts)), root_dir=base, recursive=True)]  # noqa: PTH207
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Description:
-    """What a reader sees; None where neither the files nor the user state it.
-
-    Attributes
-    ----------
-    reader
-        Format that the files, or the first of them, are read as.
-    count
-        Number of frames in all files.
-    shape
-        Rows and columns.
-    kind, cfa
-        What the frames are, and the Bayer pattern of their first pixels.
-    bit_depth
-        Bits of a sample: of the camera where the file states it, else of the file.
-    black_level, white_level
-        Grey levels (DN) that a run takes, stated or not; four black levels where they differ over the positions of the
-        2x2 cell.
-    frame_rate
-        Frames per second, as the camera was set.
-    exposure
-        Time in s that each frame collects light.
-    trigger
-        Index of the frame at the trigger; it may lie before the first or behind the last.
-    lost_frames
-        Number of frames missing between the first and the last.
-    first_time_ns, last_time_ns
-        When the first and the last frame were taken, in ns from the trigger.
-    warnings
-        What else the header states that a user should know, and why the last frame cannot be read.
-    """
-
-    reader: str
-    count: int
-    shape: tuple[int, int]
-    kind: str | None
-    cfa: str | None
-    bit_depth: int
-    black_level: float | tuple[float, ...]
-    white_level: float
-    frame_rate: float | None
-    exposure: float | None
-    trigger: int | None
-    lost_frames: int | None
-    first_time_ns: int | None
-    last_time_ns: int | None
-    warnings: tuple[str, ...]
-
-    def as_json(self) -> str:
-        """Return a JSON object, with null for what is not known."""
-        return json.dumps(asdict(self), indent=2)
-
-    def as_text(self) -> str:
-        """Return one line for each thing that is known."""
-        known = {name: value for name, value in asdict(self).items() if value is not None and name != "warnings"}
-        return "\n".join(f"{name:<15}{_text(value)}" for name, value in known.items())
-
-
-def describe(settings: FrameSettings) -> Description:
-    """Describe frames from their headers, the first and the last of them.
+def describe(settings: FrameSettings) -> dict[str, Any]:
+    """Describe frames from their headers, the first and the last of them; None where nothing states it.
 
     Parameters
     ----------
@@ -488,7 +430,16 @@ def describe(settings: FrameSettings) -> Description:
 
     Returns
     -------
-    Description
+    dict
+        ``reader``: format of the first file; ``count``: frames in all files; ``shape``: rows and columns; ``kind``,
+        ``cfa``: what the frames are, and the Bayer pattern of their first pixels; ``bit_depth``: bits of a sample, of
+        the camera where the file states it, else of the file; ``black_level``, ``white_level``: grey levels (DN) that a
+        run takes, stated or not, four black levels where they differ over the positions of the 2x2 cell;
+        ``frame_rate``: frames per second, as the camera was set; ``exposure``: seconds that each frame collects light;
+        ``trigger``: index of the frame at the trigger, which may lie before the first or behind the last;
+        ``lost_frames``: frames missing between the first and the last; ``first_time_ns``, ``last_time_ns``: when these
+        were taken, in ns from the trigger; ``warnings``: what else the header states that a user should know, and why
+        the last frame cannot be read.
 
     Raises
     ------
@@ -506,23 +457,35 @@ def describe(settings: FrameSettings) -> Description:
     except FrameError as error:  # a movie that is truncated, or still being written
         warnings.append(str(error))
     numbered = recording.times_ns is not None or recording.numbers is not None or len(series.lights[0]) > 1
-    return Description(
-        reader=reader_name(source),
-        count=len(series),
-        shape=(frame.values.shape[-2], frame.values.shape[-1]),
-        kind="bayer" if cfa else settings.kind or stored.kind,
-        cfa=cfa,
-        bit_depth=recording.bit_depth or stored.bits or 8 * stored.values.itemsize,
-        black_level=levels[0] if len(set(levels)) == 1 else levels,
-        white_level=frame.white_level,
-        frame_rate=recording.frame_rate,
-        exposure=None if recording.exposure_ns is None else recording.exposure_ns / 1e9,
-        trigger=recording.trigger,
-        lost_frames=series.lost if numbered else None,
-        first_time_ns=series.time_ns(0),
-        last_time_ns=series.time_ns(len(series) - 1),
-        warnings=tuple(warnings),
-    )
+    return {
+        "reader": next((known.name for known in known_formats() if known.source is type(source)), "unknown"),
+        "count": len(series),
+        "shape": frame.values.shape[-2:],
+        "kind": "bayer" if cfa else settings.kind or stored.kind,
+        "cfa": cfa,
+        "bit_depth": recording.bit_depth or stored.bits or 8 * stored.values.itemsize,
+        "black_level": levels[0] if len(set(levels)) == 1 else levels,
+        "white_level": frame.white_level,
+        "frame_rate": recording.frame_rate,
+        "exposure": None if recording.exposure_ns is None else recording.exposure_ns / 1e9,
+        "trigger": recording.trigger,
+        "lost_frames": series.lost if numbered else None,
+        "first_time_ns": series.time_ns(0),
+        "last_time_ns": series.time_ns(len(series) - 1),
+        "warnings": tuple(warnings),
+    }
+
+
+def description_text(description: Mapping[str, Any]) -> str:
+    """One line for each thing that is known of frames (`describe`)."""
+
+    def text(value: object) -> str:
+        if isinstance(value, tuple):
+            return ", ".join(map(text, value))
+        return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+    known = {name: value for name, value in description.items() if value is not None and name != "warnings"}
+    return "\n".join(f"{name:<15}{text(value)}" for name, value in known.items())
 
 
 def save_frame(settings: FrameSettings, index: int, path: Path, *, overwrite: bool = False) -> None:
@@ -555,9 +518,3 @@ def _opened(settings: FrameSettings) -> FrameSeries:
         if stored.kind is None and stored.values.ndim == 2:
             return open_series(replace(settings, kind="monochrome"))
     return series
-
-
-def _text(value: object) -> str:
-    if isinstance(value, tuple):
-        return ", ".join(map(_text, value))
-    return f"{value:.6g}" if isinstance(value, float) else str(value)

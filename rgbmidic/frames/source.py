@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, wraps
 from pathlib import Path
-from typing import ClassVar, Protocol, TypeVar
+from typing import ClassVar, TypeVar
 
 from rgbmidic.errors import FrameError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
@@ -17,9 +17,6 @@ from rgbmidic.frames.stored import Camera, StoredFrame, damaged, raw_frame
 from rgbmidic.settings import FrameSettings, regular
 
 _T = TypeVar("_T")
-_SAMPLES, _PIECE = 64, 4096
-"""Number of the pieces of a file, and bytes of each (a page of memory), that its fingerprint is made of: 256 KiB are
-read in a millisecond; a movie that was exchanged differs in all of them, one that was cut in its size."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,17 +150,22 @@ class FrameSource(ABC):
     def _stored(self, index: int) -> StoredFrame: ...
 
 
-class MovieHeader(Protocol):
-    """What the header of a movie states of all its frames."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MovieHeader(ABC):
+    """What the header of a movie states of all its frames.
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of every frame."""
+    Attributes
+    ----------
+    shape
+        Rows and columns of every frame.
+    recording
+        Number, times and settings of the frames.
+    """
 
-    @property
-    def recording(self) -> Recording:
-        """Number, times and settings of the frames."""
+    shape: tuple[int, int]
+    recording: Recording
 
+    @abstractmethod
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame, the first of which is a whole multiple of 4."""
 
@@ -290,10 +292,13 @@ def file_fingerprint(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
+    # 256 KiB, in pages of memory, are read in a millisecond; a movie that was exchanged differs in all of them, and one
+    # that was cut in its size
+    pieces, page = 64, 4096
     with regular(Path(path)).open("rb") as file:
         size = file.seek(0, 2)
         digest = hashlib.sha256(str(size).encode())
-        for number in range(_SAMPLES):
-            file.seek(max(size - _PIECE, 0) * number // (_SAMPLES - 1))
-            digest.update(file.read(_PIECE))
+        for number in range(pieces):
+            file.seek(max(size - page, 0) * number // (pieces - 1))
+            digest.update(file.read(page))
     return digest.hexdigest()

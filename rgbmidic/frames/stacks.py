@@ -21,7 +21,7 @@ import numpy as np
 
 from rgbmidic.errors import FrameError, first_line, legible
 from rgbmidic.frames.data import Integers, Recording, even_times
-from rgbmidic.frames.source import Movie, remembered
+from rgbmidic.frames.source import Movie, MovieHeader, remembered
 from rgbmidic.frames.stored import (
     MAXIMUM_BYTES,
     MAXIMUM_FRAMES,
@@ -37,20 +37,16 @@ from rgbmidic.frames.stored import (
 if TYPE_CHECKING:
     import h5py
 
-_MAXIMUM_HEADER = 2**16
-"""Bytes: numpy refuses to parse more than 10,000, but reads as many as a damaged header announces, up to 4 GB."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Stack:
-    """An array of frames: the shape of one, (H, W) or (H, W, 3), the type of its samples, and how they were recorded.
+class _Stack(MovieHeader):
+    """An array of frames: the shape of one, (H, W) or (H, W, 3), and the type of its samples.
 
     `place` is where it lies: the byte where it begins in a .npy file, the name of the dataset in an HDF5 file.
     """
 
     frame: tuple[int, ...]
     dtype: np.dtype[Any]
-    recording: Recording
     place: Any
 
     @classmethod
@@ -69,11 +65,8 @@ class _Stack:
                 f"{what} is an array of shape {shape} and type {dtype}; allowed are (frames, rows, columns), the same "
                 "with 3 channels behind, or one frame alone, of uint8 or uint16"
             )
-        return cls(frame=shape[-axes:], dtype=dtype, recording=Recording(count=count), place=place)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.frame[0], self.frame[1]
+        frame = shape[-axes:]
+        return cls(shape=(frame[0], frame[1]), frame=frame, dtype=dtype, recording=Recording(count=count), place=place)
 
     @property
     def count(self) -> int:
@@ -106,7 +99,8 @@ class _NpyStack(_Stack):
 @remembered
 def _npy_stack(path: Path) -> _NpyStack:
     with path.open("rb") as file:
-        head = io.BytesIO(file.read(_MAXIMUM_HEADER))
+        # numpy refuses to parse more than 10,000 bytes, but reads as many as a damaged header announces, up to 4 GB
+        head = io.BytesIO(file.read(2**16))
     try:
         version = np.lib.format.read_magic(head)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

@@ -12,7 +12,7 @@ import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -135,10 +135,6 @@ class Layout:
         check_size(path, needed=size, stored=size)
         return cls(count=count, start=start, size=size, stride=size if stride is None else stride)
 
-    def whole(self, file_size: int) -> int:
-        """Return the number of frames that are all in a file of so many bytes."""
-        return min(max((file_size - self.start - self.size) // self.stride + 1, 0), self.count)
-
     def read(self, path: Path, index: int, rows: range, of: int) -> bytes:
         """Read the bytes of some `rows` of frame `index`, which has `of` rows of one length.
 
@@ -150,7 +146,8 @@ class Layout:
         with path.open("rb") as file:
             begin, size = self.start + index * self.stride, file.seek(0, 2)
             if size < begin + self.size:
-                raise cut_short(path, whole=self.whole(size), count=self.count)
+                whole = min(max((size - self.start - self.size) // self.stride + 1, 0), self.count)
+                raise cut_short(path, whole=whole, count=self.count)
             first, last = (self.size * row // of for row in (rows.start, rows.stop))
             file.seek(begin + first)
             return file.read(last - first)
@@ -229,7 +226,7 @@ class StoredFrame:
     Attributes
     ----------
     values : ndarray, shape (H, W) or (H, W, 3), uint8 or uint16
-        Raw grey levels (DN); three channels are R, G, B.
+        Raw grey levels (DN); three channels are R, G, B. Empty in a header, which states the rest of all frames.
     kind
         ``"rgb"`` where the file has three channels; ``"bayer"`` or ``"monochrome"`` only where the file states it.
     cfa
@@ -242,7 +239,7 @@ class StoredFrame:
         Bits of a sample where they are fewer than those of its type.
     """
 
-    values: AnyArray
+    values: AnyArray = field(default_factory=lambda: np.empty((0, 0), dtype=np.uint16))
     kind: FrameKind | None = None
     cfa: str | None = None
     black_level: FloatArray | None = None
@@ -313,10 +310,6 @@ class Camera(Protocol):
 _T = TypeVar("_T")
 _Statement = tuple[Path | str | None, _T | None]
 """Who states something, None for the user (in TEST.toml or an option), and what; None: nothing."""
-
-_BLACK_TOLERANCE = 1.0
-"""DN: a file's black levels differ by position, and LibRaw rounds some; less than a grey level is no contradiction.
-Between two files that both round, captures and frames, a whole one is none."""
 
 
 def raw_frame(
@@ -420,13 +413,15 @@ def _white_level(stored: StoredFrame, stated: FrameSettings, path: Path, camera:
 
 
 def _black_level(stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None) -> FloatArray:
+    # a file's black levels differ by position, and LibRaw rounds some; less than a grey level (DN) is no contradiction
+    tolerance = 1.0
     in_file, user, known = stored.black_level, stated.black_level, camera.black_level if camera else None
-    if in_file is not None and user is not None and not (np.abs(in_file - user) < _BLACK_TOLERANCE).all():
+    if in_file is not None and user is not None and not (np.abs(in_file - user) < tolerance).all():
         raise _differ("black_level", (None, user), (path, in_file))
     if camera and known is not None:
-        if user is not None and abs(user - known) >= _BLACK_TOLERANCE:
+        if user is not None and abs(user - known) >= tolerance:
             raise _differ("black_level", (None, user), (camera.name, known))
-        if in_file is not None and abs(in_file.mean() - known) > _BLACK_TOLERANCE:  # whole numbers both, rounded apart
+        if in_file is not None and abs(in_file.mean() - known) > tolerance:  # captures and frames may be rounded apart
             raise _differ("black_level", (path, in_file), (camera.name, known))
     level = next((value for value in (user, known) if value is not None), 0.0)
     return np.full((1, 1), level) if in_file is None else in_file

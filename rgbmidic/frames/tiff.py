@@ -19,16 +19,14 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.data import Integers, Recording, even_times, fraction
+from rgbmidic.frames.data import SECOND, Integers, Recording, even_times, fraction
 from rgbmidic.frames.images import decode
-from rgbmidic.frames.source import FrameSource, Movie, remembered
+from rgbmidic.frames.source import FrameSource, Movie, MovieHeader, remembered
 from rgbmidic.frames.stored import CHECKED_FROM, Layout, StoredFrame, check_count, check_size, damaged
 from rgbmidic.frames.tiff_pages import (
-    COLUMNS,
-    DESCRIPTION,
-    ROWS,
     UNCOMPRESSED,
     PageList,
+    Tag,
     cfa_pattern,
     is_stored_as_is,
     missing_data,
@@ -46,10 +44,7 @@ TIFF_ENDINGS = (".tif", ".tiff")
 
 _BY_TIFFFILE: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
 """Compressions (deflate, LZMA) that tifffile undoes, without a limit, and what undoes them up to one."""
-_BY_OPENCV = (5, 7, 32773)
-"""LZW, JPEG, PackBits."""
 _MIN_IS_WHITE, _PALETTE = 0, 3
-_COLOUR_MAP, _ORIENTATION = 320, 274
 
 
 class TiffFile(FrameSource):
@@ -92,7 +87,7 @@ def _stored_rows(page: TiffPage, path: Path, rows: range, index: int = 0, count:
 def _as_shown(values: AnyArray, page: TiffPage, path: Path) -> StoredFrame:
     """Return samples of a page as its tags state that they are shown; a colour table that changes them is refused."""
     if page.photometric == _PALETTE:
-        table = np.asarray(page.tags[_COLOUR_MAP].value, dtype=np.int64).reshape(3, -1)
+        table = np.asarray(page.tags[Tag.COLOUR_MAP].value, dtype=np.int64).reshape(3, -1)
         # some cameras' software writes grey images with a table that changes nothing, of 257 i or of 256 i
         if values.dtype != np.uint8 or not (table // 256 == np.arange(table.shape[1])).all():
             raise FrameError(f"{path} shows its grey levels through a colour table; save it as a plain grey image")
@@ -144,8 +139,8 @@ def _unpacked(page: TiffPage, path: Path) -> AnyArray:
 def _by_opencv(page: TiffPage, path: Path) -> AnyArray:
     """Unpack the samples of the only page of a file, by OpenCV what tifffile cannot."""
     # OpenCV turns such samples, some more than others
-    turned = (tag(page, _ORIENTATION) or (1,)) != (1,) or page.photometric in (_MIN_IS_WHITE, _PALETTE)
-    if turned or page.compression not in _BY_OPENCV:
+    turned = (tag(page, Tag.ORIENTATION) or (1,)) != (1,) or page.photometric in (_MIN_IS_WHITE, _PALETTE)
+    if turned or page.compression not in (5, 7, 32773):  # LZW, JPEG, PackBits
         return _unpacked(page, path)
     values = decode(path.read_bytes(), path)
     if (*values.shape[:2], values.dtype) != (page.imagelength, page.imagewidth, page.dtype):
@@ -168,7 +163,7 @@ def _check_unpacked(page: TiffPage, path: Path) -> None:
 
 
 _UNITS = {"s": 1, "sec": 1, "seconds": 1}
-_UNITS |= {"ms": 10**3, "msec": 10**3, "µs": 10**6, "us": 10**6, "usec": 10**6, "ns": 10**9}
+_UNITS |= {"ms": 10**3, "msec": 10**3, "µs": 10**6, "us": 10**6, "usec": 10**6, "ns": SECOND}
 """Of time, by how many make a second."""
 
 
@@ -190,12 +185,10 @@ def is_tiff_stack(path: Path) -> bool:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Hyperstack:
-    """Where the pages begin (one, where ImageJ stored all frames behind it), the size of the first, the recording."""
+class _Hyperstack(MovieHeader):
+    """Where the pages begin (one, where ImageJ stored all frames behind it), of which the first has the `shape`."""
 
     offsets: Integers
-    shape: tuple[int, int]
-    recording: Recording
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame."""
@@ -223,8 +216,8 @@ def _stack(path: Path) -> _Hyperstack:
         pages = PageList.begin(file, path)
         offsets, ends_early = pages.offsets(path)
         entries, _ = pages.page(offsets[0]) or ({}, 0)
-        text = pages.text(entries, DESCRIPTION)
-        shape = (pages.value(entries, ROWS), pages.value(entries, COLUMNS))
+        text = pages.text(entries, Tag.DESCRIPTION)
+        shape = (pages.value(entries, Tag.ROWS), pages.value(entries, Tag.COLUMNS))
     images = re.search(r"^images=([0-9]{1,9})$", text, re.MULTILINE) if text.startswith("ImageJ=") else None
     count = int(images[1]) if images and len(offsets) == 1 else len(offsets) + (ends_early and len(offsets) > 1)
     check_count(path, count)
@@ -257,7 +250,7 @@ def _ome_times(text: str, count: int) -> Integers | None:
     planes = {plane.get("TheT"): plane for plane in pixels.iterfind("{*}Plane")}
     each = [planes.get(str(index), pixels) for index in range(count)]
     times = [_seconds(plane.get("DeltaT", ""), plane.get("DeltaTUnit", "s")) for plane in each]
-    known = [round(time * 10**9) for time in times if time is not None]
+    known = [round(time * SECOND) for time in times if time is not None]
     return np.array(known, dtype=np.int64) if len(known) == count else None
 
 

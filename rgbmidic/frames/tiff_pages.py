@@ -12,6 +12,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
@@ -28,18 +29,27 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())
 _HEADERS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 """Of TIFF and BigTIFF; several cameras' raws begin with II or MM, too, and are none."""
 UNCOMPRESSED = 1
-_REDUCED = 1
-_DNG_VERSION = 50706
-COLUMNS, ROWS, DESCRIPTION = 256, 257, 270
-_NEW_TYPE = 254
-_SHORT = 3
-_CLASSIC = 4
-"""Bytes of an offset in TIFF; in BigTIFF, which LibRaw does not read, they are 8."""
-_MOST_ENTRIES = 4096
-"""Entries of a page beyond which it is no page: those seen have a few dozen."""
-_TEXT_BYTES = 256 * 2**20
-"""Most bytes of a description: OME uses some 300 for every frame."""
-_CFA_REPEAT, _CFA_PATTERN = 33421, 33422
+"""Code of the compression of samples that are not compressed."""
+
+
+class Tag(IntEnum):
+    """Codes of the tags that are read (TIFF 6.0; TIFF/EP; DNG 1.4, chapter 4)."""
+
+    NEW_SUBFILE_TYPE = 254
+    COLUMNS = 256
+    ROWS = 257
+    DESCRIPTION = 270
+    ORIENTATION = 274
+    COLOUR_MAP = 320
+    CFA_REPEAT = 33421
+    CFA_PATTERN = 33422
+    DNG_VERSION = 50706
+    BLACK_REPEAT = 50713
+    BLACK = 50714
+    BLACK_DELTA_H = 50715
+    BLACK_DELTA_V = 50716
+    ACTIVE_AREA = 50829
+
 
 Entries = dict[int, tuple[int, int, bytes]]
 """Type, number of values, and the values or where they lie, of the entries of a page by their codes."""
@@ -62,7 +72,7 @@ def tiff_pages(path: Path) -> Iterator[list[TiffPage]]:
                 raise ValueError("its list of images leads back to itself")
             pages[page.offset] = page
         found = (one for page in pages.values() for one in (page, *(child.aspage() for child in page.pages or ())))
-        yield [page for page in found if not int(page.subfiletype) & _REDUCED]
+        yield [page for page in found if not int(page.subfiletype) & 1]  # not reduced
 
 
 @contextmanager
@@ -97,8 +107,8 @@ def is_dng(path: Path) -> bool:
     try:
         with regular(path).open("rb") as file:
             pages = PageList.begin(file, path)
-            first = pages.page(pages.first) if pages.offset == _CLASSIC else None
-            return first is not None and _DNG_VERSION in first[0]
+            first = pages.page(pages.first) if pages.offset == 4 else None  # LibRaw reads no BigTIFF
+            return first is not None and Tag.DNG_VERSION in first[0]
     except (OSError, FrameError):
         return False
 
@@ -132,7 +142,7 @@ class PageList:
         if head not in _HEADERS:
             raise damaged(path, "it is not a TIFF file")
         order: Literal["little", "big"] = "little" if head[:1] == b"I" else "big"
-        offset = 8 if head in _HEADERS[2:] else _CLASSIC
+        offset = 8 if head in _HEADERS[2:] else 4
         file.seek(offset)  # of both headers the offset of the first page is the last field
         first = int.from_bytes(file.read(offset), order)
         return cls(file=file, size=file.seek(0, 2), order=order, offset=offset, first=first)
@@ -148,7 +158,7 @@ class PageList:
                 return found, True
             seen.add(offset)
             entries, following = page
-            if not self.value(entries, _NEW_TYPE) & _REDUCED:
+            if not self.value(entries, Tag.NEW_SUBFILE_TYPE) & 1:
                 found.append(offset)
             offset = following
         if not found:
@@ -163,7 +173,8 @@ class PageList:
         self.file.seek(offset)
         number = int.from_bytes(self.file.read(counter), self.order)
         length = number * (4 + 2 * self.offset)
-        if not 0 < number <= _MOST_ENTRIES or offset + counter + length + self.offset > self.size:
+        # pages that are seen have a few dozen entries
+        if not 0 < number <= 4096 or offset + counter + length + self.offset > self.size:
             return None
         stored = struct.iter_unpack(("<" if self.order == "little" else ">") + entry, self.file.read(length))
         entries = {code: (kind, many, place) for code, kind, many, place in stored}
@@ -171,15 +182,16 @@ class PageList:
 
     def value(self, entries: Entries, code: int) -> int:
         """Return the one value of an entry; 0 where there is none."""
-        kind, _, place = entries.get(code, (_SHORT, 0, b""))
-        return int.from_bytes(place[: 2 if kind == _SHORT else 4], self.order)
+        short = 3  # the type of numbers of 16 bit
+        kind, _, place = entries.get(code, (short, 0, b""))
+        return int.from_bytes(place[: 2 if kind == short else 4], self.order)
 
     def text(self, entries: Entries, code: int) -> str:
         """Return the text of an entry; empty where there is none."""
         _, number, content = entries.get(code, (0, 0, b""))
         if number > self.offset:  # the entry holds where the text lies
             self.file.seek(min(int.from_bytes(content, self.order), self.size))
-            content = self.file.read(min(number, _TEXT_BYTES))
+            content = self.file.read(min(number, 256 * 2**20))  # OME uses some 300 bytes for every frame
         return content[:number].decode(errors="replace").rstrip("\0")
 
 
@@ -211,7 +223,7 @@ def tag(page: TiffPage, code: int) -> tuple[Any, ...] | None:
 
 def cfa_pattern(page: TiffPage) -> str | None:
     """Return the name of the 2x2 colour filter array in the page's tags, or None where there is none."""
-    pattern = tag(page, _CFA_PATTERN)
-    if pattern is None or tag(page, _CFA_REPEAT) != (2, 2) or not set(pattern) <= {0, 1, 2}:
+    pattern = tag(page, Tag.CFA_PATTERN)
+    if pattern is None or tag(page, Tag.CFA_REPEAT) != (2, 2) or not set(pattern) <= {0, 1, 2}:
         return None
     return "".join("RGB"[channel] for channel in pattern)

@@ -180,13 +180,13 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
     with np.load(settings.base / "truth.npz") as archive:
         truth, angles = archive["displacement"].astype(np.float64), archive["angle_deg"]
     mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
-    assert settings.calibration_file is not None
-    calibration = Calibration.read(settings.calibration_file)
+    assert settings.calibration.file is not None
+    calibration = Calibration.read(settings.calibration.file)
     separation, frames = Separation(calibration=calibration), open_series(settings.frames, settings.base, calibration)
     images = [align(separation(frames.read(index))).values for index in range(len(frames))]
     options: dict[str, Any] = {
         "region": settings.region.rectangle,
-        "element_size": settings.element_size,
+        "element_size": settings.mesh.element_size,
         "normalise": settings.illumination.normalise,
     }
     rows = []

@@ -156,7 +156,7 @@ def _plane(points: FloatArray, faces: IntArray, path: Path) -> tuple[tuple[int, 
             f"the mesh of {path} must lie on a plane across one of its axes, but most of it lies on one {tilt:.3g} "
             f"degrees from the nearest of these, with nodes up to {off:.4g} (in the file's unit) off its mean plane"
         )
-    alike = [plane for plane in planes if plane[0] > _SAME * largest]
+    alike = [plane for plane in planes if plane[0] > 0.999 * largest]  # front and back of a plate
     _, axis, height, chosen = max(alike, key=lambda plane: plane[1:3])
     if len(chosen) < len(faces):
         which = "the largest" if len(alike) == 1 else "the largest and, of several as large, the farthest along"
@@ -165,10 +165,6 @@ def _plane(points: FloatArray, faces: IntArray, path: Path) -> tuple[tuple[int, 
             "%s: measured is its plane %s with %d of %d faces, %s", path, where, len(chosen), len(faces), which
         )
     return ((1, 2), (0, 2), (0, 1))[axis], np.sort(chosen)
-
-
-_SAME = 0.999
-"""Fraction of the largest plane's area from which another is as large: front and back of a plate (chosen)."""
 
 
 def _triangles(places: FloatArray, faces: IntArray, numbers: IntArray, path: Path) -> tuple[IntArray, IntArray]:

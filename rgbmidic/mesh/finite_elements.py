@@ -56,18 +56,9 @@ class FiniteElementMesh:
 
     def __post_init__(self) -> None:
         """Check the arrays, convert them to their types and order the corners."""
-        points, elements = np.array(self.points, dtype=np.float64), np.array(self.elements, dtype=np.int32)
-        if points.ndim != 2 or points.shape[1] != 2 or elements.ndim != 2 or elements.shape[1] != 3:
-            raise InputError(
-                f"{self.name}: points are (N, 2) and elements (E, 3), not {points.shape}, {elements.shape}"
-            )
-        if not np.isfinite(points).all() or not len(elements) or elements.min() < 0 or elements.max() >= len(points):
-            raise InputError(f"{self.name}: points must be finite and elements must name existing ones")
-        area = cross(points, elements)
-        if not (np.abs(area) > 1e-12 * np.ptp(points, axis=0).max() ** 2).all():
-            number = np.asarray(self.element_numbers)[np.argmin(np.abs(area))]
-            raise InputError(f"{self.name}: element {number} has no area")
-        elements[area < 0] = elements[area < 0][:, [0, 2, 1]]
+        points, elements, area = oriented(self.points, self.elements, self.name)
+        if not (area > 1e-12 * np.ptp(points, axis=0).max() ** 2).all():
+            raise InputError(f"{self.name}: element {np.asarray(self.element_numbers)[area.argmin()]} has no area")
         for key, values, count in (
             ("points", points, len(points)),
             ("elements", elements, len(elements)),
@@ -140,6 +131,21 @@ class FiniteElementMesh:
                 return int(self.element_numbers[a[depth.argmax()]]), int(self.element_numbers[b[depth.argmax()]])
             step += 1
         return None
+
+
+def oriented(
+    points: npt.ArrayLike, elements: npt.ArrayLike, what: str
+) -> tuple[FloatArray, npt.NDArray[np.int32], FloatArray]:
+    """Copies of nodes and triangles, checked and of their types, with corners as the axes turn; and twice the areas."""
+    nodes = np.array(points, dtype=np.float64, order="C")
+    corners = np.array(elements, dtype=np.int32)
+    if nodes.ndim != 2 or nodes.shape[1] != 2 or corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
+        raise InputError(f"{what} has nodes (N, 2) and elements (E, 3), not {nodes.shape} and {corners.shape}")
+    if not np.isfinite(nodes).all() or corners.min() < 0 or corners.max() >= len(nodes):
+        raise InputError(f"{what}: nodes must be finite and elements must name existing nodes")
+    area = cross(nodes, corners)
+    corners[area < 0] = corners[area < 0][:, [0, 2, 1]]
+    return nodes, corners, np.abs(area)
 
 
 def _depth(one: FloatArray, other: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ A stated crack is a path through the region: a row of mesh nodes, along which th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
@@ -18,28 +19,65 @@ from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.finite_elements import cross
 from rgbmidic.typing import BoolArray, FloatArray
 
-_CROWDED = 0.3
-"""Distance in elements under which a node of the outline is left out beside another one, or beside a crack: the least
-angle of a triangle with two other sides of an element is then 17 degrees (derived)."""
-_DEEP = 0.6
-"""Depth in elements from which a lattice point is a node: over half the pitch, so that triangles at the outline are no
-flatter than those inside."""
-_SMOOTHED = 0.06
-"""Distance in elements within which the polygon of the outline follows its pixels, but at least a pixel: a chord of an
-element's length is that far from an arc with a radius of two elements (derived)."""
-_CLEAR = 0.55
-"""Distance in elements that nodes inside keep from a crack: they see a piece of it, at most an element long, under less
-than 85 degrees, two of them from both sides under less than 180, which makes it an edge of the Delaunay mesh."""
-_HALVINGS = 4
-"""Times that a piece of a crack is halved where another crack or the outline keeps it from being an edge: pieces of a
-16th of an element, 1.6 px for 25 px elements, are nearly as fine as a path is followed (`_FINE`)."""
-_SLIVER = 0.04
-"""Twice the area, in squares of an element's side, under which a triangle at the edge is left out: a regular one has
-.87, and one under .04 has too few pixels (8 for 20 px elements) for its six unknowns to be measured."""
+EDGES = np.array([[0, 1], [1, 2], [2, 0]])
+"""Corners of the edges of an element."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutlineConstants:
+    """Constants of `outline_mesh`: lengths in sides of an element, where nothing else is stated.
+
+    Attributes
+    ----------
+    crowded
+        Distance under which a node of the outline is left out beside another one, or beside a crack: the least angle of
+        a triangle with two other sides of an element is then 17 degrees (derived). A path's end so near the region's
+        edge counts as on it.
+    deep
+        Depth from which a lattice point is a node: over half the pitch, so that triangles at the outline are no flatter
+        than those inside.
+    smoothed
+        Distance within which the polygon of the outline follows its pixels, but at least a pixel: a chord of an
+        element's length is that far from an arc with a radius of two elements (derived).
+    clear
+        Distance that nodes inside keep from a crack: they see a piece of it, at most an element long, under less than
+        85 degrees, two of them from both sides under less than 180, which makes it an edge of the Delaunay mesh.
+    halvings
+        Times that a piece of a crack is halved where another crack or the outline keeps it from being an edge: pieces
+        of a 16th of an element, 1.6 px for 25 px elements, are nearly as fine as a path is followed (`fine`).
+    sliver
+        Twice the area, in squares of an element's side, under which a triangle at the edge is left out: a regular one
+        has .87, and one under .04 has too few pixels (8 for 20 px elements) for its six unknowns to be measured.
+    step
+        Distance (px) of the points at which a path is looked at: no pixel that it crosses by more than half is missed.
+    fine
+        How far (px) the row of nodes may be beside the stated path: pixels that near its edges are left out.
+    along
+        Least distance of nodes along a path, and most by which a branch moves along the path it leaves: the nodes of
+        an earlier path are at most an element apart.
+    sharp_deg
+        Turn from which a corner of the outline is not given up for a crack beside it: polygons around round holes turn
+        less from a radius of 12 px on.
+    """
+
+    crowded: float = 0.3
+    deep: float = 0.6
+    smoothed: float = 0.06
+    clear: float = 0.55
+    halvings: int = 4
+    sliver: float = 0.04
+    step: float = 0.5
+    fine: float = 1.0
+    along: float = 0.5
+    sharp_deg: float = 60.0
 
 
 def outline_mesh(
-    mask: BoolArray, size: float, cracks: Sequence[npt.ArrayLike], origin: tuple[int, int] = (0, 0)
+    mask: BoolArray,
+    size: float,
+    cracks: Sequence[npt.ArrayLike],
+    origin: tuple[int, int] = (0, 0),
+    constants: OutlineConstants = OutlineConstants(),
 ) -> tuple[FloatArray, npt.NDArray[np.int32]]:
     """Nodes (N, 2) and elements (E, 3) of about `size` px for the region `mask` (H, W), split along `cracks`.
 
@@ -51,23 +89,26 @@ def outline_mesh(
         The region is too small for one element, or a crack misses it.
     """
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    polygons = [cv2.approxPolyDP(line, max(1.0, _SMOOTHED * size), True)[:, 0].astype(np.float64) for line in contours]
+    beside = max(1.0, constants.smoothed * size)
+    polygons = [cv2.approxPolyDP(line, beside, True)[:, 0].astype(np.float64) for line in contours]
     edge, outlines = np.concatenate(contours)[:, 0].astype(np.float64), [line for line in polygons if len(line) >= 3]
     outline = _outline_points(outlines, size)
+    outline = outline[uncrowded(outline, constants.crowded * size)]
     padded = np.pad(mask, 1).astype(np.uint8)
     depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
     inner = _lattice_points(mask.shape, size, origin)
-    inner = inner[depth[np.round(inner[:, 1]).astype(int), np.round(inner[:, 0]).astype(int)] > _DEEP * size]
-    sharp = sharp_corners(outlines)
-    paths = crack_paths(cracks, mask, edge, sharp, size)
+    inner = inner[depth[np.round(inner[:, 1]).astype(int), np.round(inner[:, 0]).astype(int)] > constants.deep * size]
+    sharp = _sharp_corners(outlines, constants.sharp_deg)
+    paths = _crack_paths(cracks, mask, edge, sharp, size, constants)
     if paths:
+        near = cKDTree(np.concatenate([_subdivided(path, constants.step) for path in paths]))
         is_sharp = (outline[:, None] == sharp).all(axis=2).any(axis=1)
-        outline = outline[is_sharp | (distance_to(paths, outline) > _CROWDED * size)]
-        inner = inner[distance_to(paths, inner) > _CLEAR * size]
-    points, triangles, pieces = _triangulated(np.concatenate([outline, inner]), paths)
+        outline = outline[is_sharp | (near.query(outline)[0] > constants.crowded * size)]
+        inner = inner[near.query(inner)[0] > constants.clear * size]
+    points, triangles, pieces = _triangulated(np.concatenate([outline, inner]), paths, constants.halvings)
     centre = np.round(points[triangles].mean(axis=1)).astype(int)
     inside = mask[np.clip(centre[:, 1], 0, mask.shape[0] - 1), np.clip(centre[:, 0], 0, mask.shape[1] - 1)]
-    large = np.abs(cross(points, triangles)) > _SLIVER * size**2
+    large = np.abs(cross(points, triangles)) > constants.sliver * size**2
     triangles = triangles[inside & large]
     if not len(triangles):
         raise RegionError(f"the region of {int(mask.sum())} px is too small for one element of {size} px")
@@ -75,16 +116,16 @@ def outline_mesh(
 
 
 def _triangulated(
-    points: FloatArray, paths: list[FloatArray]
+    points: FloatArray, paths: list[FloatArray], halvings: int
 ) -> tuple[FloatArray, npt.NDArray[np.int32], npt.NDArray[np.int64]]:
-    """Delaunay mesh of points (N, 2) and of the nodes of the paths.
+    """Delaunay mesh of points (N, 2) and of the nodes of the paths, whose pieces are halved where they are no edges.
 
     Returns
     -------
     tuple
         Nodes, triangles, and the pieces of the paths as edges (n, 2) of the mesh.
     """
-    for _ in range(_HALVINGS + 1):
+    for _ in range(halvings + 1):
         nodes = np.concatenate([points, *paths])
         nodes = nodes[uncrowded(nodes, 1e-6)]
         try:
@@ -93,12 +134,15 @@ def _triangulated(
             raise RegionError("the region is too small for one element") from None
         rows = [np.asarray(cKDTree(nodes).query(path)[1]) for path in paths]
         pieces = np.concatenate([np.empty((0, 2), dtype=np.int64), *(np.stack([r[:-1], r[1:]], axis=1) for r in rows)])
-        edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+        edges = triangles[:, EDGES].reshape(-1, 2)
         missing = ~np.isin(edge_keys(pieces, len(nodes)), edge_keys(edges, len(nodes)))
         if not missing.any():
             return nodes, triangles, pieces
         parts = np.split(missing, np.cumsum([len(path) - 1 for path in paths])[:-1])
-        paths = [halved(path, part) for path, part in zip(paths, parts, strict=True)]
+        paths = [
+            np.insert(path, np.flatnonzero(part) + 1, (path[1:] + path[:-1])[part] / 2, axis=0)
+            for path, part in zip(paths, parts, strict=True)
+        ]
     raise RegionError(
         "mesh.cracks cross, or run too close to each other or to a corner of the region, for the elements"
     )
@@ -121,39 +165,20 @@ def _outline_points(outlines: list[FloatArray], size: float) -> FloatArray:
         for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
             pieces = max(1, round(float(np.hypot(*(end - start))) / size))
             points.append(start + np.arange(pieces)[:, None] / pieces * (end - start))
-    every = np.concatenate(points)
-    return every[uncrowded(every, _CROWDED * size)]
+    return np.concatenate(points)
 
 
-_STEP = 0.5
-"""Distance (px) of the points at which a path is looked at: no pixel that it crosses by more than half is missed."""
-_FINE = 1.0
-"""How far (px) the row of nodes may be beside the stated path: pixels that near its edges are left out."""
-_CRACKS_CROWDED = 0.5
-"""Least distance of nodes along a path, and most by which a branch moves along the path it leaves, in elements: the
-nodes of an earlier path are at most an element apart."""
-_AT_EDGE = 0.3
-"""Distance in elements from the region's edge within which a path's end counts as on it: that of crowded nodes."""
-_SHARP = np.cos(np.radians(60))
-"""Cosine of the turn from which a corner of the outline is not given up for a crack beside it: polygons around round
-holes turn less from a radius of 12 px on."""
-
-
-def crack_paths(
-    cracks: Sequence[npt.ArrayLike], mask: BoolArray, edge: FloatArray, sharp: FloatArray, size: float
+def _crack_paths(
+    cracks: Sequence[npt.ArrayLike],
+    mask: BoolArray,
+    edge: FloatArray,
+    sharp: FloatArray,
+    size: float,
+    constants: OutlineConstants,
 ) -> list[FloatArray]:
-    """Nodes of every crack within the region, shape (n, 2) each, at most `size` px apart.
+    """Nodes (n, 2) of every crack (M, 2) within the region, at most `size` px apart.
 
-    Parameters
-    ----------
-    cracks
-        Corners (x, y) in px of each path, shape (M, 2).
-    mask : ndarray, shape (H, W), bool
-        The region.
-    edge, sharp : ndarray, shape (n, 2)
-        Points of its edge, on which a path ends that leaves the region or nearly reaches it, and the sharp corners.
-    size
-        Side of the elements in px.
+    A path that leaves the region or nearly reaches its edge ends on points of the `edge`, or on a `sharp` corner.
 
     Raises
     ------
@@ -167,15 +192,17 @@ def crack_paths(
         corners = np.asarray(crack, dtype=np.float64)
         if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 2 or not np.isfinite(corners).all():
             raise InputError(f"mesh.cracks[{number}] is at least two finite corners (x, y) in px; given is {crack!r}")
-        for part in _parts_within(corners, mask, size, number):
+        for part in _parts_within(corners, mask, size, number, constants.step):
             earlier = np.concatenate([np.empty((0, 2)), *paths])
-            paths.append(_path_nodes(part, ((earlier, _CRACKS_CROWDED), (sharp, _AT_EDGE), (edge, _AT_EDGE)), size))
+            at_edge = constants.crowded * size
+            ends = ((earlier, constants.along * size), (sharp, at_edge), (edge, at_edge))
+            paths.append(_path_nodes(part, ends, size, constants))
     return paths
 
 
-def _parts_within(corners: FloatArray, mask: BoolArray, size: float, number: int) -> list[FloatArray]:
-    """Return the parts of a path within the region that are as long as an element, as points `_STEP` px apart."""
-    points = _subdivided(corners, _STEP)
+def _parts_within(corners: FloatArray, mask: BoolArray, size: float, number: int, step: float) -> list[FloatArray]:
+    """Return the parts of a path within the region that are as long as an element, as points `step` px apart."""
+    points = _subdivided(corners, step)
     column, row = np.round(points).astype(int).T
     in_image = (column >= 0) & (column < mask.shape[1]) & (row >= 0) & (row < mask.shape[0])
     within = np.zeros(len(points), dtype=bool)
@@ -183,44 +210,45 @@ def _parts_within(corners: FloatArray, mask: BoolArray, size: float, number: int
     changes = np.flatnonzero(np.diff(within, prepend=False, append=False))
     parts = [points[first:last] for first, last in changes.reshape(-1, 2)]
     lengths = [float(np.hypot(*np.diff(part, axis=0).T).sum()) for part in parts]
-    if max(lengths, default=0.0) + 2 * _STEP < size:
+    long = [part for part, length in zip(parts, lengths, strict=True) if length + 2 * step >= size]
+    if not long:
         rows, columns = np.nonzero(mask)
         raise RegionError(
             f"mesh.cracks[{number}] must run through the region (x {columns.min()} to {columns.max()}, y {rows.min()} "
             f"to {rows.max()} px) for at least an element, {size:g} px; given is {corners.tolist()}, with "
             f"{max(lengths, default=0.0):.0f} px in it"
         )
-    return [part for part, length in zip(parts, lengths, strict=True) if length + 2 * _STEP >= size]
+    return long
 
 
-def _path_nodes(part: FloatArray, ends: Sequence[tuple[FloatArray, float]], size: float) -> FloatArray:
-    """Nodes (n, 2) along a part of a path, at most `size` px apart, each end moved as by `_end`."""
-    corners = cv2.approxPolyDP(part.astype(np.float32), _FINE, False)[:, 0].astype(np.float64)
+def _path_nodes(
+    part: FloatArray, places: Sequence[tuple[FloatArray, float]], size: float, constants: OutlineConstants
+) -> FloatArray:
+    """Nodes (n, 2) along a part of a path, at most `size` px apart.
+
+    Each end moves to the nearest of the first `places` (points, reach in px) that is within reach.
+    """
+    corners = cv2.approxPolyDP(part.astype(np.float32), constants.fine, False)[:, 0].astype(np.float64)
     for end in (0, -1):
-        corners[end] = _end(corners[end], ends, size)
+        for points, reach in places:
+            distance = np.hypot(*(points - corners[end]).T)
+            if distance.min(initial=np.inf) <= reach:
+                corners[end] = points[np.argmin(distance)]
+                break
     nodes = _subdivided(corners, size)
     ends_first = np.roll(nodes, 1, axis=0)
-    nodes = np.roll(ends_first[uncrowded(ends_first, _CRACKS_CROWDED * size)], -1, axis=0)
+    nodes = np.roll(ends_first[uncrowded(ends_first, constants.along * size)], -1, axis=0)
     # a crack between two tips opens only if a node lies in between
     return nodes if len(nodes) > 2 else _subdivided(nodes, float(np.hypot(*(nodes[1] - nodes[0]))) / 2)
 
 
-def _end(end: FloatArray, places: Sequence[tuple[FloatArray, float]], size: float) -> FloatArray:
-    """Return the nearest of the first `places` (points, reach in elements) within reach of a path's end, or the end."""
-    for points, reach in places:
-        distance = np.hypot(*(points - end).T)
-        if distance.min(initial=np.inf) <= reach * size:
-            return np.asarray(points[np.argmin(distance)])
-    return end
-
-
-def sharp_corners(polygons: Sequence[FloatArray]) -> FloatArray:
-    """Corners (n, 2) at which polygons (M, 2) turn sharply."""
+def _sharp_corners(polygons: Sequence[FloatArray], turn_deg: float) -> FloatArray:
+    """Corners (n, 2) at which polygons (M, 2) turn by more than `turn_deg`."""
     sharp = [np.empty((0, 2))]
     for corners in polygons:
         side = np.roll(corners, -1, axis=0) - corners
         side /= np.hypot(*side.T)[:, None]
-        sharp.append(corners[(side * np.roll(side, 1, axis=0)).sum(axis=1) < _SHARP])
+        sharp.append(corners[(side * np.roll(side, 1, axis=0)).sum(axis=1) < np.cos(np.radians(turn_deg))])
     return np.concatenate(sharp)
 
 
@@ -233,18 +261,6 @@ def _subdivided(corners: FloatArray, longest: float) -> FloatArray:
     return np.concatenate(points)
 
 
-def distance_to(paths: Sequence[FloatArray], points: FloatArray) -> FloatArray:
-    """Distance (px) of points (N, 2) from the nearest path, shape (N,), within a pixel's quarter."""
-    dense = np.concatenate([_subdivided(path, _STEP) for path in paths])
-    return np.asarray(cKDTree(dense).query(points)[0])
-
-
-def halved(path: FloatArray, pieces: BoolArray) -> FloatArray:
-    """Return a path (n, 2) with another node in the middle of the chosen pieces (n - 1,)."""
-    middles = (path[1:] + path[:-1]) / 2
-    return np.insert(path, np.flatnonzero(pieces) + 1, middles[pieces], axis=0)
-
-
 def split_along(
     nodes: FloatArray, elements: npt.NDArray[np.int32], pieces: npt.NDArray[np.int64]
 ) -> tuple[FloatArray, npt.NDArray[np.int32]]:
@@ -254,7 +270,7 @@ def split_along(
     tip, and only that.
     """
     corner = elements.ravel()
-    ends = np.stack([np.arange(corner.size), np.arange(corner.size).reshape(-1, 3)[:, [1, 2, 0]].ravel()], axis=1)
+    ends = np.arange(corner.size).reshape(-1, 3)[:, EDGES].reshape(-1, 2)
     ends = np.take_along_axis(ends, np.argsort(corner[ends], axis=1), axis=1)  # each edge from its lower node
     key, cut = edge_keys(corner[ends], len(nodes)), edge_keys(pieces, len(nodes))
     order = np.argsort(key)

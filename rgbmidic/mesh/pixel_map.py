@@ -15,10 +15,6 @@ from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-_RIM = 3.0
-"""Farthest (px) that a pixel of the region may lie from the element that owns it: the polygon of an outline is within
-0.06 elements of it (`outline_mesh`), 3 px for elements of 50 px."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PixelMap:
@@ -268,11 +264,14 @@ def _owned_rows(owner: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], ..
 
 
 def _claim_rim(owner: npt.NDArray[np.int32]) -> None:
-    """Give free pixels of the region near an owned one to its element, in place."""
+    """Give free pixels of the region near an owned one to its element, in place.
+
+    The polygon of an outline is within 0.06 elements of it (`outline_mesh`): 3 px for elements of 50 px.
+    """
     free = (owner < 0).astype(np.uint8)
     distance, label = cv2.distanceTransformWithLabels(free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     owned = owner >= 0
     element_of_label = np.full(int(label.max()) + 1, -1, dtype=np.int32)
     element_of_label[label[owned]] = owner[owned]
-    rim = (owner == -1) & (np.asarray(distance) <= _RIM)
+    rim = (owner == -1) & (np.asarray(distance) <= 3.0)
     owner[rim] = element_of_label[label[rim]]

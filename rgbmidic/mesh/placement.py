@@ -24,6 +24,26 @@ from rgbmidic.typing import FloatArray
 logger = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlacementConstants:
+    """Constants of `Placement.fit`, all chosen.
+
+    Attributes
+    ----------
+    pointing
+        Residuals (px) that a point set by hand may have, and that decide nothing: a click is on a whole pixel.
+    decided
+        How many times larger the residuals of the other sense must be for pairs to decide: beyond any scatter.
+    stretched
+        Ratio of lengths on the mesh and on a camera's plane beyond which they contradict each other: a wrong unit is 25
+        or more, a scale that is known to 5 % is no calibration.
+    """
+
+    pointing: float = 0.5
+    decided: float = 3.0
+    stretched: float = 1.05
+
+
 class Plane(Protocol):
     """Map between px of the image and mm on a plane: `rgbmidic.CameraCalibration`."""
 
@@ -59,7 +79,14 @@ class Placement:
     pairs: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
 
     @classmethod
-    def fit(cls, pairs: npt.ArrayLike, camera: Plane | None = None, *, where: str = "mesh.points") -> Self:
+    def fit(
+        cls,
+        pairs: npt.ArrayLike,
+        camera: Plane | None = None,
+        *,
+        where: str = "mesh.points",
+        constants: PlacementConstants = PlacementConstants(),
+    ) -> Self:
         """Fit a placement to pairs of points by least squares.
 
         Without a camera it is a similarity: shift, rotation and scale. With one it is a rigid motion, for both have mm.
@@ -75,6 +102,8 @@ class Placement:
             Lens and plane.
         where
             Name of the pairs in messages.
+        constants
+            Of the doubts that are reported.
 
         Returns
         -------
@@ -95,19 +124,20 @@ class Placement:
         if camera is not None:
             on_plane, on_mesh = (part - part.mean(axis=0) for part in (camera.to_mm(given[:, 2:]), given[:, :2]))
             stretch = np.linalg.norm(on_plane) / np.linalg.norm(on_mesh)
-            if not 1 / _STRETCHED < stretch < _STRETCHED:
+            if not 1 / constants.stretched < stretch < constants.stretched:
                 raise InputError(
                     f"the pairs of {where} lie {stretch:.4g} times as far apart on the camera's plane as on the mesh, "
                     "where both are in mm: look at mesh.unit, the points and the calibration"
                 )
         best, other = (cls._fitted(given, camera, reflected) for reflected in (True, False))
-        if len(given) > 2 and max(best.rms, other.rms) < _DECIDED * max(min(best.rms, other.rms), _POINTING):
-            logger.warning(
-                "%s does not decide whether the image shows the mesh or its mirror image: up is taken", where
-            )
-        elif len(given) > 2 and other.rms < best.rms:
-            best = other
-        if best.rms > _DECIDED * _POINTING:
+        if len(given) > 2:
+            small, large = sorted((best.rms, other.rms))
+            if large < constants.decided * max(small, constants.pointing):
+                text = "%s does not decide whether the image shows the mesh or its mirror image: up is taken"
+                logger.warning(text, where)
+            elif other.rms < best.rms:
+                best = other
+        if best.rms > constants.decided * constants.pointing:
             off = np.hypot(*best.residuals.T)
             text = "%s leaves residuals of %.1f px rms, the largest, %.1f px, at %s[%d]: check the pairs"
             logger.warning(text, where, best.rms, off.max(), where, off.argmax())
@@ -149,7 +179,7 @@ class Placement:
     def mm_per_pixel_std(self) -> float:
         """Standard uncertainty of `mm_per_pixel` from the residuals; 0 where two pairs leave none, or with a camera."""
         free = 2 * len(self.pairs) - 4
-        if self.camera is not None or free < 1 or self.mm_per_pixel is None:
+        if free < 1 or self.mm_per_pixel is None:
             return 0.0
         spread = ((self.pairs[:, 2:] - self.pairs[:, 2:].mean(axis=0)) ** 2).sum()
         return float(self.mm_per_pixel * np.sqrt((self.residuals**2).sum() / free / spread))
@@ -269,9 +299,7 @@ class Placement:
         str
         """
         turned = np.degrees(np.arctan2(self.matrix[1, 0], self.matrix[0, 0]))
-        scale = (
-            "" if self.mm_per_pixel is None else f"{self.mm_per_pixel:.6g} ± {self.mm_per_pixel_std:.2g} mm per px, "
-        )
+        scale = f"{self.mm_per_pixel:.6g} ± {self.mm_per_pixel_std:.2g} mm per px, " if self.mm_per_pixel else ""
         fit = f"{len(self.pairs)} pairs, residuals {self.rms:.2g} px rms"
         return f"{scale}x axis at {turned:.2f} degrees, y axis {'up' if self.reflected else 'down'}; {fit}"
 
@@ -323,12 +351,3 @@ def on_image(
     owner = np.full(shape, -1, dtype=np.int32)
     claim_pixels(mesh.nodes, mesh.elements, owner)
     return part, mesh, Region.from_mask(owner >= 0)
-
-
-_POINTING = 0.5
-"""Residuals (px) that a point set by hand may have, and that decide nothing: a click is on a whole pixel (chosen)."""
-_DECIDED = 3.0
-"""How many times larger the residuals of the other sense must be for pairs to decide (chosen: beyond any scatter)."""
-_STRETCHED = 1.05
-"""Ratio of lengths on the mesh and on a camera's plane beyond which they contradict each other (chosen: a wrong unit is
-25 or more, a scale that is known to 5 % is no calibration)."""

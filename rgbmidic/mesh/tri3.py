@@ -16,19 +16,12 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from rgbmidic.errors import InputError, RegionError
-from rgbmidic.mesh.finite_elements import cross
-from rgbmidic.mesh.outline_mesh import edge_keys, outline_mesh
+from rgbmidic.mesh.finite_elements import oriented
+from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, outline_mesh
 from rgbmidic.mesh.region import Region
 from rgbmidic.typing import BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
-
-NARROW = 10
-"""Width (px) under which a region is reported as narrow: speckles are 3 to 5 px wide, and a pixel or two at each border
-serve the filters only."""
-_GRADED = 2.0
-"""Ratio of element sizes from which a mesh counts as graded. Those of `Tri3Mesh.from_region`, for which one size
-serves, differ by 1.53 at most (8 to 40 px over rectangles, discs, rings and polygons, with a crack; measured)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,29 +54,20 @@ class Tri3Mesh:
 
     def __post_init__(self) -> None:
         """Check nodes and elements, order the corners and derive the areas."""
-        nodes = np.array(self.nodes, dtype=np.float64, order="C")
-        elements = np.array(self.elements, dtype=np.int32)
-        if nodes.ndim != 2 or nodes.shape[1] != 2 or elements.ndim != 2 or elements.shape[1] != 3 or not len(elements):
-            raise InputError(
-                f"a TRI3 mesh has nodes (N, 2) and elements (E, 3), not {nodes.shape} and {elements.shape}"
-            )
-        if not np.isfinite(nodes).all() or elements.min() < 0 or elements.max() >= len(nodes):
-            raise InputError("mesh nodes must be finite and elements must name existing nodes")
-        area = cross(nodes, elements) / 2
-        if (area == 0).any():
-            raise InputError(f"element {int(np.argmin(np.abs(area)))} of the mesh has no area")
-        elements[area < 0] = elements[area < 0][:, [0, 2, 1]]
-        for name, values in (("nodes", nodes), ("elements", elements), ("areas", np.abs(area))):
+        nodes, elements, twice_areas = oriented(self.nodes, self.elements, "a TRI3 mesh")
+        if not twice_areas.all():
+            raise InputError(f"element {int(np.argmin(twice_areas))} of the mesh has no area")
+        for name, values in (("nodes", nodes), ("elements", elements), ("areas", twice_areas / 2)):
             values.setflags(write=False)
             object.__setattr__(self, name, values)
         object.__setattr__(self, "size", float(np.sqrt(2 * np.median(self.areas))))
         number = np.bincount(elements.ravel(), minlength=len(nodes))
         sizes = np.sqrt(2 * self.to_nodes(self.areas) / np.maximum(number, 1))
         small, large = np.quantile(sizes[number > 0], [0.1, 0.9])
-        object.__setattr__(self, "is_graded", bool(large > _GRADED * small))
-        if not self.is_graded:
-            sizes = np.full(len(nodes), self.size)
-        sizes[number == 0] = self.size
+        # sizes of `from_region`, for which one serves, differ by 1.53 at most (8 to 40 px over rectangles, discs, rings
+        # and polygons, with a crack; measured)
+        object.__setattr__(self, "is_graded", bool(large > 2.0 * small))
+        sizes[(number == 0) | (not self.is_graded)] = self.size
         sizes.setflags(write=False)
         object.__setattr__(self, "sizes", sizes)
 
@@ -125,7 +109,8 @@ class Tri3Mesh:
         if not (isinstance(given, int | float | np.number) and math.isfinite(given) and given >= 4):
             chosen = ': "auto" is for rgbmidic.measure' if given == "auto" else ""
             raise InputError(f"element_size must be a number of at least 4 px; given is {given!r}{chosen}")
-        if (width := region.width) < NARROW:
+        # speckles are 3 to 5 px wide, and a pixel or two at each border serve the filters only
+        if (width := region.width) < 10:
             logger.warning("the region is %d px across: two or three speckles, hardly enough to measure", width)
         elif width < element_size:
             logger.warning(
@@ -269,22 +254,29 @@ class Tri3Mesh:
 
     def _boundary_edges(self) -> npt.NDArray[np.int32]:
         """Edges (B, 2) that belong to one element only."""
-        pairs, count = self._edges()
-        return np.asarray(pairs[count == 1])
+        edges, count = self._edges()
+        return np.asarray(edges[count == 1])
 
     def _edges(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.intp]]:
         """Every edge once (M, 2), and the number of elements that share it (M,)."""
-        edges = np.concatenate([self.elements[:, [0, 1]], self.elements[:, [1, 2]], self.elements[:, [2, 0]]])
-        keys, count = np.unique(edge_keys(edges, len(self.nodes)), return_counts=True)
+        edges = edge_keys(self.elements[:, EDGES].reshape(-1, 2), len(self.nodes))
+        keys, count = np.unique(edges, return_counts=True)
         return np.stack(np.divmod(keys, len(self.nodes)), axis=1).astype(np.int32), count
 
     @property
     def crack_edges(self) -> npt.NDArray[np.int32]:
         """Edges of both sides of the cracks, shape (C, 2): those at one place that belong to one element each."""
-        edges, place, copies = self._boundary_edges(), np.arange(len(self.nodes)), self.copies
-        np.minimum.at(place, copies[:, 1], copies[:, 0])
-        _, index, count = np.unique(edge_keys(place[edges], len(place)), return_inverse=True, return_counts=True)
+        edges = self._boundary_edges()
+        keys = edge_keys(self.one_of_copies[edges], len(self.nodes))
+        _, index, count = np.unique(keys, return_inverse=True, return_counts=True)
         return np.asarray(edges[count[index] > 1])
+
+    @property
+    def one_of_copies(self) -> npt.NDArray[np.intp]:
+        """Index (N,) of the same node for those at one place, on both sides of a crack; of others their own."""
+        place, copies = np.arange(len(self.nodes)), self.copies
+        np.minimum.at(place, copies[:, 1], copies[:, 0])
+        return place
 
     @property
     def neighbours(self) -> npt.NDArray[np.int32]:
@@ -318,10 +310,6 @@ def _rectangle_mesh(
     return np.stack([x.ravel(), y.ravel()], 1), elements
 
 
-_EDGES = np.array([[0, 1], [1, 2], [2, 0]])
-"""Corners of the edges of an element."""
-
-
 def refined(mesh: Tri3Mesh, marked: BoolArray, least: float) -> Tri3Mesh:
     """Bisect elements at their longest edges, and those beside as far as no node then hangs on an edge.
 
@@ -343,10 +331,9 @@ def refined(mesh: Tri3Mesh, marked: BoolArray, least: float) -> Tri3Mesh:
     Tri3Mesh
         The finer mesh; `mesh` itself where nothing can be bisected.
     """
-    place, corners, count = np.arange(len(mesh.nodes)), mesh.elements.astype(np.int64), len(mesh.nodes)
-    np.minimum.at(place, mesh.copies[:, 1], mesh.copies[:, 0])
+    corners, count = mesh.elements.astype(np.int64), len(mesh.nodes)
     # edges by place: what is cut on one side of a crack is cut on the other
-    keys, edge = np.unique(edge_keys(place[corners][:, _EDGES].reshape(-1, 2), count), return_inverse=True)
+    keys, edge = np.unique(edge_keys(mesh.one_of_copies[corners][:, EDGES].reshape(-1, 2), count), return_inverse=True)
     edge = edge.reshape(-1, 3)
     start, end = mesh.nodes[np.stack(np.divmod(keys, count))]
     rank = np.empty(len(keys), dtype=np.int64)
@@ -375,7 +362,7 @@ def refined(mesh: Tri3Mesh, marked: BoolArray, least: float) -> Tri3Mesh:
 def _bisected(mesh: Tri3Mesh, corners: npt.NDArray[np.int64], cut: BoolArray) -> Tri3Mesh:
     """Cut edges (E, 3) of elements, the first edge of each before the others; edge i joins corners i and i + 1."""
     count = len(mesh.nodes)
-    keys, middle = np.unique(edge_keys(corners[:, _EDGES][cut], count), return_inverse=True)
+    keys, middle = np.unique(edge_keys(corners[:, EDGES][cut], count), return_inverse=True)
     at = np.full(cut.shape, -1)
     at[cut] = count + middle
     a, b, c = corners.T

@@ -156,7 +156,7 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         end = "cannot be measured" if solution.status is Status.FAILED else "did not converge"
         logger.warning("frame %d (%s) %s: %s", index, name, end, solution.reason)
     key = place % STRIDE == 0 or place == len(plan.series.chosen) - 1
-    if (settings.mesh_error is True or (settings.mesh_error == "key" and key)) and solution.measured.any():
+    if (settings.mesh.error is True or (settings.mesh.error == "key" and key)) and solution.measured.any():
         with stage("conclusion"):
             solution = discretisation_error(reference, deformed, solution, plan.solver, plan.method)
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution

@@ -195,12 +195,12 @@ class Plan:
             the settings.
         """
         _check_given(settings, source, separation, weights, mesh)
-        whole_calibration = None if settings.calibration_file is None else Calibration.read(settings.calibration_file)
+        whole_calibration = None if settings.calibration.file is None else Calibration.read(settings.calibration.file)
         series, calibration = _series_and_calibration(settings, source, whole_calibration)
         separate = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
         whole = any(one is not None for one in (source, weights, mesh, region))
         finite_elements, placement = None, None
-        if settings.mesh_file is not None:
+        if settings.mesh.file is not None:
             finite_elements, placement, mesh, region = finite_elements_of(settings, series.shape)
         if whole or not isinstance(separate, WindowedSeparation):
             region, window = region or read_region(settings.region, series.shape), Window.whole(series.shape)
@@ -211,9 +211,11 @@ class Plan:
         rest = ReferenceState.read(settings, series, separate, window, region, calibration)
         if separation is not None and isinstance(rest.states[0], IlluminationImages):
             raise ConfigurationError("the source gives images of the lights, which need no separation: give only one")
-        size = settings.side if mesh is None else mesh.size
+        size = settings.mesh.side if mesh is None else mesh.size
         if mesh is None:
-            mesh = Tri3Mesh.from_region(region, size, [np.subtract(path, window.origin) for path in settings.cracks])
+            mesh = Tri3Mesh.from_region(
+                region, size, [np.subtract(path, window.origin) for path in settings.mesh.cracks]
+            )
         cracked = len(mesh.crack_edges) > 0
         sigma, solver = grey_levels(settings.illumination.normalise, settings.solver, cracked=cracked)
         weights = weights or prepare_weights(
@@ -372,21 +374,21 @@ def _check_given(
             f'weights.method = "{settings.weights.method}", and weights are given: state "statistics", with which both '
             'count, or "none"'
         )
-    if mesh is not None and settings.mesh_file is not None:
-        raise ConfigurationError(f"mesh.file names {settings.mesh_file}, and a mesh is given: leave one of them out")
-    if mesh is not None and settings.cracks:
+    if mesh is not None and settings.mesh.file is not None:
+        raise ConfigurationError(f"mesh.file names {settings.mesh.file}, and a mesh is given: leave one of them out")
+    if mesh is not None and settings.mesh.cracks:
         raise ConfigurationError("mesh.cracks splits a mesh that is made here; the mesh that is given has its own")
-    if settings.element_size == "auto":
+    if settings.mesh.element_size == "auto":
         raise ConfigurationError(
             'mesh.element_size = "auto" is found on the frames of a test by rgbmidic.measure, for a mesh that is made '
             "there: state a number"
         )
-    if settings.mesh_refine is not False:
+    if settings.mesh.refine is not False:
         raise ConfigurationError(
             "mesh.refine is done on the frames of a test by rgbmidic.measure, for a mesh made there: leave it out"
         )
     kind = settings.frames.kind
-    if kind in ("bayer", "rgb") and separation is None and settings.calibration_file is None:
+    if kind in ("bayer", "rgb") and separation is None and settings.calibration.file is None:
         raise ConfigurationError(
             f'frames.kind = "{kind}" needs the lights\' crosstalk: state calibration.file, a file that '
             "rgbmidic-calibrate writes"

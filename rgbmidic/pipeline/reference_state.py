@@ -109,9 +109,11 @@ def _check_raw(
     if not window.is_whole:
         calibration = calibration.cropped(window.origin, window.shape)
     repeat = raw[1] if len(raw) > 1 else None
-    for found in check_state(raw[0], calibration, region.mask, names, accept=settings.accept, repeat=repeat):
+    for found in check_state(
+        raw[0], calibration, region.mask, names, accept=settings.calibration.accept, repeat=repeat
+    ):
         if not found.certain:
-            logger.warning("%s may not be what %s calibrates: %s", names, settings.calibration_file, found.text)
+            logger.warning("%s may not be what %s calibrates: %s", names, settings.calibration.file, found.text)
 
 
 _ABOVE = 2.0

@@ -29,13 +29,13 @@ def finite_elements_of(
     settings: TestSettings, frame: tuple[int, int]
 ) -> tuple[FiniteElementMesh, Placement, Tri3Mesh, Region]:
     """The part of ``mesh.file`` that is measured, where it lies on frames of this shape, and its pixels."""
-    assert settings.mesh_file is not None
+    assert settings.mesh.file is not None
     camera = None if settings.scale.camera is None else CameraCalibration.read(settings.scale.camera)
-    placement = Placement.fit(settings.mesh_points or (), camera)
+    placement = Placement.fit(settings.mesh.points or (), camera)
     logger.info("mesh.points: %s", placement.summary())
     limits = settings.region
     allowed = read_region(limits, frame) if limits.is_stated else Region.from_mask(np.ones(frame, dtype=bool))
-    every = read_mesh(settings.mesh_file, unit=settings.mesh_unit or "mm", part=settings.mesh_part)
+    every = read_mesh(settings.mesh.file, unit=settings.mesh.unit or "mm", part=settings.mesh.part)
     part, mesh, region = on_image(every, placement, frame, allowed.without(limits.holes))
     return part, placement, mesh, region
 
@@ -53,7 +53,7 @@ def region_and_window(settings: TestSettings, region: Region | None, frame: tupl
 
 def window_around(points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int]) -> Window:
     """What lies within `reach` of points (N, 2), and what its images depend on."""
-    may_crack = bool(settings.cracks) or settings.mesh_file is not None
+    may_crack = bool(settings.mesh.cracks) or settings.mesh.file is not None
     sigma, _ = grey_levels(settings.illumination.normalise, settings.solver, cracked=may_crack)
     return Window.around(points, reach + max(_REACH, 3 * max(sigma, settings.weights.blur)), frame)
 

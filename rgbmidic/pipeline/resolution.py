@@ -126,13 +126,13 @@ def study_sizes(
         The settings or frames are not usable, there is no deformed frame, none of them can be measured, or a size or
         gauge does not fit.
     """
-    if settings.mesh_file is not None or given.get("mesh") is not None:
-        what = "a mesh is given" if settings.mesh_file is None else f"mesh.file names {settings.mesh_file}"
+    if settings.mesh.file is not None or given.get("mesh") is not None:
+        what = "a mesh is given" if settings.mesh.file is None else f"mesh.file names {settings.mesh.file}"
         raise ConfigurationError(f"{what}, whose elements have their sizes: one is found for a mesh made here only")
     if sizes and min(sizes) < _LEAST:
         raise InputError(f"elements of {min(sizes):g} px are too small: {_LEAST:g} px are the least")
     middle = min(sizes, key=lambda size: abs(size - ELEMENT_SIZE), default=ELEMENT_SIZE)
-    plan = Plan.from_settings(replace(settings, element_size=middle), **given)
+    plan = Plan.from_settings(replace(settings, mesh=replace(settings.mesh, element_size=middle)), **given)
     sizes = tuple(sorted(sizes)) or sizes_to_try(plan)
     if max(sizes) > (most := largest_size(plan)):
         raise InputError(
@@ -332,7 +332,7 @@ def _deformed(plan: Plan, index: int) -> Deformed:
 
 def _resized(plan: Plan, size: float) -> Plan:
     """The same test on elements of another size; the weights are those prepared for this one's."""
-    cracks = [np.subtract(path, plan.window.origin) for path in plan.settings.cracks]
+    cracks = [np.subtract(path, plan.window.origin) for path in plan.settings.mesh.cracks]
     return replace(plan.on_mesh(Tri3Mesh.from_region(plan.region, size, cracks)), element_size=size)
 
 

@@ -123,14 +123,14 @@ def measure(
     choice: Choice | None = None
     begun = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()
     kept = read_provenance(Path(out)) if begun else {}
-    if settings.element_size == "auto":
+    if settings.mesh.element_size == "auto":
         choice = Choice(**kept["element_size"]) if kept.get("element_size") else choose(settings, **given)
-    if settings.mesh_refine is not False and mesh is not None:
+    if settings.mesh.refine is not False and mesh is not None:
         raise InputError("mesh.refine is for a mesh made here, and a mesh is given: leave one of them out")
-    sized = settings if choice is None else replace(settings, element_size=choice.element_size)
-    plan = Plan.from_settings(replace(sized, mesh_refine=False), **given)
-    if settings.mesh_refine is not False:
-        plan = _refined(plan, settings.mesh_refine, Path(out), kept)
+    sized = settings.mesh if choice is None else replace(settings.mesh, element_size=choice.element_size)
+    plan = Plan.from_settings(replace(settings, mesh=replace(sized, refine=False)), **given)
+    if settings.mesh.refine is not False:
+        plan = _refined(plan, settings.mesh.refine, Path(out), kept)
     plan = replace(plan, settings=settings, choice=choice, timings=timings)
     objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
     if settings.weights.method == "images":  # the masks, whatever their files are called

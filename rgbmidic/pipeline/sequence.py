@@ -33,6 +33,7 @@ from rgbmidic.settings import (
     ELEMENT_SIZE,
     FrameSettings,
     IlluminationSettings,
+    MeshSettings,
     RegionSettings,
     SolverOptions,
     TestSettings,
@@ -122,7 +123,7 @@ def measure_sequence(
         settings = TestSettings(
             frames=FrameSettings(path=(), update_reference=update_reference),
             region=RegionSettings(rectangle=corners),
-            element_size=element_size,
+            mesh=MeshSettings(element_size=element_size),
             illumination=IlluminationSettings(normalise=normalise),
             weights=WeightSettings(method="statistics" if statistics else "none"),
             solver=solver_settings(options),

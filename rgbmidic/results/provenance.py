@@ -108,7 +108,7 @@ class Origin:
         document |= {"platform": platform.platform(), "machine": machine()}
         if self.settings is not None:
             document |= {"settings": self.settings.to_mapping(), "base": str(self.settings.base)}
-            if (file := self.settings.calibration_file) is not None:
+            if (file := self.settings.calibration.file) is not None:
                 document["calibration"] = {"file": str(file), "sha256": file_hash(file)}
             if (file := self.settings.scale.camera) is not None:
                 document["camera"] = CameraCalibration.read(file).to_document()

@@ -1,18 +1,22 @@
-"""Values of a settings file converted to what the schema says, and back."""
+"""Sections and values of a settings file converted to the dataclasses of the schema, and back."""
 
 from __future__ import annotations
 
 import difflib
 import math
+import operator
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import MISSING, Field, field, fields, is_dataclass
+from functools import cache
 from pathlib import Path, PurePath
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from rgbmidic.errors import ConfigurationError
+
+_Section = TypeVar("_Section")
 
 
 def read_table(document: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -212,17 +216,15 @@ def read_range(text: str, where: str) -> range:
     return range(int(found[1]), int(found[2]))
 
 
-_LONGEST = 100_000
-"""Most frames in a range for an average. A reference of n frames adds 1/n to a frame's variance: 100 are enough, and
-this is a thousand times that. A longer range is a slip, and took a minute and 3 GB until the frames refused it."""
-
-
 def _convert_list(value: Any, kinds: tuple[Any, ...], where: str, base: Path | str) -> tuple[Any, ...]:
     if kinds == (int, Ellipsis) and isinstance(value, str):
         value = read_range(value, where)
     if isinstance(value, range):
-        if len(value) > _LONGEST:
-            raise ConfigurationError(f"{where} names {len(value)} frames; at most {_LONGEST} are allowed")
+        # a reference of n frames adds 1/n to a frame's variance: 100 are enough, and a longer range than this is a slip
+        # that took a minute and 3 GB until the frames refused it
+        most = 100_000
+        if len(value) > most:
+            raise ConfigurationError(f"{where} names {len(value)} frames; at most {most} are allowed")
         value = tuple(value)
     if len(kinds) == 2 and kinds[1] is Ellipsis:
         entries = value if _depth(value) > _hint_depth(kinds[0]) else [value]  # a single one needs no brackets
@@ -265,3 +267,131 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and math.isnan(value):
         return None
     return str(value) if isinstance(value, Path) else value
+
+
+@cache
+def hints_of(settings: Any) -> dict[str, Any]:
+    """Types of the fields of a class of settings, which take a while to resolve."""
+    return get_type_hints(settings)
+
+
+def bounded(default: Any = MISSING, **bounds: float) -> Any:
+    """A field whose number, or every number of it, keeps the bounds `above`, `at_least`, `at_most`, `below`.
+
+    Parameters
+    ----------
+    default
+        Value where none is stated; none: the key is required.
+    **bounds
+        Bounds by their names.
+
+    Returns
+    -------
+    dataclasses.Field
+    """
+    return field(default=default, metadata={"bounds": bounds})
+
+
+_BOUNDS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le, "below": operator.lt}
+
+
+def converted(entry: Field[Any], value: Any, hint: Any, where: str, base: Path | str = "") -> Any:
+    """A value in the type of a field, every number of it finite and within the field's bounds."""
+    value = convert_value(value, hint, where, base)
+    for number in _numbers(value):
+        if not math.isfinite(number):
+            raise ConfigurationError(f"{where} must be finite, not {number}")
+        for bound, limit in entry.metadata.get("bounds", {}).items():
+            if not _BOUNDS[bound](number, limit):
+                raise ConfigurationError(f"{where} must be {bound.replace('_', ' ')} {limit:g}, not {number:g}")
+    return value
+
+
+def _numbers(value: Any) -> list[float]:
+    if isinstance(value, tuple):
+        return [number for entry in value for number in _numbers(entry)]
+    return [value] if isinstance(value, int | float) else []
+
+
+class Checked:
+    """Settings that are checked when they are made: every field by its type and bounds, then what keys must keep."""
+
+    __slots__ = ()
+    section = ""
+
+    def __post_init__(self) -> None:
+        hints = hints_of(cast(Any, self.__class__))
+        for entry in fields(cast(Any, self)):
+            where = f"{self.section}.{entry.name}".lstrip(".")
+            value = converted(entry, getattr(self, entry.name), hints[entry.name], where)
+            object.__setattr__(self, entry.name, value)
+        for problem in self._problems():
+            raise ConfigurationError(problem)
+
+    def _problems(self) -> Iterator[str]:
+        """Normalise what depends on other keys, and yield what contradicts them, a sentence each."""
+        return iter(())
+
+
+def read_section(
+    kind: type[_Section], name: str, content: Mapping[str, Any], base: Path | str = ".", /, **ready: Any
+) -> _Section:
+    """Object of a dataclass from the keys and plain values of a section: of TEST.toml, SCENE.toml or a calibration.
+
+    Parameters
+    ----------
+    kind
+        Class of the section, such as `FrameSettings`.
+    name
+        Name of the section, for messages.
+    content
+        Its keys and values.
+    base
+        Folder that relative paths start from.
+    **ready
+        Fields that are no keys of the section.
+
+    Returns
+    -------
+    object of `kind`
+
+    Raises
+    ------
+    ConfigurationError
+        A key is unknown, missing, of the wrong type, out of range, or contradicts another.
+    """
+    hints = {key: hint for key, hint in hints_of(cast(Any, kind)).items() if key not in ready}
+    check_names(content, hints, "key", f"[{name}]")
+    for entry in fields(cast(Any, kind)):
+        if entry.name in content:
+            value, hint, where = content[entry.name], hints[entry.name], f"{name}.{entry.name}"
+            inner = next((part for part in (hint, *get_args(hint)) if is_dataclass(part)), None)
+            if inner is not None and isinstance(value, Mapping):
+                value = read_section(cast(Any, inner), where, value, base)
+            ready[entry.name] = converted(entry, value, hint, where, base)
+        elif entry.default is entry.default_factory is MISSING and entry.name not in ready:
+            raise ConfigurationError(f"{name}.{entry.name} is missing")
+    return kind(**ready)
+
+
+def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of a JSON file (`object_pairs_hook`), as TOML reads it: a key stated twice is an error.
+
+    Parameters
+    ----------
+    pairs
+        Keys and values of the object, in its order.
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    ValueError
+        A key is stated twice.
+    """
+    keys = [key for key, _ in pairs]
+    if len(found := dict(pairs)) < len(keys):
+        raise ValueError(f'the key "{next(key for key in found if keys.count(key) > 1)[:40]}" is stated twice')
+    return found

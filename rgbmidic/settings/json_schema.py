@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import types
-from dataclasses import MISSING, Field
+from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
-from rgbmidic.settings.conversion import plain
-from rgbmidic.settings.schema import TestSettings, section_keys
+from rgbmidic.settings.conversion import hints_of, plain
+from rgbmidic.settings.schema import section_kinds
 
 _TYPES = {bool: "boolean", float: "number", int: "integer", str: "string", Path: "string"}
 _BOUNDS = {
@@ -20,7 +20,7 @@ _BOUNDS = {
 
 
 def json_schema() -> dict[str, Any]:
-    """Describe TEST.toml as a JSON schema (draft 2020-12), generated from `TestSettings`.
+    """Describe TEST.toml as a JSON schema (draft 2020-12), generated from `rgbmidic.settings.TestSettings`.
 
     Bounds and types of single keys are in it; what keys demand of each other is checked when a file is read.
 
@@ -32,10 +32,10 @@ def json_schema() -> dict[str, Any]:
         name: {
             "type": "object",
             "additionalProperties": False,
-            "properties": {key: _described(hint, entry) for key, (hint, entry) in keys.items()},
-            "required": [key for key, (_, entry) in keys.items() if entry.default is entry.default_factory is MISSING],
+            "properties": {entry.name: _described(hints_of(kind)[entry.name], entry) for entry in fields(kind)},
+            "required": [entry.name for entry in fields(kind) if entry.default is entry.default_factory is MISSING],
         }
-        for name, keys in section_keys(TestSettings).items()
+        for name, kind in section_kinds().items()
     }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

@@ -8,42 +8,31 @@ and a single entry in place of a list of one are what they stand for, in a file 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_args
+from typing import Any, Literal
 
 from rgbmidic.errors import ConfigurationError
-from rgbmidic.settings.conversion import check_names, convert_value, plain, read_table, read_toml
-from rgbmidic.settings.sections import (
+from rgbmidic.settings.conversion import (
     Checked,
+    bounded,
+    check_names,
+    hints_of,
+    plain,
+    read_section,
+    read_table,
+    read_toml,
+)
+from rgbmidic.settings.sections import (
+    CalibrationSettings,
     FrameSettings,
     IlluminationSettings,
+    MeshSettings,
     RegionSettings,
     SolverSettings,
     WeightSettings,
-    bounded,
-    converted,
-    hints_of,
-    require,
-    require_corners,
 )
-
-_Section = TypeVar("_Section")
-
-
-FrameCheck = Literal["noise", "levels", "greens", "lights", "demosaiced"]
-"""Checks of a frame against its calibration (`rgbmidic.illumination.frame_check`)."""
-
-ELEMENT_SIZE = 25.0
-"""Side of the elements in px where nobody states another: the paper's (section 2.2)."""
-
-SMALLEST_HALVED = 8.0
-"""Side (px) of the smallest elements of which the discretisation error is known: their halves, of 4 px, have some eight
-samples for six unknowns."""
-
-LENGTH_UNITS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "inch": 25.4}
-"""Millimetres in a length of 1 of a mesh's file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,15 +58,11 @@ class ScaleSettings(Checked):
     camera: Path | None = None
     frame_rate: float | None = bounded(None, above=0)
 
-    def _check(self) -> None:
-        require(
-            self.camera is None or self.mm_per_pixel is None,
-            f"scale.camera ({self.camera}) holds the scale, scale.mm_per_pixel states another: leave one of them out",
-        )
-        require(
-            not self.mm_per_pixel_std or self.mm_per_pixel is not None,
-            "scale.mm_per_pixel_std is the uncertainty of scale.mm_per_pixel, which is missing",
-        )
+    def _problems(self) -> Iterator[str]:
+        if self.camera is not None and self.mm_per_pixel is not None:
+            yield f"scale.camera ({self.camera}) and scale.mm_per_pixel both state the scale: leave one of them out"
+        if self.mm_per_pixel_std and self.mm_per_pixel is None:
+            yield "scale.mm_per_pixel_std is the uncertainty of scale.mm_per_pixel, which is missing"
 
 
 _Place2 = tuple[tuple[float, float], ...]
@@ -151,39 +136,33 @@ class ProbeSettings(Checked):
     rigid_motion: Literal["none", "tell", "remove"] = "none"
     names: tuple[tuple[str, str], ...] = ()
 
-    def _check(self) -> None:
-        require(
-            self.window == 0 or self.window >= 4, f"probes.window must be 0 or at least 4 frames, not {self.window}"
-        )
+    def _problems(self) -> Iterator[str]:
+        if 0 < self.window < 4:
+            yield f"probes.window must be 0 or at least 4 frames, not {self.window}"
         for key in ("circles", "strain_gauges"):
             sizes = [size for *_, size in getattr(self, key)]
-            require(all(size > 0 for size in sizes), f"probes.{key} are [x, y, size] with a size above 0, not {sizes}")
+            if not all(size > 0 for size in sizes):
+                yield f"probes.{key} are [x, y, size] with a size above 0, not {sizes}"
         for x0, y0, x1, y1 in self.regions:
-            require(
-                x0 != x1 and y0 != y1,
-                f"probes.regions are [x0, y0, x1, y1] of a rectangle with an area, not {[x0, y0, x1, y1]}",
-            )
+            if x0 == x1 or y0 == y1:
+                yield f"probes.regions are [x0, y0, x1, y1] of a rectangle with an area, not {[x0, y0, x1, y1]}"
         for *_, inner, outer in self.tips:
-            require(
-                0 < inner < outer,
-                f"probes.tips are [x, y, r0, r1] with radii 0 < r0 < r1 in px, not {inner:g} and {outer:g}",
-            )
+            if not 0 < inner < outer:
+                yield f"probes.tips are [x, y, r0, r1] with radii 0 < r0 < r1 in px, not {inner:g} and {outer:g}"
         missing = [key for key in ("youngs_modulus", "poissons_ratio", "plane") if getattr(self, key) is None]
-        require(
-            not (self.tips and missing),
-            'probes.tips need probes.youngs_modulus (MPa), probes.poissons_ratio and probes.plane ("stress" or '
-            f'"strain"), as options --youngs-modulus, --poissons-ratio, --plane; missing: {", ".join(missing)}',
-        )
-        require(self.terms != 1, "probes.terms must be 0 (chosen by a test) or at least 2, not 1")
+        if self.tips and missing:
+            yield (
+                'probes.tips need probes.youngs_modulus (MPa), probes.poissons_ratio and probes.plane ("stress" or '
+                f'"strain"), as options --youngs-modulus, --poissons-ratio, --plane; missing: {", ".join(missing)}'
+            )
+        if self.terms == 1:
+            yield "probes.terms must be 0 (chosen by a test) or at least 2, not 1"
         check_names((probe for probe, _ in self.names), self.numbered, "probe", "probes.names")
         given = [name for _, name in self.names]
         for name in given:
-            require(
-                PROBE_NAME.fullmatch(name) and given.count(name) == 1,
-                'probes.names must be different, of letters, digits, spaces, "." and "-" (60 at most), not "'
-                + name
-                + '"',
-            )
+            if not PROBE_NAME.fullmatch(name) or given.count(name) > 1:
+                allowed = 'different, of letters, digits, spaces, "." and "-" (60 at most)'
+                yield f'probes.names must be {allowed}, not "{name}"'
 
     @property
     def numbered(self) -> list[str]:
@@ -233,14 +212,13 @@ class ChannelSettings(Checked):
     area: float | None = bounded(None, above=0)
     force: str | None = None
 
-    def _check(self) -> None:
+    def _problems(self) -> Iterator[str]:
         stated = [name for name in ("offset", "trigger", "align") if getattr(self, name)]
-        require(len(stated) < 2, f"channels.{' and channels.'.join(stated)} both relate the clocks: state one of them")
+        if len(stated) > 1:
+            yield f"channels.{' and channels.'.join(stated)} both relate the clocks: state one of them"
         others = [entry.name for entry in fields(self) if getattr(self, entry.name) and entry.name != "file"]
-        require(
-            self.file is not None or not others,
-            f"channels.{(others or ['file'])[0]} is of channels, whose file (channels.file) is not stated",
-        )
+        if self.file is None and others:
+            yield f"channels.{others[0]} is of channels, whose file (channels.file) is not stated"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -290,33 +268,8 @@ class TestSettings(Checked):
 
     Attributes
     ----------
-    frames, region, illumination, weights, solver, scale, setup, probes, channels
+    frames, region, calibration, mesh, illumination, weights, solver, scale, setup, probes, channels
         The sections of the same name.
-    calibration_file
-        ``file`` in ``[calibration]``; needed for colour frames, unless a script gives its own separation.
-    accept
-        ``accept`` in ``[calibration]``: checks of the reference frame against the calibration whose contradictions are
-        accepted (`rgbmidic.illumination.frame_check`).
-    element_size
-        ``element_size`` in ``[mesh]``: side of the elements in px; ``"auto"``: what a study of the test's own frames
-        recommends (`rgbmidic.pipeline.resolution`); None with `mesh_file`, which has its own.
-    cracks
-        ``cracks`` in ``[mesh]``: paths, each of corners (x, y) in px on the reference, along which the mesh is split.
-    mesh_file
-        ``file`` in ``[mesh]``: finite-element mesh to measure on (`rgbmidic.read_mesh`).
-    mesh_points
-        ``points`` in ``[mesh]``: pairs (x_mm, y_mm, x_px, y_px), two or more, that place it on the image
-        (`rgbmidic.Placement.fit`).
-    mesh_unit
-        ``unit`` in ``[mesh]``: unit of length of the file; the points are in mm.
-    mesh_part
-        ``part`` in ``[mesh]``: set of its elements that is measured; None: all.
-    mesh_error
-        ``error`` in ``[mesh]``: whether the discretisation error is estimated (`rgbmidic.discretisation_error`), in
-        every frame, or in key frames (``"key"``): every 16th and the last.
-    mesh_refine
-        ``refine`` in ``[mesh]``: whether elements are bisected where the discretisation error of strain is more than
-        twice its noise (`rgbmidic.pipeline.resolution.refine`), in the frame of this index, or in a key frame (True).
     base
         Folder that relative paths start from.
     """
@@ -325,20 +278,8 @@ class TestSettings(Checked):
 
     frames: FrameSettings
     region: RegionSettings = field(default_factory=RegionSettings)
-    calibration_file: Path | None = field(default=None, metadata={"key": "calibration.file"})
-    accept: tuple[FrameCheck, ...] = field(default=(), metadata={"key": "calibration.accept"})
-    element_size: float | Literal["auto"] | None = field(
-        default=None, metadata={"key": "mesh.element_size", "bounds": {"above": 0}}
-    )
-    cracks: tuple[tuple[tuple[float, float], ...], ...] = field(default=(), metadata={"key": "mesh.cracks"})
-    mesh_file: Path | None = field(default=None, metadata={"key": "mesh.file"})
-    mesh_points: tuple[tuple[float, float, float, float], ...] | None = field(
-        default=None, metadata={"key": "mesh.points"}
-    )
-    mesh_unit: Literal["mm", "m", "um", "inch"] | None = field(default=None, metadata={"key": "mesh.unit"})
-    mesh_part: str | None = field(default=None, metadata={"key": "mesh.part"})
-    mesh_error: bool | Literal["key"] = field(default=False, metadata={"key": "mesh.error"})
-    mesh_refine: int | Literal[True, False] = field(default=False, metadata={"key": "mesh.refine"})
+    calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
+    mesh: MeshSettings = field(default_factory=MeshSettings)
     illumination: IlluminationSettings = field(default_factory=IlluminationSettings)
     weights: WeightSettings = field(default_factory=WeightSettings)
     solver: SolverSettings = field(default_factory=SolverSettings)
@@ -346,49 +287,15 @@ class TestSettings(Checked):
     setup: SetupSettings = field(default_factory=SetupSettings)
     probes: ProbeSettings = field(default_factory=ProbeSettings)
     channels: ChannelSettings = field(default_factory=ChannelSettings)
-    base: Path = field(default_factory=Path, metadata={"key": ""})
+    base: Path = field(default_factory=Path)
 
-    def _check(self) -> None:
-        require(
-            not (self.mesh_error and self.frames.update_reference),
-            "mesh.error is for one reference, and frames.update_reference makes others: leave one of them out",
-        )
-        for key, asked in (("error", self.mesh_error), ("refine", self.mesh_refine is not False)):
-            require(
-                not asked or self.mesh_file is not None or self.side >= SMALLEST_HALVED,
-                f"mesh.{key} halves the elements: mesh.element_size must be {SMALLEST_HALVED:g} px or more for it, not "
-                f"{self.side:g}",
-            )
-        require(
-            self.mesh_refine is False or self.element_size != "auto",
-            'mesh.refine and mesh.element_size = "auto" both choose the elements: state a number, or leave refine out',
-        )
-        for number, crack in enumerate(self.cracks):
-            require_corners(f"mesh.cracks[{number}]", crack, 2, "two")
-        if self.mesh_file is None:
-            for key in ("points", "unit", "part"):
-                require(getattr(self, f"mesh_{key}") is None, f"mesh.{key} is for mesh.file, which is missing")
-            require(
-                self.region.is_stated,
-                "[region] is missing or empty: it needs exactly one of rectangle, polygon, mask; given are 0",
-            )
-            if self.element_size is None:
-                object.__setattr__(self, "element_size", ELEMENT_SIZE)
-            return
-        stated = {"element_size": self.element_size, "cracks": self.cracks, "refine": self.mesh_refine is not False}
-        for key, value in stated.items():
-            require(not value, f"mesh.{key} is for a mesh made here, and mesh.file names one: leave one out")
-        pairs = self.mesh_points or ()
-        require(len(pairs) >= 2, f"mesh.file needs mesh.points, two or more [x_mm, y_mm, x_px, y_px], not {len(pairs)}")
-        require(
-            self.scale.mm_per_pixel is None,
-            f"scale.mm_per_pixel ({self.scale.mm_per_pixel}) states a scale, mesh.points hold another: leave it out",
-        )
-
-    @property
-    def side(self) -> float:
-        """Side of the elements in px, where it is stated; the default where it is not, or is found by the run."""
-        return self.element_size if isinstance(self.element_size, float) else ELEMENT_SIZE
+    def _problems(self) -> Iterator[str]:
+        if self.mesh.error and self.frames.update_reference:
+            yield "mesh.error is for one reference, and frames.update_reference makes others: leave one of them out"
+        if self.mesh.file is None and not self.region.is_stated:
+            yield "[region] is missing or empty: it needs exactly one of rectangle, polygon, mask; given are 0"
+        if self.mesh.file is not None and (scale := self.scale.mm_per_pixel) is not None:
+            yield f"scale.mm_per_pixel ({scale}) states a scale, mesh.points hold another: leave it out"
 
     @classmethod
     def from_mapping(cls, document: Mapping[str, Any], base: Path | str = ".") -> TestSettings:
@@ -410,23 +317,12 @@ class TestSettings(Checked):
         ConfigurationError
             A section or key is unknown, missing, of the wrong type, out of range, or contradicts another.
         """
-        base = Path(base).resolve()
-        hints, sections = hints_of(cast(Any, cls)), section_keys(cls)
-        places = {_place(entry): entry.name for entry in fields(cls)}
-        check_names(document, sections, "section", "the file")
-        values: dict[str, Any] = {"base": base}
-        for name in document:
-            content = read_table(document, name)
-            if name in hints:
-                values[name] = read_section(hints[name], name, content, base)
-                continue
-            check_names(content, sections[name], "key", f"[{name}]")
-            for key, value in content.items():
-                values[places[name, key]] = convert_value(value, sections[name][key][0], f"{name}.{key}", base)
-        for entry in fields(cls):
-            if _is_required(entry) and entry.name not in values:
-                raise ConfigurationError(f"the section [{entry.name}] is missing")
-        return cls(**values)
+        base, kinds = Path(base).resolve(), section_kinds()
+        check_names(document, kinds, "section", "the file")
+        if "frames" not in document:
+            raise ConfigurationError("the section [frames] is missing")
+        sections = {name: read_section(kinds[name], name, read_table(document, name), base) for name in document}
+        return cls(base=base, **sections)
 
     def to_mapping(self) -> dict[str, dict[str, Any]]:
         """The settings as sections of plain values, defaults included, without `base` and what is not known.
@@ -437,79 +333,15 @@ class TestSettings(Checked):
         -------
         dict of str to dict
         """
-        document: dict[str, dict[str, Any]] = {}
-        for entry in fields(self):
-            section, key = _place(entry)
-            value = plain(getattr(self, entry.name))
-            if not key and section:
-                document[section] = {name: content for name, content in value.items() if content is not None}
-            elif section and value is not None:
-                document.setdefault(section, {})[key] = value
-        return document
+        return {
+            name: {key: value for key, value in plain(getattr(self, name)).items() if value is not None}
+            for name in section_kinds()
+        }
 
 
-def read_section(
-    kind: type[_Section], name: str, content: Mapping[str, Any], base: Path | str = ".", /, **ready: Any
-) -> _Section:
-    """Object of a dataclass from the keys and plain values of a section: of TEST.toml, SCENE.toml or a calibration.
-
-    Parameters
-    ----------
-    kind
-        Class of the section, such as `FrameSettings`.
-    name
-        Name of the section, for messages.
-    content
-        Its keys and values.
-    base
-        Folder that relative paths start from.
-    **ready
-        Fields that are no keys of the section.
-
-    Returns
-    -------
-    object of `kind`
-
-    Raises
-    ------
-    ConfigurationError
-        A key is unknown, missing, of the wrong type, out of range, or contradicts another.
-    """
-    hints = {key: hint for key, hint in hints_of(cast(Any, kind)).items() if key not in ready}
-    check_names(content, hints, "key", f"[{name}]")
-    for entry in fields(cast(Any, kind)):
-        if entry.name in content:
-            value, hint, where = content[entry.name], hints[entry.name], f"{name}.{entry.name}"
-            inner = next((part for part in (hint, *get_args(hint)) if is_dataclass(part)), None)
-            if inner is not None and isinstance(value, Mapping):
-                value = read_section(cast(Any, inner), where, value, base)
-            ready[entry.name] = converted(entry, value, hint, where, base)
-        elif _is_required(entry) and entry.name not in ready:
-            raise ConfigurationError(f"{name}.{entry.name} is missing")
-    return kind(**ready)
-
-
-def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object of a JSON file (`object_pairs_hook`), as TOML reads it: a key stated twice is an error.
-
-    Parameters
-    ----------
-    pairs
-        Keys and values of the object, in its order.
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    ValueError
-        A key is stated twice.
-    """
-    keys = [key for key, _ in pairs]
-    if len(found := dict(pairs)) < len(keys):
-        raise ValueError(f'the key "{next(key for key in found if keys.count(key) > 1)[:40]}" is stated twice')
-    return found
+def section_kinds() -> dict[str, Any]:
+    """Names of the sections of a TEST.toml, and the classes that hold their keys."""
+    return {name: kind for name, kind in hints_of(TestSettings).items() if is_dataclass(kind)}
 
 
 def read_test(path: Path | str) -> TestSettings:
@@ -535,27 +367,3 @@ def read_test(path: Path | str) -> TestSettings:
         return TestSettings.from_mapping(document, path.parent)
     except ConfigurationError as error:
         raise ConfigurationError(f"{path}: {error}") from None
-
-
-def _place(entry: Field[Any]) -> tuple[str, str]:
-    """Section and key that a field of `TestSettings` comes from; a whole section has no key, `base` has neither."""
-    section, _, key = entry.metadata.get("key", entry.name).partition(".")
-    return section, key
-
-
-def _is_required(entry: Field[Any]) -> bool:
-    return entry.default is MISSING and entry.default_factory is MISSING
-
-
-def section_keys(settings: type[TestSettings]) -> dict[str, dict[str, tuple[Any, Field[Any]]]]:
-    """For every section its keys, each with the type of its value and the field that holds it."""
-    hints = hints_of(cast(Any, settings))
-    sections: dict[str, dict[str, tuple[Any, Field[Any]]]] = {}
-    for entry in fields(settings):
-        section, key = _place(entry)
-        if key:
-            sections.setdefault(section, {})[key] = hints[entry.name], entry
-        elif section:
-            parts = hints_of(hints[entry.name])
-            sections[section] = {part.name: (parts[part.name], part) for part in fields(hints[entry.name])}
-    return sections

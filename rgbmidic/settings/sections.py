@@ -2,74 +2,18 @@
 
 from __future__ import annotations
 
-import math
-import operator
-from dataclasses import MISSING, Field, dataclass, field, fields, replace
-from functools import cache
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypedDict, cast, get_type_hints
+from typing import Any, Literal, TypedDict
 
-from rgbmidic.errors import ConfigurationError
-from rgbmidic.settings.conversion import convert_value
-
-
-@cache
-def hints_of(settings: Any) -> dict[str, Any]:
-    """Types of the fields of a class of settings, which take a while to resolve."""
-    return get_type_hints(settings)
-
+from rgbmidic.settings.conversion import Checked, bounded
 
 FrameKind = Literal["bayer", "rgb", "monochrome"]
 
 
 BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 """The four phases of the Bayer colour filter array, named by the top-left 2x2 cell read row by row."""
-
-
-def bounded(default: Any = MISSING, **bounds: float) -> Any:
-    """A field whose number, or every number of it, keeps the bounds `above`, `at_least`, `at_most`, `below`.
-
-    Parameters
-    ----------
-    default
-        Value where none is stated; none: the key is required.
-    **bounds
-        Bounds by their names.
-
-    Returns
-    -------
-    dataclasses.Field
-    """
-    return field(default=default, metadata={"bounds": bounds})
-
-
-class Checked:
-    """Settings that are checked when they are made: every field by its type and bounds, then what keys must keep."""
-
-    __slots__ = ()
-    section = ""
-
-    def __post_init__(self) -> None:
-        hints = hints_of(cast(Any, self.__class__))
-        for entry in fields(cast(Any, self)):
-            where = entry.metadata.get("key") or f"{self.section}.{entry.name}".lstrip(".")
-            value = converted(entry, getattr(self, entry.name), hints[entry.name], where)
-            object.__setattr__(self, entry.name, value)
-        self._check()
-
-    def _check(self) -> None:
-        """Raise a `ConfigurationError` where keys contradict each other."""
-
-
-def require(kept: object, message: str) -> None:
-    """Refuse settings of which a condition is not kept."""
-    if not kept:
-        raise ConfigurationError(message)
-
-
-def require_corners(where: str, corners: tuple[Any, ...], least: int, words: str) -> None:
-    """Refuse a path or polygon of too few corners."""
-    require(len(corners) >= least, f"{where} needs at least {words} corners [x, y], not {len(corners)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,42 +65,33 @@ class FrameSettings(Checked):
     dtype: Literal["uint8", "uint16", ">u2"] | None = None
     crop_origin: tuple[int, int] | None = bounded(None, at_least=0)
 
-    def _check(self) -> None:
-        require(all(self.path), "frames.path must name the frame files")
-        require(
-            len(self.path) <= 1 or self.kind == "monochrome",
-            f"frames.path with {len(self.path)} entries means as many lights fired in succession before a monochrome "
-            'camera: state kind = "monochrome", or give a single path',
-        )
-        require(
-            self.lights == 1 or (len(self.path) == 1 and self.kind == "monochrome"),
-            f"frames.lights = {self.lights} means lights that fire in turn before a monochrome camera that records "
-            f'them in one series: state kind = "monochrome" and a single path, not {len(self.path)}',
-        )
-        require(
-            self.last is None or self.last >= self.first,
-            f"frames.last must be at least frames.first ({self.first}), not {self.last}",
-        )
-        require(
-            self.reference and len(set(self.reference)) == len(self.reference),
-            f"frames.reference must name different frames, not {list(self.reference)}",
-        )
+    def _problems(self) -> Iterator[str]:
+        if not all(self.path):
+            yield "frames.path must name the frame files"
+        if len(self.path) > 1 and self.kind != "monochrome":
+            yield (
+                f"frames.path with {len(self.path)} entries means as many lights fired in succession before a "
+                'monochrome camera: state kind = "monochrome", or give a single path'
+            )
+        if self.lights > 1 and (len(self.path) != 1 or self.kind != "monochrome"):
+            yield (
+                f"frames.lights = {self.lights} means lights that fire in turn before a monochrome camera that records "
+                f'them in one series: state kind = "monochrome" and a single path, not {len(self.path)}'
+            )
+        if self.last is not None and self.last < self.first:
+            yield f"frames.last must be at least frames.first ({self.first}), not {self.last}"
+        if not self.reference or len(set(self.reference)) < len(self.reference):
+            yield f"frames.reference must name different frames, not {list(self.reference)}"
         if self.cfa is not None:
             object.__setattr__(self, "cfa", self.cfa.upper())
-            allowed = ", ".join(BAYER_PATTERNS)
-            require(self.cfa in BAYER_PATTERNS, f'frames.cfa must be one of {allowed}, not "{self.cfa}"')
-        require(
-            self.black_level is None or self.white_level is None or self.white_level > self.black_level,
-            f"frames.white_level must be above black_level {self.black_level}, not {self.white_level}",
-        )
+            if self.cfa not in BAYER_PATTERNS:
+                yield f'frames.cfa must be one of {", ".join(BAYER_PATTERNS)}, not "{self.cfa}"'
+        if self.black_level is not None and self.white_level is not None and self.white_level <= self.black_level:
+            yield f"frames.white_level must be above black_level {self.black_level}, not {self.white_level}"
 
 
 LOCAL_MEAN = 10.0
 """Width (px) of the local mean. Chosen: two to three speckles."""
-_WIDER_AT_CRACKS = 3.0
-"""How many times as wide it is where a mesh has cracks: a gap changes so wide a mean nearly alike all over an element,
-and the gain of the means takes that out. With 5 the gap is followed no better and a slope of the brightness worse
-(rendered cracks open by up to 5 px)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,6 +112,108 @@ class IlluminationSettings(Checked):
 
     demosaic: Literal["auto", "reflection-aware", "malvar", "normalised"] = "auto"
     normalise: float | Literal["auto"] = bounded("auto", at_least=0)
+
+
+FrameCheck = Literal["noise", "levels", "greens", "lights", "demosaiced"]
+"""Checks of a frame against its calibration (`rgbmidic.illumination.frame_check`)."""
+
+ELEMENT_SIZE = 25.0
+"""Side of the elements in px where nobody states another: the paper's (section 2.2)."""
+
+SMALLEST_HALVED = 8.0
+"""Side (px) of the smallest elements of which the discretisation error is known: their halves, of 4 px, have some eight
+samples for six unknowns."""
+
+LENGTH_UNITS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "inch": 25.4}
+"""Millimetres in a length of 1 of a mesh's file."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationSettings(Checked):
+    """Calibration of the camera and the lights (``[calibration]``).
+
+    Attributes
+    ----------
+    file
+        What ``rgbmidic-calibrate`` wrote; needed for colour frames, unless a script gives its own separation.
+    accept
+        Checks of the reference frame against the calibration whose contradictions are accepted
+        (`rgbmidic.illumination.frame_check`).
+    """
+
+    section = "calibration"
+
+    file: Path | None = None
+    accept: tuple[FrameCheck, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeshSettings(Checked):
+    """The mesh that is measured on (``[mesh]``): made here, or of finite elements from a file.
+
+    Attributes
+    ----------
+    element_size
+        Side of the elements in px, 25 where none is stated; ``"auto"``: what a study of the test's own frames
+        recommends (`rgbmidic.pipeline.resolution`); None with `file`, which has its own.
+    cracks
+        Paths, each of corners (x, y) in px on the reference, along which the mesh is split.
+    file
+        Finite-element mesh to measure on (`rgbmidic.read_mesh`).
+    points
+        Pairs (x_mm, y_mm, x_px, y_px), two or more, that place it on the image (`rgbmidic.Placement.fit`).
+    unit
+        Unit of length of the file; the points are in mm.
+    part
+        Set of its elements that is measured; None: all.
+    error
+        Whether the discretisation error is estimated (`rgbmidic.discretisation_error`), in every frame, or in key
+        frames (``"key"``): every 16th and the last.
+    refine
+        Whether elements are bisected where the discretisation error of strain is more than twice its noise
+        (`rgbmidic.pipeline.resolution.refine`), in the frame of this index, or in a key frame (True).
+    """
+
+    section = "mesh"
+
+    element_size: float | Literal["auto"] | None = bounded(None, above=0)
+    cracks: tuple[tuple[tuple[float, float], ...], ...] = ()
+    file: Path | None = None
+    points: tuple[tuple[float, float, float, float], ...] | None = None
+    unit: Literal["mm", "m", "um", "inch"] | None = None
+    part: str | None = None
+    error: bool | Literal["key"] = False
+    refine: int | Literal[True, False] = False
+
+    def _problems(self) -> Iterator[str]:
+        refining = self.refine is not False
+        for key, asked in (("error", self.error), ("refine", refining)):
+            if asked and self.file is None and self.side < SMALLEST_HALVED:
+                yield (
+                    f"mesh.{key} halves the elements: mesh.element_size must be {SMALLEST_HALVED:g} px or more for it, "
+                    f"not {self.side:g}"
+                )
+        if refining and self.element_size == "auto":
+            yield 'mesh.refine and mesh.element_size = "auto" both choose the elements: state a number or leave one out'
+        for number, crack in enumerate(self.cracks):
+            yield from _few_corners(f"mesh.cracks[{number}]", crack, 2, "two")
+        if self.file is None:
+            for key in ("points", "unit", "part"):
+                if getattr(self, key) is not None:
+                    yield f"mesh.{key} is for mesh.file, which is missing"
+            if self.element_size is None:
+                object.__setattr__(self, "element_size", ELEMENT_SIZE)
+            return
+        for key, value in {"element_size": self.element_size, "cracks": self.cracks, "refine": refining}.items():
+            if value:
+                yield f"mesh.{key} is for a mesh made here, and mesh.file names one: leave one out"
+        if (count := len(self.points or ())) < 2:
+            yield f"mesh.file needs mesh.points, two or more [x_mm, y_mm, x_px, y_px], not {count}"
+
+    @property
+    def side(self) -> float:
+        """Side of the elements in px, where it is stated; the default where it is not, or is found by the run."""
+        return self.element_size if isinstance(self.element_size, float) else ELEMENT_SIZE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,19 +241,18 @@ class RegionSettings(Checked):
     mask: Path | None = None
     holes: tuple[tuple[tuple[float, float], ...], ...] = ()
 
-    def _check(self) -> None:
+    def _problems(self) -> Iterator[str]:
         stated = sum(getattr(self, kind) is not None for kind in ("rectangle", "polygon", "mask"))
-        require(stated <= 1, f"[region] needs exactly one of rectangle, polygon, mask; given are {stated}")
+        if stated > 1:
+            yield f"[region] needs exactly one of rectangle, polygon, mask; given are {stated}"
         if self.rectangle is not None:
             x0, y0, x1, y1 = self.rectangle
-            require(
-                x0 < x1 and y0 < y1,
-                f"region.rectangle is [x0, y0, x1, y1] with x0 < x1 and y0 < y1, not {list(self.rectangle)}",
-            )
+            if x0 >= x1 or y0 >= y1:
+                yield f"region.rectangle is [x0, y0, x1, y1] with x0 < x1 and y0 < y1, not {list(self.rectangle)}"
         if self.polygon is not None:
-            require_corners("region.polygon", self.polygon, 3, "three")
+            yield from _few_corners("region.polygon", self.polygon, 3, "three")
         for number, hole in enumerate(self.holes):
-            require_corners(f"region.holes[{number}]", hole, 3, "three")
+            yield from _few_corners(f"region.holes[{number}]", hole, 3, "three")
 
     @property
     def is_stated(self) -> bool:
@@ -262,18 +298,15 @@ class WeightSettings(Checked):
     images: tuple[Path, ...] = ()
     limit_deg: float | None = bounded(None, above=0, below=180)
 
-    def _check(self) -> None:
+    def _problems(self) -> Iterator[str]:
         geometric = self.method == "geometry"
-        require(
-            geometric == (self.geometry is not None),
-            'weights.method = "geometry" and weights.geometry = "SCENE.toml" go together',
-        )
-        require(
-            (self.method == "images") == bool(self.images),
-            'weights.method = "images" and weights.images = ["MASK.png", ...] go together',
-        )
+        if geometric != (self.geometry is not None):
+            yield 'weights.method = "geometry" and weights.geometry = "SCENE.toml" go together'
+        if (self.method == "images") != bool(self.images):
+            yield 'weights.method = "images" and weights.images = ["MASK.png", ...] go together'
         for key in ("height_map", "limit_deg"):
-            require(geometric or getattr(self, key) is None, f'weights.{key} is for weights.method = "geometry"')
+            if not geometric and getattr(self, key) is not None:
+                yield f'weights.{key} is for weights.method = "geometry"'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -346,28 +379,16 @@ def grey_levels(
     solver : SolverSettings
     """
     if normalise == "auto":
-        normalise = LOCAL_MEAN * (_WIDER_AT_CRACKS if cracked else 1.0)
+        # a gap changes so wide a mean nearly alike all over an element, and the gain of the means takes that out; with
+        # 5 the gap is followed no better and a slope of the brightness worse (rendered cracks open by up to 5 px)
+        wider_at_cracks = 3.0
+        normalise = LOCAL_MEAN * (wider_at_cracks if cracked else 1.0)
     if solver.brightness == "auto":
         solver = replace(solver, brightness="mean" if cracked and normalise else "none")
     return normalise, solver
 
 
-_BOUNDS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le, "below": operator.lt}
-
-
-def converted(entry: Field[Any], value: Any, hint: Any, where: str, base: Path | str = "") -> Any:
-    """A value in the type of a field, every number of it finite and within the field's bounds."""
-    value = convert_value(value, hint, where, base)
-    for number in _numbers(value):
-        if not math.isfinite(number):
-            raise ConfigurationError(f"{where} must be finite, not {number}")
-        for bound, limit in entry.metadata.get("bounds", {}).items():
-            if not _BOUNDS[bound](number, limit):
-                raise ConfigurationError(f"{where} must be {bound.replace('_', ' ')} {limit:g}, not {number:g}")
-    return value
-
-
-def _numbers(value: Any) -> list[float]:
-    if isinstance(value, tuple):
-        return [number for entry in value for number in _numbers(entry)]
-    return [value] if isinstance(value, int | float) else []
+def _few_corners(where: str, corners: tuple[Any, ...], least: int, words: str) -> Iterator[str]:
+    """What is wrong with a path or polygon of too few corners."""
+    if len(corners) < least:
+        yield f"{where} needs at least {words} corners [x, y], not {len(corners)}"

@@ -97,7 +97,7 @@ class GeometryWeights:
             limit_deg=weights.limit_deg,
             instrument=Instrument.of(
                 scene,
-                element_size=settings.side,
+                element_size=settings.mesh.side,
                 demosaic=settings.illumination.demosaic,
                 prefilter=settings.solver.prefilter,
             ),

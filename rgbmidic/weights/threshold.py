@@ -300,7 +300,7 @@ def automatic_weights(
     index = next((i for i in measured if i not in settings.frames.reference), None)
     if index is not None:
         why = f"no disturbed zone in frame {index}"
-        size, prefilter = settings.side, settings.solver.prefilter
+        size, prefilter = settings.mesh.side, settings.solver.prefilter
         try:
             deformed = images_of(index)
             found = automatic_threshold(reference, deformed, region, blur=blur, element_size=size, prefilter=prefilter)

@@ -10,7 +10,7 @@ from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic.lab.virtual import record, render, sphere_scene, truth, turned
 from rgbmidic.lab.virtual.dataset import dark_frames, target_scene
 from rgbmidic.pipeline import measure
-from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
+from rgbmidic.settings import CalibrationSettings, FrameSettings, RegionSettings, TestSettings
 from rgbmidic_calibration.captures import stack_frames
 from rgbmidic_calibration.crosstalk import estimate_crosstalk
 from rgbmidic_calibration.noise import photon_transfer
@@ -71,7 +71,7 @@ def test_calibration_from_captures_loses_less_than_five_per_cent(tmp_path):
         settings = TestSettings(
             frames=FrameSettings(path=("frames/*.dng",)),
             region=RegionSettings(rectangle=(BORDER, BORDER, SIZE - 1 - BORDER, SIZE - 1 - BORDER)),
-            calibration_file=tmp_path / f"{name}.json",
+            calibration=CalibrationSettings(file=tmp_path / f"{name}.json"),
             base=tmp_path,
         )
         result = measure(settings, tmp_path / name)

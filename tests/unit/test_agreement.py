@@ -240,8 +240,8 @@ def test_what_is_said_alike_is_no_contradiction(row: str, dng: bool, tmp_path: P
             said.say(who, key, value)
     said.arguments(tmp_path / "out")
     test = read_test(tmp_path / "TEST.toml")
-    assert test.calibration_file is not None
-    calibration = Calibration.read(test.calibration_file)
+    assert test.calibration.file is not None
+    calibration = Calibration.read(test.calibration.file)
     stated = state_frames(test, **{key: f"{value}".lower() if key == "cfa" else value})
     (frame,) = open_series(stated, tmp_path, calibration).read(0)
     assert isinstance(frame, Mosaic)

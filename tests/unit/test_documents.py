@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import re
 import sys
-from dataclasses import MISSING
+from dataclasses import MISSING, fields
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 import typer
 
-from rgbmidic import NodeStatus, Status, TestSettings, cli
+from rgbmidic import NodeStatus, Status, cli
 from rgbmidic.command import execute
 from rgbmidic.results import QUANTITIES
 from rgbmidic.results.quantities import SHARED
-from rgbmidic.settings.schema import section_keys
+from rgbmidic.settings.schema import section_kinds
 from rgbmidic_calibration import cli as calibrate
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,10 +37,7 @@ def documented() -> dict[str, dict[str, str]]:
 
 def defaults() -> dict[str, dict[str, object]]:
     """Section, key and default of the code; MISSING where the key is needed."""
-    return {
-        name: {key: entry.default for key, (_, entry) in keys.items()}
-        for name, keys in section_keys(TestSettings).items()
-    }
+    return {name: {entry.name: entry.default for entry in fields(kind)} for name, kind in section_kinds().items()}
 
 
 def as_written(default: object) -> str:
@@ -63,10 +61,8 @@ def test_every_key_of_the_test_file_is_documented_with_its_default():
 
 def test_every_choice_of_a_key_is_named():
     text = (DOCS / "reference/test-file.md").read_text(encoding="utf-8")
-    from typing import get_args
-
-    for section, keys in section_keys(TestSettings).items():
-        for key, (hint, _) in keys.items():
+    for section, kind in section_kinds().items():
+        for key, hint in get_type_hints(kind).items():
             row = next(line for line in text.splitlines() if line.startswith(f"| `{key}` |"))
             for choice in (c for part in (hint, *get_args(hint)) for c in get_args(part) if isinstance(c, str)):
                 assert choice in row, f"{section}.{key}: {choice}"
@@ -107,7 +103,7 @@ def test_every_term_of_the_glossary_is_defined_in_a_sentence():
 
 def test_the_identifiers_of_the_glossary_exist():
     """Names in code quotes are keys of TEST.toml, quantities of a result, or names in the package."""
-    keys = {key for section in section_keys(TestSettings).values() for key in section} | {*QUANTITIES, *SHARED}
+    keys = {entry.name for kind in section_kinds().values() for entry in fields(kind)} | {*QUANTITIES, *SHARED}
     source = "\n".join(file.read_text(encoding="utf-8") for file in (ROOT / "rgbmidic").rglob("*.py"))
     source += "\n".join(file.read_text(encoding="utf-8") for file in (ROOT / "calibration").rglob("*.py"))
     for _, names, *_ in glossary():

@@ -20,9 +20,11 @@ import rgbmidic.settings
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.settings import (
     BAYER_PATTERNS,
+    CalibrationSettings,
     ChannelSettings,
     FrameSettings,
     IlluminationSettings,
+    MeshSettings,
     ProbeSettings,
     RegionSettings,
     ScaleSettings,
@@ -96,9 +98,9 @@ def test_every_key(tmp_path: Path) -> None:
     assert settings.frames == FrameSettings(
         path=("frames/*.tif",), kind="bayer", cfa="GRBG", black_level=64.0, white_level=4095.0, reference=(0, 1, 2)
     )
-    assert settings.calibration_file == tmp_path.resolve() / "calibration.json"
+    assert settings.calibration.file == tmp_path.resolve() / "calibration.json"
     assert settings.region.polygon == ((0.0, 0.0), (100.0, 0.0), (50.0, 80.5))
-    assert settings.element_size == 20.0
+    assert settings.mesh.element_size == 20.0
     assert (settings.weights.threshold, settings.weights.blur) == (0.5, 3.0)
     assert settings.solver.tolerance == 1e-4
     assert settings.scale == ScaleSettings(mm_per_pixel=0.055, frame_rate=12000.0)
@@ -135,7 +137,7 @@ def test_geometry_is_relative_to_the_file_and_survives_the_mapping(tmp_path: Pat
 @pytest.mark.parametrize("stated", ["[[0, 5], [9, 5.5]]", "[[[0, 5], [9, 5.5]]]"])
 def test_a_single_crack_needs_no_outer_brackets_and_survives_the_mapping(tmp_path: Path, stated: str) -> None:
     settings = _read(tmp_path, f"{LEAST}[mesh]\ncracks = {stated}")
-    assert settings.cracks == (((0.0, 5.0), (9.0, 5.5)),)
+    assert settings.mesh.cracks == (((0.0, 5.0), (9.0, 5.5)),)
     assert TestSettings.from_mapping(settings.to_mapping(), settings.base) == settings
 
 
@@ -146,7 +148,7 @@ def test_mask_is_relative_to_the_file(tmp_path: Path) -> None:
 
 def test_absolute_path_stays(tmp_path: Path) -> None:
     settings = _read(tmp_path, LEAST + '[calibration]\nfile = "/data/c.json"')
-    assert settings.calibration_file == Path("/data/c.json")
+    assert settings.calibration.file == Path("/data/c.json")
 
 
 def test_file_with_a_byte_order_mark(tmp_path: Path) -> None:
@@ -261,8 +263,8 @@ _settings = st.builds(
         st.builds(RegionSettings, polygon=st.lists(st.tuples(_numbers, _numbers), min_size=3, max_size=6).map(tuple)),
         st.builds(RegionSettings, mask=st.just(Path("/data/mask.png"))),
     ),
-    calibration_file=st.none() | st.just(Path("/data/calibration.json")),
-    element_size=_numbers,
+    calibration=st.builds(CalibrationSettings, file=st.none() | st.just(Path("/data/calibration.json"))),
+    mesh=st.builds(MeshSettings, element_size=_numbers),
     illumination=st.builds(IlluminationSettings),
     weights=st.builds(WeightSettings, threshold=st.floats(0.01, 1), blur=_numbers),
     solver=st.builds(
@@ -297,6 +299,14 @@ BUILT: dict[str, Any] = {
         shape=(40, 60),
         dtype="uint16",
         crop_origin=(3, 0),
+    ),
+    "calibration": CalibrationSettings(file=Path("calibration.json"), accept=("noise", "greens")),
+    "mesh": MeshSettings(element_size=20, cracks=(SQUARE,)),
+    "mesh of finite elements": MeshSettings(
+        file=Path("specimen.inp"),
+        points=((0.0, 0.0, 10.0, 90.0), (5.0, 0.0, 60.0, 90.0)),
+        unit="m",
+        part="PLATE",
     ),
     "illumination": IlluminationSettings(demosaic="malvar", normalise=8.5),
     "region": RegionSettings(rectangle=PLACE, holes=(SQUARE, SQUARE)),
@@ -343,19 +353,9 @@ BUILT: dict[str, Any] = {
 }
 BUILT["test"] = TestSettings(
     **{name: built for name, built in BUILT.items() if " " not in name},
-    calibration_file=Path("calibration.json"),
-    accept=("noise", "greens"),
-    element_size=20,
-    cracks=(SQUARE,),
     base=Path("/data"),
 )
-BUILT["test on finite elements"] = TestSettings(
-    frames=BUILT["frames"],
-    mesh_file=Path("specimen.inp"),
-    mesh_points=((0.0, 0.0, 10.0, 90.0), (5.0, 0.0, 60.0, 90.0)),
-    mesh_unit="m",
-    mesh_part="PLATE",
-)
+BUILT["test on finite elements"] = TestSettings(frames=BUILT["frames"], mesh=BUILT["mesh of finite elements"])
 """Settings of every kind with a value in every field."""
 STATED = [
     pytest.param(built, entry.name, id=f"{name}.{entry.name}")
@@ -402,27 +402,22 @@ def test_settings_built_in_python_are_checked_as_those_read(built: Any, name: st
     value = getattr(built, name)
     inner = np.asarray(value, dtype=object).ravel()[0] if isinstance(value, tuple) else value
     wrong: list[Any] = [3j, {}, object(), [[[[1]]]]]
-    wrong += ["true", *([1] if name != "mesh_refine" else [1.0])] if isinstance(inner, bool) else [True]  # or a frame
+    wrong += ["true", *([1] if name != "refine" else [1.0])] if isinstance(inner, bool) else [True]  # or a frame
     wrong += ["1e-3", float("nan")] if isinstance(inner, int | float) else [3]
     wrong += [1.5] if type(inner) is int else []
     section = next(section.split()[0] for section, settings in BUILT.items() if settings is built)
     prefix = "" if section == "test" else rf"{section}\."
-    key = {"calibration_file": r"calibration\.file", "element_size": r"mesh\.element_size", "cracks": r"mesh\.cracks"}
-    key |= {"accept": r"calibration\.accept"}
-    key |= {f"mesh_{one}": rf"mesh\.{one}" for one in ("file", "points", "unit", "part", "error", "refine")}
-    key = key if isinstance(built, TestSettings) else {}
     for instead in wrong:
-        with pytest.raises(ConfigurationError, match=rf"^{prefix}{key.get(name, name)} must be") as caught:
+        with pytest.raises(ConfigurationError, match=rf"^{prefix}{name} must be") as caught:
             replace(built, **{name: instead})
         assert "\n" not in str(caught.value)
 
 
 def test_a_number_is_no_word() -> None:
     """1 == True, but states a frame; 1.0 states none."""
-    test = BUILT["test"]
-    assert [replace(test, mesh_refine=one).mesh_refine is one for one in (1, True, False)] == [True] * 3
+    assert [MeshSettings(refine=one).refine is one for one in (1, True, False)] == [True] * 3
     with pytest.raises(ConfigurationError, match=r"^mesh\.refine must be a whole number, not 1\.0"):
-        replace(test, mesh_refine=1.0)
+        MeshSettings(refine=1.0)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -459,7 +454,7 @@ def test_a_mapping_may_hold_numbers_of_numpy_and_paths(tmp_path: Path) -> None:
     )
     assert built.frames == FrameSettings(path=(str(tmp_path / "*.dng"),), reference=(0, 1, 2), first=1)
     assert built.region.rectangle == (1.0, 2.0, 30.0, 40.0)
-    assert built.calibration_file == tmp_path / "calibration.json"
+    assert built.calibration.file == tmp_path / "calibration.json"
     assert built.solver.tolerance == 1e-4
 
 

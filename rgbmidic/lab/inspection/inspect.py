@@ -79,7 +79,7 @@ def inspect_files(
         A file is missing, damaged or contradicts what is stated; the frame cannot be inspected.
     """
     stated = frame or (test.frames if test else FrameSettings(path=("frame",)))
-    calibrated = calibration or (test.calibration_file if test else None)
+    calibrated = calibration or (test.calibration.file if test else None)
     known = None if calibrated is None else Calibration.read(calibrated)
     if files:
         paths = [Path(file) for file in files]
@@ -94,16 +94,16 @@ def inspect_files(
     shape = frames[0].values.shape[-2], frames[0].values.shape[-1]
     known = known and known.cropped(stated.crop_origin, shape)
     place = Region.from_rectangle(region, shape) if region is not None else None
-    sides = None if test is None else test.side
+    sides = None if test is None else test.mesh.side
     if place is None and test is not None:
-        if test.mesh_file is None:
+        if test.mesh.file is None:
             place = read_region(test.region, shape)
         else:
             _, _, mesh, place = finite_elements_of(test, shape)
             sides = mesh.size
     how: dict[str, Any] = {"name": name}
     if test is not None:
-        how |= {"element_size": sides, "accept": test.accept}
+        how |= {"element_size": sides, "accept": test.calibration.accept}
         how |= {"demosaic": test.illumination.demosaic, "prefilter": test.solver.prefilter}
     how |= {key: value for key, value in options.items() if value is not None}
     try:

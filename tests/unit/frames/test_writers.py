@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from rgbmidic.errors import InputError
 from rgbmidic.frames import read_frame
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.frames.images import MINIMUM_DNG_SIZE, write_dng, write_tiff
+from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.settings import BAYER_PATTERNS
 
 
@@ -71,7 +71,7 @@ def test_tiff_channels_written_and_read_are_the_same(folder: Path, frame: Channe
 
 
 def test_what_a_dng_cannot_hold_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
-    small = Mosaic(values=np.ones((MINIMUM_DNG_SIZE - 1, 40)), cfa="RGGB", black_level=0, white_level=9)
+    small = Mosaic(values=np.ones((21, 40)), cfa="RGGB", black_level=0, white_level=9)
     broken = Mosaic(values=np.ones((40, 40)), cfa="RGGB", black_level=64.5, white_level=4095)
     for mosaic, word in ((small, "22"), (broken, "64.5")):
         with pytest.raises(InputError, match=word):

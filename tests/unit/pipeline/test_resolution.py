@@ -22,7 +22,7 @@ from rgbmidic.pipeline.resolution import study_sizes
 from rgbmidic.pipeline.size_figures import ResolutionStudy, SizeFigures
 from rgbmidic.report.setup import analysis_rows
 from rgbmidic.results.physical import Physical
-from rgbmidic.settings import TestSettings
+from rgbmidic.settings import MeshSettings, TestSettings
 
 STATES = Scene("bump", width=12, height=1.5, noise=0, side=144).images()[0].astype(np.float32)
 NOISE = np.random.default_rng(3).normal(scale=10, size=(5, *STATES[0].shape)).astype(np.float32)
@@ -87,7 +87,7 @@ def test_figures_of_a_scene_with_static_frames():
     fine, middle, coarse = found.sizes
     assert fine.scatter > 1.3 * middle.scatter > 1.3**2 * coarse.scatter
     assert fine.strain_scatter > 1.6 * middle.strain_scatter > 1.6**2 * coarse.strain_scatter
-    plan = Plan.from_settings(replace(stated, element_size=25.0), source=FRAMES)
+    plan = Plan.from_settings(replace(stated, mesh=MeshSettings(element_size=25.0)), source=FRAMES)
     at_rest = resolution._deformed(plan, 4)  # no frame of the reference: its displacement is all noise
     for size in found.sizes[:2]:
         solution = resolution._solve(resolution._resized(plan, size.element_size), at_rest, None)
@@ -141,7 +141,9 @@ def test_a_run_takes_the_recommended_size_and_goes_on_with_it(tmp_path, monkeypa
     kept = auto.provenance["element_size"]
     assert kept == {"element_size": chosen.element_size, "reason": chosen.reason}
     assert auto.setting("mesh", "element_size") == "auto"
-    by_hand = measure(replace(stated, element_size=chosen.element_size), tmp_path / "hand", source=FRAMES)
+    by_hand = measure(
+        replace(stated, mesh=MeshSettings(element_size=chosen.element_size)), tmp_path / "hand", source=FRAMES
+    )
     np.testing.assert_array_equal(auto.u, by_hand.u)
     assert "element_size" not in by_hand.provenance
 
@@ -155,7 +157,7 @@ def test_a_run_takes_the_recommended_size_and_goes_on_with_it(tmp_path, monkeypa
     measure(stated, parts, source=FRAMES, resume=True)
     assert len(asked) == 1
     with pytest.raises(AnotherTestError, match=r"mesh.element_size was \"auto\", now 30"):
-        measure(replace(stated, element_size=30.0), parts, source=FRAMES, resume=True)
+        measure(replace(stated, mesh=MeshSettings(element_size=30.0)), parts, source=FRAMES, resume=True)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,16 @@ from results import MESH, make_origin, make_result, random_record
 
 from rgbmidic.errors import ResultError
 from rgbmidic.results import Result, ResultStore, finish_result, provenance
-from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, SolverSettings, TestSettings
+from rgbmidic.settings import (
+    CalibrationSettings,
+    FrameSettings,
+    MeshSettings,
+    ProbeSettings,
+    RegionSettings,
+    ScaleSettings,
+    SolverSettings,
+    TestSettings,
+)
 
 FRAMES = 600
 KILLS = 20
@@ -95,7 +104,7 @@ def _settings(folder: Path, tolerance: float) -> TestSettings:
         frames=FrameSettings(path=("*.dng",)),
         region=RegionSettings(rectangle=(0, 0, 9, 9)),
         solver=SolverSettings(tolerance=tolerance),
-        calibration_file=folder / "calibration.json",
+        calibration=CalibrationSettings(file=folder / "calibration.json"),
         base=folder,
     )
 
@@ -135,10 +144,10 @@ def test_the_result_of_another_test_is_refused_with_the_difference(
 
 
 def test_a_frame_number_is_no_true(tmp_path: Path) -> None:
-    settings = replace(_settings(tmp_path, 0.001), mesh_refine=True)
+    settings = replace(_settings(tmp_path, 0.001), mesh=MeshSettings(refine=True))
     ResultStore.create(tmp_path / "out", make_origin(3, settings=settings)).release()
     with pytest.raises(ResultError, match=r"mesh\.refine was true, now 1; give"):
-        ResultStore.resume(tmp_path / "out", make_origin(3, settings=replace(settings, mesh_refine=1)))
+        ResultStore.resume(tmp_path / "out", make_origin(3, settings=replace(settings, mesh=MeshSettings(refine=1))))
 
 
 @pytest.mark.parametrize(("readers", "refused"), [((), False), (("tifffile",), False), (("rawpy",), True)])

@@ -19,7 +19,7 @@ from rgbmidic._version import __version__
 from rgbmidic.correlation import NodeStatus, Solution, Status
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, FrameRecord, Result, ResultStore
-from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
+from rgbmidic.settings import CalibrationSettings, FrameSettings, RegionSettings, TestSettings
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_provenance(tmp_path: Path) -> None:
     test = TestSettings(
         frames=FrameSettings(path=("*.dng",)),
         region=RegionSettings(rectangle=(0, 0, 9, 9)),
-        calibration_file=tmp_path / "calibration.json",
+        calibration=CalibrationSettings(file=tmp_path / "calibration.json"),
         base=tmp_path,
     )
     result = make_result(tmp_path / "out", settings=test, notes={"frame_rate": 1e6}, inputs={"shot.cine": "ab"})
