@@ -28,8 +28,6 @@ MEASURES = (*_OF_STRETCH, "engineering")
 """Names of the strain measures; the first is the default."""
 _SMALL = np.array([[1, 0, 0, 0], [0, 0, 0, 1], [0, 0.5, 0.5, 0]])
 """Derivative of the small exx, eyy, exy by the gradient."""
-_SAME = 1e-6
-"""Eigenvalues of C that differ by less count as one where a difference is divided by theirs: 1e-10 of error at most."""
 _LARGEST_ANGLE = np.degrees(np.pi / np.sqrt(12))
 """Standard uncertainty (degrees) of a direction of which nothing is known."""
 _EQUIVALENT = np.array([[4 / 3, 2 / 3, 0], [2 / 3, 4 / 3, 0], [0, 0, 4 / 3]])
@@ -131,10 +129,30 @@ def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: st
         tensor, slopes = (h + h.transpose(0, 2, 1)) / 2, _SMALL
     else:
         tensor, slopes = hencky if measure == "hencky" else _of_stretch(h, *_OF_STRETCH[measure])
-    covariances = [slope @ spread @ np.swapaxes(slope, -1, -2) for slope in (slopes, hencky[1])]
+    covariance, of_hencky = (slope @ spread @ np.swapaxes(slope, -1, -2) for slope in (slopes, hencky[1]))
+    principal, vectors = _eigen(tensor)
+    c, s = vectors[:, 0, 0], vectors[:, 1, 0]
+    along, across = np.stack([c * c, s * s, 2 * c * s], axis=1), np.stack([s * s, c * c, -2 * c * s], axis=1)
+    turn = np.stack([-c * s, c * s, c * c - s * s], axis=1)
+    split = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 2.0]])  # exx - eyy and 2 exy, whose length is e1 - e2
+    shear, shear_std = length_of(_components(tensor) @ split.T, split @ covariance @ split.T)
     with np.errstate(divide="ignore", invalid="ignore"):
-        equivalent = _equivalent(_components(hencky[0]), covariances[1])
-    return _with_principal(measure, tensor, covariances[0], equivalent, shape)
+        equivalent, equivalent_std = _equivalent(_components(hencky[0]), of_hencky)
+        apart = principal[:, 0] - principal[:, 1]
+        direction_std = np.degrees(_deviation(turn, covariance) / apart)
+    parts = {
+        "components": _components(tensor),
+        "components_std": np.sqrt(np.maximum(np.einsum("naa->na", covariance), 0)),
+        "principal": principal,
+        "principal_std": np.stack([_deviation(along, covariance), _deviation(across, covariance)], axis=1),
+        "direction_deg": np.where(apart > 0, (np.degrees(np.arctan2(s, c)) + 90) % 180 - 90, np.nan),
+        "direction_std_deg": np.minimum(direction_std, _LARGEST_ANGLE),
+        "equivalent": equivalent,
+        "equivalent_std": equivalent_std,
+        "shear": shear,
+        "shear_std": shear_std,
+    }
+    return Strain(measure=measure, **{name: part.reshape((*shape, *part.shape[1:])) for name, part in parts.items()})
 
 
 def _of_stretch(gradient: FloatArray, function: _Function, derivative: _Function) -> tuple[FloatArray, FloatArray]:
@@ -144,7 +162,7 @@ def _of_stretch(gradient: FloatArray, function: _Function, derivative: _Function
     values = np.maximum(values, np.finfo(float).tiny)
     at = function(values)
     gap, mean = values[:, 1] - values[:, 0], values.mean(axis=1)
-    close = np.abs(gap) < _SAME
+    close = np.abs(gap) < 1e-6  # an error of 1e-10 at most
     across = np.where(close, derivative(mean), (at[:, 1] - at[:, 0]) / np.where(close, 1, gap))
     along = derivative(values)
     # what a change of H[c, d] alone makes of C along the axes a and b of C: F_ca V_db + V_da F_cb, F turned by V
@@ -171,39 +189,6 @@ def _eigen(tensor: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _components(tensor: FloatArray) -> FloatArray:
     return np.stack([tensor[:, 0, 0], tensor[:, 1, 1], tensor[:, 0, 1]], axis=1)
-
-
-def _with_principal(
-    measure: str,
-    tensor: FloatArray,
-    covariance: FloatArray,
-    equivalent: tuple[FloatArray, FloatArray],
-    shape: tuple[int, ...],
-) -> Strain:
-    """Complete a `Strain` from the tensor (n, 2, 2), the covariance (n, 3, 3) of exx, eyy, exy, and the equivalent."""
-    principal, vectors = _eigen(tensor)
-    angle = np.degrees(np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0]))
-    c, s = vectors[:, 0, 0], vectors[:, 1, 0]
-    along, across = np.stack([c * c, s * s, 2 * c * s], axis=1), np.stack([s * s, c * c, -2 * c * s], axis=1)
-    turn = np.stack([-c * s, c * s, c * c - s * s], axis=1)
-    split = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 2.0]])  # exx - eyy and 2 exy, whose length is e1 - e2
-    shear, shear_std = length_of(_components(tensor) @ split.T, split @ covariance @ split.T)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        apart = principal[:, 0] - principal[:, 1]
-        direction = np.degrees(_deviation(turn, covariance) / apart)
-    parts = {
-        "components": _components(tensor),
-        "components_std": np.sqrt(np.maximum(np.einsum("naa->na", covariance), 0)),
-        "principal": principal,
-        "principal_std": np.stack([_deviation(along, covariance), _deviation(across, covariance)], axis=1),
-        "direction_deg": np.where(apart > 0, (angle + 90) % 180 - 90, np.nan),
-        "direction_std_deg": np.minimum(direction, _LARGEST_ANGLE),
-        "equivalent": equivalent[0],
-        "equivalent_std": equivalent[1],
-        "shear": shear,
-        "shear_std": shear_std,
-    }
-    return Strain(measure=measure, **{name: part.reshape((*shape, *part.shape[1:])) for name, part in parts.items()})
 
 
 def _deviation(direction: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -22,10 +22,6 @@ from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
 SHORTEST = 3.0
 """Length of the shortest gauge in elements: a node and those around it."""
-_ROUND = 0.9
-"""Fraction of it that will do: the sides of a mesh's elements differ by some percent from the size asked for."""
-_FLAT = 1e-2
-"""Least ratio of the second moments of a gauge's nodes across and along it: below, they lie on a line."""
 
 
 def shortest_gauge(mesh: Tri3Mesh) -> float:
@@ -174,12 +170,12 @@ class StrainGauges:
     def _around(
         cls, covariance: NodalCovariance, centres: FloatArray, length: float | None, needed: sp.csr_matrix
     ) -> Self:
-        mesh = covariance.mesh
-        stated = length is not None
-        length = shortest_gauge(mesh) if length is None else float(length)
-        if not (np.isfinite(length) and length >= _ROUND * shortest_gauge(mesh)):
+        mesh, stated, shortest = covariance.mesh, length is not None, shortest_gauge(covariance.mesh)
+        length = shortest if length is None else float(length)
+        # the sides of a mesh's elements differ by some percent from the size asked for
+        if not (np.isfinite(length) and length >= 0.9 * shortest):
             raise InputError(
-                f"a strain gauge must be at least {shortest_gauge(mesh):.4g} px long, {SHORTEST:g} elements; given are "
+                f"a strain gauge must be at least {shortest:.4g} px long, {SHORTEST:g} elements; given are "
                 f"{length:g} px"
             )
         lengths = np.full(len(centres), length)
@@ -266,7 +262,8 @@ class StrainGauges:
         x, y = (part - (self._sum(use * part) / count)[self.rows] for part in arm)
         xx, xy, yy = (self._sum(use * a * b) for a, b in ((x, x), (x, y), (y, y)))
         determinant = xx * yy - xy * xy
-        determinant = np.where(determinant > _FLAT * ((xx + yy) / 2) ** 2, determinant, np.nan)
+        # a hundredth of the second moment across as along: the nodes lie on a line
+        determinant = np.where(determinant > 1e-2 * ((xx + yy) / 2) ** 2, determinant, np.nan)
         xx, xy, yy = (part[self.rows] / determinant[self.rows] for part in (xx, xy, yy))
         return np.stack([use * (yy * x - xy * y), use * (xx * y - xy * x)])
 

@@ -19,7 +19,6 @@ import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields import (
-    EQUIVALENT,
     History,
     Nodal,
     NodalCovariance,
@@ -32,6 +31,7 @@ from rgbmidic.fields import (
     rounded,
 )
 from rgbmidic.fields.history import rate_frames, rate_words
+from rgbmidic.fields.measures import EQUIVALENT
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.physical import exposure, frame_times, rectification_of, reference_frames, shared_part, units_of

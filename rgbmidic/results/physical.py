@@ -15,7 +15,6 @@ from typing import Any, Self
 import numpy as np
 
 from rgbmidic.fields import (
-    EQUIVALENT,
     MEASURES,
     CameraCalibration,
     NodalCovariance,
@@ -26,6 +25,7 @@ from rgbmidic.fields import (
     reference_fraction,
     strain_of_gradient,
 )
+from rgbmidic.fields.measures import EQUIVALENT
 from rgbmidic.mesh import Placement, Tri3Mesh
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, ResultQuantity
 from rgbmidic.results.result import Result
