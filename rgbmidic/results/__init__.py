@@ -5,7 +5,6 @@ from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
-from rgbmidic.results.field import MapField
 from rgbmidic.results.histories import Histories, HistoryColumn, history_rows, write_histories
 from rgbmidic.results.maps import Maps, MapValues
 from rgbmidic.results.physical import (
@@ -21,7 +20,7 @@ from rgbmidic.results.physical import (
 )
 from rgbmidic.results.profiles import Profile, Wave, read_profile, write_profile
 from rgbmidic.results.provenance import Origin
-from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, ResultQuantity
+from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, Quantity
 from rgbmidic.results.result import Result
 from rgbmidic.results.store import ResultStore, finish_result
 
@@ -34,13 +33,12 @@ __all__ = [
     "FrameRecord",
     "Histories",
     "HistoryColumn",
-    "MapField",
     "MapValues",
     "Maps",
     "Origin",
     "Profile",
+    "Quantity",
     "Result",
-    "ResultQuantity",
     "ResultStore",
     "Wave",
     "channels_of",

@@ -27,7 +27,7 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.fields import column
 from rgbmidic.results.files import check_file, write_complete, writing
 from rgbmidic.results.physical import Physical
-from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, ResultQuantity
+from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, Quantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray
@@ -145,7 +145,7 @@ def _describe(out: h5py.File, dataset: h5py.Dataset, axes: tuple[str, ...], abou
     return dataset
 
 
-def _declare(out: h5py.File, physical: Physical, entry: ResultQuantity) -> None:
+def _declare(out: h5py.File, physical: Physical, entry: Quantity) -> None:
     """Create the array of a quantity for all frames, still without content."""
     axes = tuple(axis if isinstance(axis, str) else f"part_of_{axis}" for axis in entry.axes)
     for name, axis in zip(axes, entry.axes, strict=True):

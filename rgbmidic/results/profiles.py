@@ -15,10 +15,10 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.fields import ProfileLine, Units, column
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
-from rgbmidic.results.field import MapField
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.maps import Maps
 from rgbmidic.results.physical import frame_times, shared_part
+from rgbmidic.results.quantities import Quantity
 from rgbmidic.typing import AnyArray, FloatArray
 
 
@@ -67,7 +67,7 @@ class Profile:
         How the field is derived (`Maps.how`).
     """
 
-    field: MapField
+    field: Quantity
     line: ProfileLine
     frames: npt.NDArray[np.int64]
     numbers: npt.NDArray[np.int64]
