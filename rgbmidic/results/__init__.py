@@ -9,14 +9,11 @@ from rgbmidic.results.histories import Histories, HistoryColumn, history_rows, w
 from rgbmidic.results.maps import Maps, MapValues
 from rgbmidic.results.physical import (
     channels_of,
-    exposure,
     frame_times,
     placement_of,
     probes_of,
-    reference_frames,
     scale_of,
     shared_part,
-    units_of,
 )
 from rgbmidic.results.profiles import Profile, Wave, read_profile, write_profile
 from rgbmidic.results.provenance import Origin
@@ -43,20 +40,17 @@ __all__ = [
     "Wave",
     "channels_of",
     "export_result",
-    "exposure",
     "finish_result",
     "frame_times",
     "history_rows",
     "placement_of",
     "probes_of",
     "read_profile",
-    "reference_frames",
     "rounded",
     "scale_of",
     "shared_part",
     "speckle_diameter",
     "uncertain",
-    "units_of",
     "write_histories",
     "write_profile",
 ]

@@ -132,23 +132,6 @@ def placement_of(result: Result) -> Placement | None:
     return None if kept is None else Placement.from_document(kept["placement"], _kept_camera(result))
 
 
-def units_of(result: Result, scale: ScaleSettings | None = None) -> Units:
-    """Return the units of a result, with its own ``[scale]`` or another one in its place.
-
-    Parameters
-    ----------
-    result
-        The result.
-    scale
-        It replaces the ``[scale]`` that was kept with the result; None: that one.
-
-    Returns
-    -------
-    Units
-    """
-    return replace(rectification_of(result, scale).units, timed=frame_times(result, scale) is not None)
-
-
 def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArray | None:
     """Find the time of each frame.
 
@@ -195,22 +178,6 @@ def _compare(recorded: float, stated: float | None, contradiction: str) -> None:
     """
     if stated and abs(recorded / stated - 1) > 0.01:
         logger.warning(f"scale.frame_rate states %g frames per second, {contradiction}", stated, recorded)
-
-
-def exposure(result: Result) -> float | None:
-    """Return the exposure time of a frame in seconds; None where the files do not report it.
-
-    Parameters
-    ----------
-    result
-        The result.
-
-    Returns
-    -------
-    float or None
-    """
-    nanoseconds = result.provenance.get("exposure_ns")
-    return None if nanoseconds is None else float(nanoseconds) * 1e-9
 
 
 def reference_frames(result: Result) -> BoolArray:

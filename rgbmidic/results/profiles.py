@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +13,7 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.fields import ProfileLine, Units, column
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
-from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.maps import Maps
 from rgbmidic.results.physical import frame_times, shared_part
 from rgbmidic.results.quantities import Quantity
@@ -247,42 +245,32 @@ def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *
     beside = arrivals_file(out)
     for file in (out, *([beside] if wave else [])):
         check_file(file, overwrite=overwrite)
-    unit, name = profile.units.length, profile.field
-    places = profile.line.points * (profile.units.mm_per_pixel or 1.0)
+    unit, value = profile.units.length, column(profile.field.name, profile.field.unit)
     head = [column(part, unit) for part in ("position", "x", "y")]
-    at = np.column_stack([profile.positions, places]).tolist()
-    value = column(name.name, name.unit)
+    at = np.column_stack([profile.positions, profile.line.points * (profile.units.mm_per_pixel or 1.0)])
+    timed = [] if profile.times is None else ["time_s"]
 
-    def table(file: BinaryIO) -> None:
-        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-        writer = csv.writer(text)
-        timed = [] if profile.times is None else ["time_s"]
-        writer.writerow(["frame", "number", *timed, *head, value, f"{value}_std"])
+    def rows() -> Iterator[list[object]]:
         for row, (frame, number, clock) in enumerate(zip(profile.frames, profile.numbers, profile.clock, strict=True)):
             start = [frame, number, *([f"{clock:.12g}"] if timed else [])]
-            for place, *pair in zip(at, profile.values[row], profile.std[row], strict=True):
-                writer.writerow([*start, *map(_number, (*place, *pair))])
-        text.detach()  # leaves the file open for whoever opened it
+            for numbers in np.column_stack([at, profile.values[row], profile.std[row]]).tolist():
+                yield [*start, *numbers]
 
-    write_complete(out, table)
+    names = ["frame", "number", *timed, *head, value, f"{value}_std"]
+    write_complete(out, lambda file: write_table(file, names, rows()))
     if wave is None:
         return
-    clock = "s" if profile.times is not None else "frame"
+    clock = "s" if timed else "frame"
     columns = {
-        **dict(zip(head, np.array(at).T, strict=True)),
+        **dict(zip(head, at.T, strict=True)),
         f"arrival_{clock}": wave.arrivals.times,
         f"arrival_{clock}_std": wave.arrivals.std,
         f"residual_{clock}": wave.front.residuals,
         "used": wave.front.used.astype(float),
     }
-    rows = "".join(",".join(map(_number, row)) + "\r\n" for row in np.column_stack([*columns.values()]).tolist())
-    write_complete(beside, lambda file: file.write((",".join(columns) + "\r\n" + rows).encode()))
+    write_complete(beside, lambda file: write_table(file, columns, np.column_stack([*columns.values()]).tolist()))
 
 
 def arrivals_file(out: Path) -> Path:
     """Return the file of arrival times beside that of a profile."""
     return out.with_name(f"{out.stem}_arrivals.csv")
-
-
-def _number(value: float) -> str:
-    return "" if value != value else f"{value:.9g}"
