@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from rgbmidic.fields import Units
 from rgbmidic.fields.measures import EQUIVALENT
-from rgbmidic.results.quantities import QUANTITIES, Quantity
+from rgbmidic.results.quantities import QUANTITIES, Quantity, with_uncertainty
 
 _NODE = ("node",)
 UV = ("u", "v")
@@ -40,27 +41,26 @@ OF_STRAINS = {
     )
 }
 """Rates of the strain, by name."""
-STRAINS = {
-    name: Quantity(name, _NODE, unit, source, meaning, symbol=symbol, std_source=std_source, group="Strain", kind=kind)
-    for name, symbol, unit, kind, source, std_source, meaning in (
-        ("exx", "εxx", "", "strain", "components.0", "components_std.0", "strain in x"),
-        ("eyy", "εyy", "", "strain", "components.1", "components_std.1", "strain in y"),
-        ("exy", "εxy", "", "strain", "components.2", "components_std.2", "strain, tensor shear"),
-        ("e1", "ε₁", "", "strain", "principal.0", "principal_std.0", "larger principal strain in the plane"),
-        ("e2", "ε₂", "", "strain", "principal.1", "principal_std.1", "smaller principal strain in the plane"),
-        ("direction", "θ₁", "deg", "angle", "direction_deg", "direction_std_deg", "direction of e1, from x towards y"),
-        ("shear", "γmax", "", "positive", "shear", "shear_std", "largest engineering shear in the plane, e1 - e2"),
-        ("equivalent", "εeq (Hencky)", "", "positive", "equivalent", "equivalent_std", EQUIVALENT),
-    )
-}
-"""Strain of a frame over a gauge, by name."""
-_TOGETHER = (("exx", "eyy", "exy"), ("e1", "e2"), ("direction",), ("shear",), ("equivalent",))
-STRAIN = tuple(
-    entry
-    for names in _TOGETHER
-    for entry in (*(STRAINS[name] for name in names), *(STRAINS[name].uncertainty for name in names))
+_POSITIVE: dict[str, Any] = {"group": "Strain", "kind": "positive"}
+_ANGLE: dict[str, Any] = {"group": "Strain", "kind": "angle"}
+_TOWARDS, _LARGEST = "direction of e1, from x towards y", "largest engineering shear in the plane, e1 - e2"
+STRAIN = (
+    *with_uncertainty(
+        Quantity("exx", _NODE, "", "components.0", "strain in x", symbol="εxx", group="Strain"),
+        Quantity("eyy", _NODE, "", "components.1", "strain in y", symbol="εyy", group="Strain"),
+        Quantity("exy", _NODE, "", "components.2", "strain, tensor shear", symbol="εxy", group="Strain"),
+    ),
+    *with_uncertainty(
+        Quantity("e1", _NODE, "", "principal.0", "larger principal strain in the plane", symbol="ε₁", group="Strain"),
+        Quantity("e2", _NODE, "", "principal.1", "smaller principal strain in the plane", symbol="ε₂", group="Strain"),
+    ),
+    *with_uncertainty(Quantity("direction", _NODE, "deg", "direction_deg", _TOWARDS, symbol="θ₁", **_ANGLE)),
+    *with_uncertainty(Quantity("shear", _NODE, "", "shear", _LARGEST, symbol="γmax", **_POSITIVE)),
+    *with_uncertainty(Quantity("equivalent", _NODE, "", "equivalent", EQUIVALENT, symbol="εeq (Hencky)", **_POSITIVE)),
 )
-"""The same with their standard uncertainties, in the order of exports."""
+"""Strain of a frame over a gauge, in the order of exports."""
+STRAINS = {entry.name: entry for entry in STRAIN if entry.group == "Strain"}
+"""The same by name, without the uncertainties."""
 ELEMENT_STRAIN = tuple(
     replace(entry, name=f"{name}_element", axes=("element",), meaning=f"{entry.meaning}, constant in an element")
     for name, entry in list(STRAINS.items())[:3]

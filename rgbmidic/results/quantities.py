@@ -5,6 +5,7 @@ Each is declared once, here or in `rgbmidic.results.derived`; record, store, exp
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,7 +15,6 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.fields.units import Units, rounded, uncertain
 from rgbmidic.timing import STAGES
-from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
     from rgbmidic.correlation.solution import Solution
@@ -39,7 +39,7 @@ class Quantity:
         Empty where there is none; ``"px"`` becomes the reader's unit of lengths (`in_units`).
     source
         Attribute of the object that it comes from, a `Solution` or a `Strain`, a column of it behind a dot; empty where
-        the main job provides it.
+        the main job provides it. That of its standard uncertainty has ``_std`` behind the first word.
     meaning
         Its description in docs/reference/conventions.md.
     dtype
@@ -50,8 +50,6 @@ class Quantity:
         What each integer means, for a status.
     symbol
         How formulas and pictures write it; empty for what maps do not show.
-    std_source
-        Where its standard uncertainty comes from, as `source`.
     parts, order
         Quantities from which it follows: their length where there are two, their derivative by time of an order.
     group
@@ -70,7 +68,6 @@ class Quantity:
     blank: float | int | str = float("nan")
     codes: tuple[str, ...] = ()
     symbol: str = ""
-    std_source: str = ""
     parts: tuple[str, ...] = ()
     order: int = 0
     group: str = "Quality"
@@ -79,9 +76,15 @@ class Quantity:
     @property
     def uncertainty(self) -> Quantity:
         """Its standard uncertainty."""
-        name, symbol, meaning = f"{self.name}_std", f"σ({self.symbol})", f"standard uncertainty of {self.name}"
-        more: dict[str, Any] = {"source": self.std_source, "group": "Uncertainty", "kind": "positive"}
-        return replace(self, name=name, symbol=symbol, meaning=meaning, **more)
+        return replace(
+            self,
+            name=f"{self.name}_std",
+            source=re.sub(r"^[a-z]+", r"\g<0>_std", self.source),
+            meaning=f"standard uncertainty of {self.name}",
+            symbol=f"σ({self.symbol})",
+            group="Uncertainty",
+            kind="positive",
+        )
 
     def in_units(self, units: Units) -> Quantity:
         """Return it with the reader's units of length and time.
@@ -235,6 +238,11 @@ class Quantity:
         return value[:, int(column)] if column else value
 
 
+def with_uncertainty(*quantities: Quantity) -> tuple[Quantity, ...]:
+    """Return quantities, then the standard uncertainty of each."""
+    return *quantities, *(one.uncertainty for one in quantities)
+
+
 NO_CHECKSUM = -1
 """`checksum` of a frame that could not be measured at all."""
 UNKNOWN_TIME = np.iinfo(np.int64).min
@@ -304,12 +312,11 @@ _TABLE = (
     Quantity("v", _NODE, "px", "displacement.1", f"displacement in y {_AT_NODE}", **_EXACT),
     Quantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
     Quantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
-    Quantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
-    Quantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
-    Quantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_AROUND}"),
-    Quantity("exx_std", _NODE, "", "strain_std.0", "standard uncertainty of exx"),
-    Quantity("eyy_std", _NODE, "", "strain_std.1", "standard uncertainty of eyy"),
-    Quantity("exy_std", _NODE, "", "strain_std.2", "standard uncertainty of exy"),
+    *with_uncertainty(
+        Quantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
+        Quantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
+        Quantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_AROUND}"),
+    ),
     *(
         Quantity(f"{name}_mesh_error", _ESTIMATED, unit, source, _LEFT_OUT.format(name))
         for name, unit, source in (
@@ -392,7 +399,7 @@ class FrameRecord:
         nodes, lights
             Their numbers N and k.
         **values
-            Quantities by name; None where not known.
+            Quantities by name; None where not known. `inputs` may be the SHA-256 of each file by its path.
 
         Returns
         -------
@@ -401,36 +408,33 @@ class FrameRecord:
         sizes = {"node": nodes, "light": lights}
         blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items()}
         given = {name: value for name, value in values.items() if value is not None}
+        if isinstance(files := given.get("inputs"), Mapping):
+            given["inputs"] = np.array(list(files.items()), dtype=np.str_).reshape(-1, 2)
         return cls(values=blank | given, sizes=sizes)
 
     @classmethod
-    def from_solution(cls, solution: Solution, *, inputs: Mapping[str, str] | None = None, **given: Any) -> FrameRecord:
+    def from_solution(cls, solution: Solution, **given: Any) -> FrameRecord:
         """Make the record of a solved frame.
 
         Parameters
         ----------
         solution
             Provides the quantities that have a `Quantity.source`.
-        inputs
-            Path and SHA-256 of the files that the frame was read from.
         **given
-            The others, such as `number`, `time_ns`, `brightness` and `weights_thumbnail`; None where not known.
+            The others, such as `number`, `time_ns`, `inputs`, `brightness` and `weights_thumbnail`, as of `of`.
 
         Returns
         -------
         FrameRecord
         """
         nodes, lights = np.shape(solution.light_fraction)
-        known = [name for name, entry in QUANTITIES.items() if entry.source]
+        known = [entry for entry in QUANTITIES.values() if entry.source]
         if not np.isfinite(solution.displacement_error).any():
-            known = [name for name in known if not QUANTITIES[name].estimated]
-        solved = {name: QUANTITIES[name].of(solution) for name in known}
-        return cls.of(nodes=nodes, lights=lights, inputs=_pairs(inputs), **solved, **given)
+            known = [entry for entry in known if not entry.estimated]
+        return cls.of(nodes=nodes, lights=lights, **{entry.name: entry.of(solution) for entry in known}, **given)
 
     @classmethod
-    def failed(
-        cls, reason: str, *, nodes: int, lights: int, inputs: Mapping[str, str] | None = None, **given: Any
-    ) -> FrameRecord:
+    def failed(cls, reason: str, *, nodes: int, lights: int, **given: Any) -> FrameRecord:
         """Make the record of a frame that could not be measured at all: NaN everywhere, and the reason.
 
         Parameters
@@ -439,16 +443,14 @@ class FrameRecord:
             Why nothing could be measured.
         nodes, lights
             Their numbers N and k.
-        inputs
-            Path and SHA-256 of the files that the frame was read from.
         **given
-            Other quantities by name.
+            Other quantities, as of `of`.
 
         Returns
         -------
         FrameRecord
         """
-        return cls.of(nodes=nodes, lights=lights, reason=reason, inputs=_pairs(inputs), **given)
+        return cls.of(nodes=nodes, lights=lights, reason=reason, **given)
 
     def __repr__(self) -> str:
         """Return number, status and size of the frame, and the names of its quantities."""
@@ -462,7 +464,3 @@ class FrameRecord:
         if name in QUANTITIES:
             return self.values[name]
         raise AttributeError(f"a frame record has no quantity {name!r}")
-
-
-def _pairs(inputs: Mapping[str, str] | None) -> AnyArray:
-    return np.array(list((inputs or {}).items()), dtype=np.str_).reshape(-1, 2)

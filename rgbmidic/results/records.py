@@ -37,8 +37,6 @@ _CHECK, _END, _COMMENT = struct.Struct("<I"), struct.calcsize("<4s4H2IH"), struc
 _VERSION, _DATE = 20, 0x21
 """Version 2.0 of the format has all that is used; the first of January 1980 is its first date."""
 _STORED, _DEFLATED = 0, 8
-_FAST = 1
-"""zlib's quickest level."""
 _NOT_YET, _DAMAGED = "not measured yet", "damaged"
 _REMEDY = "`rgbmidic run` with --resume measures it again, --partial (partial=True) reads the rest"
 
@@ -108,7 +106,7 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes) -> N
     for name, file in layout.files.items():
         content = npy_bytes(record.values[name])
         picture = QUANTITIES[name].dtype is np.uint8 and not QUANTITIES[name].stackable
-        stored = zlib.compress(content, _FAST, wbits=-zlib.MAX_WBITS) if picture else content
+        stored = zlib.compress(content, zlib.Z_BEST_SPEED, wbits=-zlib.MAX_WBITS) if picture else content
         method, sizes = _DEFLATED if picture else _STORED, (len(stored), len(content), len(file), 0)
         about = (_VERSION, 0, method, 0, _DATE, zlib.crc32(content), *sizes)
         parts += _LOCAL.pack(b"PK\x03\x04", *about), file, stored

@@ -23,9 +23,6 @@ from rgbmidic.typing import FloatArray
 
 logger = logging.getLogger(__name__)
 
-_DIFFERENT = 0.01
-"""Relative difference of the scale of points from a stated one above which a warning names both: half a pixel at each
-end of 100 px is .7 % (derived)."""
 _FIELDS = ("displacement", "displacements", "u", "disp")
 """Names, in small letters, under which a displacement is written: by ParaView and CalculiX, by Abaqus, by others."""
 _COMPONENT = re.compile(r"(?:u|v|u[xy12]|u_[xy12])(?:_(mm|m|um|inch))?", re.IGNORECASE)
@@ -243,8 +240,8 @@ def place(result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence
             "--points X_MM,Y_MM:X_PX,Y_PX each"
         )
     found = Placement.fit(known, rectification_of(result, scale).camera, where=where)
-    stated = (scale or scale_of(result)).mm_per_pixel
-    if found.mm_per_pixel is not None and stated is not None and abs(found.mm_per_pixel / stated - 1) > _DIFFERENT:
+    stated = (scale or scale_of(result)).mm_per_pixel  # half a pixel at each end of 100 px is .7 % of it
+    if found.mm_per_pixel is not None and stated is not None and abs(found.mm_per_pixel / stated - 1) > 0.01:
         text = "%s state %.6g mm per px, scale.mm_per_pixel %.6g: the former is taken"
         logger.warning(text, where, found.mm_per_pixel, stated)
     return found
