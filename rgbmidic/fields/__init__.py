@@ -3,10 +3,10 @@
 from rgbmidic.fields.crack_tip import StressIntensity, Williams, stress_intensity
 from rgbmidic.fields.cracks import Jump, crack_jump
 from rgbmidic.fields.history import SIGMA, History, Nodal, Probe, Rates, high_pass, rates
-from rgbmidic.fields.measures import MEASURES, RigidMotion, Strain, length_of, strain_of_gradient
 from rgbmidic.fields.nodal import (
     NodalCovariance,
     Places,
+    RigidMotion,
     at_nodes,
     at_pixels,
     difference_std,
@@ -17,7 +17,15 @@ from rgbmidic.fields.nodal import (
 from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.probes import Area, Mean, make_probe
 from rgbmidic.fields.profiles import ProfileLine
-from rgbmidic.fields.strain import StrainGauges, shortest_gauge, strain_of
+from rgbmidic.fields.strain import (
+    MEASURES,
+    Strain,
+    StrainGauges,
+    length_of,
+    shortest_gauge,
+    strain_of,
+    strain_of_gradient,
+)
 from rgbmidic.fields.units import Units, column, rounded, uncertain
 
 __all__ = [

@@ -18,7 +18,7 @@ from rgbmidic.fields.history import History, Nodal
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.outline_mesh import edge_keys
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -133,22 +133,20 @@ def listed(numbers: Any) -> str:
     return ", ".join(f"{number:g}" for number in numbers)
 
 
-def lowest_copies(mesh: Tri3Mesh) -> npt.NDArray[np.int64]:
+def lowest_copies(mesh: Tri3Mesh) -> IntArray:
     """Lowest of the nodes at the same place, for every node (N,)."""
     place, copies = np.arange(len(mesh.nodes)), mesh.copies
     np.minimum.at(place, copies[:, 1], copies[:, 0])
     return place
 
 
-def crack_faces(mesh: Tri3Mesh) -> npt.NDArray[np.int64]:
+def crack_faces(mesh: Tri3Mesh) -> IntArray:
     """Both sides of the pieces of cracks as nodes (F, 2), in the order of their elements."""
     sides = mesh.elements[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     return sides[np.isin(edge_keys(sides, len(mesh.nodes)), edge_keys(mesh.crack_edges, len(mesh.nodes)))].astype(int)
 
 
-def nearest_node(
-    mesh: Tri3Mesh, name: str, nodes: npt.NDArray[np.int64], point: FloatArray, what: str = "on a crack"
-) -> int:
+def nearest_node(mesh: Tri3Mesh, name: str, nodes: IntArray, point: FloatArray, what: str = "on a crack") -> int:
     """Return the one of some nodes at a stated point, px."""
     if not len(nodes):
         raise InputError(f"{name}: no node of this result is {what}; cracks are stated in [mesh] cracks before the run")
@@ -198,7 +196,7 @@ def crack_jump(
     return probe.read(at_some(displacement, probe.nodes))
 
 
-def at_some(nodal: Nodal, nodes: npt.NDArray[np.int64]) -> Nodal:
+def at_some(nodal: Nodal, nodes: IntArray) -> Nodal:
     """Displacements at some of the nodes."""
     parts = {name: np.asarray(getattr(nodal, name))[:, nodes] for name in ("u", "v", "u_std", "v_std")}
     return Nodal(**parts)

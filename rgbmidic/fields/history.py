@@ -24,7 +24,7 @@ import numpy.typing as npt
 from rgbmidic._kernels.rates import LOWEST, mean_rates
 from rgbmidic.errors import InputError
 from rgbmidic.fields.units import column
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 SIGMA = 40.0
 """Standard deviation (px) of the paper's Gaussian filter."""
@@ -87,7 +87,7 @@ class Probe(Protocol):
         """First part of the names of its histories."""
 
     @property
-    def nodes(self) -> npt.NDArray[np.int64]:
+    def nodes(self) -> IntArray:
         """Nodes that it needs."""
 
     def histories(self, nodal: Nodal) -> list[History]:

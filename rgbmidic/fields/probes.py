@@ -19,13 +19,12 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.crack_tip import CrackTip, Williams
 from rgbmidic.fields.cracks import JumpAlong
 from rgbmidic.fields.history import History, Nodal, Probe
-from rgbmidic.fields.measures import MEASURES, Strain, strain_of_gradient
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.plane import Rectification
-from rgbmidic.fields.strain import StrainGauges
+from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.settings import ProbeSettings
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +71,7 @@ class Mean:
     """
 
     name: str
-    nodes: npt.NDArray[np.int64]
+    nodes: IntArray
     weights: FloatArray
     correlation: FloatArray
     least: float = 1.0
@@ -314,7 +313,7 @@ class Area(Mean):
         One of `rgbmidic.fields.MEASURES`.
     """
 
-    elements: npt.NDArray[np.int64]
+    elements: IntArray
     parts: FloatArray
     slopes: FloatArray
     measure: str

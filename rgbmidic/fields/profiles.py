@@ -27,7 +27,7 @@ from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.strain import StrainGauges
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.quadratic_fit import quadratic_fit
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 ARRIVALS = ("front", "peak")
 """What arrives: the rise through a fraction of the peak, or the peak."""
@@ -132,7 +132,7 @@ class ProfileLine:
 
     points: FloatArray
     positions: FloatArray
-    nodes: npt.NDArray[np.int64]
+    nodes: IntArray
     places: Places
     even: BoolArray
     correlations: Mapping[str, FloatArray]

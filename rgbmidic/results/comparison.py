@@ -21,7 +21,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.correlation.assembly import BLOCK, OF_ELEMENT
@@ -34,7 +33,7 @@ from rgbmidic.results.quantities import QUANTITIES as STORED
 from rgbmidic.results.result import Result
 from rgbmidic.results.simulation import Simulation, places_among
 from rgbmidic.settings import ScaleSettings
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
@@ -315,7 +314,7 @@ class Comparison:
         return fit, np.tensordot(rigid, motions, 1), taken
 
     @cached_property
-    def _own(self) -> npt.NDArray[np.int64]:
+    def _own(self) -> IntArray:
         """Node (M,) of the measurement that is each of the simulation's, by number and place; -1 where there is none.
 
         All are -1 where the measurement has nodes of its own.

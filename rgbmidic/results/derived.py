@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from rgbmidic.fields import Units
-from rgbmidic.fields.measures import EQUIVALENT
+from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.results.quantities import QUANTITIES, Quantity, with_uncertainty
 
 _NODE = ("node",)

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields import (
@@ -32,13 +31,13 @@ from rgbmidic.fields import (
     rounded,
 )
 from rgbmidic.fields.history import rate_frames, rate_words
-from rgbmidic.fields.measures import EQUIVALENT
+from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.physical import MOVED, frame_times, rectification_of, reference_frames, shared_part
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, IntArray
 
 HistoryColumn = History
 """A column of `Histories`: one quantity over the frames in the reader's unit."""
@@ -66,9 +65,9 @@ class Histories:
         Recorded beside the test, by the clock of the frames; None: there are none.
     """
 
-    frames: npt.NDArray[np.int64]
-    numbers: npt.NDArray[np.int64]
-    status: npt.NDArray[np.int64]
+    frames: IntArray
+    numbers: IntArray
+    status: IntArray
     times: FloatArray | None
     units: Units
     quantities: tuple[HistoryColumn, ...] = ()
@@ -372,7 +371,7 @@ def _remarks(
     rectified: Rectification,
     speed: FloatArray,
     exposure_ns: float | None,
-    frames: npt.NDArray[np.int64],
+    frames: IntArray,
     read: Mapping[str, list[History]],
 ) -> Iterator[str]:
     camera, units, exposed = rectified.camera, rectified.units, (exposure_ns or 0) * 1e-9

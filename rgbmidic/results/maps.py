@@ -43,7 +43,7 @@ from rgbmidic.results.physical import MOVED, Physical, frame_times, named, refer
 from rgbmidic.results.quantities import UNKNOWN_TIME, Quantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 WINDOW = 9
 """Frames that a parabola takes in for rates where none are stated. Chosen: the noise of a velocity is then .13 of that
@@ -109,17 +109,7 @@ class Maps:
     window: int = WINDOW
 
     @classmethod
-    def of(
-        cls,
-        result: Result,
-        scale: ScaleSettings | None = None,
-        *,
-        gauge: float | None = None,
-        measure: str | None = None,
-        since: int | None = None,
-        rigid_removed: bool = False,
-        window: int | None = None,
-    ) -> Self:
+    def of(cls, result: Result, scale: ScaleSettings | None = None, **choices: Any) -> Self:
         """Choose how fields are derived.
 
         Parameters
@@ -128,12 +118,8 @@ class Maps:
             The result; a run may still add to it.
         scale
             It replaces the ``[scale]`` that was kept with the result; None: that one.
-        gauge
-            Length of the virtual strain gauge in px; None: the shortest, three elements.
-        measure
-            One of `rgbmidic.fields.MEASURES`; None: the first.
-        since, rigid_removed, window
-            See the class; the window is that of ``[probes]``, or 9 frames, where None is stated.
+        **choices
+            `gauge`, `measure`, `since`, `rigid_removed` and `window`, as of `chosen`.
 
         Returns
         -------
@@ -142,10 +128,9 @@ class Maps:
         Raises
         ------
         InputError
-            There is no such frame or measure, the gauge is too short, or the window holds fewer than 4 frames.
+            As of `chosen`.
         """
-        plain = cls(result=result, physical=Physical.untimed(result, scale))
-        return plain.chosen(gauge=gauge, measure=measure, since=since, rigid_removed=rigid_removed, window=window)
+        return cls(result=result, physical=Physical.untimed(result, scale)).chosen(**choices)
 
     def chosen(
         self,
@@ -160,8 +145,12 @@ class Maps:
 
         Parameters
         ----------
-        gauge, measure, since, rigid_removed, window
-            As of `of`.
+        gauge
+            Length of the virtual strain gauge in px; None: the shortest, three elements.
+        measure
+            One of `rgbmidic.fields.MEASURES`; None: the first.
+        since, rigid_removed, window
+            See the class; the window is that of ``[probes]``, or 9 frames, where None is stated.
 
         Returns
         -------
@@ -170,7 +159,8 @@ class Maps:
         Raises
         ------
         InputError
-            There is no frame `since`, nothing is measured in it, or the `window` is too short for rates.
+            There is no frame `since`, nothing is measured in it, there is no such measure, the gauge is too short, or
+            the window holds fewer than 4 frames.
         """
         frames = len(self.result)
         if since is not None and not 0 <= since < frames:
@@ -445,7 +435,7 @@ class Maps:
         return values[row], std[row]
 
     @cached_property
-    def _there(self) -> npt.NDArray[np.int64]:
+    def _there(self) -> IntArray:
         return np.flatnonzero(self.result.finished)
 
     @cached_property

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields import ProfileLine, Units, column
@@ -17,7 +16,7 @@ from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.maps import Maps
 from rgbmidic.results.physical import frame_times, shared_part
 from rgbmidic.results.quantities import Quantity
-from rgbmidic.typing import AnyArray, FloatArray
+from rgbmidic.typing import AnyArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -67,8 +66,8 @@ class Profile:
 
     field: Quantity
     line: ProfileLine
-    frames: npt.NDArray[np.int64]
-    numbers: npt.NDArray[np.int64]
+    frames: IntArray
+    numbers: IntArray
     times: FloatArray | None
     units: Units
     values: FloatArray

@@ -21,14 +21,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import AnotherTestError, ResultError, disk_faults
 from rgbmidic.results.files import npy_array, npy_bytes, write_complete, writing
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.settings import regular
-from rgbmidic.typing import BoolArray
+from rgbmidic.typing import BoolArray, IntArray
 
 _NAME = re.compile(r"([0-9]{6}|[1-9][0-9]{6,})\.npz")
 _LOCAL = struct.Struct("<4s5H3I2H")
@@ -180,7 +179,7 @@ class FrameTable:
     folder: Path
     sizes: Mapping[str, int]
     run: bytes
-    written: npt.NDArray[np.int64]
+    written: IntArray
     damaged: BoolArray
 
     @classmethod

@@ -19,7 +19,7 @@ from rgbmidic.mesh import FiniteElementMesh, Placement, read_mesh
 from rgbmidic.results.physical import placement_of, rectification_of, scale_of
 from rgbmidic.results.result import Result
 from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, regular
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
@@ -208,7 +208,7 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
     return values, steps if clock else None
 
 
-def places_among(numbers: npt.NDArray[np.int64], wanted: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+def places_among(numbers: IntArray, wanted: npt.NDArray[Any]) -> IntArray:
     """Place of each wanted label among some numbers; -1 where it is none of them."""
     index = {number: place for place, number in enumerate(numbers.tolist())}
     return np.array([index.get(number, -1) for number in wanted.tolist()], dtype=np.int64)
