@@ -8,7 +8,7 @@ those on the reference.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -268,8 +268,7 @@ class StrainGauge:
     ) -> None:
         gauges = StrainGauges.at_points(covariance, np.array([[x, y]]), length)
         self.name, self.measure, self.nodes = name, measure, np.unique(gauges.nodes)
-        own, needed = np.searchsorted(self.nodes, gauges.nodes), gauges.needed[:, self.nodes]
-        self.gauges = replace(gauges, points=gauges.points[self.nodes], nodes=own, needed=needed)
+        self.gauges = gauges.of_nodes(self.nodes)
         self.inside = float(Places.of(covariance.mesh, _circle(x, y, gauges.length / 2)).inside.mean())
 
     def histories(self, nodal: Nodal) -> list[History]:

@@ -11,11 +11,10 @@ between the positions; the speed is that of the straight line through the arriva
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +26,7 @@ from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.strain import StrainGauges
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.quadratic_fit import quadratic_fit
-from rgbmidic.typing import BoolArray, FloatArray, IntArray
+from rgbmidic.typing import BoolArray, FloatArray
 
 ARRIVALS = ("front", "peak")
 """What arrives: the rise through a fraction of the peak, or the peak."""
@@ -105,12 +104,20 @@ _WIDTHS = {"front": 1.5, "peak": 3.0}
 maximum."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ProfileLine:
-    """Points along a line in a mesh, at which nodal fields are read.
+    """Points .38 elements apart along a line in a mesh, at which nodal fields are read.
 
     A value is that of the quadratics through the nodes around each node, weighted by its shape function, as in
     `at_pixels`; its uncertainty follows from the correlation of the nodes' errors.
+
+    Parameters
+    ----------
+    covariance
+        Of the mesh.
+    gauges
+        Strain gauges at its nodes.
+    x0, y0, x1, y1
+        Ends in px on the reference.
 
     Attributes
     ----------
@@ -128,39 +135,16 @@ class ProfileLine:
     correlations
         Correlation (n, n) of the errors at these nodes of a displacement (``""``), of the strains ``"exx"`` and
         ``"eyy"``, which are slopes along x and y, and of all other strains (``"strain"``), taken as the mean of both.
+
+    Raises
+    ------
+    InputError
+        Both ends are the same, or half of the line or more is outside the mesh.
     """
 
-    points: FloatArray
-    positions: FloatArray
-    nodes: IntArray
-    places: Places
-    even: BoolArray
-    correlations: Mapping[str, FloatArray]
-
-    @classmethod
-    def between(
-        cls, covariance: NodalCovariance, gauges: StrainGauges, x0: float, y0: float, x1: float, y1: float
-    ) -> Self:
-        """Lay points .38 elements apart along a line.
-
-        Parameters
-        ----------
-        covariance
-            Of the mesh.
-        gauges
-            Strain gauges at its nodes.
-        x0, y0, x1, y1
-            Ends in px on the reference.
-
-        Returns
-        -------
-        ProfileLine
-
-        Raises
-        ------
-        InputError
-            Both ends are the same, or half of the line or more is outside the mesh.
-        """
+    def __init__(
+        self, covariance: NodalCovariance, gauges: StrainGauges, x0: float, y0: float, x1: float, y1: float
+    ) -> None:
         mesh, length = covariance.mesh, math.hypot(x1 - x0, y1 - y0)
         if not length > 0:
             raise InputError(f"a line needs two different points, not ({x0:g}, {y0:g}) twice")
@@ -169,28 +153,23 @@ class ProfileLine:
             raise InputError(
                 f"half or more of the line from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) px is outside {places.where}"
             )
-        along = np.clip((mesh.nodes - points[0]) @ (points[-1] - points[0]) / length**2, 0, 1)
-        away = mesh.nodes - points[0] - along[:, None] * (points[-1] - points[0])
+        way = points[-1] - points[0]
+        along = np.clip((mesh.nodes - points[0]) @ way / length**2, 0, 1)
+        away = mesh.nodes - points[0] - along[:, None] * way
         near = np.hypot(*away.T) <= _CONSTANTS.around * mesh.size
         elements = mesh.elements[near[mesh.elements].all(axis=1)]
-        nodes = np.unique(elements)
+        self.nodes = nodes = np.unique(elements)
         part = Tri3Mesh(nodes=mesh.nodes[nodes], elements=np.searchsorted(nodes, elements).astype(np.int32))
-        chosen = sp.csr_matrix((np.ones(len(nodes)), (np.arange(len(nodes)), nodes)), (len(nodes), len(mesh.nodes)))
-        size = (len(mesh.nodes), len(mesh.nodes))
-        slopes = [chosen @ sp.csr_matrix((w, (gauges.rows, gauges.nodes)), size) for w in gauges.whole]
+        self.points, self.positions = points, np.linspace(0, length, len(points))
+        self.places = Places.of(part, points)
+        slopes = [sp.eye(len(mesh.nodes), format="csr")[nodes] @ slope for slope in gauges.slopes]
         exx, eyy = (_unit(slope @ covariance.correlation @ slope.T) for slope in slopes)
+        self.correlations = {"": covariance.part(nodes), "exx": exx, "eyy": eyy, "strain": (exx + eyy) / 2}
         count = np.bincount(gauges.rows, weights=gauges.fractions, minlength=len(mesh.nodes))
-        arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ (points[-1] - points[0]) / length
+        arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ way / length
         lopsided = np.abs(np.bincount(gauges.rows, weights=gauges.fractions * arm, minlength=len(mesh.nodes)) / count)
-        at = Places.of(part, points)
-        return cls(
-            points=points,
-            positions=np.linspace(0, length, len(points)),
-            nodes=nodes,
-            places=at,
-            even=(lopsided[nodes][part.elements[at.element]] < _CONSTANTS.lopsided * mesh.size).all(axis=1),
-            correlations={"": covariance.part(nodes), "exx": exx, "eyy": eyy, "strain": (exx + eyy) / 2},
-        )
+        at_corners = lopsided[nodes][part.elements[self.places.element]]
+        self.even = (at_corners < _CONSTANTS.lopsided * mesh.size).all(axis=1)
 
     def read(self, values: FloatArray, std: FloatArray, kind: str = "") -> tuple[FloatArray, FloatArray]:
         """Interpolate a nodal field (N,) and its standard uncertainty at the points, each (P,).

@@ -13,7 +13,8 @@ good practice guide, the length is that of the window of points plus one of them
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -273,17 +274,24 @@ def strain_of(
     return StrainGauges.at_nodes(covariance, gauge).strain(u, v, u_std, v_std, measure=measure)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StrainGauges:
     """Virtual strain gauges of one length at some places.
 
-    Attributes
+    Parameters
     ----------
-    length
-        In px. On a graded mesh each gauge has three elements as they are around it, and this length where that is more
-        and the length is stated; if it is not, this is that of elements of the mesh's size.
+    covariance
+        Of the mesh.
     centres : ndarray, shape (G, 2)
         In px on the reference.
+    length
+        In px; None: the shortest, three elements. On a graded mesh each gauge has three elements as they are around it,
+        and this length where that is more and the length is stated; if it is not, `length` is that of elements of the
+        mesh's size.
+    needed : csr_matrix, shape (G, N)
+        Nodes that must have data, else the gauge has none: the centre and those beside it.
+
+    Attributes
+    ----------
     points : ndarray, shape (N, 2)
         The nodes.
     rows, nodes : ndarray, shape (M,), int
@@ -291,23 +299,46 @@ class StrainGauges:
         lies across a crack or a hole.
     fractions : ndarray, shape (M,)
         Part of each node that is within the gauge's circle.
-    needed : csr_matrix, shape (G, N)
-        Nodes that must have data, else the gauge has none: the centre and those beside it.
     whole : ndarray, shape (2, M)
         Weight of every node in the slopes along x and y where all are measured.
+    slopes : list of csr_matrix, shape (G, N)
+        The same as matrices.
     inflation : ndarray, shape (G, 3)
         Variance of the slopes along x and y, and their covariance, over what independent nodes would give.
+
+    Raises
+    ------
+    InputError
+        The gauge is too short.
     """
 
-    length: float
-    centres: FloatArray
-    points: FloatArray
-    rows: IntArray
-    nodes: IntArray
-    fractions: FloatArray
-    needed: sp.csr_matrix
-    whole: FloatArray
-    inflation: FloatArray
+    def __init__(
+        self, covariance: NodalCovariance, centres: FloatArray, length: float | None, needed: sp.csr_matrix
+    ) -> None:
+        mesh, shortest = covariance.mesh, shortest_gauge(covariance.mesh)
+        self.length = shortest if length is None else float(length)
+        self.centres, self.needed, self.points = centres, needed, mesh.nodes
+        # the sides of a mesh's elements differ by some percent from the size asked for
+        if not (np.isfinite(self.length) and self.length >= 0.9 * shortest):
+            raise InputError(
+                f"a strain gauge must be at least {shortest:.4g} px long, {SHORTEST:g} elements; given are "
+                f"{self.length:g} px"
+            )
+        lengths = np.full(len(centres), self.length)
+        if mesh.is_graded:
+            around = (needed @ mesh.sizes) / np.asarray(needed.sum(axis=1)).ravel()
+            lengths = np.maximum(SHORTEST * around, length or 0)
+        pattern = _reach(mesh, centres, lengths / 2, needed)
+        self.rows = np.repeat(np.arange(len(centres)), np.diff(pattern.indptr))
+        self.nodes = pattern.indices.astype(np.int64)
+        away = np.hypot(*(mesh.nodes[self.nodes] - centres[self.rows]).T)
+        self.fractions = np.clip((lengths[self.rows] / 2 - away) / mesh.sizes[self.nodes], 0, 1)
+        self.whole = self._weights(np.ones(len(mesh.nodes), dtype=bool))
+        self.slopes = [sp.csr_matrix((w, (self.rows, self.nodes)), shape=needed.shape) for w in self.whole]
+        together = [np.asarray((a @ covariance.correlation).multiply(a).sum(axis=1)).ravel() for a in self.slopes]
+        alone = [np.asarray(a.multiply(a).sum(axis=1)).ravel() for a in self.slopes]
+        along, across = (a / np.where(b > 0, b, 1) for a, b in zip(together, alone, strict=True))
+        self.inflation = np.stack([along, across, np.sqrt(along * across)], axis=1)
 
     @classmethod
     def at_nodes(cls, covariance: NodalCovariance, length: float | None = None) -> Self:
@@ -324,8 +355,7 @@ class StrainGauges:
         -------
         StrainGauges
         """
-        mesh = covariance.mesh
-        return cls._around(covariance, mesh.nodes, length, _ring(mesh))
+        return cls(covariance, covariance.mesh.nodes, length, _ring(covariance.mesh))
 
     @classmethod
     def at_points(cls, covariance: NodalCovariance, points: FloatArray, length: float | None = None) -> Self:
@@ -352,48 +382,26 @@ class StrainGauges:
         mesh = covariance.mesh
         places = Places.of(mesh, points)
         places.check("the strain gauge")
-        row = np.repeat(np.arange(len(points)), 3)
-        nodes = mesh.elements[places.element].ravel()
+        row, nodes = np.repeat(np.arange(len(points)), 3), mesh.elements[places.element].ravel()
         needed = sp.csr_matrix((np.ones(len(row)), (row, nodes)), shape=(len(points), len(mesh.nodes)))
-        return cls._around(covariance, np.asarray(points, dtype=np.float64), length, needed)
+        return cls(covariance, places.points, length, needed)
 
-    @classmethod
-    def _around(
-        cls, covariance: NodalCovariance, centres: FloatArray, length: float | None, needed: sp.csr_matrix
-    ) -> Self:
-        mesh, stated, shortest = covariance.mesh, length is not None, shortest_gauge(covariance.mesh)
-        length = shortest if length is None else float(length)
-        # the sides of a mesh's elements differ by some percent from the size asked for
-        if not (np.isfinite(length) and length >= 0.9 * shortest):
-            raise InputError(
-                f"a strain gauge must be at least {shortest:.4g} px long, {SHORTEST:g} elements; given are "
-                f"{length:g} px"
-            )
-        lengths = np.full(len(centres), length)
-        if mesh.is_graded:
-            around = (needed @ mesh.sizes) / np.asarray(needed.sum(axis=1)).ravel()
-            lengths = np.maximum(SHORTEST * around, length if stated else 0)
-        pattern = _reach(mesh, centres, lengths / 2, needed)
-        rows = np.repeat(np.arange(len(centres)), np.diff(pattern.indptr))
-        away = np.hypot(*(mesh.nodes[pattern.indices] - centres[rows]).T)
-        gauges = cls(
-            length=length,
-            centres=centres,
-            points=mesh.nodes,
-            rows=rows,
-            nodes=pattern.indices.astype(np.int64),
-            fractions=np.clip((lengths[rows] / 2 - away) / mesh.sizes[pattern.indices], 0, 1),
-            needed=needed,
-            whole=np.zeros((2, len(rows))),
-            inflation=np.ones((len(centres), 3)),
-        )
-        weights = gauges._weights(np.ones(len(mesh.nodes), dtype=bool))
-        x, y = (sp.csr_matrix((weight, (rows, gauges.nodes)), shape=needed.shape) for weight in weights)
-        together = [np.asarray((a @ covariance.correlation).multiply(a).sum(axis=1)).ravel() for a in (x, y)]
-        alone = [np.asarray(a.multiply(a).sum(axis=1)).ravel() for a in (x, y)]
-        along, across = (a / np.where(b > 0, b, 1) for a, b in zip(together, alone, strict=True))
-        inflation = np.stack([along, across, np.sqrt(along * across)], axis=1)
-        return replace(gauges, whole=weights, inflation=inflation)
+    def of_nodes(self, nodes: IntArray) -> Self:
+        """Return the gauges for the fields of some nodes alone, all of theirs among them.
+
+        Parameters
+        ----------
+        nodes : ndarray, shape (n,)
+            Indices of the nodes, rising.
+
+        Returns
+        -------
+        StrainGauges
+        """
+        gauges = copy(self)
+        gauges.points, gauges.needed = self.points[nodes], self.needed[:, nodes]
+        gauges.nodes, gauges.slopes = np.searchsorted(nodes, self.nodes), [part[:, nodes] for part in self.slopes]
+        return gauges
 
     def gradient(
         self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray

@@ -352,8 +352,7 @@ class Comparison:
     def _correlations(self) -> list[tuple[sp.csr_matrix, sp.csr_matrix]]:
         """Correlation (M, M) of each of the `QUANTITIES` between the nodes, and its squares, entry by entry."""
         read, (gauges, given), whole = self._read[0], self._gauges, self.covariance.correlation
-        shape, entries = (given.shape[1], read.shape[1]), (gauges.rows, gauges.nodes)
-        slopes = [given @ sp.csr_matrix((part, entries), shape=shape) for part in gauges.whole]
+        slopes = [given @ slope for slope in gauges.slopes]
         moved, x, y = (_unit(matrix @ whole @ matrix.T) for matrix in (read, *slopes))
         shear = _unit(sum(slope @ whole @ slope.T for slope in slopes))
         return [(one, sp.csr_matrix(one.multiply(one))) for one in (moved, moved, x, y, shear)]
