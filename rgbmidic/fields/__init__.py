@@ -17,16 +17,8 @@ from rgbmidic.fields.nodal import (
 from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.probes import Area, Mean, make_probe
 from rgbmidic.fields.profiles import ProfileLine
-from rgbmidic.fields.strain import (
-    MEASURES,
-    Strain,
-    StrainGauges,
-    length_of,
-    shortest_gauge,
-    strain_of,
-    strain_of_gradient,
-)
-from rgbmidic.fields.units import Units, column, rounded, uncertain
+from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, shortest_gauge, strain_of, strain_of_gradient
+from rgbmidic.fields.units import Units, rounded, uncertain
 
 __all__ = [
     "MEASURES",
@@ -51,13 +43,11 @@ __all__ = [
     "Williams",
     "at_nodes",
     "at_pixels",
-    "column",
     "crack_jump",
     "difference_std",
     "field_rms",
     "frame_covariance",
     "high_pass",
-    "length_of",
     "make_probe",
     "rates",
     "reference_fraction",

@@ -52,7 +52,7 @@ class ProbeConstants:
 _CONSTANTS = ProbeConstants()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(kw_only=True, eq=False)
 class Mean:
     """Displacement at a point, or its mean along a line or over an area: u and v.
 
@@ -293,12 +293,22 @@ def _strain_histories(name: str, strain: Strain, note: str) -> list[History]:
     ]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Area(Mean):
     """Mean displacement over an area, and the strain of the mean displacement gradient over it.
 
     The gradient of a linear displacement is constant in an element, so that its mean over the area is one of the
     elements, each by the part of the area that it holds. It is that of the nodes around the area alone (Gauss).
+
+    Parameters
+    ----------
+    covariance
+        Of the mesh.
+    name
+        Name of the probe.
+    points : ndarray, shape (P, 2)
+        Middles of equal parts of the area on the reference, px.
+    measure
+        Strain measure, as of `strain_of`.
 
     Attributes
     ----------
@@ -308,56 +318,24 @@ class Area(Mean):
         Fraction of the area within each; their sum is 1.
     slopes : ndarray, shape (E, 3, 2)
         Gradient of the shape functions, per px.
-    measure
-        One of `rgbmidic.fields.MEASURES`.
+
+    Raises
+    ------
+    InputError
+        Half of the area or more is outside the region.
     """
 
-    elements: IntArray
-    parts: FloatArray
-    slopes: FloatArray
-    measure: str
-
-    @classmethod
-    def of(cls, covariance: NodalCovariance, name: str, points: FloatArray, measure: str = MEASURES[0]) -> Area:
-        """Average over the area that points (P, 2) stand for, px.
-
-        Parameters
-        ----------
-        covariance
-            Of the mesh.
-        name
-            Name of the probe.
-        points : ndarray, shape (P, 2)
-            Middles of equal parts of the area on the reference, px.
-        measure
-            Strain measure, as of `strain_of`.
-
-        Returns
-        -------
-        Area
-
-        Raises
-        ------
-        InputError
-            Half of the area or more is outside the region.
-        """
+    def __init__(self, covariance: NodalCovariance, name: str, points: FloatArray, measure: str = MEASURES[0]) -> None:
         mesh, places = covariance.mesh, Places.of(covariance.mesh, points)
         if (inside := float(places.inside.mean())) < _CONSTANTS.least:
             raise InputError(f"half or more of {name} is outside {places.where}")
         elements, count = np.unique(places.element[places.inside], return_counts=True)
         nodes = np.unique(mesh.elements[elements]).astype(np.int64)
-        return cls(
-            name=name,
-            nodes=nodes,
-            weights=places.mean()[nodes],
-            correlation=covariance.part(nodes),
-            least=_CONSTANTS.least - _CONSTANTS.rounding,
-            inside=inside,
-            elements=np.searchsorted(nodes, mesh.elements[elements]),
-            parts=count / count.sum(),
-            slopes=mesh.shape_gradients()[elements],
-            measure=measure,
-        )
+        weights, correlation = places.mean()[nodes], covariance.part(nodes)
+        least = _CONSTANTS.least - _CONSTANTS.rounding
+        super().__init__(name=name, nodes=nodes, weights=weights, correlation=correlation, least=least, inside=inside)
+        self.elements, self.parts = np.searchsorted(nodes, mesh.elements[elements]), count / count.sum()
+        self.slopes, self.measure = mesh.shape_gradients()[elements], measure
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px, then strain, principal strains and equivalent strain.
@@ -371,7 +349,7 @@ class Area(Mean):
         -------
         list of History
         """
-        moved, known = Mean.histories(self, nodal), _known(nodal)
+        moved, known = super().histories(nodal), _known(nodal)
         gradient, covariance = np.full((len(known), 2, 2), np.nan), np.full((len(known), 4, 4), np.nan)
         patterns, of_frame = np.unique(known[:, self.elements].all(axis=2), axis=0, return_inverse=True)
         for place, there in enumerate(patterns):
@@ -393,8 +371,8 @@ _Make = Callable[..., Probe]
 PROBES: dict[str, tuple[int, int, _Make]] = {
     "point": (1, 0, lambda c, name, *place: Mean.over(c, name, [place])),
     "line": (2, 0, lambda c, name, *place: Mean.over(c, name, _line(*place), _CONSTANTS.least)),
-    "circle": (1, 1, lambda c, name, *place, **more: Area.of(c, name, _circle(*place), **more)),
-    "region": (2, 0, lambda c, name, *place, **more: Area.of(c, name, _rectangle(*place), **more)),
+    "circle": (1, 1, lambda c, name, *place, **more: Area(c, name, _circle(*place), **more)),
+    "region": (2, 0, lambda c, name, *place, **more: Area(c, name, _rectangle(*place), **more)),
     "gauge": (2, 0, Gauge),
     "straight_gauge": (2, 0, partial(Gauge, moving=False)),
     "strain_gauge": (1, 1, StrainGauge),

@@ -7,14 +7,7 @@ from rgbmidic.results.channels import Channels
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
 from rgbmidic.results.histories import Histories, HistoryColumn, history_rows, write_histories
 from rgbmidic.results.maps import Maps, MapValues
-from rgbmidic.results.physical import (
-    channels_of,
-    frame_times,
-    placement_of,
-    probes_of,
-    scale_of,
-    shared_part,
-)
+from rgbmidic.results.physical import channels_of, frame_times, placement_of, probes_of, scale_of, shared_part
 from rgbmidic.results.profiles import Profile, Wave, read_profile, write_profile
 from rgbmidic.results.provenance import Origin
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, Quantity

@@ -22,7 +22,7 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.fields import column
+from rgbmidic.fields.units import column
 from rgbmidic.results.files import check_file, write_complete, write_table, writing
 from rgbmidic.results.physical import Physical
 from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, Quantity

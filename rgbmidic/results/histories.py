@@ -17,21 +17,12 @@ from typing import BinaryIO
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import (
-    History,
-    Nodal,
-    NodalCovariance,
-    Probe,
-    Rates,
-    Rectification,
-    RigidMotion,
-    Units,
-    make_probe,
-    rates,
-    rounded,
-)
-from rgbmidic.fields.history import rate_frames, rate_words
+from rgbmidic.fields.history import History, Nodal, Probe, Rates, rate_frames, rate_words, rates
+from rgbmidic.fields.nodal import NodalCovariance, RigidMotion
+from rgbmidic.fields.plane import Rectification
+from rgbmidic.fields.probes import make_probe
 from rgbmidic.fields.strain import EQUIVALENT
+from rgbmidic.fields.units import Units, rounded
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.physical import MOVED, frame_times, rectification_of, reference_frames, shared_part

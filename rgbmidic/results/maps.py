@@ -15,19 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import (
-    MEASURES,
-    NodalCovariance,
-    RigidMotion,
-    Strain,
-    StrainGauges,
-    Units,
-    frame_covariance,
-    length_of,
-    rates,
-    strain_of_gradient,
-)
-from rgbmidic.fields.history import FEWEST, rate_frames, rate_words
+from rgbmidic.fields.history import FEWEST, rate_frames, rate_words, rates
+from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
+from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
+from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.derived import (
     COMPONENTS,

@@ -14,17 +14,10 @@ from typing import Self
 
 import numpy as np
 
-from rgbmidic.fields import (
-    MEASURES,
-    CameraCalibration,
-    NodalCovariance,
-    Rectification,
-    Strain,
-    StrainGauges,
-    Units,
-    reference_fraction,
-    strain_of_gradient,
-)
+from rgbmidic.fields.nodal import NodalCovariance, reference_fraction
+from rgbmidic.fields.plane import CameraCalibration, Rectification
+from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
+from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Placement, Tri3Mesh
 from rgbmidic.results.derived import ELEMENT_STRAIN, STRAIN
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, Quantity

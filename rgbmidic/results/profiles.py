@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import ProfileLine, column
+from rgbmidic.fields import ProfileLine
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
+from rgbmidic.fields.units import column
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.maps import Maps
 from rgbmidic.results.physical import frame_times, shared_part
