@@ -3,10 +3,10 @@
 from rgbmidic.fields.crack_tip import StressIntensity, Williams, stress_intensity
 from rgbmidic.fields.cracks import Jump, crack_jump
 from rgbmidic.fields.history import SIGMA, History, Nodal, Probe, Rates, high_pass, rates
-from rgbmidic.fields.measures import EQUIVALENT, MEASURES, RigidMotion, Strain, length_of, strain_of_gradient
 from rgbmidic.fields.nodal import (
     NodalCovariance,
     Places,
+    RigidMotion,
     at_nodes,
     at_pixels,
     difference_std,
@@ -15,19 +15,16 @@ from rgbmidic.fields.nodal import (
     reference_fraction,
 )
 from rgbmidic.fields.plane import CameraCalibration, Rectification
-from rgbmidic.fields.probes import PROBES, Area, Gauge, Mean, StrainGauge, make_probe
+from rgbmidic.fields.probes import Area, Mean, make_probe
 from rgbmidic.fields.profiles import ProfileLine
-from rgbmidic.fields.strain import StrainGauges, shortest_gauge, strain_of
-from rgbmidic.fields.units import Units, column, rounded, uncertain
+from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, shortest_gauge, strain_of, strain_of_gradient
+from rgbmidic.fields.units import Units, rounded, uncertain
 
 __all__ = [
-    "EQUIVALENT",
     "MEASURES",
-    "PROBES",
     "SIGMA",
     "Area",
     "CameraCalibration",
-    "Gauge",
     "History",
     "Jump",
     "Mean",
@@ -40,20 +37,17 @@ __all__ = [
     "Rectification",
     "RigidMotion",
     "Strain",
-    "StrainGauge",
     "StrainGauges",
     "StressIntensity",
     "Units",
     "Williams",
     "at_nodes",
     "at_pixels",
-    "column",
     "crack_jump",
     "difference_std",
     "field_rms",
     "frame_covariance",
     "high_pass",
-    "length_of",
     "make_probe",
     "rates",
     "reference_fraction",

@@ -12,9 +12,8 @@ direction of the crack, the shear modulus G and Kolosov's constant k::
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -28,28 +27,52 @@ from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-_INNER = 2.0
-"""Least inner radius of an annulus, in elements: from there on K of an image without noise is right to .3 % (measured,
-docs/how-to/results.md)."""
-_STRAIGHT = 1.0
-"""Distance (px) of a straight crack's nodes from its line: as near as a row of nodes follows a stated path."""
-_MOST_TERMS = 7
-"""Highest term of the series that a test may ask for."""
-_PER_COEFFICIENT = 4
-"""Least number of measured components of displacement for a coefficient of the series."""
-_CHANCE = 1e-3
-"""Probability with which noise alone asks for more terms of the series, over all frames together."""
-_GAP_DEG = 45.0
-"""Largest angle without a measured node: half of the shortest period, 90 degrees, of the terms up to the 7th that are
-left when the smooth ones are taken (chosen)."""
-_OUTSIDE = 0.02
-"""Part of an annulus that may be outside the mesh: slivers at the edge are left out of it."""
-_STEPS, _EXACT = 20, 1e-3
-"""Most Gauss-Newton steps of a tip's place, and the step (px) that ends them."""
-_POOR = 1.5
-"""Chi-square over its degrees of freedom from which a remark says that the field is not the series'."""
-_LEAST = 1e-3
-"""Least uncertainty of a node over the median one: a node that is stated without noise does not outweigh all others."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CrackTipConstants:
+    """Numbers of the fit at a crack's tip.
+
+    Attributes
+    ----------
+    inner
+        Least inner radius of an annulus, in elements: from there on K of an image without noise is right to .3 %
+        (measured, docs/how-to/results.md).
+    straight
+        Distance (px) of a straight crack's nodes from its line: as near as a row of nodes follows a stated path.
+    most_terms
+        Highest term of the series that a test may ask for.
+    per_coefficient
+        Least number of measured components of displacement for a coefficient of the series.
+    chance
+        Probability with which noise alone asks for more terms of the series, over all frames together.
+    gap_deg
+        Largest angle without a measured node: half of the shortest period, 90 degrees, of the terms up to the 7th that
+        are left when the smooth ones are taken (chosen).
+    outside
+        Part of an annulus that may be outside the mesh: slivers at the edge are left out of it.
+    steps, exact
+        Most Gauss-Newton steps of a tip's place, and the step (px) that ends them.
+    poor
+        Chi-square over its degrees of freedom from which a remark says that the field is not the series'.
+    least_std
+        Least uncertainty of a node over the median one: a node that is stated without noise does not outweigh all
+        others.
+    """
+
+    inner: float = 2.0
+    straight: float = 1.0
+    most_terms: int = 7
+    per_coefficient: int = 4
+    chance: float = 1e-3
+    gap_deg: float = 45.0
+    outside: float = 0.02
+    steps: int = 20
+    exact: float = 1e-3
+    poor: float = 1.5
+    least_std: float = 1e-3
+
+
+_CONSTANTS = CrackTipConstants()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,14 +184,22 @@ class StressIntensity:
     terms: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CrackTip:
     """A probe of the stress intensity factors at the tip of a straight crack.
 
+    Parameters
+    ----------
+    covariance
+        Of the mesh.
+    name
+        Name of the probe.
+    *place
+        Point x, y at the tip, then inner and outer radius of the annulus whose nodes are taken, px.
+    williams
+        Material, scale and what is fitted.
+
     Attributes
     ----------
-    name, nodes
-        See `Probe`.
     tip : ndarray, shape (2,)
         Place of the mesh's tip, px.
     axes : ndarray, shape (2, 2)
@@ -177,51 +208,40 @@ class CrackTip:
         The nodes of the annulus in these axes from the tip, px.
     face : ndarray, shape (m,)
         1 for a node on the left side of the crack, -1 on its right side, else 0.
-    radii : tuple of float
-        Of the annulus, px.
     correlation : ndarray, shape (m, m)
         Of the nodes' errors.
-    williams
-        Material, scale and what is fitted.
+    least
+        Least number of nodes for the terms that are asked for.
+    most_terms
+        Highest term that is taken, stated or allowed to the test.
+
+    Raises
+    ------
+    InputError
+        The place is no tip of the mesh, the crack is not straight up to the outer radius, or the annulus leaves the
+        region, has too few nodes, or reaches into the elements at the tip.
     """
 
-    name: str
-    nodes: npt.NDArray[np.int64]
-    tip: FloatArray
-    axes: FloatArray
-    points: FloatArray
-    face: FloatArray
-    radii: tuple[float, float]
-    correlation: FloatArray
-    williams: Williams
-
-    @classmethod
-    def at(cls, covariance: NodalCovariance, name: str, *place: float, williams: Williams) -> Self:
-        """Lay an annulus around the tip at x, y, from one radius to another, px.
-
-        Raises
-        ------
-        InputError
-            The place is no tip of the mesh, the crack is not straight up to the outer radius, or the annulus leaves the
-            region, has too few nodes, or reaches into the elements at the tip.
-        """
+    def __init__(self, covariance: NodalCovariance, name: str, *place: float, williams: Williams) -> None:
         mesh, (inner, outer) = covariance.mesh, place[2:]
+        self.name, self.williams, self.radii = name, williams, (float(inner), float(outer))
         faces, places = crack_faces(mesh), lowest_copies(mesh)
         alone = np.setdiff1d(faces, mesh.copies)
         node = nearest_node(mesh, name, alone, np.array(place[:2]), "the tip of a crack")
-        tip = mesh.nodes[node]
-        if not _INNER * mesh.size <= inner < outer:
+        self.tip = tip = mesh.nodes[node]
+        nearest = _CONSTANTS.inner * mesh.size
+        if not nearest <= inner < outer:
             raise InputError(
-                f"{name} needs an inner radius of 2 elements, {_INNER * mesh.size:.3g} px, or more, as nearer nodes do "
-                f"not resolve the field at a tip, and a larger outer one; given are {inner:g} and {outer:g} px"
+                f"{name} needs an inner radius of 2 elements, {nearest:.3g} px, or more, as nearer nodes do not "
+                f"resolve the field at a tip, and a larger outer one; given are {inner:g} and {outer:g} px"
             )
         near = np.setdiff1d(places[faces], node)
         behind = tip - mesh.nodes[near]
         behind = behind[np.hypot(*behind.T) < outer]
         ahead = behind.sum(axis=0) / np.hypot(*behind.sum(axis=0))
-        axes = np.array([ahead, [ahead[1], -ahead[0]]])
-        along, beside = axes @ behind.T
-        if np.abs(beside).max() > _STRAIGHT or along.min() < 0 or along.max() < outer - 2 * mesh.size:
+        self.axes = np.array([ahead, [ahead[1], -ahead[0]]])
+        along, beside = self.axes @ behind.T
+        if np.abs(beside).max() > _CONSTANTS.straight or along.min() < 0 or along.max() < outer - 2 * mesh.size:
             raise InputError(
                 f"{name} needs one crack that is straight from the tip at ({listed(tip.round(1))}) px to the outer "
                 f"radius, {outer:g} px; it is {along.max():.4g} px long there and leaves its line by "
@@ -231,20 +251,12 @@ class CrackTip:
         forward = (mesh.nodes[faces[:, 1]] - mesh.nodes[faces[:, 0]]) @ ahead > 0
         side[faces[forward]], side[faces[~forward]] = -1, 1
         away = np.hypot(*(mesh.nodes - tip).T)
-        nodes = np.flatnonzero((away >= inner) & (away <= outer))
-        probe = cls(
-            name=name,
-            nodes=nodes,
-            tip=tip,
-            axes=axes,
-            points=(mesh.nodes[nodes] - tip) @ axes.T,
-            face=side[nodes],
-            radii=(float(inner), float(outer)),
-            correlation=covariance.part(nodes),
-            williams=williams,
-        )
-        probe._check_annulus(mesh)
-        return probe
+        self.nodes = np.flatnonzero((away >= inner) & (away <= outer))
+        self.points, self.face = (mesh.nodes[self.nodes] - tip) @ self.axes.T, side[self.nodes]
+        self.correlation, per = covariance.part(self.nodes), _CONSTANTS.per_coefficient
+        self.least = per * ((williams.terms or 2) + 1)
+        self.most_terms = williams.terms or min(_CONSTANTS.most_terms, len(self.nodes) // per - 1)
+        self._check_annulus(mesh)
 
     def _check_annulus(self, mesh: Tri3Mesh) -> None:
         inner, outer = self.radii
@@ -252,27 +264,17 @@ class CrackTip:
         ring = self.tip + radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         outside = 1 - Places.of(mesh, ring.reshape(-1, 2)).inside.reshape(ring.shape[:2]).mean(axis=1)
         where = f"{self.name}: the annulus from {inner:g} to {outer:g} px around ({listed(self.tip.round(1))}) px"
-        if (outside > _OUTSIDE).any():
-            cut = int(np.argmax(outside > _OUTSIDE))
-            most = f"it may reach to {radii[cut - 1]:.4g} px" if cut else "no part of it is within"
+        if len(cut := np.flatnonzero(outside > _CONSTANTS.outside)):
+            most = f"it may reach to {radii[cut[0] - 1]:.4g} px" if cut[0] else "no part of it is within"
             raise InputError(
                 f"{where} leaves the region (edge or hole) at {100 * outside.max():.0f} % of its angles; {most}"
             )
         if not self._enough(np.ones(len(self.nodes), dtype=bool)):
             raise InputError(
                 f"{where} has {len(self.nodes)} nodes, none over up to {self._gap(self.points):.0f} degrees; "
-                f"{self._least} are needed, and one every {_GAP_DEG:g} degrees: widen it, or take smaller elements"
+                f"{self.least} are needed, and one every {_CONSTANTS.gap_deg:g} degrees: widen it, or take smaller "
+                "elements"
             )
-
-    @property
-    def _least(self) -> int:
-        """Least number of nodes for the terms that are asked for."""
-        return _PER_COEFFICIENT * ((self.williams.terms or 2) + 1)
-
-    @property
-    def most_terms(self) -> int:
-        """Highest term that is taken, stated or allowed to the test."""
-        return self.williams.terms or min(_MOST_TERMS, len(self.nodes) // _PER_COEFFICIENT - 1)
 
     def series(self, points: FloatArray, face: FloatArray, orders: range) -> FloatArray:
         """Evaluate terms at points (m, 2), those of a `face` on its side, in (r / outer radius)^(n/2); (m, 2, p)."""
@@ -285,7 +287,7 @@ class CrackTip:
         return float(np.degrees(np.diff(np.sort([-np.pi, *np.arctan2(points[:, 1], points[:, 0]), np.pi])).max()))
 
     def _enough(self, known: BoolArray) -> bool:
-        return bool(known.sum() >= self._least and self._gap(self.points[known]) <= _GAP_DEG)
+        return bool(known.sum() >= self.least and self._gap(self.points[known]) <= _CONSTANTS.gap_deg)
 
     def read(self, nodal: Nodal) -> StressIntensity:
         """Fit the series to the displacements of the `nodes` in every frame.
@@ -298,11 +300,10 @@ class CrackTip:
         fields = np.stack([nodal.u, nodal.v, nodal.u_std, nodal.v_std], axis=1)
         known: BoolArray = np.asarray(np.isfinite(fields).all(axis=1))
         frames = np.flatnonzero([self._enough(row) for row in known])
-        data = {frame: _Weighted.of(self, fields[frame], known[frame]) for frame in frames.tolist()}
+        data = {frame: _Weighted(self, fields[frame], known[frame]) for frame in frames.tolist()}
         fit_tip = self.williams.fit_tip
         terms = self.williams.terms or self._terms([one for one in data.values() if not one.certain])
-        found = np.full((len(fields), 4, 2), np.nan)
-        chi_square = np.full(len(fields), np.nan)
+        found, chi_square = np.full((len(fields), 4, 2), np.nan), np.full(len(fields), np.nan)
         for frame, weighted in data.items():
             if (fit := weighted.fit(terms, fit_tip=fit_tip)) is not None:
                 values, covariance, chi_square[frame] = fit
@@ -337,7 +338,7 @@ class CrackTip:
         freedom = np.array([2 * len(frame.points) - 2 * len(orders) for frame in frames])
         level = np.maximum(1, misfits[:, -1] / freedom)
         for terms in range(2, most):
-            limit = chi2.isf(_CHANCE / max(len(frames), 1), 2 * (most - terms))
+            limit = chi2.isf(_CONSTANTS.chance / max(len(frames), 1), 2 * (most - terms))
             if (misfits[:, terms - most - 1] - misfits[:, -1] < limit * level).all():
                 return terms
         return most
@@ -351,7 +352,7 @@ class CrackTip:
             f"({'stated' if w.terms else 'by a test'}), {len(self.nodes)} nodes at {listed(self.radii)} px, plane "
             f"{w.plane}, E = {w.youngs_modulus:g} MPa, nu = {w.poissons_ratio:g}"
         )
-        if np.isfinite(s.chi_square).any() and (worst := np.nanmax(s.chi_square)) > _POOR:
+        if np.isfinite(s.chi_square).any() and (worst := np.nanmax(s.chi_square)) > _CONSTANTS.poor:
             note += (
                 f"; its chi-square over the degrees of freedom is up to {worst:.3g}, where 1 is expected: the "
                 "field is not the series' within the noise, and what this makes of the factors is not known"
@@ -370,63 +371,47 @@ class CrackTip:
         ]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Weighted:
-    """The displacements of a frame in an annulus, without rotation, and what makes their errors independent.
+    """The displacements and uncertainties (4, m) of a frame in an annulus, without rotation, their errors independent.
 
     Attributes
     ----------
-    probe
-        The tip.
     points, face
         Those of `CrackTip` that are measured.
     data : ndarray, shape (2 m,)
         Displacements over their errors.
     turned : ndarray, shape (2, 2)
         The crack's axes as the body has turned: rows.
-    whiten
-        Divides fields (2, m, p) by their errors, (2 m, p).
     certain
         Whether the displacements are stated without uncertainty, as those of the reference: all errors are then 1 px.
     """
 
-    probe: CrackTip
-    points: FloatArray
-    face: FloatArray
-    data: FloatArray
-    turned: FloatArray
-    whiten: Callable[[FloatArray], FloatArray]
-    certain: bool
-
-    @classmethod
-    def of(cls, probe: CrackTip, field: FloatArray, known: BoolArray) -> Self:
-        """Take the measured of the displacements and uncertainties (4, m) of a frame."""
-        factor, std = cholesky(probe.correlation[np.ix_(known, known)], lower=True), field[2:, known]
+    def __init__(self, probe: CrackTip, field: FloatArray, known: BoolArray) -> None:
+        std = field[2:, known]
         level = float(np.median(std))
-        std = np.maximum(std, _LEAST * level) if level > 0 else np.ones_like(std)
-
-        def whiten(parts: FloatArray) -> FloatArray:
-            scaled = parts / std[:, :, None]
-            return np.concatenate([solve_triangular(factor, part, lower=True) for part in scaled])
-
-        points, face, most = probe.points[known], probe.face[known], probe.most_terms
-        arm = points @ probe.axes
+        self.probe, self.certain = probe, not level > 0
+        self._factor = cholesky(probe.correlation[np.ix_(known, known)], lower=True)
+        self._std = np.ones_like(std) if self.certain else np.maximum(std, _CONSTANTS.least_std * level)
+        self.points, self.face = probe.points[known], probe.face[known]
+        arm = self.points @ probe.axes
         arm -= arm.mean(axis=0)
         there = arm + field[:2, known].T
         there -= there.mean(axis=0)
         # the series is that of small rotations: the body's, from the best one (Kabsch), is then that of its own term
         angle = np.arctan2((arm[:, 0] * there[:, 1] - arm[:, 1] * there[:, 0]).sum(), (arm * there).sum())
         for last in (False, True):
-            turned = probe.axes @ (turn := np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]))
-            data = there - arm @ turn
+            turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+            self.turned, data = probe.axes @ turn, there - arm @ turn
             if not last:
-                series = probe.series(points, face, range(most + 1)).reshape(2 * len(points), -1)
-                rotation = np.linalg.lstsq(series, (data @ turned.T).ravel(), rcond=None)[0][5]
+                series = probe.series(self.points, self.face, range(probe.most_terms + 1)).reshape(2 * len(arm), -1)
+                rotation = np.linalg.lstsq(series, (data @ self.turned.T).ravel(), rcond=None)[0][5]
                 angle += (probe.williams.kolosov + 1) * rotation / probe.radii[1]
-        white = whiten(data.T[:, :, None])[:, 0]
-        return cls(
-            probe=probe, points=points, face=face, data=white, turned=turned, whiten=whiten, certain=not level > 0
-        )
+        self.data = self.whiten(data.T[:, :, None])[:, 0]
+
+    def whiten(self, parts: FloatArray) -> FloatArray:
+        """Divide fields (2, m, p) by their errors, (2 m, p)."""
+        scaled = parts / self._std[:, :, None]
+        return np.concatenate([solve_triangular(self._factor, part, lower=True) for part in scaled])
 
     def series(self, orders: range, tip: float = 0.0) -> FloatArray:
         """Evaluate the terms, in (r / outer radius)^(n/2), for a tip so many px ahead; (2, m, p)."""
@@ -446,7 +431,7 @@ class _Weighted:
         """
         orders, tip, step = range(terms + 1), 0.0, 1e-3 * self.probe.radii[1]
         solved = self._solved(self.series(orders))
-        for _ in range(_STEPS if fit_tip else 0):
+        for _ in range(_CONSTANTS.steps if fit_tip else 0):
             values = solved[0][: 2 * len(orders)]
             slope = (self.series(orders, tip + step) - self.series(orders, tip - step)) @ values / (2 * step)
             solved = self._solved(np.concatenate([self.series(orders, tip), slope[..., None]], axis=2))
@@ -454,7 +439,7 @@ class _Weighted:
             tip += change
             if not abs(tip) < self.probe.radii[0] / 2:
                 return None
-            if abs(change) < _EXACT:
+            if abs(change) < _CONSTANTS.exact:
                 return np.r_[solved[0][:-1], tip], *solved[1:]
         return None if fit_tip else solved
 
@@ -503,5 +488,5 @@ def stress_intensity(
         region, has too few nodes, or reaches into the elements at the tip.
     """
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
-    probe = CrackTip.at(covariance, "the tip", *tip, *radii, williams=williams)
+    probe = CrackTip(covariance, "the tip", *tip, *radii, williams=williams)
     return probe.read(at_some(displacement, probe.nodes))

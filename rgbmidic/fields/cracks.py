@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,11 +18,7 @@ from rgbmidic.fields.history import History, Nodal
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.outline_mesh import edge_keys
-from rgbmidic.typing import FloatArray
-
-_NEAR = 0.5
-"""Distance in elements within which a stated point counts as on a crack or at its tip: where a path of `[mesh] cracks`
-is moved, it is by as much."""
+from rgbmidic.typing import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,40 +45,16 @@ class Jump:
     sliding_std: FloatArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class JumpAlong:
-    """A probe of the jump across a crack, between two of its points.
+    """A probe of the jump across a crack of the mesh, from its point x0, y0 to x1, y1, px.
 
-    Attributes
-    ----------
-    name, nodes
-        See `Probe`.
-    points : ndarray, shape (n, 2)
-        Places along the crack, px.
-    sides : ndarray, shape (n, 2), int
-        Node on the left and on the right of each, as place in `nodes`; the same at a tip.
-    pairs : ndarray, shape (P,), int
-        The places at which both sides have one node each.
-    correlation : ndarray, shape (m, m)
-        Of the nodes' errors.
+    Raises
+    ------
+    InputError
+        The mesh has no crack, a point is not on one, or no pair of nodes lies between them.
     """
 
-    name: str
-    nodes: npt.NDArray[np.int64]
-    points: FloatArray
-    sides: npt.NDArray[np.int64]
-    pairs: npt.NDArray[np.int64]
-    correlation: FloatArray
-
-    @classmethod
-    def between(cls, covariance: NodalCovariance, name: str, *place: float) -> Self:
-        """Follow a crack of the mesh from the point x0, y0 to x1, y1, px.
-
-        Raises
-        ------
-        InputError
-            The mesh has no crack, a point is not on one, or no pair of nodes lies between them.
-        """
+    def __init__(self, covariance: NodalCovariance, name: str, *place: float) -> None:
         from scipy.sparse import csr_matrix
         from scipy.sparse.csgraph import dijkstra
 
@@ -92,32 +64,25 @@ class JumpAlong:
         length = np.hypot(*(mesh.nodes[faces[:, 1]] - mesh.nodes[faces[:, 0]]).T)
         graph = csr_matrix((length, places.T), shape=(len(mesh.nodes),) * 2)
         before = dijkstra(graph, directed=False, indices=np.array(ends[0]), return_predecessors=True)[1]
-        way = [ends[1]]
-        while before[way[-1]] >= 0:
-            way.append(before[way[-1]])
-        path = np.array(way[::-1])
+        path = [ends[1]]
+        while before[path[-1]] >= 0:
+            path.append(int(before[path[-1]]))
+        path.reverse()
         if path[0] != ends[0] or len(path) < 2:
             raise InputError(f"{name} needs two different points of one crack of the mesh, not {listed(place)} px")
         # an element is on the right of its sides as these run: the image has y down
         face = dict(zip(map(tuple, places.tolist()), faces.tolist(), strict=True))
-        steps = np.array([(face[end, start][::-1], face[start, end]) for start, end in pairwise(path.tolist())])
-        arrives, leaves = (
-            np.concatenate([steps[:1, :, 0], steps[:, :, 1]]),
-            np.concatenate([steps[:, :, 0], steps[-1:, :, 1]]),
-        )
+        steps = np.array([(face[end, start][::-1], face[start, end]) for start, end in pairwise(path)])
+        arrives = np.concatenate([steps[:1, :, 0], steps[:, :, 1]])
+        leaves = np.concatenate([steps[:, :, 0], steps[-1:, :, 1]])
         one = (arrives == leaves).all(axis=1)  # else another crack branches off here
-        pairs = np.flatnonzero(one & (arrives[:, 0] != arrives[:, 1]))
-        if not len(pairs):
+        # `sides` (n, 2): node on the left and on the right of each of `points`, as place in `nodes`; the same at a tip
+        self.pairs = np.flatnonzero(one & (arrives[:, 0] != arrives[:, 1]))
+        if not len(self.pairs):
             raise InputError(f"no pair of nodes lies on the crack between the points {listed(place)} px of {name}")
-        nodes, index = np.unique(arrives, return_inverse=True)
-        return cls(
-            name=name,
-            nodes=nodes,
-            points=mesh.nodes[path],
-            sides=index.reshape(-1, 2),
-            pairs=pairs,
-            correlation=covariance.part(nodes),
-        )
+        self.name, self.points = name, mesh.nodes[path]
+        self.nodes, index = np.unique(arrives, return_inverse=True)
+        self.sides, self.correlation = index.reshape(-1, 2), covariance.part(self.nodes)
 
     def read(self, nodal: Nodal) -> Jump:
         """Compute the jump from the displacements of the `nodes`; its uncertainty is that to first order."""
@@ -157,11 +122,9 @@ class JumpAlong:
         )
         parts = {"opening": (jump.opening, jump.opening_std), "sliding": (jump.sliding, jump.sliding_std)}
         return [
-            History(
-                name=f"{self.name}_{pair + 1}_{kind}", unit="px", values=values[:, pair], std=std[:, pair], note=note
-            )
+            History(name=f"{self.name}_{pair}_{kind}", unit="px", values=one, std=error, note=note)
             for kind, (values, std) in parts.items()
-            for pair in range(len(self.pairs))
+            for pair, (one, error) in enumerate(zip(values.T, std.T, strict=True), start=1)
         ]
 
 
@@ -170,32 +133,31 @@ def listed(numbers: Any) -> str:
     return ", ".join(f"{number:g}" for number in numbers)
 
 
-def lowest_copies(mesh: Tri3Mesh) -> npt.NDArray[np.int64]:
+def lowest_copies(mesh: Tri3Mesh) -> IntArray:
     """Lowest of the nodes at the same place, for every node (N,)."""
     place, copies = np.arange(len(mesh.nodes)), mesh.copies
     np.minimum.at(place, copies[:, 1], copies[:, 0])
     return place
 
 
-def crack_faces(mesh: Tri3Mesh) -> npt.NDArray[np.int64]:
+def crack_faces(mesh: Tri3Mesh) -> IntArray:
     """Both sides of the pieces of cracks as nodes (F, 2), in the order of their elements."""
     sides = mesh.elements[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     return sides[np.isin(edge_keys(sides, len(mesh.nodes)), edge_keys(mesh.crack_edges, len(mesh.nodes)))].astype(int)
 
 
-def nearest_node(
-    mesh: Tri3Mesh, name: str, nodes: npt.NDArray[np.int64], point: FloatArray, what: str = "on a crack"
-) -> int:
+def nearest_node(mesh: Tri3Mesh, name: str, nodes: IntArray, point: FloatArray, what: str = "on a crack") -> int:
     """Return the one of some nodes at a stated point, px."""
     if not len(nodes):
         raise InputError(f"{name}: no node of this result is {what}; cracks are stated in [mesh] cracks before the run")
     nodes = np.unique(nodes)
     away = np.hypot(*(mesh.nodes[nodes] - point).T)
     nearest = int(nodes[np.argmin(away)])
-    if away.min() > _NEAR * mesh.size:
+    near = 0.5 * mesh.size  # where a path of `[mesh] cracks` is moved, it is by as much
+    if away.min() > near:
         raise InputError(
             f"{name} at ({listed(point)}) px is not {what} of the mesh; the nearest node that is lies at "
-            f"({listed(mesh.nodes[nearest].round(1))}) px, {away.min():.3g} px away; {_NEAR * mesh.size:.3g} px count"
+            f"({listed(mesh.nodes[nearest].round(1))}) px, {away.min():.3g} px away; {near:.3g} px count"
         )
     return nearest
 
@@ -230,11 +192,11 @@ def crack_jump(
         The mesh has no crack, a point is not on one, or no pair of nodes lies between them.
     """
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
-    probe = JumpAlong.between(covariance, "the crack", *start, *end)
+    probe = JumpAlong(covariance, "the crack", *start, *end)
     return probe.read(at_some(displacement, probe.nodes))
 
 
-def at_some(nodal: Nodal, nodes: npt.NDArray[np.int64]) -> Nodal:
+def at_some(nodal: Nodal, nodes: IntArray) -> Nodal:
     """Displacements at some of the nodes."""
     parts = {name: np.asarray(getattr(nodal, name))[:, nodes] for name in ("u", "v", "u_std", "v_std")}
     return Nodal(**parts)

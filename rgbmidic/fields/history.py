@@ -24,18 +24,10 @@ import numpy.typing as npt
 from rgbmidic._kernels.rates import LOWEST, mean_rates
 from rgbmidic.errors import InputError
 from rgbmidic.fields.units import column
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
-_WIDE = 1.01
-"""Windows are as wide as stated and 1 % more: cameras round time stamps, to 1 us at 10,000 frames a second."""
-_KINK = 4.0
-"""Standard uncertainties by which the rates of both sides differ at a kink: in noise once in 16,000 frames."""
-_EXACT = 1e-3
-"""Least noise of a value over the median one: a value that is stated without noise does not outweigh all others."""
 SIGMA = 40.0
 """Standard deviation (px) of the paper's Gaussian filter."""
-_KNOWN = 1e-3
-"""Fraction of the filter's weight that must lie on measured pixels: single precision then holds the mean to 1e-4."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -95,7 +87,7 @@ class Probe(Protocol):
         """First part of the names of its histories."""
 
     @property
-    def nodes(self) -> npt.NDArray[np.int64]:
+    def nodes(self) -> IntArray:
         """Nodes that it needs."""
 
     def histories(self, nodal: Nodal) -> list[History]:
@@ -221,7 +213,7 @@ def rates(
         raise InputError(f"rates need a time for each frame, not {when.shape} for values {what.shape}, {error.shape}")
     if not (np.diff(when) > 0).all():
         raise InputError("rates need the times of the frames to rise from each to the next")
-    reach = window * _WIDE
+    reach = 1.01 * window  # cameras round time stamps, to 1 us at 10,000 frames a second
     most = int((np.searchsorted(when, when + reach, side="right") - np.arange(len(when))).max())
     if most < FEWEST:
         raise InputError(
@@ -237,8 +229,8 @@ def rates(
     out[:, 1] = np.sqrt(np.maximum(out[:, 1], 0))
     out /= reach ** np.array(list(_POWERS.values()), dtype=np.float64)[:, None]
     before, after = out[:, :, 3:5], out[:, :, 5:]
-    with np.errstate(invalid="ignore"):
-        kink = (np.abs(after[:, 0] - before[:, 0]) > _KINK * np.hypot(after[:, 1], before[:, 1])).any(axis=1)
+    with np.errstate(invalid="ignore"):  # a kink is 4 standard uncertainties: in noise once in 16,000 frames
+        kink = (np.abs(after[:, 0] - before[:, 0]) > 4 * np.hypot(after[:, 1], before[:, 1])).any(axis=1)
     out[:, :, 3:] = np.where(kink[:, None, None], out[:, :, 3:], np.nan)
     named = out.transpose(1, 2, 3, 0).reshape(2, len(_POWERS), *what.shape)
     return Rates(
@@ -263,7 +255,8 @@ def _noise(
     least = np.where(np.isfinite(least), least, variance / (1 - fraction))
     noise = np.sqrt(np.where(references, (1 - fraction) * least, np.maximum(variance - fraction * least, 0)))
     middle, size = np.median(noise, axis=1), np.abs(np.nan_to_num(values)).max(axis=1)
-    floor = np.where(middle > 0, _EXACT * middle, 1e-9 * size + np.finfo(float).tiny)
+    # a value that is stated without noise does not outweigh all others
+    floor = np.where(middle > 0, 1e-3 * middle, 1e-9 * size + np.finfo(float).tiny)
     return np.where(known, np.maximum(noise, floor[:, None]), 0.0), fraction * least
 
 
@@ -302,8 +295,9 @@ def high_pass(field: npt.ArrayLike, sigma: float = SIGMA) -> FloatArray:
     trend, laplacian = _quadratic_trend(values, known)
     rest = np.where(known, values - trend, 0.0)
     weight = _blur(known.astype(np.float64), sigma)
-    smooth = _blur(rest, sigma) / np.maximum(weight, _KNOWN)
-    usable = known & (weight > _KNOWN)
+    least = 1e-3  # of the weight on measured pixels: single precision then holds the mean to 1e-4
+    smooth = _blur(rest, sigma) / np.maximum(weight, least)
+    usable = known & (weight > least)
     return np.where(usable, rest - smooth - sigma**2 / 2 * laplacian, np.nan)
 
 

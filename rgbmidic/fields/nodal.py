@@ -1,4 +1,4 @@
-"""Nodal fields: points in a mesh, fields between nodes and pixels, and the covariance of nodes and of frames.
+"""Nodal fields: points in a mesh, nodes and pixels, the covariance of nodes and of frames, rigid motion.
 
 The solve is a least-squares fit of linear elements, whose covariance is the inverse of a Hessian: for a texture that is
 alike everywhere the inverse of the mesh's mass matrix. The displacement at a node is then that of a quadratic through
@@ -25,16 +25,10 @@ from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matr
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.mesh.quadratic_fit import blended, quadratic_fit
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage, IntArray
 
-_CANDIDATES = 24
-"""Elements nearest to a point among which its own is looked for: their sizes in one mesh differ by a factor of 2."""
-_EDGE = 1e-6
-"""How far outside an element, in barycentric coordinates, a point may be and still belong to it: rounding, 1e-5 px."""
 _LOW, _HIGH = 0.5, 2.0
 """Bounds of the eigenvalues of a TRI3 mass matrix over its diagonal, on any mesh (Wathen, IMA J Numer Anal 7, 1987)."""
-_RINGS = 4
-"""Edges from a node up to which the inverse mass matrix is kept: what lies beyond is .8 % or less."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,7 +51,7 @@ class Places:
     mesh: Tri3Mesh
     points: FloatArray
     inside: BoolArray
-    element: npt.NDArray[np.int64]
+    element: IntArray
     barycentric: FloatArray
 
     @classmethod
@@ -80,13 +74,13 @@ class Places:
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         corners, slopes = mesh.nodes[mesh.elements], mesh.shape_gradients()
         middle = corners.mean(axis=1)
-        count = min(_CANDIDATES, len(middle))
+        count = min(24, len(middle))  # the nearest elements: their sizes in one mesh differ by a factor of 2
         near = np.asarray(cKDTree(middle).query(points, k=count)[1]).reshape(len(points), count)
         shape = 1 / 3 + np.einsum("pced,pcd->pce", slopes[near], points[:, None] - middle[near])
         best = shape.min(axis=2).argmax(axis=1)
         row = np.arange(len(points))
         barycentric = shape[row, best]
-        inside = barycentric.min(axis=1) >= -_EDGE
+        inside = barycentric.min(axis=1) >= -1e-6  # rounding, 1e-5 px
         return cls(mesh=mesh, points=points, inside=inside, element=near[row, best], barycentric=barycentric)
 
     def check(self, what: str) -> None:
@@ -235,7 +229,7 @@ class NodalCovariance:
         """
         mass = mass_matrix(mesh)
         scale = sp.diags(1 / np.sqrt(mass.diagonal()))
-        inverse = scale @ _chebyshev_inverse(sp.csr_matrix(scale @ mass @ scale), _RINGS) @ scale
+        inverse = scale @ _chebyshev_inverse(sp.csr_matrix(scale @ mass @ scale)) @ scale
         everywhere = np.ones(len(mesh.elements), dtype=bool)
         recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes)), linear_fit_offset(mesh)).value
         whole = sp.csr_matrix(recovery @ inverse @ recovery.T)
@@ -261,7 +255,7 @@ class NodalCovariance:
         total = np.einsum("fn,fn->f", flat @ self.correlation, flat)
         return np.asarray(np.maximum(total, 0)).reshape(parts.shape[:-1])
 
-    def part(self, nodes: npt.NDArray[np.int64]) -> FloatArray:
+    def part(self, nodes: IntArray) -> FloatArray:
         """Extract the correlation (m, m) of some nodes, given by their indices (m,).
 
         Parameters
@@ -279,11 +273,12 @@ class NodalCovariance:
         return np.asarray((chosen @ self.correlation @ chosen.T).toarray())
 
 
-def _chebyshev_inverse(matrix: sp.csr_matrix, degree: int) -> sp.csr_matrix:
+def _chebyshev_inverse(matrix: sp.csr_matrix, degree: int = 4) -> sp.csr_matrix:
     """Approximate the inverse of a matrix with eigenvalues in the bounds above by the best polynomial of a `degree`.
 
     Saad, Iterative methods for sparse linear systems, algorithm 12.1, on the unit matrix. Every such polynomial is
-    positive within the bounds, so that no combination of nodes gets a negative variance.
+    positive within the bounds, so that no combination of nodes gets a negative variance. The degree is the number of
+    edges from a node up to which the inverse is kept: what lies beyond 4 is .8 % or less.
     """
     middle, half = (_HIGH + _LOW) / 2, (_HIGH - _LOW) / 2
     residual: Any = sp.eye(matrix.shape[0], format="csr")
@@ -360,3 +355,111 @@ def difference_std(first: FloatArray, second: FloatArray, common_fraction: float
     first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     shared = common_fraction * np.minimum(first, second) ** 2
     return np.asarray(np.sqrt(first**2 + second**2 - 2 * shared))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RigidMotion:
+    """Shift and rotation that fit a displacement field best, by least squares over its measured nodes.
+
+    Attributes
+    ----------
+    centre : ndarray, shape (2,)
+        Middle of the measured nodes on the reference, px: the shift is that of this point.
+    shift, shift_std : ndarray, shape (2,)
+        In px.
+    rotation, rotation_std : float
+        In rad, from x towards y.
+    """
+
+    centre: FloatArray
+    shift: FloatArray
+    shift_std: FloatArray
+    rotation: float
+    rotation_std: float
+
+    @classmethod
+    def of(
+        cls, covariance: NodalCovariance, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray
+    ) -> Self:
+        """Fit shift and rotation of any size (Kabsch, Acta Cryst A32, 1976).
+
+        Parameters
+        ----------
+        covariance
+            Of the mesh.
+        u, v, u_std, v_std : ndarray, shape (N,)
+            In px; NaN where not measured.
+
+        Returns
+        -------
+        RigidMotion
+
+        Raises
+        ------
+        InputError
+            Fewer than two nodes are measured.
+        """
+        nodes, known = covariance.mesh.nodes, np.isfinite(u + v + u_std + v_std)
+        if known.sum() < 2:
+            raise InputError("a rigid motion needs two measured nodes or more")
+        centre = nodes[known].mean(axis=0)
+        arm, moved = nodes[known] - centre, np.stack([u, v], axis=1)[known]
+        shift = moved.mean(axis=0)
+        there = arm + moved - shift
+        along, turned = (arm * there).sum(), (arm[:, 0] * there[:, 1] - arm[:, 1] * there[:, 0]).sum()
+        even = known / known.sum()
+        lever = np.zeros((2, len(nodes)))
+        angle = float(np.arctan2(turned, along))
+        # d(angle) = sum of (arm, turned along) x d(moved) / (arm . there)
+        c, s = np.cos(angle), np.sin(angle)
+        lever[:, known] = np.stack([-(s * arm[:, 0] + c * arm[:, 1]), c * arm[:, 0] - s * arm[:, 1]]) / np.hypot(
+            along, turned
+        )
+        variance = [covariance.variance(even, part) for part in (u_std, v_std)]
+        turning = covariance.variance(lever[0], u_std) + covariance.variance(lever[1], v_std)
+        return cls(
+            centre=centre,
+            shift=shift,
+            shift_std=np.sqrt(np.array(variance)),
+            rotation=angle,
+            rotation_std=float(np.sqrt(turning)),
+        )
+
+    def removed(self, nodes: FloatArray, field: FloatArray) -> FloatArray:
+        """Subtract the rigid motion from a displacement field: the field in axes that move with the body.
+
+        The remaining displacements are rotated back, so that lengths and strains stay as they are.
+
+        Parameters
+        ----------
+        nodes : ndarray, shape (N, 2)
+            In px on the reference.
+        field : ndarray, shape (4, N)
+            u, v and their standard uncertainty, px. That of the rigid motion itself is not added: it is the less, the
+            more nodes there are.
+
+        Returns
+        -------
+        ndarray, shape (4, N)
+            As `field`.
+        """
+        c, s = np.cos(self.rotation), np.sin(self.rotation)
+        back = np.array([[c, s], [-s, c]])
+        arm = nodes - self.centre
+        left = (arm + field[:2].T - self.shift) @ back.T - arm
+        return np.concatenate([left.T, np.sqrt(back**2 @ field[2:] ** 2)])
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """Compute the displacement (P, 2) in px of points (P, 2) by the rigid motion alone.
+
+        Parameters
+        ----------
+        points : ndarray, shape (P, 2)
+            Points (x, y) on the reference, px.
+
+        Returns
+        -------
+        ndarray, shape (P, 2)
+        """
+        c, s = np.cos(self.rotation), np.sin(self.rotation)
+        return np.asarray((points - self.centre) @ (np.array([[c, -s], [s, c]]) - np.eye(2)).T + self.shift)

@@ -8,7 +8,8 @@ those on the reference.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,25 +19,40 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.crack_tip import CrackTip, Williams
 from rgbmidic.fields.cracks import JumpAlong
 from rgbmidic.fields.history import History, Nodal, Probe
-from rgbmidic.fields.measures import MEASURES, Strain, strain_of_gradient
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.plane import Rectification
-from rgbmidic.fields.strain import StrainGauges
+from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.settings import ProbeSettings
-from rgbmidic.typing import BoolArray, FloatArray
-
-_LEAST = 0.5
-"""Least part of an area that must be measured for its mean to be stated: the larger part represents the whole."""
-_WHOLE = 0.995
-"""Part of a place from which nothing is said of the rest, which is rounding of its points. Chosen."""
-_ROUNDING = 1e-9
-"""Of a sum of weights."""
-_STEP = 1.0
-"""Distance in px of the points that stand for a line or an area: an element of 10 px holds some 40."""
+from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProbeConstants:
+    """Numbers by which places are laid and judged.
+
+    Attributes
+    ----------
+    least
+        Least part of an area that must be measured for its mean to be stated: the larger part represents the whole.
+    whole
+        Part of a place from which nothing is said of the rest, which is rounding of its points. Chosen.
+    rounding
+        Of a sum of weights.
+    step
+        Distance in px of the points that stand for a line or an area: an element of 10 px holds some 40.
+    """
+
+    least: float = 0.5
+    whole: float = 0.995
+    rounding: float = 1e-9
+    step: float = 1.0
+
+
+_CONSTANTS = ProbeConstants()
+
+
+@dataclass(kw_only=True, eq=False)
 class Mean:
     """Displacement at a point, or its mean along a line or over an area: u and v.
 
@@ -55,7 +71,7 @@ class Mean:
     """
 
     name: str
-    nodes: npt.NDArray[np.int64]
+    nodes: IntArray
     weights: FloatArray
     correlation: FloatArray
     least: float = 1.0
@@ -94,7 +110,7 @@ class Mean:
             nodes=nodes,
             weights=weights[nodes],
             correlation=covariance.part(nodes),
-            least=least - _ROUNDING,
+            least=least - _CONSTANTS.rounding,
         )
 
     def histories(self, nodal: Nodal) -> list[History]:
@@ -109,29 +125,13 @@ class Mean:
         -------
         list of History
         """
-        uv = [*zip("uv", self.read(nodal), strict=True)]
-        used = np.where(np.isfinite(uv[0][1][0]), _known(nodal) @ self.weights, 1.0)
-        note = _cut(self.name, "mean", self.inside * used)
+        known = _known(nodal)
+        u, v = (self.average(*pair, known) for pair in ((nodal.u, nodal.u_std), (nodal.v, nodal.v_std)))
+        note = _cut(self.name, "mean", self.inside * np.where(np.isfinite(u[0]), known @ self.weights, 1.0))
         return [
             History(name=f"{self.name}_{name}", unit="px", values=values, std=std, note=note)
-            for name, (values, std) in uv
+            for name, (values, std) in {"u": u, "v": v}.items()
         ]
-
-    def read(self, nodal: Nodal) -> list[tuple[FloatArray, FloatArray]]:
-        """Average u and v, each (T,), with their standard uncertainty.
-
-        Parameters
-        ----------
-        nodal
-            Displacements of its `nodes` in every frame.
-
-        Returns
-        -------
-        list of (ndarray, ndarray), shape (T,) each
-            Mean of u, then of v, with its standard uncertainty, px.
-        """
-        known = _known(nodal)
-        return [self.average(*pair, known) for pair in ((nodal.u, nodal.u_std), (nodal.v, nodal.v_std))]
 
     def average(
         self, values: FloatArray, std: FloatArray, known: BoolArray, *, alike: bool = False
@@ -171,20 +171,20 @@ def _known(nodal: Nodal) -> BoolArray:
 def _cut(name: str, what: str, used: FloatArray) -> str:
     """What is said of a probe of which only a part (T,) is `used`, where it reaches beyond what is measured."""
     least = float(used.min(initial=1.0))
-    if least > _WHOLE:
+    if least > _CONSTANTS.whole:
         return ""
     return f"{name} is the {what} of {least:.0%} of its place at least: the rest lies outside the region or has no data"
 
 
 def _line(x0: float, y0: float, x1: float, y1: float) -> FloatArray:
-    return np.linspace((x0, y0), (x1, y1), int(np.hypot(x1 - x0, y1 - y0) / _STEP) + 2)
+    return np.linspace((x0, y0), (x1, y1), int(np.hypot(x1 - x0, y1 - y0) / _CONSTANTS.step) + 2)
 
 
 def _rectangle(x0: float, y0: float, x1: float, y1: float) -> FloatArray:
     """Make the points (P, 2) that stand for the cells of a rectangle."""
     axes = []
     for low, high in ((min(x0, x1), max(x0, x1)), (min(y0, y1), max(y0, y1))):
-        count = max(int(np.ceil((high - low) / _STEP)), 1)
+        count = max(int(np.ceil((high - low) / _CONSTANTS.step)), 1)
         axes.append(low + (np.arange(count) + 0.5) * (high - low) / count)
     x, y = np.meshgrid(*axes)
     return np.stack([x.ravel(), y.ravel()], axis=1)
@@ -195,166 +195,84 @@ def _circle(x: float, y: float, radius: float) -> FloatArray:
     return grid[np.hypot(grid[:, 0] - x, grid[:, 1] - y) <= radius]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Gauge:
     """An extensometer between two points: extension in px and strain, extension over length.
 
-    Attributes
+    Parameters
     ----------
+    covariance
+        Of the mesh.
     name
-        See `Probe`.
-    ends : ndarray, shape (2, 2)
-        Both points, px.
-    difference
-        Of the displacements at both ends, as a mean whose weights add up to 0.
+        Name of the gauge.
+    *place
+        Ends x0, y0, x1, y1 in px on the reference.
     moving
         Whether the length is that between the points as they move; else the extension along the line as it was.
+
+    Raises
+    ------
+    InputError
+        A point is outside the region, or both are the same.
     """
 
-    name: str
-    ends: FloatArray
-    difference: Mean
-    moving: bool
-
-    @classmethod
-    def between(cls, covariance: NodalCovariance, name: str, *place: float, moving: bool = True) -> Gauge:
-        """Lay a gauge between two points, x0, y0, x1, y1 in px.
-
-        Parameters
-        ----------
-        covariance
-            Of the mesh.
-        name
-            Name of the gauge.
-        *place
-            Ends x0, y0, x1, y1 in px on the reference.
-        moving
-            Whether the gauge goes with the specimen.
-
-        Returns
-        -------
-        Gauge
-
-        Raises
-        ------
-        InputError
-            A point is outside the region, or both are the same.
-        """
+    def __init__(self, covariance: NodalCovariance, name: str, *place: float, moving: bool = True) -> None:
         ends = np.array(place, dtype=np.float64).reshape(2, 2)
-        if not np.hypot(*(ends[1] - ends[0])) > 0:
+        self.name, self.moving, self.arm = name, moving, ends[1] - ends[0]
+        if not np.hypot(*self.arm) > 0:
             raise InputError(f"{name} needs two different points, not ({place[0]:g}, {place[1]:g}) twice")
         Places.of(covariance.mesh, ends).check(name)
         first, second = (Places.of(covariance.mesh, end).mean() for end in ends)
-        nodes = np.flatnonzero(second - first).astype(np.int64)
-        correlation = covariance.part(nodes)
-        difference = Mean(name=name, nodes=nodes, weights=(second - first)[nodes], correlation=correlation)
-        return cls(name=name, ends=ends, difference=difference, moving=moving)
-
-    @property
-    def nodes(self) -> npt.NDArray[np.int64]:
-        """The nodes around both points."""
-        return self.difference.nodes
-
-    @property
-    def length(self) -> float:
-        """Distance of both points on the reference, px."""
-        return float(np.hypot(*(self.ends[1] - self.ends[0])))
+        self.nodes = np.flatnonzero(second - first).astype(np.int64)
+        self.weights, self.correlation = (second - first)[self.nodes], covariance.part(self.nodes)
 
     def histories(self, nodal: Nodal) -> list[History]:
-        """Compute the extension in px and the strain.
-
-        Parameters
-        ----------
-        nodal
-            Displacements of its `nodes` in every frame.
-
-        Returns
-        -------
-        list of History
-        """
-        d = self.difference
-        apart = np.stack([nodal.u @ d.weights, nodal.v @ d.weights], axis=1)
-        arm = self.ends[1] - self.ends[0]
-        now = arm + apart if self.moving else np.broadcast_to(arm, apart.shape)
+        """Compute the extension in px and the strain from the displacements of its `nodes` in every frame."""
+        length = float(np.hypot(*self.arm))
+        apart = np.stack([nodal.u @ self.weights, nodal.v @ self.weights], axis=1)
+        now = self.arm + apart if self.moving else np.broadcast_to(self.arm, apart.shape)
         towards = now / np.hypot(*now.T)[:, None]
-        extension = np.hypot(*now.T) - self.length if self.moving else (towards * apart).sum(axis=1)
-        parts = [d.weights * std for std in (nodal.u_std, nodal.v_std)]
-        spread = np.stack([np.einsum("tm,tm->t", part @ d.correlation, part) for part in parts], axis=1)
+        extension = np.hypot(*now.T) - length if self.moving else (towards * apart).sum(axis=1)
+        parts = [self.weights * std for std in (nodal.u_std, nodal.v_std)]
+        spread = np.stack([np.einsum("tm,tm->t", part @ self.correlation, part) for part in parts], axis=1)
         std = np.sqrt(np.maximum((towards**2 * spread).sum(axis=1), 0))
         return [
             History(name=f"{self.name}_extension", unit="px", values=extension, std=std),
-            History(name=f"{self.name}_strain", unit="", values=extension / self.length, std=std / self.length),
+            History(name=f"{self.name}_strain", unit="", values=extension / length, std=std / length),
         ]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StrainGauge:
     """A virtual strain gauge: strain, principal strains with their direction, equivalent of the Hencky strain.
 
-    Attributes
+    Parameters
     ----------
-    name, nodes
-        See `Probe`.
-    gauges
-        One gauge, whose nodes count as in `nodes`.
+    covariance
+        Of the mesh.
+    name
+        Name of the gauge.
+    x, y
+        Its middle in px on the reference.
+    length
+        Its length in px.
     measure
-        One of `rgbmidic.fields.MEASURES`.
-    inside
-        Part of the gauge that lies in the region.
+        Strain measure, as of `strain_of`.
+
+    Raises
+    ------
+    InputError
+        It is outside the region, or too short.
     """
 
-    name: str
-    nodes: npt.NDArray[np.int64]
-    gauges: StrainGauges
-    measure: str
-    inside: float
-
-    @classmethod
-    def around(
-        cls, covariance: NodalCovariance, name: str, x: float, y: float, length: float, *, measure: str = MEASURES[0]
-    ) -> StrainGauge:
-        """Lay a gauge of a length around a point, px; an `InputError` where it is outside the region or too short.
-
-        Parameters
-        ----------
-        covariance
-            Of the mesh.
-        name
-            Name of the gauge.
-        x, y
-            Its middle in px on the reference.
-        length
-            Its length in px.
-        measure
-            Strain measure, as of `strain_of`.
-
-        Returns
-        -------
-        StrainGauge
-        """
+    def __init__(
+        self, covariance: NodalCovariance, name: str, x: float, y: float, length: float, *, measure: str = MEASURES[0]
+    ) -> None:
         gauges = StrainGauges.at_points(covariance, np.array([[x, y]]), length)
-        nodes = np.unique(gauges.nodes)
-        reduced = replace(
-            gauges,
-            points=gauges.points[nodes],
-            nodes=np.searchsorted(nodes, gauges.nodes),
-            needed=gauges.needed[:, nodes],
-        )
-        inside = float(Places.of(covariance.mesh, _circle(x, y, reduced.length / 2)).inside.mean())
-        return cls(name=name, nodes=nodes, gauges=reduced, measure=measure, inside=inside)
+        self.name, self.measure, self.nodes = name, measure, np.unique(gauges.nodes)
+        self.gauges = gauges.of_nodes(self.nodes)
+        self.inside = float(Places.of(covariance.mesh, _circle(x, y, gauges.length / 2)).inside.mean())
 
     def histories(self, nodal: Nodal) -> list[History]:
-        """Compute exx, eyy, exy, e1, e2, the direction of e1 and the von Mises equivalent.
-
-        Parameters
-        ----------
-        nodal
-            Displacements of its `nodes` in every frame.
-
-        Returns
-        -------
-        list of History
-        """
+        """Compute strain, principal strains and equivalent from the displacements of its `nodes` in every frame."""
         rows = zip(nodal.u, nodal.v, nodal.u_std, nodal.v_std, strict=True)
         gradients, covariances = zip(*(self.gauges.gradient(*row) for row in rows), strict=True)
         strain = strain_of_gradient(np.concatenate(gradients), np.concatenate(covariances), self.measure)
@@ -375,12 +293,22 @@ def _strain_histories(name: str, strain: Strain, note: str) -> list[History]:
     ]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Area(Mean):
     """Mean displacement over an area, and the strain of the mean displacement gradient over it.
 
     The gradient of a linear displacement is constant in an element, so that its mean over the area is one of the
     elements, each by the part of the area that it holds. It is that of the nodes around the area alone (Gauss).
+
+    Parameters
+    ----------
+    covariance
+        Of the mesh.
+    name
+        Name of the probe.
+    points : ndarray, shape (P, 2)
+        Middles of equal parts of the area on the reference, px.
+    measure
+        Strain measure, as of `strain_of`.
 
     Attributes
     ----------
@@ -390,56 +318,24 @@ class Area(Mean):
         Fraction of the area within each; their sum is 1.
     slopes : ndarray, shape (E, 3, 2)
         Gradient of the shape functions, per px.
-    measure
-        One of `rgbmidic.fields.MEASURES`.
+
+    Raises
+    ------
+    InputError
+        Half of the area or more is outside the region.
     """
 
-    elements: npt.NDArray[np.int64]
-    parts: FloatArray
-    slopes: FloatArray
-    measure: str
-
-    @classmethod
-    def of(cls, covariance: NodalCovariance, name: str, points: FloatArray, measure: str = MEASURES[0]) -> Area:
-        """Average over the area that points (P, 2) stand for, px.
-
-        Parameters
-        ----------
-        covariance
-            Of the mesh.
-        name
-            Name of the probe.
-        points : ndarray, shape (P, 2)
-            Middles of equal parts of the area on the reference, px.
-        measure
-            Strain measure, as of `strain_of`.
-
-        Returns
-        -------
-        Area
-
-        Raises
-        ------
-        InputError
-            Half of the area or more is outside the region.
-        """
+    def __init__(self, covariance: NodalCovariance, name: str, points: FloatArray, measure: str = MEASURES[0]) -> None:
         mesh, places = covariance.mesh, Places.of(covariance.mesh, points)
-        if (inside := float(places.inside.mean())) < _LEAST:
+        if (inside := float(places.inside.mean())) < _CONSTANTS.least:
             raise InputError(f"half or more of {name} is outside {places.where}")
         elements, count = np.unique(places.element[places.inside], return_counts=True)
         nodes = np.unique(mesh.elements[elements]).astype(np.int64)
-        return cls(
-            name=name,
-            nodes=nodes,
-            weights=places.mean()[nodes],
-            correlation=covariance.part(nodes),
-            least=_LEAST - _ROUNDING,
-            inside=inside,
-            elements=np.searchsorted(nodes, mesh.elements[elements]),
-            parts=count / count.sum(),
-            slopes=mesh.shape_gradients()[elements],
-            measure=measure,
-        )
+        weights, correlation = places.mean()[nodes], covariance.part(nodes)
+        least = _CONSTANTS.least - _CONSTANTS.rounding
+        super().__init__(name=name, nodes=nodes, weights=weights, correlation=correlation, least=least, inside=inside)
+        self.elements, self.parts = np.searchsorted(nodes, mesh.elements[elements]), count / count.sum()
+        self.slopes, self.measure = mesh.shape_gradients()[elements], measure
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px, then strain, principal strains and equivalent strain.
@@ -453,7 +349,7 @@ class Area(Mean):
         -------
         list of History
         """
-        moved, known = Mean.histories(self, nodal), _known(nodal)
+        moved, known = super().histories(nodal), _known(nodal)
         gradient, covariance = np.full((len(known), 2, 2), np.nan), np.full((len(known), 4, 4), np.nan)
         patterns, of_frame = np.unique(known[:, self.elements].all(axis=2), axis=0, return_inverse=True)
         for place, there in enumerate(patterns):
@@ -474,14 +370,14 @@ class Area(Mean):
 _Make = Callable[..., Probe]
 PROBES: dict[str, tuple[int, int, _Make]] = {
     "point": (1, 0, lambda c, name, *place: Mean.over(c, name, [place])),
-    "line": (2, 0, lambda c, name, *place: Mean.over(c, name, _line(*place), _LEAST)),
-    "circle": (1, 1, lambda c, name, *place, **more: Area.of(c, name, _circle(*place), **more)),
-    "region": (2, 0, lambda c, name, *place, **more: Area.of(c, name, _rectangle(*place), **more)),
-    "gauge": (2, 0, Gauge.between),
-    "straight_gauge": (2, 0, lambda *a, **k: Gauge.between(*a, **k, moving=False)),
-    "strain_gauge": (1, 1, StrainGauge.around),
-    "crack": (2, 0, JumpAlong.between),
-    "tip": (1, 2, CrackTip.at),
+    "line": (2, 0, lambda c, name, *place: Mean.over(c, name, _line(*place), _CONSTANTS.least)),
+    "circle": (1, 1, lambda c, name, *place, **more: Area(c, name, _circle(*place), **more)),
+    "region": (2, 0, lambda c, name, *place, **more: Area(c, name, _rectangle(*place), **more)),
+    "gauge": (2, 0, Gauge),
+    "straight_gauge": (2, 0, partial(Gauge, moving=False)),
+    "strain_gauge": (1, 1, StrainGauge),
+    "crack": (2, 0, JumpAlong),
+    "tip": (1, 2, CrackTip),
 }
 """Every kind of probe with how many points and lengths (px) place it, and what makes it."""
 _STRAINED = ("circle", "region", "strain_gauge")

@@ -11,11 +11,10 @@ between the positions; the speed is that of the straight line through the arriva
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,50 +30,94 @@ from rgbmidic.typing import BoolArray, FloatArray
 
 ARRIVALS = ("front", "peak")
 """What arrives: the rise through a fraction of the peak, or the peak."""
-_LEAST = 0.5
-"""Least part of a line that must be inside the region: the larger part represents the whole, as of a probe's."""
-_STEP = 0.382
-"""Distance of the points along a line in elements, the golden section: the positions of a fit then lie anywhere between
-the nodes, and what interpolation leaves out shows in its chi-square. With half an element it was 3.4 times that."""
-_AROUND = 4.0
-"""Elements around a line whose nodes are read: the quadratic at a node is fitted to those within two edges of it."""
-_LOPSIDED = 0.1
-"""Elements by which the middle of a gauge's nodes may lie off its own along a line: a tenth of what an edge does."""
-_CLEAR = 5.0
-"""Standard uncertainties that a peak must reach: noise alone does in one of 3,500 series of 500 frames."""
-_SMOOTHEST = 3.5
-"""Least half-width of the smoothing in frames: a parabola through six or more of them."""
-_DETERMINED = 1e-4
-"""Least determinant of a parabola's normal equations over that of its weights; with all frames it is .01."""
-_FINE = 8
-"""Places of the smooth curve to an interval of the frames. With 16 the arrival times change by less than 1e-3 of it."""
-_ROWS = 1000
-"""Places whose weights are computed at once: 80 MB for a test of 10,000 frames."""
-_RISE = (0.2, 0.8)
-"""Fractions of the peak between which a front rises, by which the smoothing is chosen: nearly straight for a half sine
-and for an error function."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProfileConstants:
+    """Numbers of a profile along a line and of the fit of a front.
+
+    Attributes
+    ----------
+    least
+        Least part of a line that must be inside the region: the larger part represents the whole, as of a
+        probe's.
+    step
+        Distance of the points along a line in elements, the golden section: the positions of a fit then lie
+        anywhere between the nodes, and what interpolation leaves out shows in its chi-square. With half an
+        element it was 3.4 times that.
+    around
+        Elements around a line whose nodes are read: the quadratic at a node is fitted to those within two edges
+        of it.
+    lopsided
+        Elements by which the middle of a gauge's nodes may lie off its own along a line: a tenth of what an
+        edge does.
+    clear
+        Standard uncertainties that a peak must reach: noise alone does in one of 3,500 series of 500 frames.
+    smoothest
+        Least half-width of the smoothing in frames: a parabola through six or more of them.
+    determined
+        Least determinant of a parabola's normal equations over that of its weights; with all frames it is .01.
+    fine
+        Places of the smooth curve to an interval of the frames. With 16 the arrival times change by less than
+        1e-3 of it.
+    rows
+        Places whose weights are computed at once: 80 MB for a test of 10,000 frames.
+    rise
+        Fractions of the peak between which a front rises, by which the smoothing is chosen: nearly straight for
+        a half sine and for an error function.
+    abrupt
+        Rises of a step, smoothed, within which the frames do not resolve when the front arrives between two of
+        them.
+    independent
+        Correlation of the noise between neighbouring positions of a fit, at most: beyond it positions add
+        little, and the inverse of their covariance amplifies what is not known of it.
+    travels
+        Standard uncertainties by which the slope of the arrival times must differ from 0: as for a kink in
+        `rates`.
+    doubtful
+        Probability of the chi-square below which the arrival times do not lie on a line.
+    fewest
+        Positions that a fit needs: two parameters, and two more to see whether they describe anything.
+    """
+
+    least: float = 0.5
+    step: float = 0.382
+    around: float = 4.0
+    lopsided: float = 0.1
+    clear: float = 5.0
+    smoothest: float = 3.5
+    determined: float = 1e-4
+    fine: int = 8
+    rows: int = 1000
+    rise: tuple[float, float] = (0.2, 0.8)
+    abrupt: float = 1.2
+    independent: float = 0.5
+    travels: float = 4.0
+    doubtful: float = 1e-3
+    fewest: int = 4
+
+
+_CONSTANTS = ProfileConstants()
+
 _WIDTHS = {"front": 1.5, "peak": 3.0}
 """Rises that the smoothing is wide on either side: with half of it, noise of 5 % of the peak moves it to another
 maximum."""
-_ABRUPT = 1.2
-"""Rises of a step, smoothed, within which the frames do not resolve when the front arrives between two of them."""
-_INDEPENDENT = 0.5
-"""Correlation of the noise between neighbouring positions of a fit, at most: beyond it positions add little, and the
-inverse of their covariance amplifies what is not known of it."""
-_TRAVELS = 4.0
-"""Standard uncertainties by which the slope of the arrival times must differ from 0: as for a kink in `rates`."""
-_DOUBTFUL = 1e-3
-"""Probability of the chi-square below which the arrival times do not lie on a line."""
-_FEWEST = 4
-"""Positions that a fit needs: two parameters, and two more to see whether they describe anything."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ProfileLine:
-    """Points along a line in a mesh, at which nodal fields are read.
+    """Points .38 elements apart along a line in a mesh, at which nodal fields are read.
 
     A value is that of the quadratics through the nodes around each node, weighted by its shape function, as in
     `at_pixels`; its uncertainty follows from the correlation of the nodes' errors.
+
+    Parameters
+    ----------
+    covariance
+        Of the mesh.
+    gauges
+        Strain gauges at its nodes.
+    x0, y0, x1, y1
+        Ends in px on the reference.
 
     Attributes
     ----------
@@ -92,69 +135,41 @@ class ProfileLine:
     correlations
         Correlation (n, n) of the errors at these nodes of a displacement (``""``), of the strains ``"exx"`` and
         ``"eyy"``, which are slopes along x and y, and of all other strains (``"strain"``), taken as the mean of both.
+
+    Raises
+    ------
+    InputError
+        Both ends are the same, or half of the line or more is outside the mesh.
     """
 
-    points: FloatArray
-    positions: FloatArray
-    nodes: npt.NDArray[np.int64]
-    places: Places
-    even: BoolArray
-    correlations: Mapping[str, FloatArray]
-
-    @classmethod
-    def between(
-        cls, covariance: NodalCovariance, gauges: StrainGauges, x0: float, y0: float, x1: float, y1: float
-    ) -> Self:
-        """Lay points .38 elements apart along a line.
-
-        Parameters
-        ----------
-        covariance
-            Of the mesh.
-        gauges
-            Strain gauges at its nodes.
-        x0, y0, x1, y1
-            Ends in px on the reference.
-
-        Returns
-        -------
-        ProfileLine
-
-        Raises
-        ------
-        InputError
-            Both ends are the same, or half of the line or more is outside the mesh.
-        """
+    def __init__(
+        self, covariance: NodalCovariance, gauges: StrainGauges, x0: float, y0: float, x1: float, y1: float
+    ) -> None:
         mesh, length = covariance.mesh, math.hypot(x1 - x0, y1 - y0)
         if not length > 0:
             raise InputError(f"a line needs two different points, not ({x0:g}, {y0:g}) twice")
-        points = np.linspace((x0, y0), (x1, y1), max(math.ceil(length / (_STEP * mesh.size)), 1) + 1)
-        if (places := Places.of(mesh, points)).inside.mean() < _LEAST:
+        points = np.linspace((x0, y0), (x1, y1), max(math.ceil(length / (_CONSTANTS.step * mesh.size)), 1) + 1)
+        if (places := Places.of(mesh, points)).inside.mean() < _CONSTANTS.least:
             raise InputError(
                 f"half or more of the line from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) px is outside {places.where}"
             )
-        along = np.clip((mesh.nodes - points[0]) @ (points[-1] - points[0]) / length**2, 0, 1)
-        away = mesh.nodes - points[0] - along[:, None] * (points[-1] - points[0])
-        near = np.hypot(*away.T) <= _AROUND * mesh.size
+        way = points[-1] - points[0]
+        along = np.clip((mesh.nodes - points[0]) @ way / length**2, 0, 1)
+        away = mesh.nodes - points[0] - along[:, None] * way
+        near = np.hypot(*away.T) <= _CONSTANTS.around * mesh.size
         elements = mesh.elements[near[mesh.elements].all(axis=1)]
-        nodes = np.unique(elements)
+        self.nodes = nodes = np.unique(elements)
         part = Tri3Mesh(nodes=mesh.nodes[nodes], elements=np.searchsorted(nodes, elements).astype(np.int32))
-        chosen = sp.csr_matrix((np.ones(len(nodes)), (np.arange(len(nodes)), nodes)), (len(nodes), len(mesh.nodes)))
-        size = (len(mesh.nodes), len(mesh.nodes))
-        slopes = [chosen @ sp.csr_matrix((w, (gauges.rows, gauges.nodes)), size) for w in gauges.whole]
+        self.points, self.positions = points, np.linspace(0, length, len(points))
+        self.places = Places.of(part, points)
+        slopes = [sp.eye(len(mesh.nodes), format="csr")[nodes] @ slope for slope in gauges.slopes]
         exx, eyy = (_unit(slope @ covariance.correlation @ slope.T) for slope in slopes)
+        self.correlations = {"": covariance.part(nodes), "exx": exx, "eyy": eyy, "strain": (exx + eyy) / 2}
         count = np.bincount(gauges.rows, weights=gauges.fractions, minlength=len(mesh.nodes))
-        arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ (points[-1] - points[0]) / length
+        arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ way / length
         lopsided = np.abs(np.bincount(gauges.rows, weights=gauges.fractions * arm, minlength=len(mesh.nodes)) / count)
-        at = Places.of(part, points)
-        return cls(
-            points=points,
-            positions=np.linspace(0, length, len(points)),
-            nodes=nodes,
-            places=at,
-            even=(lopsided[nodes][part.elements[at.element]] < _LOPSIDED * mesh.size).all(axis=1),
-            correlations={"": covariance.part(nodes), "exx": exx, "eyy": eyy, "strain": (exx + eyy) / 2},
-        )
+        at_corners = lopsided[nodes][part.elements[self.places.element]]
+        self.even = (at_corners < _CONSTANTS.lopsided * mesh.size).all(axis=1)
 
     def read(self, values: FloatArray, std: FloatArray, kind: str = "") -> tuple[FloatArray, FloatArray]:
         """Interpolate a nodal field (N,) and its standard uncertainty at the points, each (P,).
@@ -306,15 +321,17 @@ def arrival_times(
     size = np.where(known, y / np.where(spread > 0, spread, np.inf), 0.0)
     signs = np.where(np.abs(size).max(axis=0) > 0, np.sign(size[np.abs(size).argmax(axis=0), np.arange(y.shape[1])]), 0)
     series = (1.0 if signs.sum() >= 0 else -1.0) * y
-    first = _Smooth(when, _SMOOTHEST * interval)
-    rises = [first.rise(series[:, p], known[:, p]) for p in np.flatnonzero((np.abs(size) > _CLEAR).any(axis=0))]
+    first = _Smooth(when, _CONSTANTS.smoothest * interval)
+    rises = [
+        first.rise(series[:, p], known[:, p]) for p in np.flatnonzero((np.abs(size) > _CONSTANTS.clear).any(axis=0))
+    ]
     rises = [rise for rise in rises if math.isfinite(rise)]
     rise = float(np.median(rises)) if rises else math.nan
-    smooth = _Smooth(when, max(_SMOOTHEST * interval, _WIDTHS[what] * rise if rises else 0.0))
+    smooth = _Smooth(when, max(_CONSTANTS.smoothest * interval, _WIDTHS[what] * rise if rises else 0.0))
     found, errors, weights = np.full(y.shape[1], np.nan), np.full(y.shape[1], np.nan), np.zeros(y.T.shape)
     own = np.eye(len(when)) if between_frames is None else between_frames
     step = first.rise((when > when[len(when) // 2]) * 1.0, np.ones(len(when), dtype=bool))
-    abrupt = bool(rises) and rise < _ABRUPT * step
+    abrupt = bool(rises) and rise < _CONSTANTS.abrupt * step
     for p in range(y.shape[1]):
         at = smooth.arrival(series[:, p], np.where(known[:, p], spread[:, p], np.nan), what, level)
         if at is not None:
@@ -339,14 +356,14 @@ class _Smooth:
 
     def __init__(self, times: FloatArray, half: float) -> None:
         self.times, self.half = times, half
-        steps = [np.linspace(a, b, _FINE, endpoint=False) for a, b in pairwise(times)]
+        steps = [np.linspace(a, b, _CONSTANTS.fine, endpoint=False) for a, b in pairwise(times)]
         self.places = np.append(np.concatenate(steps), times[-1])
         self._kept: dict[bytes, sp.csr_matrix] = {}
 
     def operator(self, known: BoolArray) -> sp.csr_matrix:
         """Return the weight (G, T) of every frame in the curve at each place; NaN where too few frames are known."""
         if (key := known.tobytes()) not in self._kept:
-            parts = np.array_split(self.places, math.ceil(len(self.places) / _ROWS))
+            parts = np.array_split(self.places, math.ceil(len(self.places) / _CONSTANTS.rows))
             self._kept[key] = sp.csr_matrix(sp.vstack([sp.csr_matrix(self._rows(part, known)) for part in parts]))
         return self._kept[key]
 
@@ -355,19 +372,19 @@ class _Smooth:
         w = np.clip(1 - np.abs(away) ** 3, 0, None) ** 3 * known
         powers = np.stack([np.ones_like(away), away, away**2], axis=1)
         normal = np.einsum("gt,git,gjt->gij", w, powers, powers, optimize=True)
-        enough = np.linalg.det(normal) > _DETERMINED * normal[:, 0, 0] ** 3
+        enough = np.linalg.det(normal) > _CONSTANTS.determined * normal[:, 0, 0] ** 3
         normal[~enough] = np.nan
         first = np.full((len(places), 3), np.nan)
         first[enough] = np.linalg.inv(normal[enough])[:, 0]
         return np.asarray(w * np.einsum("gi,git->gt", first, powers))
 
     def rise(self, series: FloatArray, known: BoolArray) -> float:
-        """Return how long a series rises between the `_RISE` fractions of its peak; NaN where it does not."""
+        """Return how long a series rises between the `_CONSTANTS.rise` fractions of its peak; NaN where it does not."""
         curve = self.operator(known) @ np.where(known, series, 0.0)
         if not np.isfinite(curve).any():
             return math.nan
         top = int(np.nanargmax(curve))
-        low, high = (self._crossing(curve, top, part * curve[top]) for part in _RISE)
+        low, high = (self._crossing(curve, top, part * curve[top]) for part in _CONSTANTS.rise)
         return high - low
 
     def _crossing(self, curve: FloatArray, top: int, level: float) -> float:
@@ -390,7 +407,7 @@ class _Smooth:
         top = int(np.nanargmax(curve))
         highest = operator[top].toarray().ravel()
         noise = float(np.linalg.norm(highest * np.nan_to_num(std)))
-        if not (0 < top < len(curve) - 1 and curve[top] > _CLEAR * noise):
+        if not (0 < top < len(curve) - 1 and curve[top] > _CONSTANTS.clear * noise):
             return None
         step = (self.places[-1] - self.places[0]) / (len(self.places) - 1)
         if what == "peak":
@@ -445,7 +462,7 @@ class Front:
     @property
     def straight(self) -> bool:
         """Whether the arrival times lie on a line within their uncertainty."""
-        return self.probability >= _DOUBTFUL
+        return self.probability >= _CONSTANTS.doubtful
 
 
 def fit_front(
@@ -483,13 +500,13 @@ def fit_front(
     """
     there, used = np.flatnonzero(np.isfinite(arrivals.times) & (True if usable is None else usable)), list[int]()
     for p in there:
-        if not used or abs(correlation[p, used[-1]]) <= _INDEPENDENT:
+        if not used or abs(correlation[p, used[-1]]) <= _CONSTANTS.independent:
             used.append(int(p))
-    if len(used) < _FEWEST:
+    if len(used) < _CONSTANTS.fewest:
         raise InputError(
             f"no front: something arrives at {len(there)} of {len(positions)} positions, {len(used)} of them far "
-            f"enough apart to be independent; a speed needs {_FEWEST}. A peak counts that exceeds {_CLEAR:g} standard "
-            "uncertainties and lies within the frames"
+            f"enough apart to be independent; a speed needs {_CONSTANTS.fewest}. A peak counts that exceeds "
+            f"{_CONSTANTS.clear:g} standard uncertainties and lies within the frames"
         )
     parts = arrivals.weights[used] * np.nan_to_num(std.T[used])
     own = parts @ parts.T if between_frames is None else parts @ between_frames @ parts.T
@@ -505,11 +522,11 @@ def fit_front(
     probability = float(chdtrc(freedom, chi_square))
     spread = spread * max(chi_square / freedom, 1)
     start_std, slope_std = np.sqrt(np.diag(spread))
-    if not abs(slope) > _TRAVELS * slope_std:
+    if not abs(slope) > _CONSTANTS.travels * slope_std:
         raise InputError(
             f"no front travels along the line: the arrival times differ by {slope * np.ptp(positions[used]):.3g} ± "
             f"{slope_std * np.ptp(positions[used]):.2g} between its ends (chi-square {chi_square:.3g} of {freedom}); "
-            f"a speed needs {_TRAVELS:g} standard uncertainties"
+            f"a speed needs {_CONSTANTS.travels:g} standard uncertainties"
         )
     chosen = np.zeros(len(positions), dtype=bool)
     chosen[used] = True

@@ -1,13 +1,20 @@
-"""Strain over a virtual strain gauge: a plane is fitted to the displacements of the nodes around a place.
+"""Strain: finite strain of a displacement gradient with its uncertainty, and that over virtual strain gauges.
 
-No new measurement is needed: gauges of any length follow from the stored displacements. The length of a virtual strain
-gauge is the diameter of a circle. A node stands for as much as an element is wide and counts by the part of that within
-the circle, so that, as in the iDICs good practice guide, the length is that of the window of points plus one of them.
+With the deformation gradient ``F = I + H`` and the stretch ``U = sqrt(F^T F)``: Green-Lagrange ``(U^2 - I) / 2``,
+Hencky ``ln U``, Biot ``U - I``, engineering (small strain) ``(H + H^T) / 2``. All are in the axes of the reference. The
+first three are functions of ``C = F^T F`` alone, hence independent of rotation, and have its eigenvectors.
+
+In a gauge a plane is fitted to the displacements of the nodes around a place. No new measurement is needed: gauges of
+any length follow from the stored displacements. The length of a virtual strain gauge is the diameter of a circle. A
+node stands for as much as an element is wide and counts by the part of that within the circle, so that, as in the iDICs
+good practice guide, the length is that of the window of points plus one of them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -15,17 +22,198 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields.measures import MEASURES, Strain, strain_of_gradient
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.typing import AnyArray, BoolArray, FloatArray
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
 SHORTEST = 3.0
 """Length of the shortest gauge in elements: a node and those around it."""
-_ROUND = 0.9
-"""Fraction of it that will do: the sides of a mesh's elements differ by some percent from the size asked for."""
-_FLAT = 1e-2
-"""Least ratio of the second moments of a gauge's nodes across and along it: below, they lie on a line."""
+_Function = Callable[[FloatArray], FloatArray]
+_OF_STRETCH: dict[str, tuple[_Function, _Function]] = {
+    "green-lagrange": (lambda c: (c - 1) / 2, lambda c: np.full_like(c, 0.5)),
+    "hencky": (lambda c: np.log(c) / 2, lambda c: 0.5 / c),
+    "biot": (lambda c: np.sqrt(c) - 1, lambda c: 0.5 / np.sqrt(c)),
+}
+"""Each measure as a function of an eigenvalue of C, and its derivative."""
+MEASURES = (*_OF_STRETCH, "engineering")
+"""Names of the strain measures; the first is the default."""
+_SMALL = np.array([[1, 0, 0, 0], [0, 0, 0, 1], [0, 0.5, 0.5, 0]])
+"""Derivative of the small exx, eyy, exy by the gradient."""
+_LARGEST_ANGLE = np.degrees(np.pi / np.sqrt(12))
+"""Standard uncertainty (degrees) of a direction of which nothing is known."""
+_EQUIVALENT = np.array([[4 / 3, 2 / 3, 0], [2 / 3, 4 / 3, 0], [0, 0, 4 / 3]])
+"""``e^T A e`` for the Hencky strain e = (exx, eyy, exy) is the square of the von Mises equivalent at constant volume:
+only there is constant volume ``e1 + e2 + e3 = 0``, so that the third principal strain is known."""
+EQUIVALENT = "von Mises equivalent of the Hencky strain, for a material of constant volume"
+"""Description of the equivalent strain wherever it is stated."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Strain:
+    """Strain at some places, in the axes x, y of the reference; NaN where it is not measured.
+
+    Attributes
+    ----------
+    measure
+        One of `MEASURES`.
+    components, components_std : ndarray, shape (..., 3)
+        exx, eyy, exy (tensor shear) and their standard uncertainty.
+    principal, principal_std : ndarray, shape (..., 2)
+        The larger and the smaller principal strain, in the plane.
+    direction_deg, direction_std_deg : ndarray, shape (...)
+        Direction of the larger one on the reference, from x towards y, between -90 and 90 degrees. Where both are the
+        same within their uncertainty it means nothing, and the uncertainty tends to 52 degrees; NaN without strain.
+    equivalent, equivalent_std : ndarray, shape (...)
+        Von Mises equivalent of the Hencky strain at constant volume, ``sqrt(4/3 (h1^2 + h1 h2 + h2^2))``, whatever
+        `measure` is: ``ln`` of the stretch in a tensile test. Where the volume changes it is another number: in tension
+        with a Poisson ratio of .3 it is 2.6 % too large. Being positive, it is more than 0 in noise alone, by about
+        its uncertainty.
+    shear, shear_std : ndarray, shape (...)
+        Largest shear angle in the plane, ``e1 - e2``: engineering shear, twice the tensor's. Positive, see `length_of`.
+    """
+
+    measure: str
+    components: FloatArray
+    components_std: FloatArray
+    principal: FloatArray
+    principal_std: FloatArray
+    direction_deg: FloatArray
+    direction_std_deg: FloatArray
+    equivalent: FloatArray
+    equivalent_std: FloatArray
+    shear: FloatArray
+    shear_std: FloatArray
+
+
+def length_of(parts: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Compute the length of vectors and its standard uncertainty: first order where long, else that of noise alone.
+
+    A length is positive: of nothing but noise it is as large as the noise, where the first order fails. By as much as
+    its square exceeds the noise's, the first order counts.
+
+    Parameters
+    ----------
+    parts : ndarray, shape (..., d)
+        Components of the vectors.
+    covariance : ndarray, shape (..., d, d)
+        Of the components.
+
+    Returns
+    -------
+    length, std : ndarray, shape (...)
+    """
+    square, noise = (parts**2).sum(axis=-1), np.einsum("...aa->...", covariance)
+    over = np.where(square > 0, square, 1.0)
+    first = np.einsum("...a,...ab,...b->...", parts, covariance, parts) / over
+    long = np.maximum(square - noise, 0) / over
+    return np.sqrt(square), np.sqrt(np.maximum(long * first + (1 - long) * noise, 0))
+
+
+def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: str = MEASURES[0]) -> Strain:
+    """Compute the strain of displacement gradients and, to first order, its standard uncertainty.
+
+    Parameters
+    ----------
+    gradient : ndarray, shape (..., 2, 2)
+        ``H[c, d]``: derivative of the displacement c by the coordinate d.
+    covariance : ndarray, shape (..., 4, 4)
+        Of ``H`` row by row: du/dx, du/dy, dv/dx, dv/dy.
+    measure
+        One of `MEASURES`.
+
+    Returns
+    -------
+    Strain
+        Of the shape (...).
+
+    Raises
+    ------
+    InputError
+        The measure is unknown.
+    """
+    if measure not in MEASURES:
+        raise InputError(f'unknown strain measure "{measure}"; allowed are {", ".join(MEASURES)}')
+    shape = gradient.shape[:-2]
+    h, spread = gradient.reshape(-1, 2, 2), covariance.reshape(-1, 4, 4)
+    hencky = _of_stretch(h, *_OF_STRETCH["hencky"])
+    if measure == "engineering":
+        tensor, slopes = (h + h.transpose(0, 2, 1)) / 2, _SMALL
+    else:
+        tensor, slopes = hencky if measure == "hencky" else _of_stretch(h, *_OF_STRETCH[measure])
+    covariance, of_hencky = (slope @ spread @ np.swapaxes(slope, -1, -2) for slope in (slopes, hencky[1]))
+    principal, vectors = _eigen(tensor)
+    c, s = vectors[:, 0, 0], vectors[:, 1, 0]
+    along, across = np.stack([c * c, s * s, 2 * c * s], axis=1), np.stack([s * s, c * c, -2 * c * s], axis=1)
+    turn = np.stack([-c * s, c * s, c * c - s * s], axis=1)
+    split = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 2.0]])  # exx - eyy and 2 exy, whose length is e1 - e2
+    shear, shear_std = length_of(_components(tensor) @ split.T, split @ covariance @ split.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        equivalent, equivalent_std = _equivalent(_components(hencky[0]), of_hencky)
+        apart = principal[:, 0] - principal[:, 1]
+        direction_std = np.degrees(_deviation(turn, covariance) / apart)
+    parts = {
+        "components": _components(tensor),
+        "components_std": np.sqrt(np.maximum(np.einsum("naa->na", covariance), 0)),
+        "principal": principal,
+        "principal_std": np.stack([_deviation(along, covariance), _deviation(across, covariance)], axis=1),
+        "direction_deg": np.where(apart > 0, (np.degrees(np.arctan2(s, c)) + 90) % 180 - 90, np.nan),
+        "direction_std_deg": np.minimum(direction_std, _LARGEST_ANGLE),
+        "equivalent": equivalent,
+        "equivalent_std": equivalent_std,
+        "shear": shear,
+        "shear_std": shear_std,
+    }
+    return Strain(measure=measure, **{name: part.reshape((*shape, *part.shape[1:])) for name, part in parts.items()})
+
+
+def _of_stretch(gradient: FloatArray, function: _Function, derivative: _Function) -> tuple[FloatArray, FloatArray]:
+    """Compute a function of C (n, 2, 2) and the derivative (n, 3, 4) of xx, yy, xy by H (Daleckii and Krein)."""
+    f = np.eye(2) + gradient
+    values, vectors = _eigen(f.transpose(0, 2, 1) @ f)
+    values = np.maximum(values, np.finfo(float).tiny)
+    at = function(values)
+    gap, mean = values[:, 1] - values[:, 0], values.mean(axis=1)
+    close = np.abs(gap) < 1e-6  # an error of 1e-10 at most
+    across = np.where(close, derivative(mean), (at[:, 1] - at[:, 0]) / np.where(close, 1, gap))
+    along = derivative(values)
+    # what a change of H[c, d] alone makes of C along the axes a and b of C: F_ca V_db + V_da F_cb, F turned by V
+    turned = f @ vectors
+    change = [turned[:, :, None, a] * vectors[:, None, :, b] for a in (0, 1) for b in (0, 1)]
+    parts = [2 * change[0] * along[:, 0, None, None], 2 * change[3] * along[:, 1, None, None]]
+    parts.append((change[1] + change[2]) * across[:, None, None])
+    first, second, shear = (part.reshape(-1, 4) for part in parts)
+    slope = np.empty((len(f), 3, 4))
+    for row, (i, j) in enumerate(((0, 0), (1, 1), (0, 1))):
+        (vi, wi), (vj, wj) = vectors[:, i].T[..., None], vectors[:, j].T[..., None]
+        slope[:, row] = vi * vj * first + wi * wj * second + (vi * wj + wi * vj) * shear
+    return (vectors * at[:, None]) @ vectors.transpose(0, 2, 1), slope
+
+
+def _eigen(tensor: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Compute eigenvalues (n, 2), the larger first, and eigenvectors (n, 2, 2) in columns; NaN for NaN."""
+    half, shear = (tensor[:, 0, 0] - tensor[:, 1, 1]) / 2, tensor[:, 0, 1]
+    middle, radius, angle = half + tensor[:, 1, 1], np.hypot(half, shear), np.arctan2(shear, half) / 2
+    c, s = np.cos(angle), np.sin(angle)
+    vectors = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
+    return np.stack([middle + radius, middle - radius], axis=1), vectors
+
+
+def _components(tensor: FloatArray) -> FloatArray:
+    return np.stack([tensor[:, 0, 0], tensor[:, 1, 1], tensor[:, 0, 1]], axis=1)
+
+
+def _deviation(direction: FloatArray, covariance: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.maximum(np.einsum("na,nab,nb->n", direction, covariance, direction), 0)))
+
+
+def _equivalent(e: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Compute the equivalent strain (n,) and its uncertainty: first order where large, else that of noise alone."""
+    square = np.einsum("na,ab,nb->n", e, _EQUIVALENT, e)
+    noise = np.einsum("ab,nab->n", _EQUIVALENT, covariance)
+    slope = e @ _EQUIVALENT
+    first = np.einsum("na,nab,nb->n", slope, covariance, slope) / np.where(square > 0, square, np.inf)
+    large = square / (square + noise)
+    return np.sqrt(square), np.sqrt(large * first + (1 - large) * noise)
 
 
 def shortest_gauge(mesh: Tri3Mesh) -> float:
@@ -86,17 +274,24 @@ def strain_of(
     return StrainGauges.at_nodes(covariance, gauge).strain(u, v, u_std, v_std, measure=measure)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StrainGauges:
     """Virtual strain gauges of one length at some places.
 
-    Attributes
+    Parameters
     ----------
-    length
-        In px. On a graded mesh each gauge has three elements as they are around it, and this length where that is more
-        and the length is stated; if it is not, this is that of elements of the mesh's size.
+    covariance
+        Of the mesh.
     centres : ndarray, shape (G, 2)
         In px on the reference.
+    length
+        In px; None: the shortest, three elements. On a graded mesh each gauge has three elements as they are around it,
+        and this length where that is more and the length is stated; if it is not, `length` is that of elements of the
+        mesh's size.
+    needed : csr_matrix, shape (G, N)
+        Nodes that must have data, else the gauge has none: the centre and those beside it.
+
+    Attributes
+    ----------
     points : ndarray, shape (N, 2)
         The nodes.
     rows, nodes : ndarray, shape (M,), int
@@ -104,23 +299,46 @@ class StrainGauges:
         lies across a crack or a hole.
     fractions : ndarray, shape (M,)
         Part of each node that is within the gauge's circle.
-    needed : csr_matrix, shape (G, N)
-        Nodes that must have data, else the gauge has none: the centre and those beside it.
     whole : ndarray, shape (2, M)
         Weight of every node in the slopes along x and y where all are measured.
+    slopes : list of csr_matrix, shape (G, N)
+        The same as matrices.
     inflation : ndarray, shape (G, 3)
         Variance of the slopes along x and y, and their covariance, over what independent nodes would give.
+
+    Raises
+    ------
+    InputError
+        The gauge is too short.
     """
 
-    length: float
-    centres: FloatArray
-    points: FloatArray
-    rows: npt.NDArray[np.int64]
-    nodes: npt.NDArray[np.int64]
-    fractions: FloatArray
-    needed: sp.csr_matrix
-    whole: FloatArray
-    inflation: FloatArray
+    def __init__(
+        self, covariance: NodalCovariance, centres: FloatArray, length: float | None, needed: sp.csr_matrix
+    ) -> None:
+        mesh, shortest = covariance.mesh, shortest_gauge(covariance.mesh)
+        self.length = shortest if length is None else float(length)
+        self.centres, self.needed, self.points = centres, needed, mesh.nodes
+        # the sides of a mesh's elements differ by some percent from the size asked for
+        if not (np.isfinite(self.length) and self.length >= 0.9 * shortest):
+            raise InputError(
+                f"a strain gauge must be at least {shortest:.4g} px long, {SHORTEST:g} elements; given are "
+                f"{self.length:g} px"
+            )
+        lengths = np.full(len(centres), self.length)
+        if mesh.is_graded:
+            around = (needed @ mesh.sizes) / np.asarray(needed.sum(axis=1)).ravel()
+            lengths = np.maximum(SHORTEST * around, length or 0)
+        pattern = _reach(mesh, centres, lengths / 2, needed)
+        self.rows = np.repeat(np.arange(len(centres)), np.diff(pattern.indptr))
+        self.nodes = pattern.indices.astype(np.int64)
+        away = np.hypot(*(mesh.nodes[self.nodes] - centres[self.rows]).T)
+        self.fractions = np.clip((lengths[self.rows] / 2 - away) / mesh.sizes[self.nodes], 0, 1)
+        self.whole = self._weights(np.ones(len(mesh.nodes), dtype=bool))
+        self.slopes = [sp.csr_matrix((w, (self.rows, self.nodes)), shape=needed.shape) for w in self.whole]
+        together = [np.asarray((a @ covariance.correlation).multiply(a).sum(axis=1)).ravel() for a in self.slopes]
+        alone = [np.asarray(a.multiply(a).sum(axis=1)).ravel() for a in self.slopes]
+        along, across = (a / np.where(b > 0, b, 1) for a, b in zip(together, alone, strict=True))
+        self.inflation = np.stack([along, across, np.sqrt(along * across)], axis=1)
 
     @classmethod
     def at_nodes(cls, covariance: NodalCovariance, length: float | None = None) -> Self:
@@ -137,8 +355,7 @@ class StrainGauges:
         -------
         StrainGauges
         """
-        mesh = covariance.mesh
-        return cls._around(covariance, mesh.nodes, length, _ring(mesh))
+        return cls(covariance, covariance.mesh.nodes, length, _ring(covariance.mesh))
 
     @classmethod
     def at_points(cls, covariance: NodalCovariance, points: FloatArray, length: float | None = None) -> Self:
@@ -165,48 +382,26 @@ class StrainGauges:
         mesh = covariance.mesh
         places = Places.of(mesh, points)
         places.check("the strain gauge")
-        row = np.repeat(np.arange(len(points)), 3)
-        nodes = mesh.elements[places.element].ravel()
+        row, nodes = np.repeat(np.arange(len(points)), 3), mesh.elements[places.element].ravel()
         needed = sp.csr_matrix((np.ones(len(row)), (row, nodes)), shape=(len(points), len(mesh.nodes)))
-        return cls._around(covariance, np.asarray(points, dtype=np.float64), length, needed)
+        return cls(covariance, places.points, length, needed)
 
-    @classmethod
-    def _around(
-        cls, covariance: NodalCovariance, centres: FloatArray, length: float | None, needed: sp.csr_matrix
-    ) -> Self:
-        mesh = covariance.mesh
-        stated = length is not None
-        length = shortest_gauge(mesh) if length is None else float(length)
-        if not (np.isfinite(length) and length >= _ROUND * shortest_gauge(mesh)):
-            raise InputError(
-                f"a strain gauge must be at least {shortest_gauge(mesh):.4g} px long, {SHORTEST:g} elements; given are "
-                f"{length:g} px"
-            )
-        lengths = np.full(len(centres), length)
-        if mesh.is_graded:
-            around = (needed @ mesh.sizes) / np.asarray(needed.sum(axis=1)).ravel()
-            lengths = np.maximum(SHORTEST * around, length if stated else 0)
-        pattern = _reach(mesh, centres, lengths / 2, needed)
-        rows = np.repeat(np.arange(len(centres)), np.diff(pattern.indptr))
-        away = np.hypot(*(mesh.nodes[pattern.indices] - centres[rows]).T)
-        gauges = cls(
-            length=length,
-            centres=centres,
-            points=mesh.nodes,
-            rows=rows,
-            nodes=pattern.indices.astype(np.int64),
-            fractions=np.clip((lengths[rows] / 2 - away) / mesh.sizes[pattern.indices], 0, 1),
-            needed=needed,
-            whole=np.zeros((2, len(rows))),
-            inflation=np.ones((len(centres), 3)),
-        )
-        weights = gauges._weights(np.ones(len(mesh.nodes), dtype=bool))
-        x, y = (sp.csr_matrix((weight, (rows, gauges.nodes)), shape=needed.shape) for weight in weights)
-        together = [np.asarray((a @ covariance.correlation).multiply(a).sum(axis=1)).ravel() for a in (x, y)]
-        alone = [np.asarray(a.multiply(a).sum(axis=1)).ravel() for a in (x, y)]
-        along, across = (a / np.where(b > 0, b, 1) for a, b in zip(together, alone, strict=True))
-        inflation = np.stack([along, across, np.sqrt(along * across)], axis=1)
-        return replace(gauges, whole=weights, inflation=inflation)
+    def of_nodes(self, nodes: IntArray) -> Self:
+        """Return the gauges for the fields of some nodes alone, all of theirs among them.
+
+        Parameters
+        ----------
+        nodes : ndarray, shape (n,)
+            Indices of the nodes, rising.
+
+        Returns
+        -------
+        StrainGauges
+        """
+        gauges = copy(self)
+        gauges.points, gauges.needed = self.points[nodes], self.needed[:, nodes]
+        gauges.nodes, gauges.slopes = np.searchsorted(nodes, self.nodes), [part[:, nodes] for part in self.slopes]
+        return gauges
 
     def gradient(
         self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray
@@ -266,7 +461,8 @@ class StrainGauges:
         x, y = (part - (self._sum(use * part) / count)[self.rows] for part in arm)
         xx, xy, yy = (self._sum(use * a * b) for a, b in ((x, x), (x, y), (y, y)))
         determinant = xx * yy - xy * xy
-        determinant = np.where(determinant > _FLAT * ((xx + yy) / 2) ** 2, determinant, np.nan)
+        # a hundredth of the second moment across as along: the nodes lie on a line
+        determinant = np.where(determinant > 1e-2 * ((xx + yy) / 2) ** 2, determinant, np.nan)
         xx, xy, yy = (part[self.rows] / determinant[self.rows] for part in (xx, xy, yy))
         return np.stack([use * (yy * x - xy * y), use * (xx * y - xy * x)])
 

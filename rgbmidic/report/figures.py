@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.report import style
-from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, MapField, Maps, Result
+from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Maps, Quantity, Result
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -362,7 +362,7 @@ class MapDrawer:
         return style.draw_figure(draw, count=len(maps) + 1, aspect=max(aspect, 0.5), beside=style.GAP, title=label)
 
     def _draw(
-        self, frame: int, panels: Sequence[tuple[MapField, FloatArray, FloatArray]], how: str, *, hatched: bool
+        self, frame: int, panels: Sequence[tuple[Quantity, FloatArray, FloatArray]], how: str, *, hatched: bool
     ) -> Figure:
         """Draw a map for each field, its values and uncertainties, over the reference where there is one."""
         import matplotlib as mpl
@@ -426,7 +426,7 @@ class MapDrawer:
         picture: FloatArray,
         values: FloatArray,
         norm: Normalize | None,
-        field: MapField | None = None,
+        field: Quantity | None = None,
         *,
         bar: bool = True,
     ) -> None:
@@ -448,7 +448,7 @@ class MapDrawer:
         style.add_colour_bar(axis, norm, colours, beyond=beyond, names=() if field is None else field.codes)
 
 
-def field_colours(field: MapField) -> str:
+def field_colours(field: Quantity) -> str:
     """Return the name of matplotlib's colours of a field."""
     return _COLOURS.get(field.kind, "viridis")
 

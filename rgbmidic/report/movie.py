@@ -23,7 +23,7 @@ from rgbmidic.report import style
 from rgbmidic.report.figures import field_colours, picture_limits, spread
 from rgbmidic.report.movie_curve import Curve
 from rgbmidic.report.video import PALETTE, Page, gif, video
-from rgbmidic.results import QUANTITIES, MapField, Maps, frame_times
+from rgbmidic.results import QUANTITIES, Maps, Quantity, frame_times
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.typing import AnyArray, FloatArray
 
@@ -165,7 +165,7 @@ class _Drawer:
     """
 
     maps: Maps
-    fields: tuple[MapField, ...]
+    fields: tuple[Quantity, ...]
     ends: tuple[tuple[float, float], ...]
     colours: tuple[str, ...]
     beyond: tuple[tuple[bool, bool], ...]

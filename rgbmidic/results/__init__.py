@@ -5,23 +5,12 @@ from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
-from rgbmidic.results.field import MapField
 from rgbmidic.results.histories import Histories, HistoryColumn, history_rows, write_histories
 from rgbmidic.results.maps import Maps, MapValues
-from rgbmidic.results.physical import (
-    channels_of,
-    exposure,
-    frame_times,
-    placement_of,
-    probes_of,
-    reference_frames,
-    scale_of,
-    shared_part,
-    units_of,
-)
+from rgbmidic.results.physical import channels_of, frame_times, placement_of, probes_of, scale_of, shared_part
 from rgbmidic.results.profiles import Profile, Wave, read_profile, write_profile
 from rgbmidic.results.provenance import Origin
-from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, ResultQuantity
+from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, Quantity
 from rgbmidic.results.result import Result
 from rgbmidic.results.store import ResultStore, finish_result
 
@@ -34,31 +23,27 @@ __all__ = [
     "FrameRecord",
     "Histories",
     "HistoryColumn",
-    "MapField",
     "MapValues",
     "Maps",
     "Origin",
     "Profile",
+    "Quantity",
     "Result",
-    "ResultQuantity",
     "ResultStore",
     "Wave",
     "channels_of",
     "export_result",
-    "exposure",
     "finish_result",
     "frame_times",
     "history_rows",
     "placement_of",
     "probes_of",
     "read_profile",
-    "reference_frames",
     "rounded",
     "scale_of",
     "shared_part",
     "speckle_diameter",
     "uncertain",
-    "units_of",
     "write_histories",
     "write_profile",
 ]

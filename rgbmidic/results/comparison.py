@@ -17,25 +17,23 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.errors import InputError
 from rgbmidic.fields import NodalCovariance, StrainGauges, strain_of_gradient
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh
-from rgbmidic.results.agreement import Agreement, Fit
 from rgbmidic.results.levelling import Levelling, reading
 from rgbmidic.results.physical import frame_times, rectification_of, shared_part
 from rgbmidic.results.quantities import QUANTITIES as STORED
 from rgbmidic.results.result import Result
 from rgbmidic.results.simulation import Simulation, places_among
 from rgbmidic.settings import ScaleSettings
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
@@ -48,6 +46,70 @@ _SAME = 1e-6
 _RIGID = 1e-6
 """Least squared ratio to the uncertainty, of a node on average, of what is no rigid motion in a simulation (chosen)."""
 _FAILED = STORED["status"].codes.index("failed")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Agreement:
+    """How one quantity of a frame agrees with the simulation.
+
+    Attributes
+    ----------
+    values
+        Their number n: nodes with data, of the displacement those of u and v.
+    mean, rms
+        Of the differences, measured minus simulated.
+    std
+        Median standard uncertainty.
+    beyond_2
+        Fraction of the differences above two standard uncertainties; .046 is ordinary.
+    chi_square
+        Per degree of freedom: 1 is expected where the simulation is right.
+    degrees_of_freedom
+        Of chi-square.
+    probability
+        Of a larger chi-square where the simulation is right.
+    """
+
+    values: int
+    mean: float = math.nan
+    rms: float = math.nan
+    std: float = math.nan
+    beyond_2: float = math.nan
+    chi_square: float = math.nan
+    degrees_of_freedom: float = math.nan
+    probability: float = math.nan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fit:
+    """Multiple of the levelled simulation that fits a measured displacement best, with any shift and rotation.
+
+    Where the loads are stated, a modulus that is too large by 3 % reads as a scale of 1.03.
+
+    Attributes
+    ----------
+    scale, scale_std
+        NaN where the simulation is no more than a rigid motion.
+    rigid, rigid_std : ndarray, shape (3,)
+        Shift (mm) of the middle of the measured nodes, and rotation (degrees, from x towards y), measured minus
+        simulated.
+    chi_square
+        Of what the best multiple, shift and rotation leave, per degree of freedom.
+    template : ndarray, shape (2, N)
+        The simulation without a rigid motion over the standard uncertainty, at the measurement's nodes.
+    projection, information
+        Sums of the template times the measured displacement over its uncertainty, and times itself: their quotient is
+        the scale.
+    """
+
+    template: FloatArray
+    scale: float = math.nan
+    scale_std: float = math.nan
+    rigid: FloatArray = field(default_factory=lambda: np.full(3, math.nan))
+    rigid_std: FloatArray = field(default_factory=lambda: np.full(3, math.nan))
+    chi_square: float = math.nan
+    projection: float = 0.0
+    information: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -252,7 +314,7 @@ class Comparison:
         return fit, np.tensordot(rigid, motions, 1), taken
 
     @cached_property
-    def _own(self) -> npt.NDArray[np.int64]:
+    def _own(self) -> IntArray:
         """Node (M,) of the measurement that is each of the simulation's, by number and place; -1 where there is none.
 
         All are -1 where the measurement has nodes of its own.
@@ -290,8 +352,7 @@ class Comparison:
     def _correlations(self) -> list[tuple[sp.csr_matrix, sp.csr_matrix]]:
         """Correlation (M, M) of each of the `QUANTITIES` between the nodes, and its squares, entry by entry."""
         read, (gauges, given), whole = self._read[0], self._gauges, self.covariance.correlation
-        shape, entries = (given.shape[1], read.shape[1]), (gauges.rows, gauges.nodes)
-        slopes = [given @ sp.csr_matrix((part, entries), shape=shape) for part in gauges.whole]
+        slopes = [given @ slope for slope in gauges.slopes]
         moved, x, y = (_unit(matrix @ whole @ matrix.T) for matrix in (read, *slopes))
         shear = _unit(sum(slope @ whole @ slope.T for slope in slopes))
         return [(one, sp.csr_matrix(one.multiply(one))) for one in (moved, moved, x, y, shear)]

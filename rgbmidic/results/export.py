@@ -8,15 +8,13 @@ Only what changes its sign with the direction of y is there a second time: image
 
 from __future__ import annotations
 
-import csv
 import errno
-import io
 import json
 import os
 import re
 import shutil
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -24,10 +22,10 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.fields import column
-from rgbmidic.results.files import check_file, write_complete, writing
+from rgbmidic.fields.units import column
+from rgbmidic.results.files import check_file, write_complete, write_table, writing
 from rgbmidic.results.physical import Physical
-from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, ResultQuantity
+from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, Quantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray
@@ -35,18 +33,7 @@ from rgbmidic.typing import AnyArray
 if TYPE_CHECKING:
     import h5py
 
-_VERSION = (2, 0)
-"""Of VTKHDF: the first with time steps, which ParaView reads from 5.12 on."""
-_TRIANGLE = 5
-"""VTK's number of a cell with three corners."""
-_FAILED = 2
-"""Status of a frame that has no data."""
-_HEADERS = 1_000_000
-"""Bytes, more than enough, for what HDF5 writes of the arrays themselves."""
-_SHARED_BYTES = 200
-"""Bytes, more than enough, of each frame, node, element and light in what all frames share: axes, names, mesh."""
-_TURNED_BYTES = 20
-"""Bytes of a node in the arrays with y up: a vector of three numbers, a shear and a direction, in single precision."""
+_FAILED = QUANTITIES["status"].codes.index("failed")
 _AXES = "x to the right, y down; (0, 0) is the centre of the image's top-left pixel"
 _AXES_UP = "x to the right, y up: y, v, shears and directions are those of the file's root times -1"
 _TURNED = ("exy", "direction")
@@ -76,8 +63,10 @@ def write_hdf5(physical: Physical, file: BinaryIO) -> None:
     sizes = {"node": len(physical.mesh.nodes), "element": len(physical.mesh.elements)}
     sizes["light"] = len(physical.result.lights)
     frame = sum(entry.unmeasured(sizes).nbytes for entry in physical.quantities.values())
-    frame += _TURNED_BYTES * sizes["node"]
-    shared = _SHARED_BYTES * (len(physical.result) + sum(sizes.values())) + _HEADERS
+    # more than enough: y up has a vector of three numbers, a shear and a direction in single precision; 200 bytes of
+    # each frame, node, element and light in what all frames share; what HDF5 writes of the arrays themselves
+    frame += 20 * sizes["node"]
+    shared = 200 * (len(physical.result) + sum(sizes.values())) + 1_000_000
     if shutil.disk_usage(Path(file.name).parent).free < frame * len(physical.result) + shared:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # before HDF5 itself meets a full disk
     import h5py
@@ -145,7 +134,7 @@ def _describe(out: h5py.File, dataset: h5py.Dataset, axes: tuple[str, ...], abou
     return dataset
 
 
-def _declare(out: h5py.File, physical: Physical, entry: ResultQuantity) -> None:
+def _declare(out: h5py.File, physical: Physical, entry: Quantity) -> None:
     """Create the array of a quantity for all frames, still without content."""
     axes = tuple(axis if isinstance(axis, str) else f"part_of_{axis}" for axis in entry.axes)
     for name, axis in zip(axes, entry.axes, strict=True):
@@ -166,7 +155,7 @@ def _declare_grid(group: h5py.Group, physical: Physical) -> None:
 
     mesh, frames = physical.mesh, len(physical.result)
     nodes, elements = len(mesh.nodes), len(mesh.elements)
-    group.attrs["Version"] = np.array(_VERSION, dtype=np.int64)
+    group.attrs["Version"] = np.array((2, 0), dtype=np.int64)  # the first with time steps: ParaView 5.12 and later
     group.attrs.create("Type", b"UnstructuredGrid", dtype=h5py.string_dtype("ascii", len("UnstructuredGrid")))
     group.attrs["axes"] = _AXES_UP
     x, y = physical.length * mesh.nodes.T
@@ -174,7 +163,7 @@ def _declare_grid(group: h5py.Group, physical: Physical) -> None:
     # y up turns the triangles over: without the exchange of two corners they would be seen from behind
     group["Connectivity"] = mesh.elements[:, [0, 2, 1]].astype(np.int64).ravel()
     group["Offsets"] = 3 * np.arange(elements + 1, dtype=np.int64)
-    group["Types"] = np.full(elements, _TRIANGLE, dtype=np.uint8)
+    group["Types"] = np.full(elements, 5, dtype=np.uint8)  # VTK's number of a triangle
     for name, count in {"Points": nodes, "Cells": elements, "ConnectivityIds": 3 * elements}.items():
         group[f"NumberOf{name}"] = np.array([count], dtype=np.int64)
     data, steps, first = group.create_group("PointData"), group.create_group("Steps"), np.zeros(frames, dtype=np.int64)
@@ -274,30 +263,24 @@ def _write_npz(physical: Physical, file: BinaryIO) -> None:
 
 
 def _write_csv(physical: Physical, file: BinaryIO) -> None:
-    result, text = physical.result, io.TextIOWrapper(file, encoding="utf-8", newline="")
+    result, places, timed = physical.result, physical.places, physical.units.timed
     fields = {name: entry.unit for name, entry in physical.quantities.items() if entry.axes == ("node",)}
     del fields["node_status"]  # a whole number
-    places, writer = physical.places, csv.writer(text)
-    time = ["time_s"] if physical.units.timed else []
     label = [] if result.node_number is None else [result.node_number.tolist()]
-    head = ["frame", "number", "name", *time, "status", "node", *(["node_number"] if label else []), "node_status"]
-    writer.writerow(
-        [
-            *head,
-            *(column(name, unit) for name, (unit, _) in places.items()),
-            *(column(name, unit) for name, unit in fields.items()),
-        ]
-    )
-    for index, seconds in enumerate(physical.times.tolist()):
-        values = physical.frame(index)
-        start = [index, values["number"], result.names[index], *([f"{seconds:.12g}"] if time else []), values["status"]]
-        numbers = np.column_stack([*(place for _, place in places.values()), *(values[name] for name in fields)])
-        for node, (code, row) in enumerate(zip(values["node_status"].tolist(), numbers.tolist(), strict=True)):
-            known = (numbers_of[node] for numbers_of in label)
-            writer.writerow(
-                [*start, node, *known, code, *("" if number != number else f"{number:.9g}" for number in row)]
-            )
-    text.detach()  # leaves the file open for whoever opened it
+    head = ["frame", "number", "name", *(["time_s"] if timed else []), "status", "node"]
+    head += [*(["node_number"] if label else []), "node_status"]
+    head += [column(name, unit) for name, (unit, _) in places.items()]
+    head += [column(name, unit) for name, unit in fields.items()]
+
+    def rows() -> Iterator[list[object]]:
+        for index, seconds in enumerate(physical.times.tolist()):
+            values = physical.frame(index)
+            start = [index, values["number"], result.names[index], *([f"{seconds:.12g}"] if timed else [])]
+            numbers = np.column_stack([*(place for _, place in places.values()), *(values[name] for name in fields)])
+            for node, (code, row) in enumerate(zip(values["node_status"].tolist(), numbers.tolist(), strict=True)):
+                yield [*start, values["status"], node, *(known[node] for known in label), code, *row]
+
+    write_table(file, head, rows())
 
 
 _NODEMAP = ("id", "x [mm]", "y [mm]", "z [mm]", "u [mm]", "v [mm]", "w [mm]", "eps_x [%]", "eps_y [%]", "eps_xy [1]")

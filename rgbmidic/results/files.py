@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import glob
 import io
 import json
@@ -77,6 +78,16 @@ def _npy_parsed(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     file = io.BytesIO(header)
     np.lib.format.read_magic(file)
     return np.lib.format.read_array_header_1_0(file)
+
+
+def write_table(file: BinaryIO, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write CSV: a header line, then rows, whose decimal numbers have nine digits; a field without a value is empty."""
+    text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+    writer = csv.writer(text)
+    writer.writerow(head)
+    for row in rows:
+        writer.writerow(("" if x != x else f"{x:.9g}") if isinstance(x, float) else x for x in row)
+    text.detach()  # leaves the file open for whoever opened it
 
 
 def write_json(path: Path, document: Any, *, new: bool = False) -> None:

@@ -6,46 +6,29 @@ the maps of a result, with the speed of a front that travels along it.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import (
-    EQUIVALENT,
-    History,
-    Nodal,
-    NodalCovariance,
-    Probe,
-    Rectification,
-    RigidMotion,
-    Units,
-    make_probe,
-    rates,
-    rounded,
-)
-from rgbmidic.fields.history import rate_frames, rate_words
+from rgbmidic.fields.history import History, Nodal, Probe, Rates, rate_frames, rate_words, rates
+from rgbmidic.fields.nodal import NodalCovariance, RigidMotion
+from rgbmidic.fields.plane import Rectification
+from rgbmidic.fields.probes import make_probe
+from rgbmidic.fields.strain import EQUIVALENT
+from rgbmidic.fields.units import Units, rounded
 from rgbmidic.results.channels import Channels
-from rgbmidic.results.files import check_file, write_complete
-from rgbmidic.results.physical import exposure, frame_times, rectification_of, reference_frames, shared_part, units_of
+from rgbmidic.results.files import check_file, write_complete, write_table
+from rgbmidic.results.physical import MOVED, frame_times, rectification_of, reference_frames, shared_part
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
-from rgbmidic.typing import FloatArray
-
-_BLURRED = 1.0
-"""Motion (px) within the exposure from which a frame is reported to be blurred: the speckle is smeared over a pixel."""
-_COVERED = 0.01
-"""Fraction of a recording below which a warning doubts its unit of time: a factor of 1,000 is far below (chosen)."""
-_FAST = 95
-"""Percentile of the nodes' speeds that stands for the fast ones: single outliers do not count."""
-
+from rgbmidic.typing import FloatArray, IntArray
 
 HistoryColumn = History
 """A column of `Histories`: one quantity over the frames in the reader's unit."""
@@ -61,26 +44,26 @@ class Histories:
         Place in the result, number (with gaps where frames are lost) and status of each frame.
     times : ndarray, shape (T,), or None
         In seconds.
+    units
+        Of lengths and time.
     quantities
         One after the other.
     stress_strain
         Names of the strain and the stress that go together, where a stress is known.
-    units
-        Of lengths and time.
     remarks
         What a reader should know, a line each.
     channels
         Recorded beside the test, by the clock of the frames; None: there are none.
     """
 
-    frames: npt.NDArray[np.int64]
-    numbers: npt.NDArray[np.int64]
-    status: npt.NDArray[np.int64]
+    frames: IntArray
+    numbers: IntArray
+    status: IntArray
     times: FloatArray | None
-    quantities: tuple[HistoryColumn, ...]
-    stress_strain: tuple[str, str] | None
     units: Units
-    remarks: tuple[str, ...]
+    quantities: tuple[HistoryColumn, ...] = ()
+    stress_strain: tuple[str, str] | None = None
+    remarks: tuple[str, ...] = ()
     channels: Channels | None = None
 
     def __getitem__(self, name: str) -> HistoryColumn:
@@ -148,13 +131,10 @@ def history_csv(histories: Histories, file: BinaryIO) -> None:
         columns[quantity.column] = quantity.values
         if quantity.std is not None:
             columns[f"{quantity.column}_std"] = quantity.std
-    text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-    writer = csv.writer(text)
-    writer.writerow(["frame", "number", "status", *columns])
     heads = np.stack([histories.frames, histories.numbers, histories.status], axis=1).tolist()
-    for head, row in zip(heads, np.column_stack([*columns.values()]).tolist(), strict=True):
-        writer.writerow([*head, *("" if value != value else f"{value:.9g}" for value in row)])
-    text.detach()  # leaves the file open for whoever opened it
+    numbers = np.column_stack([*columns.values()]).tolist()
+    rows = ([*head, *row] for head, row in zip(heads, numbers, strict=True))
+    write_table(file, ["frame", "number", "status", *columns], rows)
 
 
 def read_histories(
@@ -192,21 +172,19 @@ def read_histories(
     """
     if not probes.places and probes.rigid_motion == "none":
         raise InputError("no probe is stated: give one on the command line, such as --point X,Y, or in [probes]")
-    times, rectified = frame_times(result, scale), rectification_of(result, scale)
-    rectified = replace(rectified, units=(units := replace(rectified.units, timed=times is not None)))
-    there = np.flatnonzero(result.finished)
+    rectified = rectification_of(result, scale)
+    alone = _frames(result, scale, rectified.units)
+    rectified, there, units = replace(rectified, units=alone.units), alone.frames, alone.units
     if not len(there):
         raise InputError(f"no frame of {result.path} is measured yet")
     window = probes.window and rate_frames(probes.window, len(there))
-    times = None if times is None else times[there]
     covariance = NodalCovariance.from_mesh(rectified.mesh)
-    counts: dict[str, int] = {}
-    made = []
+    counts, made = Counter[str](), list[Probe]()
     for kind, place in probes.places:
-        counts[kind] = counts.get(kind, 0) + 1
+        counts[kind] += 1
         made.append(make_probe(covariance, kind, counts[kind], place, probes, rectified))
-    clock = result.number[there].astype(np.float64) if times is None else times
-    each = result.table.each(["u", "v", "u_std", "v_std"], there.tolist())
+    clock = alone.numbers.astype(np.float64) if alone.times is None else alone.times
+    each = result.table.each(MOVED, there.tolist())
     nodal, rigid, speed = _read(each, rectified, covariance, made, probes.rigid_motion, clock)
     by_probe = {probe.name: probe.histories(part) for probe, part in zip(made, nodal, strict=True)}
     for name, histories in by_probe.items():
@@ -215,46 +193,33 @@ def read_histories(
                 f"{name} is measured in no frame of {result.path}: the nodes around it are not measured (node_status "
                 "says why); place it elsewhere"
             )
+    span = (window - 1) * float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
+    shared = {"common_fraction": shared_part(result), "references": reference_frames(result)[there]}
+    rate = partial(rates, clock, window=span, **shared) if window else None
     read = [*rigid, *(history for part in by_probe.values() for history in part)]
-    references = reference_frames(result)[there]
-    quantities = [
-        quantity
-        for history in read
-        for quantity in _in_units(history, units, clock, window, shared_part(result), references)
-    ]
-    read_off = Histories(
-        frames=there,
-        numbers=result.number[there],
-        status=result.status[there],
-        times=times,
-        quantities=tuple(quantities),
-        stress_strain=None,
-        units=units,
-        remarks=(
-            *_remarks(rectified, speed, exposure(result), there, by_probe),
-            *(
-                [f"exx, eyy, exy, e1, e2: {probes.measure.title()} strain"]
-                if any(one.name.endswith("_exx") for one in quantities)
-                else []
-            ),
-            *([f"rates: {rate_words(probes.window, len(there))}"] if window else ()),
-        ),
-    )
+    quantities = tuple(quantity for history in read for quantity in _in_units(history, units, rate))
+    remarks = [*_remarks(rectified, speed, result.provenance.get("exposure_ns"), there, by_probe)]
+    if any(one.name.endswith("_exx") for one in quantities):
+        remarks.append(f"exx, eyy, exy, e1, e2: {probes.measure.title()} strain")
+    if window:
+        remarks.append(f"rates: {rate_words(probes.window, len(there))}")
+    read_off = replace(alone, quantities=quantities, remarks=tuple(remarks))
     return with_channels(read_off, channels or ChannelSettings())
 
 
 def frames_alone(result: Result) -> Histories:
     """Return histories of no probe: the measured frames and their times, for channels."""
-    there, times = np.flatnonzero(result.finished), frame_times(result)
+    return _frames(result, None, rectification_of(result).units)
+
+
+def _frames(result: Result, scale: ScaleSettings | None, units: Units) -> Histories:
+    there, times = np.flatnonzero(result.finished), frame_times(result, scale)
     return Histories(
         frames=there,
         numbers=result.number[there],
         status=result.status[there],
         times=None if times is None else times[there],
-        quantities=(),
-        stress_strain=None,
-        units=units_of(result),
-        remarks=(),
+        units=replace(units, timed=times is not None),
     )
 
 
@@ -271,11 +236,11 @@ def _read(
     motions = np.full((len(clock), 3, 2), np.nan)
     speed, before = np.full(len(clock), np.nan), np.full((2, len(rectified.mesh.nodes)), np.nan)
     for row, values in enumerate(each):
-        parts = rectified.displacement(*(values[name] for name in ("u", "v", "u_std", "v_std")))
-        field = np.stack(parts).astype(np.float64)
+        field = np.stack(rectified.displacement(*(values[name] for name in MOVED))).astype(np.float64)
         moved = np.hypot(*(field[:2] - before))
         if row and np.isfinite(moved).any():
-            speed[row] = np.nanpercentile(moved, _FAST) / (clock[row] - clock[row - 1])
+            # of the fast nodes: single outliers do not count
+            speed[row] = np.nanpercentile(moved, 95) / (clock[row] - clock[row - 1])
         before = field[:2]
         if rigid != "none" and np.isfinite(field).all(axis=0).sum() > 1:
             motion = RigidMotion.of(covariance, *field)
@@ -283,8 +248,7 @@ def _read(
             field = motion.removed(rectified.mesh.nodes, field) if rigid == "remove" else field
         for fields, probe in zip(kept, probes, strict=True):
             fields.append(field[:, probe.nodes])
-    stacked = [np.stack(fields, axis=1) for fields in kept]
-    nodal = [Nodal(u=part[0], v=part[1], u_std=part[2], v_std=part[3]) for part in stacked]
+    nodal = [Nodal(**dict(zip(MOVED, np.stack(fields, axis=1), strict=True))) for fields in kept]
     motions[:, 2] = np.degrees(motions[:, 2])
     names = {"rigid_u": "px", "rigid_v": "px", "rigid_rotation": "deg"} if rigid != "none" else {}
     histories = [
@@ -294,10 +258,8 @@ def _read(
     return nodal, histories, speed
 
 
-def _in_units(
-    history: History, units: Units, clock: FloatArray, window: int, fraction: float, references: npt.NDArray[np.bool_]
-) -> Iterator[HistoryColumn]:
-    """Convert a history to the reader's units; add its rates over a window of frames, at kinks those of both sides."""
+def _in_units(history: History, units: Units, rate: Callable[..., Rates] | None) -> Iterator[HistoryColumn]:
+    """Convert a history to the reader's units; add its rates, if asked for, at kinks those of both sides."""
     length = history.unit == "px"
     unit = units.length if length else history.unit
 
@@ -309,10 +271,9 @@ def _in_units(
         yield history
         return
     yield entry(history.name, unit, history.values, history.std)
-    if not window or (history.unit == "deg" and history.name != "rigid_rotation"):
+    if rate is None or (history.unit == "deg" and history.name != "rigid_rotation"):
         return
-    span = (window - 1) * float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
-    found = rates(clock, history.values, history.std, window=span, common_fraction=fraction, references=references)
+    found = rate(history.values, history.std)
     for power, name in enumerate(("velocity", "acceleration") if length else ("velocity",), start=1):
         for side in ("", "_before", "_after"):
             values, std = getattr(found, f"{name}{side}"), getattr(found, f"{name}{side}_std")
@@ -365,7 +326,9 @@ def with_channels(histories: Histories, stated: ChannelSettings) -> Histories:
             "the clocks of channels and frames are taken as equal: channels.offset, .trigger or .align relates them"
         )
     first, last = channels.times[[0, -1]]
-    if (covered := float(np.nanmax(times) - np.nanmin(times)) / (last - first)) < _COVERED:
+    if (
+        covered := float(np.nanmax(times) - np.nanmin(times)) / (last - first)
+    ) < 0.01:  # a factor of 1,000 is far below
         remarks.append(
             f"the frames cover {covered:.2%} of the time of the channels: is the unit of {stated.file} right?"
         )
@@ -398,22 +361,22 @@ def with_channels(histories: Histories, stated: ChannelSettings) -> Histories:
 def _remarks(
     rectified: Rectification,
     speed: FloatArray,
-    exposed: float | None,
-    frames: npt.NDArray[np.int64],
+    exposure_ns: float | None,
+    frames: IntArray,
     read: Mapping[str, list[History]],
 ) -> Iterator[str]:
-    camera, units = rectified.camera, rectified.units
+    camera, units, exposed = rectified.camera, rectified.units, (exposure_ns or 0) * 1e-9
     if camera is not None:
         yield f"lengths and strains are those on the plane of {camera.name}: {camera.summary()}"
     if units.mm_per_pixel is None:
         yield "no scale is known: lengths are in px (mm_per_pixel in [scale]; `rgbmidic scale` finds it)"
     if not units.timed:
         yield "no time is known: the frame is the unit of time (frame_rate in [scale])"
-    blurred = np.nan_to_num(speed) * (exposed or 0.0) > _BLURRED if units.timed else np.zeros(len(frames), dtype=bool)
-    if exposed and blurred.any():
+    blurred = np.nan_to_num(speed) * exposed > 1  # px: the speckle is smeared over a pixel
+    if units.timed and blurred.any():
         yield (
             f"motion blur: within the exposure of {exposed:g} s the surface moves by up to "
-            f"{np.nanmax(speed) * exposed:.3g} px, by more than {_BLURRED:g} px in {int(blurred.sum())} frames from "
+            f"{np.nanmax(speed) * exposed:.3g} px, by more than 1 px in {int(blurred.sum())} frames from "
             f"frame {frames[blurred][0]} on"
         )
     if any(history.name.endswith("_equivalent") for part in read.values() for history in part):

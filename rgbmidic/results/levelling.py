@@ -14,15 +14,6 @@ from rgbmidic.fields.nodal import Places
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
 
-_FEWEST, _MOST = 3, 12
-"""Parts of an element's side over which the simulation is averaged: elements of half the simulation's, within these
-bounds. The rule's error falls as the square of their number: 1 % of what levelling changes at 3 (derived)."""
-_BEYOND = 0.5
-"""How far beyond an element of the simulation, in its barycentric coordinates, it is continued linearly: the outline of
-a region that was drawn by hand differs by some px (chosen)."""
-_AT_ONCE = 20_000
-"""Points that are looked up at once: some 60 MB (derived)."""
-
 
 class Levelling:
     """What a measurement on a mesh makes of a simulated displacement field.
@@ -44,10 +35,13 @@ class Levelling:
     """
 
     def __init__(self, mesh: Tri3Mesh, simulated: Tri3Mesh) -> None:
-        inner = _middles(int(np.clip(math.ceil(2 * mesh.size / simulated.size), _FEWEST, _MOST)))
+        # the simulation is averaged over elements of half its own, 3 to 12 along a side: the error falls as the square
+        # of their number, and is 1 % of what levelling changes at 3 (derived)
+        inner = _middles(int(np.clip(math.ceil(2 * mesh.size / simulated.size), 3, 12)))
         points = np.einsum("qc,ecd->eqd", inner, mesh.nodes[mesh.elements])
         read, depth = reading(simulated, points.reshape(-1, 2))
-        used: BoolArray = np.asarray((depth.reshape(points.shape[:2]) > -_BEYOND).all(axis=1))
+        # it is continued linearly by half an element: the outline of a region drawn by hand differs by some px (chosen)
+        used: BoolArray = np.asarray((depth.reshape(points.shape[:2]) > -0.5).all(axis=1))
         if not used.any():
             raise InputError("the simulation's mesh covers no element of the measurement's: check where it is placed")
         row = np.arange(len(depth))
@@ -78,7 +72,8 @@ def _middles(parts: int) -> FloatArray:
 
 def reading(mesh: Tri3Mesh, points: FloatArray) -> tuple[sp.csr_matrix, FloatArray]:
     """Matrix (P, N) that reads a nodal field at points (P, 2), and the least barycentric coordinate there (P,)."""
-    parts = [Places.of(mesh, points[start : start + _AT_ONCE]) for start in range(0, len(points), _AT_ONCE)]
+    at_once = 20_000  # points: some 60 MB (derived)
+    parts = [Places.of(mesh, points[start : start + at_once]) for start in range(0, len(points), at_once)]
     values = np.concatenate([part.barycentric for part in parts])
     nodes = mesh.elements[np.concatenate([part.element for part in parts])]
     row = np.repeat(np.arange(len(points)), 3)

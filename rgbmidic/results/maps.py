@@ -15,37 +15,26 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import (
-    MEASURES,
-    NodalCovariance,
-    RigidMotion,
-    Strain,
-    StrainGauges,
-    Units,
-    frame_covariance,
-    length_of,
-    rates,
-    strain_of_gradient,
-)
-from rgbmidic.fields.history import FEWEST, rate_frames, rate_words
+from rgbmidic.fields.history import FEWEST, rate_frames, rate_words, rates
+from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
+from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
+from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.results.field import (
+from rgbmidic.results.derived import (
     COMPONENTS,
-    DERIVED,
     FINER,
     OF_LENGTHS,
     OF_STRAINS,
     STRAINS,
     UV,
     WITH_ERROR,
-    MapField,
-    map_fields,
+    map_quantities,
 )
-from rgbmidic.results.physical import Physical, frame_times, reference_frames, scale_of, shared_part
-from rgbmidic.results.quantities import UNKNOWN_TIME
+from rgbmidic.results.physical import MOVED, Physical, frame_times, named, reference_frames, scale_of, shared_part
+from rgbmidic.results.quantities import UNKNOWN_TIME, Quantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 WINDOW = 9
 """Frames that a parabola takes in for rates where none are stated. Chosen: the noise of a velocity is then .13 of that
@@ -54,7 +43,6 @@ _AROUND = 2
 """Windows of frames that are read at once, and on either side of these: the widest fit takes in 5/3 of a window."""
 _AT_ONCE = 4096
 """Nodes whose rates are computed at once: 25 MB of results at the default window."""
-_MOVED = ("u", "v", "u_std", "v_std")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -112,17 +100,7 @@ class Maps:
     window: int = WINDOW
 
     @classmethod
-    def of(
-        cls,
-        result: Result,
-        scale: ScaleSettings | None = None,
-        *,
-        gauge: float | None = None,
-        measure: str | None = None,
-        since: int | None = None,
-        rigid_removed: bool = False,
-        window: int | None = None,
-    ) -> Self:
+    def of(cls, result: Result, scale: ScaleSettings | None = None, **choices: Any) -> Self:
         """Choose how fields are derived.
 
         Parameters
@@ -131,12 +109,8 @@ class Maps:
             The result; a run may still add to it.
         scale
             It replaces the ``[scale]`` that was kept with the result; None: that one.
-        gauge
-            Length of the virtual strain gauge in px; None: the shortest, three elements.
-        measure
-            One of `rgbmidic.fields.MEASURES`; None: the first.
-        since, rigid_removed, window
-            See the class; the window is that of ``[probes]``, or 9 frames, where None is stated.
+        **choices
+            `gauge`, `measure`, `since`, `rigid_removed` and `window`, as of `chosen`.
 
         Returns
         -------
@@ -145,10 +119,9 @@ class Maps:
         Raises
         ------
         InputError
-            There is no such frame or measure, the gauge is too short, or the window holds fewer than 4 frames.
+            As of `chosen`.
         """
-        plain = cls(result=result, physical=Physical.untimed(result, scale))
-        return plain.chosen(gauge=gauge, measure=measure, since=since, rigid_removed=rigid_removed, window=window)
+        return cls(result=result, physical=Physical.untimed(result, scale)).chosen(**choices)
 
     def chosen(
         self,
@@ -163,8 +136,12 @@ class Maps:
 
         Parameters
         ----------
-        gauge, measure, since, rigid_removed, window
-            As of `of`.
+        gauge
+            Length of the virtual strain gauge in px; None: the shortest, three elements.
+        measure
+            One of `rgbmidic.fields.MEASURES`; None: the first.
+        since, rigid_removed, window
+            See the class; the window is that of ``[probes]``, or 9 frames, where None is stated.
 
         Returns
         -------
@@ -173,7 +150,8 @@ class Maps:
         Raises
         ------
         InputError
-            There is no frame `since`, nothing is measured in it, or the `window` is too short for rates.
+            There is no frame `since`, nothing is measured in it, there is no such measure, the gauge is too short, or
+            the window holds fewer than 4 frames.
         """
         frames = len(self.result)
         if since is not None and not 0 <= since < frames:
@@ -195,12 +173,12 @@ class Maps:
         return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
     @cached_property
-    def all(self) -> dict[str, MapField]:
+    def all(self) -> dict[str, Quantity]:
         """Every field by its name, displacements first; each that has an uncertainty is followed by it further down."""
         error = bool(self.result.setting("mesh", "error"))
-        return map_fields(self._units, self.physical.quantities, self.result.lights, with_error=error)
+        return map_quantities(self._units, self.result.lights, with_error=error)
 
-    def field(self, name: str) -> MapField:
+    def field(self, name: str) -> Quantity:
         """Return a field by its name.
 
         Parameters
@@ -210,7 +188,7 @@ class Maps:
 
         Returns
         -------
-        MapField
+        Quantity
 
         Raises
         ------
@@ -271,9 +249,9 @@ class Maps:
         if not 0 <= frame < len(self.result):
             raise InputError(f"there is no frame {frame} in a result of {len(self.result)} frames")
         base = name.removesuffix("_std")
-        derived = base in DERIVED or base in STRAINS or name in WITH_ERROR
+        derived = base in OF_LENGTHS | OF_STRAINS | STRAINS or name in WITH_ERROR
         stored = ("light_fraction",) if kind == "fraction" else () if derived else (base,)
-        read = next(self.result.table.each([*_MOVED, "node_status", *stored], [frame]))
+        read = next(self.result.table.each([*MOVED, "node_status", *stored], [frame]))
         nothing = np.full(len(self.result.nodes), np.nan)
         if name in WITH_ERROR:
             values, std = self._with_error(name, frame), nothing
@@ -315,10 +293,10 @@ class Maps:
         return error if name.endswith("_error") else np.hypot(error, double[f"{one}_std"])
 
     def _derived(self, name: str, frame: int) -> tuple[FloatArray, FloatArray]:
-        """Compute a field of `DERIVED`, or a strain, and its uncertainty, each (N,)."""
-        entry = DERIVED.get(name)
-        if entry is None:
+        """Compute a length, a strain or a rate, and its uncertainty, each (N,)."""
+        if name in STRAINS:
             return self._strain(frame)[name], self._strain(frame)[f"{name}_std"]
+        entry = (OF_LENGTHS | OF_STRAINS)[name]
         if entry.order:
             parts = [self._rates(part, frame, entry.order) for part in entry.parts]
         else:
@@ -367,7 +345,7 @@ class Maps:
         InputError
             The place is outside the mesh, or the gauge is too short.
         """
-        return Physical.named(self._strain_of(frame, self._gauge(*self.physical.rectified.place((x, y, length), 1))))
+        return named(self._strain_of(frame, self._gauge(*self.physical.rectified.place((x, y, length), 1))))
 
     @cached_property
     def _gauge(self) -> Callable[[float, float, float], StrainGauges]:
@@ -378,8 +356,8 @@ class Maps:
 
     def _measured(self, frame: int) -> FloatArray:
         """Read u, v and their uncertainties (4, N) against the test's reference, in rectified px."""
-        read = next(self.result.table.each(_MOVED, [frame]))
-        return np.stack(self.physical.rectified.displacement(*(np.asarray(read[name], np.float64) for name in _MOVED)))
+        read = next(self.result.table.each(MOVED, [frame]))
+        return np.stack(self.physical.rectified.displacement(*(np.asarray(read[name], np.float64) for name in MOVED)))
 
     def _since(self, frame: int) -> FloatArray:
         """Return u, v and their uncertainties (4, N) since the frame that is the reference here."""
@@ -418,7 +396,7 @@ class Maps:
     @cached_property
     def _strain(self) -> Callable[[int], Mapping[str, FloatArray]]:
         """Strain by name of a frame; of the last two it is kept, for several fields of one frame."""
-        return lru_cache(2)(lambda frame: Physical.named(self._strain_of(frame, self.physical.gauges)))
+        return lru_cache(2)(lambda frame: named(self._strain_of(frame, self.physical.gauges)))
 
     def _strain_of(self, frame: int, gauges: StrainGauges) -> Strain:
         moved = self._measured(frame)
@@ -448,7 +426,7 @@ class Maps:
         return values[row], std[row]
 
     @cached_property
-    def _there(self) -> npt.NDArray[np.int64]:
+    def _there(self) -> IntArray:
         return np.flatnonzero(self.result.finished)
 
     @cached_property

@@ -10,33 +10,25 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
-from rgbmidic.fields import (
-    EQUIVALENT,
-    MEASURES,
-    CameraCalibration,
-    NodalCovariance,
-    Rectification,
-    Strain,
-    StrainGauges,
-    Units,
-    reference_fraction,
-    strain_of_gradient,
-)
+from rgbmidic.fields.nodal import NodalCovariance, reference_fraction
+from rgbmidic.fields.plane import CameraCalibration, Rectification
+from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
+from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Placement, Tri3Mesh
-from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, ResultQuantity
+from rgbmidic.results.derived import ELEMENT_STRAIN, STRAIN
+from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, Quantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings, read_section
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
 
-_DIFFERENT = 0.01
-"""Relative difference of a stated frame rate from that of the time stamps above which a warning names both: stamps
-in whole microseconds give the median interval of 10,000 frames per second to 1 %."""
+MOVED = ("u", "v", "u_std", "v_std")
+"""Displacement and its standard uncertainty, in the order in which functions take them."""
 
 
 def scale_of(result: Result) -> ScaleSettings:
@@ -101,17 +93,20 @@ def rectification_of(result: Result, scale: ScaleSettings | None = None) -> Rect
     InputError
         The camera holds no plane.
     """
-    mesh, camera = Tri3Mesh(nodes=result.nodes, elements=result.elements), None
-    if scale is not None and scale.camera is not None:
-        camera = CameraCalibration.read(scale.camera)
-    elif scale is None and (kept := result.provenance.get("camera")) is not None:
-        camera = CameraCalibration.from_document(kept, str(scale_of(result).camera))
+    if scale is None:
+        stated, camera = scale_of(result), _kept_camera(result)
+    else:
+        stated, camera = scale, None if scale.camera is None else CameraCalibration.read(scale.camera)
     if camera is not None:
         camera.check(result.frame_shape or camera.shape)
-    stated = scale_of(result) if scale is None else scale
-    if camera is None and stated.mm_per_pixel is None and (placed := placement_of(result)) is not None:
+    elif stated.mm_per_pixel is None and (placed := placement_of(result)) is not None:
         stated = replace(stated, mm_per_pixel=placed.mm_per_pixel, mm_per_pixel_std=placed.mm_per_pixel_std)
-    return Rectification.of(mesh, stated, camera)
+    return Rectification.of(Tri3Mesh(nodes=result.nodes, elements=result.elements), stated, camera)
+
+
+def _kept_camera(result: Result) -> CameraCalibration | None:
+    document = result.provenance.get("camera")
+    return None if document is None else CameraCalibration.from_document(document, str(scale_of(result).camera))
 
 
 def placement_of(result: Result) -> Placement | None:
@@ -127,28 +122,7 @@ def placement_of(result: Result) -> Placement | None:
     Placement or None
     """
     kept = result.provenance.get("finite_elements")
-    if kept is None:
-        return None
-    document = result.provenance.get("camera")
-    camera = None if document is None else CameraCalibration.from_document(document, str(scale_of(result).camera))
-    return Placement.from_document(kept["placement"], camera)
-
-
-def units_of(result: Result, scale: ScaleSettings | None = None) -> Units:
-    """Return the units of a result, with its own ``[scale]`` or another one in its place.
-
-    Parameters
-    ----------
-    result
-        The result.
-    scale
-        It replaces the ``[scale]`` that was kept with the result; None: that one.
-
-    Returns
-    -------
-    Units
-    """
-    return replace(rectification_of(result, scale).units, timed=frame_times(result, scale) is not None)
+    return None if kept is None else Placement.from_document(kept["placement"], _kept_camera(result))
 
 
 def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArray | None:
@@ -191,25 +165,12 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
 
 
 def _compare(recorded: float, stated: float | None, contradiction: str) -> None:
-    """Warn where a stated frame rate is not the recorded one."""
-    if stated and abs(recorded / stated - 1) > _DIFFERENT:
-        logger.warning(f"scale.frame_rate states %g frames per second, {contradiction}", stated, recorded)
+    """Warn where a stated frame rate is not the recorded one.
 
-
-def exposure(result: Result) -> float | None:
-    """Return the exposure time of a frame in seconds; None where the files do not report it.
-
-    Parameters
-    ----------
-    result
-        The result.
-
-    Returns
-    -------
-    float or None
+    Time stamps in whole microseconds give the median interval of 10,000 frames per second to 1 %.
     """
-    nanoseconds = result.provenance.get("exposure_ns")
-    return None if nanoseconds is None else float(nanoseconds) * 1e-9
+    if stated and abs(recorded / stated - 1) > 0.01:
+        logger.warning(f"scale.frame_rate states %g frames per second, {contradiction}", stated, recorded)
 
 
 def reference_frames(result: Result) -> BoolArray:
@@ -242,33 +203,6 @@ def shared_part(result: Result) -> float:
     float
     """
     return reference_fraction(len(result.setting("frames", "reference", [0])))
-
-
-_NODE, _ELEMENT = ("node",), ("element",)
-STRAIN = (
-    ResultQuantity("exx", _NODE, "", "components.0", "strain in x", symbol="εxx"),
-    ResultQuantity("eyy", _NODE, "", "components.1", "strain in y", symbol="εyy"),
-    ResultQuantity("exy", _NODE, "", "components.2", "strain, tensor shear", symbol="εxy"),
-    ResultQuantity("exx_std", _NODE, "", "components_std.0", "standard uncertainty of exx"),
-    ResultQuantity("eyy_std", _NODE, "", "components_std.1", "standard uncertainty of eyy"),
-    ResultQuantity("exy_std", _NODE, "", "components_std.2", "standard uncertainty of exy"),
-    ResultQuantity("e1", _NODE, "", "principal.0", "larger principal strain in the plane", symbol="ε₁"),
-    ResultQuantity("e2", _NODE, "", "principal.1", "smaller principal strain in the plane", symbol="ε₂"),
-    ResultQuantity("e1_std", _NODE, "", "principal_std.0", "standard uncertainty of e1"),
-    ResultQuantity("e2_std", _NODE, "", "principal_std.1", "standard uncertainty of e2"),
-    ResultQuantity("direction", _NODE, "deg", "direction_deg", "direction of e1, from x towards y", symbol="θ₁"),
-    ResultQuantity("direction_std", _NODE, "deg", "direction_std_deg", "standard uncertainty of direction"),
-    ResultQuantity("shear", _NODE, "", "shear", "largest engineering shear in the plane, e1 - e2", symbol="γmax"),
-    ResultQuantity("shear_std", _NODE, "", "shear_std", "standard uncertainty of shear"),
-    ResultQuantity("equivalent", _NODE, "", "equivalent", EQUIVALENT, symbol="εeq (Hencky)"),
-    ResultQuantity("equivalent_std", _NODE, "", "equivalent_std", "standard uncertainty of equivalent"),
-)
-_ELEMENT_STRAIN = tuple(
-    replace(entry, name=f"{entry.name}_element", axes=_ELEMENT, meaning=f"{entry.meaning}, constant in an element")
-    for entry in STRAIN[:3]
-)
-_REPLACED = ("time_ns", *(entry.name for entry in STRAIN))
-"""Quantities of the table that others replace here: times in s, finite strain over a gauge."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -369,39 +303,34 @@ class Physical:
         return f"{length:.4g} px" + ("" if scale is None else f" ({length * scale:.3g} mm)")
 
     @cached_property
-    def quantities(self) -> dict[str, ResultQuantity]:
+    def quantities(self) -> dict[str, Quantity]:
         """Entries of what `frame` returns: the stackable quantities of the table, and strain; lengths in `units`."""
-        kept = [entry for entry in QUANTITIES.values() if entry.stackable and entry.name not in _REPLACED]
-        converted = [replace(entry, unit=self.units.length) if entry.unit == "px" else entry for entry in kept]
-        return {entry.name: entry for entry in (*converted, *STRAIN, *_ELEMENT_STRAIN)}
+        kept = [entry for entry in QUANTITIES.values() if entry.stackable and entry.name != "time_ns"]
+        kept = [entry for entry in kept if not self.is_strain(entry.name)]  # small strain gives way to finite strain
+        return {entry.name: entry.in_units(self.units) for entry in (*kept, *STRAIN, *ELEMENT_STRAIN)}
 
     def is_strain(self, name: str) -> bool:
         """Report whether a quantity depends on strain measure and gauge."""
-        return any(entry.name == name for entry in (*STRAIN, *_ELEMENT_STRAIN))
+        return any(entry.name == name for entry in (*STRAIN, *ELEMENT_STRAIN))
 
     @property
     def length(self) -> float:
         """Factor from px to the unit of lengths."""
         return self.units.mm_per_pixel or 1.0
 
-    def frame(self, index: int) -> dict[str, Any]:
+    def frame(self, index: int) -> dict[str, AnyArray]:
         """Return the `quantities` of one frame, each in its type; errors as `Result.frame`."""
         record = self.result.frame(index)
-        values = {name: record.values[name] for name in self.quantities if name in record.values}
-        moved = (np.asarray(record.values[name], dtype=np.float64) for name in ("u", "v", "u_std", "v_std"))
-        u, v, u_std, v_std = self.rectified.displacement(*moved)
+        values = {name: np.asarray(record.values[name]) for name in self.quantities if name in record.values}
+        u, v, u_std, v_std = self.rectified.displacement(*(values[name].astype(np.float64) for name in MOVED))
         for component, pair in {"u": (u, u_std), "v": (v, v_std)}.items():
             values |= zip((component, f"{component}_std"), self.units.lengths(*pair), strict=True)
-        values |= self.strain(u, v, u_std, v_std)
+        values |= named(self.gauges.strain(u, v, u_std, v_std, measure=self.measure))
         gradient = self.mesh.element_gradient(np.stack([u, v], axis=1))
         elements = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4)), self.measure)
-        return values | {entry.name: entry.of(elements) for entry in _ELEMENT_STRAIN}
+        return values | {entry.name: entry.of(elements) for entry in ELEMENT_STRAIN}
 
-    def strain(self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray) -> dict[str, FloatArray]:
-        """Return the strain at the nodes by name, from the displacements (N,) of one frame in rectified px."""
-        return self.named(self.gauges.strain(u, v, u_std, v_std, measure=self.measure))
 
-    @staticmethod
-    def named(strain: Strain) -> dict[str, FloatArray]:
-        """Return the quantities of a strain by name."""
-        return {entry.name: entry.of(strain) for entry in STRAIN}
+def named(strain: Strain) -> dict[str, FloatArray]:
+    """Return the quantities of a strain by name."""
+    return {entry.name: entry.of(strain) for entry in STRAIN}

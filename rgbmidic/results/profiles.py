@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields import ProfileLine, Units, column
+from rgbmidic.fields import ProfileLine
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
-from rgbmidic.results.field import MapField
-from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.fields.units import column
+from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.maps import Maps
 from rgbmidic.results.physical import frame_times, shared_part
 from rgbmidic.typing import AnyArray, FloatArray
@@ -41,14 +38,24 @@ class Wave:
     front: Front
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Profile:
-    """A field along a line in some frames.
+    """A field along a line in some frames; its values are NaN until `fill` reads them.
+
+    Parameters
+    ----------
+    maps
+        The result and how its fields are derived.
+    field
+        Name of the field.
+    place
+        Ends x0, y0, x1, y1 of the line in px of the image.
+    frames
+        Indices of the frames.
 
     Attributes
     ----------
-    field
-        What it is.
+    field, how
+        What it is, and how it is derived (`Maps.how`).
     line
         The points; its positions are in rectified px.
     frames, numbers : ndarray, shape (T,), int
@@ -63,74 +70,31 @@ class Profile:
         Fraction of the variance that all frames have in common.
     rate_window
         Time that a rate is taken over; 0 for what is no rate.
-    how
-        How the field is derived (`Maps.how`).
+
+    Raises
+    ------
+    InputError
+        The field has no uncertainty, no frame is measured yet, or half of the line is outside the mesh.
     """
 
-    field: MapField
-    line: ProfileLine
-    frames: npt.NDArray[np.int64]
-    numbers: npt.NDArray[np.int64]
-    times: FloatArray | None
-    units: Units
-    values: FloatArray
-    std: FloatArray
-    common_fraction: float
-    rate_window: float
-    how: str = ""
-
-    @classmethod
-    def along(cls, maps: Maps, field: str, place: Sequence[float], frames: Sequence[int] | AnyArray) -> Self:
-        """Lay the points of a profile whose values are not read yet; parameters and errors as `read_profile`.
-
-        Parameters
-        ----------
-        maps
-            The result and how its fields are derived.
-        field
-            Name of the field.
-        place
-            Ends x0, y0, x1, y1 of the line in px of the image.
-        frames
-            Indices of the frames.
-
-        Returns
-        -------
-        Profile
-
-        Raises
-        ------
-        InputError
-            The field has no uncertainty, or no frame is measured yet.
-        """
-        found, result, physical = maps.field(field), maps.result, maps.physical
+    def __init__(self, maps: Maps, field: str, place: Sequence[float], frames: Sequence[int] | AnyArray) -> None:
+        self.field, self.how, result, physical = maps.field(field), maps.how(field), maps.result, maps.physical
         if f"{field}_std" not in maps.all:
             raise InputError(
                 f'a profile is of a field with an uncertainty, not of "{field}"; these are '
                 + ", ".join(name for name in maps.all if f"{name}_std" in maps.all)
             )
-        chosen = np.asarray(frames, dtype=np.int64)
-        if not len(chosen):
+        self.frames = np.asarray(frames, dtype=np.int64)
+        if not len(self.frames):
             raise InputError(f"no frame of {result.path} is measured yet")
-        line = ProfileLine.between(physical.covariance, physical.gauges, *physical.rectified.place(place, 2))
-        times = frame_times(result, physical.scale)
-        values, std = np.full((2, len(chosen), len(line.points)), np.nan)
-        profile = cls(
-            field=found,
-            how=maps.how(field),
-            line=line,
-            frames=chosen,
-            numbers=result.number[chosen],
-            times=None if times is None else times[chosen],
-            units=replace(physical.units, timed=times is not None),
-            values=values,
-            std=std,
-            common_fraction=shared_part(result),
-            rate_window=0.0,
-        )
-        rated = "velocity" in field or "acceleration" in field or "_rate" in field
-        interval = float(np.median(np.diff(profile.clock))) if len(chosen) > 1 else 0.0
-        return replace(profile, rate_window=(maps.window - 1) * interval if rated else 0.0)
+        self.line = ProfileLine(physical.covariance, physical.gauges, *physical.rectified.place(place, 2))
+        times, self.numbers = frame_times(result, physical.scale), result.number[self.frames]
+        self.times = None if times is None else times[self.frames]
+        self.units = replace(physical.units, timed=times is not None)
+        self.values, self.std = np.full((2, len(self.frames), len(self.line.points)), np.nan)
+        self.common_fraction, self.rate_window = shared_part(result), 0.0
+        if self.field.group == "Rates" and len(self.frames) > 1:
+            self.rate_window = (maps.window - 1) * float(np.median(np.diff(self.clock)))
 
     def fill(self, maps: Maps, rows: Iterable[int]) -> None:
         """Read some rows of the values and of their uncertainties, in place.
@@ -217,7 +181,7 @@ def read_profile(maps: Maps, field: str, place: Sequence[float], frames: Sequenc
     InputError
         There is no such field or frame, it has no uncertainty, or half of the line is outside the mesh.
     """
-    profile = Profile.along(maps, field, place, np.flatnonzero(maps.result.finished) if frames is None else frames)
+    profile = Profile(maps, field, place, np.flatnonzero(maps.result.finished) if frames is None else frames)
     profile.fill(maps, range(len(profile.frames)))
     if not np.isfinite(profile.values).any():
         raise InputError(f"{field} is measured in no frame along the line; place it elsewhere")
@@ -247,42 +211,32 @@ def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *
     beside = arrivals_file(out)
     for file in (out, *([beside] if wave else [])):
         check_file(file, overwrite=overwrite)
-    unit, name = profile.units.length, profile.field
-    places = profile.line.points * (profile.units.mm_per_pixel or 1.0)
+    unit, value = profile.units.length, column(profile.field.name, profile.field.unit)
     head = [column(part, unit) for part in ("position", "x", "y")]
-    at = np.column_stack([profile.positions, places]).tolist()
-    value = column(name.name, name.unit)
+    at = np.column_stack([profile.positions, profile.line.points * (profile.units.mm_per_pixel or 1.0)])
+    timed = [] if profile.times is None else ["time_s"]
 
-    def table(file: BinaryIO) -> None:
-        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-        writer = csv.writer(text)
-        timed = [] if profile.times is None else ["time_s"]
-        writer.writerow(["frame", "number", *timed, *head, value, f"{value}_std"])
+    def rows() -> Iterator[list[object]]:
         for row, (frame, number, clock) in enumerate(zip(profile.frames, profile.numbers, profile.clock, strict=True)):
             start = [frame, number, *([f"{clock:.12g}"] if timed else [])]
-            for place, *pair in zip(at, profile.values[row], profile.std[row], strict=True):
-                writer.writerow([*start, *map(_number, (*place, *pair))])
-        text.detach()  # leaves the file open for whoever opened it
+            for numbers in np.column_stack([at, profile.values[row], profile.std[row]]).tolist():
+                yield [*start, *numbers]
 
-    write_complete(out, table)
+    names = ["frame", "number", *timed, *head, value, f"{value}_std"]
+    write_complete(out, lambda file: write_table(file, names, rows()))
     if wave is None:
         return
-    clock = "s" if profile.times is not None else "frame"
+    clock = "s" if timed else "frame"
     columns = {
-        **dict(zip(head, np.array(at).T, strict=True)),
+        **dict(zip(head, at.T, strict=True)),
         f"arrival_{clock}": wave.arrivals.times,
         f"arrival_{clock}_std": wave.arrivals.std,
         f"residual_{clock}": wave.front.residuals,
         "used": wave.front.used.astype(float),
     }
-    rows = "".join(",".join(map(_number, row)) + "\r\n" for row in np.column_stack([*columns.values()]).tolist())
-    write_complete(beside, lambda file: file.write((",".join(columns) + "\r\n" + rows).encode()))
+    write_complete(beside, lambda file: write_table(file, columns, np.column_stack([*columns.values()]).tolist()))
 
 
 def arrivals_file(out: Path) -> Path:
     """Return the file of arrival times beside that of a profile."""
     return out.with_name(f"{out.stem}_arrivals.csv")
-
-
-def _number(value: float) -> str:
-    return "" if value != value else f"{value:.9g}"

@@ -40,8 +40,6 @@ _ALWAYS = ("rgbmidic", *_PACKAGES[:4])
 """Packages whose version decides on the bits of any result; the others read formats of frames."""
 READING = ("scale", "probes", "setup", "channels")
 """Sections of the settings that state how a result is read, and not what is measured."""
-_NAMED = 3
-"""Differences that an error names: more do not fit a line of a terminal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -147,10 +145,8 @@ def check_same(path: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> No
     # 25 and 25.0 are one number; 1 is a frame, true is not
     names = [name for name in {**before, **after} if _typed(before.get(name)) != _typed(after.get(name))]
     if names:
-        differences = "; ".join(
-            f"{name} was {_short(before.get(name))}, now {_short(after.get(name))}" for name in names[:_NAMED]
-        )
-        more = f"; and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        stated = [f"{name} was {_short(before.get(name))}, now {_short(after.get(name))}" for name in names[:3]]
+        differences, more = "; ".join(stated), f"; and {len(names) - 3} more" if len(names) > 3 else ""
         raise AnotherTestError(
             f"{path} is of another test and is not gone on with: {differences}{more}; give another folder"
         )

@@ -1,40 +1,45 @@
-"""The field table of a result: every quantity declared once, and the record of one frame.
+"""The table of numbers of a result: what a quantity is, every quantity that is kept, and the record of one frame.
 
-Record, store, exports, figures and documents read this table.
+Each is declared once, here or in `rgbmidic.results.derived`; record, store, exports, maps and documents read that.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import KW_ONLY, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import KW_ONLY, dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.fields.units import Units, rounded, uncertain
 from rgbmidic.timing import STAGES
-from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
     from rgbmidic.correlation.solution import Solution
 
 
+Kind = Literal["displacement", "strain", "positive", "fraction", "angle", "codes"]
+
+
 @dataclass(frozen=True, slots=True)
-class ResultQuantity:
-    """An entry of the field table: what is kept under one name, of every frame or of all together.
+class Quantity:
+    """An entry of the table: what a name stands for, of every frame or of all together, kept or derived.
 
     Attributes
     ----------
     name
-        Name in records, files and exports.
+        Name in records, files, exports and maps. A fraction in a map is named by its light; a standard uncertainty
+        ends in ``_std``.
     axes
         Axes in one frame: ``"node"`` and ``"light"`` have the result's sizes, a number is a size itself, and any other
         word is open: its size may differ from frame to frame. Without axes it is a plain number or text.
     unit
-        Empty where there is none.
+        Empty where there is none; ``"px"`` becomes the reader's unit of lengths (`in_units`).
     source
-        Attribute of the object that it comes from, such as a `Solution`, a column of it behind a dot; empty where the
-        main job provides it.
+        Attribute of the object that it comes from, a `Solution` or a `Strain`, a column of it behind a dot; empty where
+        the main job provides it. That of its standard uncertainty has ``_std`` behind the first word.
     meaning
         Its description in docs/reference/conventions.md.
     dtype
@@ -44,7 +49,13 @@ class ResultQuantity:
     codes
         What each integer means, for a status.
     symbol
-        How pictures write it; empty: its name.
+        How formulas and pictures write it; empty for what maps do not show.
+    parts, order
+        Quantities from which it follows: their length where there are two, their derivative by time of an order.
+    group
+        Heading under which maps list it.
+    kind
+        Kind of the values, which sets colours and format.
     """
 
     name: str
@@ -57,6 +68,86 @@ class ResultQuantity:
     blank: float | int | str = float("nan")
     codes: tuple[str, ...] = ()
     symbol: str = ""
+    parts: tuple[str, ...] = ()
+    order: int = 0
+    group: str = "Quality"
+    kind: Kind = "strain"
+
+    @property
+    def uncertainty(self) -> Quantity:
+        """Its standard uncertainty."""
+        return replace(
+            self,
+            name=f"{self.name}_std",
+            source=re.sub(r"^[a-z]+", r"\g<0>_std", self.source),
+            meaning=f"standard uncertainty of {self.name}",
+            symbol=f"σ({self.symbol})",
+            group="Uncertainty",
+            kind="positive",
+        )
+
+    def in_units(self, units: Units) -> Quantity:
+        """Return it with the reader's units of length and time.
+
+        Parameters
+        ----------
+        units
+            Units of the reader.
+
+        Returns
+        -------
+        Quantity
+        """
+        unit = units.length if self.unit == "px" else self.unit
+        return replace(self, unit=units.per_time(unit, self.order) if self.order else unit)
+
+    @property
+    def label(self) -> str:
+        """Symbol and unit, the title of its pictures and axes."""
+        return f"{self.symbol} ({self.unit})" if self.unit else self.symbol
+
+    @property
+    def signed(self) -> bool:
+        """Whether colours symmetric about 0 make sense."""
+        return self.kind in ("displacement", "strain")
+
+    @property
+    def logarithmic(self) -> bool:
+        """Whether colours spread by ratio: uncertainties, and what is compared with 1."""
+        return self.kind == "positive" and self.group in ("Quality", "Uncertainty")
+
+    @property
+    def stepped(self) -> bool:
+        """Whether values between those of two nodes mean nothing."""
+        return self.kind in ("angle", "codes")
+
+    @property
+    def ends(self) -> tuple[float, float] | None:
+        """Values of the first and last colour, where the kind of quantity sets them."""
+        fixed = {"codes": (-0.5, len(self.codes) - 0.5), "fraction": (0.0, 1.0), "angle": (-90.0, 90.0)}
+        return fixed.get(self.kind)
+
+    def text(self, value: float, std: float = float("nan")) -> str:
+        """Return a value with its standard uncertainty and unit as text.
+
+        Parameters
+        ----------
+        value
+            The value in the quantity's unit.
+        std
+            Its standard uncertainty; NaN where not known.
+
+        Returns
+        -------
+        str
+        """
+        if not np.isfinite(value):
+            return "not measured"
+        if self.codes:
+            return self.codes[int(value)]
+        if self.group == "Uncertainty":
+            return f"{rounded(value, value)} {self.unit}".rstrip()
+        return uncertain(value, std, self.unit)
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int | None, ...]:
         """Return the shape in one frame for these sizes of ``"node"`` and ``"light"``; None for an open axis.
@@ -147,6 +238,11 @@ class ResultQuantity:
         return value[:, int(column)] if column else value
 
 
+def with_uncertainty(*quantities: Quantity) -> tuple[Quantity, ...]:
+    """Return quantities, then the standard uncertainty of each."""
+    return *quantities, *(one.uncertainty for one in quantities)
+
+
 NO_CHECKSUM = -1
 """`checksum` of a frame that could not be measured at all."""
 UNKNOWN_TIME = np.iinfo(np.int64).min
@@ -198,30 +294,31 @@ _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
 
 _TABLE = (
-    ResultQuantity("number", (), "", "", _NUMBER, dtype=np.int64, blank=-1),
-    ResultQuantity("time_ns", (), "ns", "", _TIME, dtype=np.int64, blank=UNKNOWN_TIME),
-    ResultQuantity("status", (), "", "status", "status of the frame, see below", dtype=np.int64, blank=2, codes=_ENDS),
-    ResultQuantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
-    ResultQuantity("unread", (), "", "", _UNREAD, dtype=np.int64, blank=0),
-    ResultQuantity("tries", (), "", "", _TRIES, dtype=np.int64, blank=1),
-    ResultQuantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
-    ResultQuantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
-    ResultQuantity("inputs", ("file", 2), "", "", _INPUTS, **_TEXT),
-    ResultQuantity("machine", (), "", "", _MACHINE, **_TEXT),
-    ResultQuantity("checksum", (), "", "", _CHECKSUM, dtype=np.int64, blank=NO_CHECKSUM),
-    ResultQuantity("node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS),
-    ResultQuantity("u", _NODE, "px", "displacement.0", f"displacement in x {_AT_NODE} {_NOT_FIT}", **_EXACT),
-    ResultQuantity("v", _NODE, "px", "displacement.1", f"displacement in y {_AT_NODE}", **_EXACT),
-    ResultQuantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
-    ResultQuantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
-    ResultQuantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
-    ResultQuantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
-    ResultQuantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_AROUND}"),
-    ResultQuantity("exx_std", _NODE, "", "strain_std.0", "standard uncertainty of exx"),
-    ResultQuantity("eyy_std", _NODE, "", "strain_std.1", "standard uncertainty of eyy"),
-    ResultQuantity("exy_std", _NODE, "", "strain_std.2", "standard uncertainty of exy"),
+    Quantity("number", (), "", "", _NUMBER, dtype=np.int64, blank=-1),
+    Quantity("time_ns", (), "ns", "", _TIME, dtype=np.int64, blank=UNKNOWN_TIME),
+    Quantity("status", (), "", "status", "status of the frame, see below", dtype=np.int64, blank=2, codes=_ENDS),
+    Quantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
+    Quantity("unread", (), "", "", _UNREAD, dtype=np.int64, blank=0),
+    Quantity("tries", (), "", "", _TRIES, dtype=np.int64, blank=1),
+    Quantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
+    Quantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
+    Quantity("inputs", ("file", 2), "", "", _INPUTS, **_TEXT),
+    Quantity("machine", (), "", "", _MACHINE, **_TEXT),
+    Quantity("checksum", (), "", "", _CHECKSUM, dtype=np.int64, blank=NO_CHECKSUM),
+    Quantity(
+        "node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS, kind="codes"
+    ),
+    Quantity("u", _NODE, "px", "displacement.0", f"displacement in x {_AT_NODE} {_NOT_FIT}", **_EXACT),
+    Quantity("v", _NODE, "px", "displacement.1", f"displacement in y {_AT_NODE}", **_EXACT),
+    Quantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
+    Quantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
+    *with_uncertainty(
+        Quantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
+        Quantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
+        Quantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_AROUND}"),
+    ),
     *(
-        ResultQuantity(f"{name}_mesh_error", _ESTIMATED, unit, source, _LEFT_OUT.format(name))
+        Quantity(f"{name}_mesh_error", _ESTIMATED, unit, source, _LEFT_OUT.format(name))
         for name, unit, source in (
             ("u", "px", "displacement_error.0"),
             ("v", "px", "displacement_error.1"),
@@ -230,21 +327,21 @@ _TABLE = (
             ("exy", "", "strain_error.2"),
         )
     ),
-    ResultQuantity("match", (), "", "", _MATCH),
-    ResultQuantity("best_match", (), "", "", _BEST, blank=0),
-    ResultQuantity("reference_updates", ("reference_update",), "", "", _UPDATES, dtype=np.int64, blank=0),
-    ResultQuantity("misfit", _NODE, "", "misfit", _MISFIT),
-    ResultQuantity("light_fraction", ("node", "light"), "", "light_fraction", _FRACTION, blank=0),
-    ResultQuantity("residual", _LIGHT, "", "residual", _RESIDUAL),
-    ResultQuantity("weight_fraction", _LIGHT, "", "weight_fraction", _WEIGHT),
-    ResultQuantity("brightness", ("light", 2), "", "", _BRIGHTNESS),
-    ResultQuantity("rigid", ("light", "function"), "", "rigid", _RIGID),
-    ResultQuantity("seconds", (len(STAGES),), "s", "", _SECONDS),
-    ResultQuantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
-    ResultQuantity("reflection_thumbnail", _PICTURE, "", "", _REFLECTION, **_BYTE),
+    Quantity("match", (), "", "", _MATCH),
+    Quantity("best_match", (), "", "", _BEST, blank=0),
+    Quantity("reference_updates", ("reference_update",), "", "", _UPDATES, dtype=np.int64, blank=0),
+    Quantity("misfit", _NODE, "", "misfit", _MISFIT, kind="positive"),
+    Quantity("light_fraction", ("node", "light"), "", "light_fraction", _FRACTION, blank=0),
+    Quantity("residual", _LIGHT, "", "residual", _RESIDUAL),
+    Quantity("weight_fraction", _LIGHT, "", "weight_fraction", _WEIGHT),
+    Quantity("brightness", ("light", 2), "", "", _BRIGHTNESS),
+    Quantity("rigid", ("light", "function"), "", "rigid", _RIGID),
+    Quantity("seconds", (len(STAGES),), "s", "", _SECONDS),
+    Quantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
+    Quantity("reflection_thumbnail", _PICTURE, "", "", _REFLECTION, **_BYTE),
 )
 
-QUANTITIES: dict[str, ResultQuantity] = {quantity.name: quantity for quantity in _TABLE}
+QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _TABLE}
 """Every quantity by its name, in the order of the documents."""
 
 _CORNERS = "node indices; `(p1 - p0) x (p2 - p0) > 0` in (x, y)"
@@ -252,13 +349,13 @@ _REFERENCE = "reference image of each light, stretched to 8 bit, for pictures"
 _LABEL = "number of the node in the file of `mesh.file`"
 _CELL = "number of the element in the file of `mesh.file` that the triangle is from"
 _OWN_AXES = "node positions (x, y) in the axes of the file of `mesh.file`"
-SHARED: dict[str, ResultQuantity] = {
-    "nodes": ResultQuantity("nodes", ("node", 2), "px", "", "node positions (x, y) on the reference image", **_EXACT),
-    "elements": ResultQuantity("elements", ("element", 3), "", "", _CORNERS, dtype=np.int32, blank=0),
-    "node_number": ResultQuantity("node_number", ("node",), "", "", _LABEL, dtype=np.int64, blank=-1),
-    "element_number": ResultQuantity("element_number", ("element",), "", "", _CELL, dtype=np.int64, blank=-1),
-    "node_mm": ResultQuantity("node_mm", ("node", 2), "mm", "", _OWN_AXES, **_EXACT),
-    "reference": ResultQuantity("reference", ("light", "image row", "image column"), "", "", _REFERENCE, **_BYTE),
+SHARED: dict[str, Quantity] = {
+    "nodes": Quantity("nodes", ("node", 2), "px", "", "node positions (x, y) on the reference image", **_EXACT),
+    "elements": Quantity("elements", ("element", 3), "", "", _CORNERS, dtype=np.int32, blank=0),
+    "node_number": Quantity("node_number", ("node",), "", "", _LABEL, dtype=np.int64, blank=-1),
+    "element_number": Quantity("element_number", ("element",), "", "", _CELL, dtype=np.int64, blank=-1),
+    "node_mm": Quantity("node_mm", ("node", 2), "mm", "", _OWN_AXES, **_EXACT),
+    "reference": Quantity("reference", ("light", "image row", "image column"), "", "", _REFERENCE, **_BYTE),
 }
 """Quantities that all frames have in common."""
 
@@ -302,7 +399,7 @@ class FrameRecord:
         nodes, lights
             Their numbers N and k.
         **values
-            Quantities by name; None where not known.
+            Quantities by name; None where not known. `inputs` may be the SHA-256 of each file by its path.
 
         Returns
         -------
@@ -311,36 +408,33 @@ class FrameRecord:
         sizes = {"node": nodes, "light": lights}
         blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items()}
         given = {name: value for name, value in values.items() if value is not None}
+        if isinstance(files := given.get("inputs"), Mapping):
+            given["inputs"] = np.array(list(files.items()), dtype=np.str_).reshape(-1, 2)
         return cls(values=blank | given, sizes=sizes)
 
     @classmethod
-    def from_solution(cls, solution: Solution, *, inputs: Mapping[str, str] | None = None, **given: Any) -> FrameRecord:
+    def from_solution(cls, solution: Solution, **given: Any) -> FrameRecord:
         """Make the record of a solved frame.
 
         Parameters
         ----------
         solution
-            Provides the quantities that have a `ResultQuantity.source`.
-        inputs
-            Path and SHA-256 of the files that the frame was read from.
+            Provides the quantities that have a `Quantity.source`.
         **given
-            The others, such as `number`, `time_ns`, `brightness` and `weights_thumbnail`; None where not known.
+            The others, such as `number`, `time_ns`, `inputs`, `brightness` and `weights_thumbnail`, as of `of`.
 
         Returns
         -------
         FrameRecord
         """
         nodes, lights = np.shape(solution.light_fraction)
-        known = [name for name, entry in QUANTITIES.items() if entry.source]
+        known = [entry for entry in QUANTITIES.values() if entry.source]
         if not np.isfinite(solution.displacement_error).any():
-            known = [name for name in known if not QUANTITIES[name].estimated]
-        solved = {name: QUANTITIES[name].of(solution) for name in known}
-        return cls.of(nodes=nodes, lights=lights, inputs=_pairs(inputs), **solved, **given)
+            known = [entry for entry in known if not entry.estimated]
+        return cls.of(nodes=nodes, lights=lights, **{entry.name: entry.of(solution) for entry in known}, **given)
 
     @classmethod
-    def failed(
-        cls, reason: str, *, nodes: int, lights: int, inputs: Mapping[str, str] | None = None, **given: Any
-    ) -> FrameRecord:
+    def failed(cls, reason: str, *, nodes: int, lights: int, **given: Any) -> FrameRecord:
         """Make the record of a frame that could not be measured at all: NaN everywhere, and the reason.
 
         Parameters
@@ -349,16 +443,14 @@ class FrameRecord:
             Why nothing could be measured.
         nodes, lights
             Their numbers N and k.
-        inputs
-            Path and SHA-256 of the files that the frame was read from.
         **given
-            Other quantities by name.
+            Other quantities, as of `of`.
 
         Returns
         -------
         FrameRecord
         """
-        return cls.of(nodes=nodes, lights=lights, reason=reason, inputs=_pairs(inputs), **given)
+        return cls.of(nodes=nodes, lights=lights, reason=reason, **given)
 
     def __repr__(self) -> str:
         """Return number, status and size of the frame, and the names of its quantities."""
@@ -372,7 +464,3 @@ class FrameRecord:
         if name in QUANTITIES:
             return self.values[name]
         raise AttributeError(f"a frame record has no quantity {name!r}")
-
-
-def _pairs(inputs: Mapping[str, str] | None) -> AnyArray:
-    return np.array(list((inputs or {}).items()), dtype=np.str_).reshape(-1, 2)

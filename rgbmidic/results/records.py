@@ -21,14 +21,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import AnotherTestError, ResultError, disk_faults
 from rgbmidic.results.files import npy_array, npy_bytes, write_complete, writing
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.settings import regular
-from rgbmidic.typing import BoolArray
+from rgbmidic.typing import BoolArray, IntArray
 
 _NAME = re.compile(r"([0-9]{6}|[1-9][0-9]{6,})\.npz")
 _LOCAL = struct.Struct("<4s5H3I2H")
@@ -37,8 +36,6 @@ _CHECK, _END, _COMMENT = struct.Struct("<I"), struct.calcsize("<4s4H2IH"), struc
 _VERSION, _DATE = 20, 0x21
 """Version 2.0 of the format has all that is used; the first of January 1980 is its first date."""
 _STORED, _DEFLATED = 0, 8
-_FAST = 1
-"""zlib's quickest level."""
 _NOT_YET, _DAMAGED = "not measured yet", "damaged"
 _REMEDY = "`rgbmidic run` with --resume measures it again, --partial (partial=True) reads the rest"
 
@@ -108,7 +105,7 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes) -> N
     for name, file in layout.files.items():
         content = npy_bytes(record.values[name])
         picture = QUANTITIES[name].dtype is np.uint8 and not QUANTITIES[name].stackable
-        stored = zlib.compress(content, _FAST, wbits=-zlib.MAX_WBITS) if picture else content
+        stored = zlib.compress(content, zlib.Z_BEST_SPEED, wbits=-zlib.MAX_WBITS) if picture else content
         method, sizes = _DEFLATED if picture else _STORED, (len(stored), len(content), len(file), 0)
         about = (_VERSION, 0, method, 0, _DATE, zlib.crc32(content), *sizes)
         parts += _LOCAL.pack(b"PK\x03\x04", *about), file, stored
@@ -182,7 +179,7 @@ class FrameTable:
     folder: Path
     sizes: Mapping[str, int]
     run: bytes
-    written: npt.NDArray[np.int64]
+    written: IntArray
     damaged: BoolArray
 
     @classmethod

@@ -18,7 +18,7 @@ from rgbmidic.results.provenance import fingerprint, read_provenance
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.results.records import FrameTable
 from rgbmidic.results.store import check_complete, listed, load_frames, load_result, read_reference
-from rgbmidic.typing import AnyArray, BoolArray, FloatArray
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -81,8 +81,8 @@ class Result:
     names: tuple[str, ...]
     lights: tuple[str, ...]
     provenance: Mapping[str, Any]
-    node_number: npt.NDArray[np.int64] | None = None
-    element_number: npt.NDArray[np.int64] | None = None
+    node_number: IntArray | None = None
+    element_number: IntArray | None = None
     node_mm: FloatArray | None = None
 
     @classmethod

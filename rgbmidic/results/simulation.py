@@ -19,13 +19,10 @@ from rgbmidic.mesh import FiniteElementMesh, Placement, read_mesh
 from rgbmidic.results.physical import placement_of, rectification_of, scale_of
 from rgbmidic.results.result import Result
 from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, regular
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
-_DIFFERENT = 0.01
-"""Relative difference of the scale of points from a stated one above which a warning names both: half a pixel at each
-end of 100 px is .7 % (derived)."""
 _FIELDS = ("displacement", "displacements", "u", "disp")
 """Names, in small letters, under which a displacement is written: by ParaView and CalculiX, by Abaqus, by others."""
 _COMPONENT = re.compile(r"(?:u|v|u[xy12]|u_[xy12])(?:_(mm|m|um|inch))?", re.IGNORECASE)
@@ -211,7 +208,7 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
     return values, steps if clock else None
 
 
-def places_among(numbers: npt.NDArray[np.int64], wanted: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+def places_among(numbers: IntArray, wanted: npt.NDArray[Any]) -> IntArray:
     """Place of each wanted label among some numbers; -1 where it is none of them."""
     index = {number: place for place, number in enumerate(numbers.tolist())}
     return np.array([index.get(number, -1) for number in wanted.tolist()], dtype=np.int64)
@@ -243,8 +240,8 @@ def place(result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence
             "--points X_MM,Y_MM:X_PX,Y_PX each"
         )
     found = Placement.fit(known, rectification_of(result, scale).camera, where=where)
-    stated = (scale or scale_of(result)).mm_per_pixel
-    if found.mm_per_pixel is not None and stated is not None and abs(found.mm_per_pixel / stated - 1) > _DIFFERENT:
+    stated = (scale or scale_of(result)).mm_per_pixel  # half a pixel at each end of 100 px is .7 % of it
+    if found.mm_per_pixel is not None and stated is not None and abs(found.mm_per_pixel / stated - 1) > 0.01:
         text = "%s state %.6g mm per px, scale.mm_per_pixel %.6g: the former is taken"
         logger.warning(text, where, found.mm_per_pixel, stated)
     return found

@@ -40,8 +40,6 @@ from rgbmidic.typing import AnyArray, BoolArray
 logger = logging.getLogger(__name__)
 
 _NAMES, _MESH, _REFERENCE, _FRAMES = "frames.json", "mesh.npz", "reference.npz", "solution"
-_LISTED = 5
-"""Frames that a message names: more do not fit a line of a terminal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -291,10 +289,10 @@ def check_complete(path: Path, names: tuple[str, ...], table: FrameTable, *, end
     )
 
 
-def listed(frames: Sequence[int], names: Sequence[str]) -> str:
-    """List the first of some frames with their names, and how many more there are."""
-    more = f" and {len(frames) - _LISTED} more" if len(frames) > _LISTED else ""
-    return ", ".join(f"{frame} ({names[frame]})" for frame in frames[:_LISTED]) + more
+def listed(frames: Sequence[int], names: Sequence[str], most: int = 5) -> str:
+    """List the first of some frames with their names, `most` on a line of a terminal, and how many more there are."""
+    more = f" and {len(frames) - most} more" if len(frames) > most else ""
+    return ", ".join(f"{frame} ({names[frame]})" for frame in frames[:most]) + more
 
 
 def load_result(path: Path) -> dict[str, Any]:

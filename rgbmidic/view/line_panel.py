@@ -52,7 +52,7 @@ class _Reading:
     @classmethod
     def begin(cls, maps: Maps, field: str, place: Sequence[float], before: _Reading | None) -> _Reading:
         """Lay the line; what was read `before`, of the result when it was shorter, is kept unless it may differ."""
-        profile = Profile.along(maps, field, place, range(len(maps.result)))
+        profile = Profile(maps, field, place, range(len(maps.result)))
         now, read = maps.result.table.written, np.zeros(len(maps.result), dtype=np.bool_)
         if before is not None and not profile.rate_window and (now == before.written)[before.read].all():
             profile.values[:], profile.std[:], read = before.profile.values, before.profile.std, before.read.copy()

@@ -25,7 +25,7 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.report.figures import spread
 from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, time_text
-from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, MapField, Maps, MapValues, Result
+from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, MapValues, Quantity, Result
 from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.typing import AnyArray, FloatArray
 
@@ -382,7 +382,7 @@ class Background:
         task.add_done_callback(lambda _: self._document.add_next_tick_callback(taken))
 
 
-def frame_text(maps: Maps, place: int, field: MapField, values: MapValues, remark: str) -> str:
+def frame_text(maps: Maps, place: int, field: Quantity, values: MapValues, remark: str) -> str:
     """Describe what is in view, as HTML: the frame, how it ended, the field with its extremes, and a remark."""
     result = maps.result
     read = next(result.table.each(["status", "reason", "iterations", "node_status", "time_ns"], [place]))
@@ -412,7 +412,7 @@ def frame_text(maps: Maps, place: int, field: MapField, values: MapValues, remar
     return "<br>".join([*lines, *([html.escape(remark)] if remark else [])])
 
 
-def extremes(field: MapField, values: MapValues) -> tuple[int, ...]:
+def extremes(field: Quantity, values: MapValues) -> tuple[int, ...]:
     """Return the nodes with the smallest and the largest value; none where nothing is measured, or of a status."""
     if field.codes or not np.isfinite(values.values).any():
         return ()
@@ -420,7 +420,7 @@ def extremes(field: MapField, values: MapValues) -> tuple[int, ...]:
 
 
 def pointer_text(
-    maps: Maps, field: MapField, values: MapValues, moved: FloatArray, nodes: FloatArray, x: float, y: float
+    maps: Maps, field: Quantity, values: MapValues, moved: FloatArray, nodes: FloatArray, x: float, y: float
 ) -> str:
     """Return the value at a place over nodes (N, 2), as HTML; where there is none, why. `moved` is as of `mean_of`."""
     found = element_at(nodes, maps.result.elements, x, y)
@@ -438,7 +438,7 @@ def pointer_text(
 
 
 def probe_text(
-    maps: Maps, field: MapField, values: MapValues, moved: FloatArray, frame: int, kind: str, place: tuple[float, ...]
+    maps: Maps, field: Quantity, values: MapValues, moved: FloatArray, frame: int, kind: str, place: tuple[float, ...]
 ) -> str:
     """Return what a probe of a kind measures of a field, with its uncertainty, as its history has it.
 
@@ -470,7 +470,7 @@ def probe_text(
     return f"{' mean' if kind != 'point' else ''}: {field.text(value, std)}{most}"
 
 
-def mean_of(maps: Maps, field: MapField, values: MapValues, moved: FloatArray, mean: Mean) -> tuple[float, float]:
+def mean_of(maps: Maps, field: Quantity, values: MapValues, moved: FloatArray, mean: Mean) -> tuple[float, float]:
     """Average a field over a place, as a history does, with its standard uncertainty; NaN where it has none.
 
     That of u and v is exact, from their displacement `moved`, as `Maps.displacement` returns it; the errors of other

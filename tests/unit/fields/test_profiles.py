@@ -13,7 +13,7 @@ from rgbmidic.mesh import Region, Tri3Mesh
 MESH = Tri3Mesh.from_region(Region.from_rectangle((10, 10, 490, 90), (100, 500)), 20)
 COVARIANCE = NodalCovariance.from_mesh(MESH)
 GAUGES = StrainGauges.at_nodes(COVARIANCE)
-LINE = ProfileLine.between(COVARIANCE, GAUGES, 20, 45, 480, 55)
+LINE = ProfileLine(COVARIANCE, GAUGES, 20, 45, 480, 55)
 ROOT = np.linalg.cholesky(COVARIANCE.correlation.toarray() + 1e-9 * np.eye(len(MESH.nodes)))
 SPEED, LENGTH, FRAMES = 9.0, 160.0, 80
 TRUE = SPEED * np.hypot(460, 10) / 460
@@ -136,4 +136,4 @@ def test_the_correlation_of_rates_between_frames_is_that_of_slopes_in_noise() ->
 )
 def test_a_line_that_is_none_is_refused(line: tuple[float, ...], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        ProfileLine.between(COVARIANCE, GAUGES, *line)
+        ProfileLine(COVARIANCE, GAUGES, *line)

@@ -16,8 +16,8 @@ from rgbmidic.results import (
     QUANTITIES,
     FrameRecord,
     Origin,
+    Quantity,
     Result,
-    ResultQuantity,
     ResultStore,
     export_result,
 )
@@ -86,7 +86,7 @@ def test_csv_has_no_time_where_nobody_knows_it(tmp_path: Path) -> None:
 def test_a_quantity_of_the_table_is_kept_read_and_exported_by_its_entry_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(QUANTITIES, "depth", ResultQuantity("depth", ("node",), "px", "", "how deep"))
+    monkeypatch.setitem(QUANTITIES, "depth", Quantity("depth", ("node",), "px", "", "how deep"))
     depth = np.arange(3.0)
     origin = Origin(nodes=np.eye(3)[:, :2], elements=[[0, 1, 2]], names=["only"], lights=["one"])
     with ResultStore.create(tmp_path / "out", origin) as store:
