@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import logging
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,25 @@ _DARK = 0.3
 """Share of its light in the reference under which a light is told to be failing."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measured:
+    """What measuring a frame gave.
+
+    Attributes
+    ----------
+    record
+        What is kept of it.
+    solution
+        Its solution in full; None where it failed, or was measured in another process.
+    messages
+        Level and text of what was logged in another process.
+    """
+
+    record: FrameRecord
+    solution: Solution | None = None
+    messages: tuple[tuple[int, str], ...] = ()
+
+
 def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[int, Solution]] = ()) -> FrameRecord:
     """Measure one frame of a test.
 
@@ -60,18 +79,31 @@ def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[
     -------
     FrameRecord
     """
+
+    def make() -> ReferenceUpdate:
+        reference_update = ReferenceUpdate.none(plan.reference)
+        for number, solution in updated:
+            reference_update = next_reference(plan, reference_update, number, solution)
+        return reference_update
+
     keep_memory()
+    return attempt(plan, index, start, lambda: plan.updates.get(tuple(number for number, _ in updated), make)).record
+
+
+def attempt(plan: Plan, index: int, start: Start, reference: Callable[[], ReferenceUpdate]) -> Measured:
+    """Measure a frame as `measure_frame` on the `reference` that ``start.reference_updates`` make."""
     try:
         with timed(plan.timings) as seconds:
-            values = solve_frame(plan, index, start, _updated_reference(plan, updated))
-        return FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
+            values = solve_frame(plan, index, start, reference())
+        record = FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
+        return Measured(record=record, solution=values["solution"])
     except RgbmidicError as error:
         reason, unread = str(error), isinstance(error, _UnreadError)
         logger.warning("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
     except Exception as error:  # whatever it is, the other frames can be measured
         reason, unread = f"unexpected error: {type(error).__name__}: {error}", False
         logger.exception("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
-    return failed_frame(plan, index, reason, unread=unread)
+    return Measured(record=failed_frame(plan, index, reason, unread=unread))
 
 
 def failed_frame(plan: Plan, index: int, reason: str, *, unread: bool = False) -> FrameRecord:
@@ -217,18 +249,6 @@ def next_reference(plan: Plan, before: ReferenceUpdate, index: int, solution: So
     window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
     images = plan.lights(read_state(plan, index, window)[0], window)
     return before.updated(solution, *plan.prepared(images, index), window.origin)
-
-
-def _updated_reference(plan: Plan, updated: Sequence[tuple[int, Solution]]) -> ReferenceUpdate:
-    """The reference that the frames `updated` make in turn."""
-
-    def make() -> ReferenceUpdate:
-        reference_update = ReferenceUpdate.none(plan.reference)
-        for index, solution in updated:
-            reference_update = next_reference(plan, reference_update, index, solution)
-        return reference_update
-
-    return plan.updates.get(tuple(index for index, _ in updated), make)
 
 
 def _compared(

@@ -3,38 +3,43 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from rgbmidic._kernels.threads import threads
-from rgbmidic.correlation import Status
+from rgbmidic.correlation import NodeStatus, Solution, Start, Status
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.frame import read_state
+from rgbmidic.pipeline.frame import Measured, read_state
 from rgbmidic.pipeline.given import check_object, check_type, describe
-from rgbmidic.pipeline.order import dependants
+from rgbmidic.pipeline.order import dependants, rank_of
 from rgbmidic.pipeline.plan import Choice, Plan
 from rgbmidic.pipeline.resolution import choose, refine
-from rgbmidic.pipeline.schedule import Schedule
+from rgbmidic.pipeline.schedule import Schedule, following
 from rgbmidic.pipeline.source import FrameSequence
 from rgbmidic.pipeline.suitability import light_levels
-from rgbmidic.pipeline.workers import open_workers
-from rgbmidic.results import Origin, Result, ResultStore
+from rgbmidic.pipeline.workers import Updated, open_workers
+from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.results.store import listed, read_mesh
 from rgbmidic.settings import TestSettings, read_test
+from rgbmidic.typing import AnyArray
 from rgbmidic.weights import LightWeights
 
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int, str], None]
+
+_STRAIN = ("exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std")
+_MEASURED = ("u", "v", "u_std", "v_std", *_STRAIN, "node_status", "rigid")
+"""Quantities of a frame that it makes a reference with."""
 
 
 def measure(
@@ -141,18 +146,71 @@ def measure(
     with _store(plan, Path(out), places if frames else None, objects, overwrite=overwrite, resume=resume) as store:
         if resume and frames is None:
             _take_back(plan, store, retry_failed=retry_failed)
-        schedule = Schedule(plan, store, places)
+        sink = _Folder(plan, store, places, progress)
+        schedule = Schedule(plan, sink, places)
         if schedule.done and frames is None and "finished" in read_provenance(store.path):
             logger.warning("%s is finished and whole: nothing is left to be measured", out)
             return Result.open(out)
         store.reopen()
         if not schedule.done:
-            with open_workers(plan, min(workers, len(places)), scheduler) as others:
-                schedule.run(others, progress)
+            with closing(open_workers(plan, min(workers, len(places)), scheduler)) as others:
+                schedule.run(others)
         _tell_repeated(plan, store, places)
         if frames is None:
             store.finish()
     return Result.open(out, partial=frames is not None, check=False)
+
+
+class _Folder:
+    """The sink of a result folder."""
+
+    def __init__(self, plan: Plan, store: ResultStore, places: range, progress: Progress | None) -> None:
+        self._plan, self._store, self._places, self._progress = plan, store, places, progress
+        self._finished = store.finished()
+
+    def is_finished(self, place: int) -> bool:
+        """Whether a frame is in the folder."""
+        return bool(self._finished[place])
+
+    def start_after(self, place: int) -> Start:
+        """Initial guess after a finished frame: from the last that is measured up to there.
+
+        Where a frame failed all before it are finished, since a key frame that fails waits for the one before it.
+        """
+        names = ("u", "v", "node_status", "reference_updates", "best_match")
+        for kept in self._store.table().each(names, range(place, -1, -1)):
+            if (kept["node_status"] == NodeStatus.MEASURED).any():
+                return following(self._plan, kept, Start(displacement=None))
+        return Start(displacement=None)
+
+    def updated(self, places: Sequence[int]) -> Updated:
+        """Indices and solutions of the frames that became the reference, as the folder holds them."""
+        if not places:
+            return ()
+        mesh, lights, chosen = self._plan.reference.mesh, len(self._plan.images.names), self._plan.series.chosen
+        blank = Solution.failed(mesh, lights, "", np.zeros(0))
+        found = []
+        for place, kept in zip(places, self._store.table().each(_MEASURED, places), strict=True):
+            columns: dict[str, list[AnyArray]] = {}
+            for name, values in kept.items():
+                exact = values.astype(np.float64) if values.dtype.kind == "f" else values
+                columns.setdefault(QUANTITIES[name].source.partition(".")[0], []).append(exact)
+            stacked = {name: np.stack(some, axis=1) if len(some) > 1 else some[0] for name, some in columns.items()}
+            found.append((chosen[place], replace(blank, **cast(dict[str, Any], stacked))))
+        return found
+
+    def keep(self, place: int, found: Measured, after: Start) -> None:
+        """Write a frame, and report what became of it."""
+        record, places = found.record, self._places
+        self._store.write_frame(place, record)
+        self._finished[place] = True
+        if self._progress is None:
+            return
+        done, status = int(self._finished[places.start : places.stop].sum()), Status(record.status)
+        line = f"{status.name.lower().replace('_', ' ')}: {record.reason}"
+        if status is Status.CONVERGED:
+            line = f"converged in {record.iterations} iterations, {1 - rank_of(record)[1]:.0%} of the nodes measured"
+        self._progress(done, len(places), f"{self._plan.series.name(self._plan.series.chosen[place])}: {line}")
 
 
 def _refined(plan: Plan, frame: int | bool, out: Path, kept: Mapping[str, Any]) -> Plan:

@@ -1,84 +1,100 @@
-"""Which frame is measured next, and from where it starts."""
+"""The engine: frames are measured in the order of `rgbmidic.pipeline.order`, by workers, into a sink.
+
+`rgbmidic.measure` runs it with threads or a cluster and a result folder, `rgbmidic.measure_sequence` with the latest
+state alone and a few initial guesses.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from dataclasses import replace
 from heapq import nsmallest
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from rgbmidic.correlation import NodeStatus, Solution, Start, Status
+from rgbmidic.correlation import NodeStatus, Start
 from rgbmidic.errors import FrameError, RgbmidicError
-from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.frame import failed_frame
-from rgbmidic.pipeline.order import STRIDE, better, children, lineage, loses, parent, rank_of
+from rgbmidic.pipeline.frame import Measured, failed_frame
+from rgbmidic.pipeline.order import STRIDE, better, children, lineage, loses, parent
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.workers import LOST_CLUSTER, Measured, Workers
-from rgbmidic.results import QUANTITIES, FrameRecord, ResultStore
-from rgbmidic.typing import AnyArray
+from rgbmidic.pipeline.workers import LOST_CLUSTER, Updated, Workers
 
 logger = logging.getLogger(__name__)
 
 
-_KEPT = ("u", "v", "node_status", "reference_updates", "best_match")
-_STRAIN = ("exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std")
-_MEASURED = ("u", "v", "u_std", "v_std", *_STRAIN, "node_status", "rigid")
-"""Quantities of a frame that the next one starts from, and that it makes a reference with."""
+class Sink(Protocol):
+    """Where measured frames go, by their places in the result."""
 
-Progress = Callable[[int, int, str], None]
+    def is_finished(self, place: int) -> bool:
+        """Whether a frame is there already."""
+
+    def start_after(self, place: int) -> Start:
+        """Initial guess of the frames that follow a finished one."""
+
+    def updated(self, places: Sequence[int]) -> Updated:
+        """Frames that became the reference, for workers that make it of them."""
+
+    def keep(self, place: int, found: Measured, after: Start) -> None:
+        """Take a frame, and the initial guess of those that follow it."""
 
 
 class Schedule:
-    """The frames of a test that are still to be measured.
+    """The frames that are still to be measured.
 
-    A frame starts from its parent in the tree of `rgbmidic.pipeline.order`, or, where that one failed, from where it
-    started. A key frame that is not measured well from there is measured once more from the frame just before it, and
-    the better of both is kept.
+    A frame starts from its parent in the tree, or, where that one failed, from where it started. A key frame that is
+    not measured well from there is measured once more from the frame just before it, and the better of both is kept.
     """
 
-    def __init__(self, plan: Plan, store: ResultStore, places: range) -> None:
-        self._plan, self._store, self._places = plan, store, places
-        self._finished = store.finished()
-        self._wanted = np.zeros_like(self._finished)
-        self._ready: list[tuple[int, Start]] = []
+    def __init__(self, plan: Plan, sink: Sink, places: Iterable[int] = ()) -> None:
+        self._plan, self._sink = plan, sink
+        self._ready = list[tuple[int, Start]]()
+        self._wanted = set[int]()
         self._waiting: dict[int, list[int]] = {}
-        self._first_tries: dict[int, FrameRecord] = {}
-        self._running: dict[Future[Measured], tuple[int, Start]] = {}
-        for position in places:
-            self._want(position)
+        self._first_tries: dict[int, Measured] = {}
+        for place in places:
+            self.want(place)
 
     @property
     def done(self) -> bool:
         """Whether nothing is left to be measured."""
-        return not (self._ready or self._running)
+        return not self._ready
 
-    def run(self, workers: Workers, progress: Progress | None = None) -> None:
-        """Have frames measured, and keep each in the store as it finishes.
+    def want(self, place: int) -> None:
+        """Have a frame measured, and all that it depends on."""
+        first = None
+        for ancestor in lineage(place):
+            if self._sink.is_finished(ancestor):
+                break
+            if ancestor in self._wanted:
+                return
+            self._wanted.add(ancestor)
+            first = ancestor
+        if first is not None:
+            before = parent(first)
+            self._ready.append((first, Start(displacement=None) if before is None else self._sink.start_after(before)))
 
-        Parameters
-        ----------
-        workers
-            Who measures.
-        progress
-            Called after every frame with the number of frames done, their total and a line about the last one.
+    def run(self, workers: Workers) -> None:
+        """Have workers measure the frames, and give each to the sink as it finishes.
 
         Raises
         ------
         ResultError
-            The store cannot be written.
+            The sink cannot be written.
         FrameError
             All files of the frames are gone.
         """
-        while not self.done:
-            while self._ready and len(self._running) < workers.slots:
-                self._submit(workers, *self._next(workers.slots))
-            for future in wait(self._running, return_when=FIRST_COMPLETED).done:
-                position, start = self._running.pop(future)
-                self._take(position, start, self._outcome(future, position), progress)
+        running: dict[Future[Measured], tuple[int, Start]] = {}
+        while self._ready or running:
+            while self._ready and len(running) < workers.slots:
+                place, start = self._next(workers.slots)
+                last = start.reference_updates[-2:]  # all that the reference which they make depends on
+                running[workers.submit(self._index(place), start, self._sink.updated(last))] = place, start
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                place, start = running.pop(future)
+                self._take(place, start, self._outcome(future, place))
 
     def _next(self, slots: int) -> tuple[int, Start]:
         """Take the frame that is to be measured next out of those that can be.
@@ -91,86 +107,48 @@ class Schedule:
         self._ready.remove(found)
         return found
 
-    def _submit(self, workers: Workers, position: int, start: Start) -> None:
-        last = start.reference_updates[-2:]  # all that the reference which they make depends on
-        mesh, lights = self._plan.reference.mesh, len(self._plan.images.names)
-        found = [_solution(mesh, lights, kept) for kept in self._store.table().each(_MEASURED, last)] if last else []
-        future = workers.submit(self._index(position), start, list(zip(map(self._index, last), found, strict=True)))
-        self._running[future] = position, start
-
-    def _index(self, position: int) -> int:
+    def _index(self, place: int) -> int:
         """Place in the series of a frame of the result."""
-        return self._plan.series.chosen[position]
+        return self._plan.series.chosen[place]
 
-    def _outcome(self, future: Future[Measured], position: int) -> FrameRecord:
+    def _outcome(self, future: Future[Measured], place: int) -> Measured:
         """What a worker found, or why it found nothing."""
         try:
-            measured = future.result()
+            found = future.result()
         except CancelledError:
             raise RgbmidicError(LOST_CLUSTER) from None
         except Exception as error:  # a worker of a cluster that died over the frame more often than the cluster allows
-            name = self._plan.series.name(self._index(position))
-            logger.warning("a worker died while %s was measured (%s)", name, str(error) or type(error).__name__)
-            return failed_frame(self._plan, self._index(position), f"its worker died: {type(error).__name__}")
-        for level, text in measured.messages:
+            index, kind = self._index(place), type(error).__name__
+            name = self._plan.series.name(index)
+            logger.warning("a worker died while %s was measured (%s)", name, str(error) or kind)
+            return Measured(record=failed_frame(self._plan, index, f"its worker died: {kind}"))
+        for level, text in found.messages:
             logger.log(level, "%s", text)
-        return measured.record
+        return found
 
-    def _take(self, position: int, start: Start, record: FrameRecord, progress: Progress | None) -> None:
-        """Keep a record, or have the frame measured again, and release what waits for it."""
-        if record.unread and (gone := self._plan.series.gone()):
+    def _take(self, place: int, start: Start, found: Measured) -> None:
+        """Keep a frame, or have it measured again, and release what waits for it."""
+        if found.record.unread and (gone := self._plan.series.gone()):
             raise FrameError(f"the frames are gone: {gone}; go on with --resume when they are there again")
-        first = self._first_tries.pop(position, None)
-        if first is None and loses(position, record, start):
-            self._first_tries[position] = record
-            before = position - 1  # it may have to be measured first
-            if self._finished[before]:
-                self._ready.append((position, self._start_after(before)))
+        first = self._first_tries.pop(place, None)
+        if first is None and loses(place, found.record, start):
+            self._first_tries[place] = found
+            before = place - 1  # it may have to be measured first
+            if self._sink.is_finished(before):
+                self._ready.append((place, self._sink.start_after(before)))
             else:
-                self._waiting.setdefault(before, []).append(position)
-                self._want(before)
+                self._waiting.setdefault(before, []).append(place)
+                self.want(before)
             return
         if first is not None:
-            record = better(first, record)
-            record = replace(record, values={**record.values, "tries": 2})
-        self._store.write_frame(position, record)
-        self._finished[position] = True
-        next_start = following(self._plan, record.values, start)
-        released = [child for child in children(position, len(self._finished)) if self._wanted[child]]
-        for after in (*released, *self._waiting.pop(position, ())):
-            self._ready.append((after, next_start))
-        if progress is not None:
-            places = self._places
-            done, status = int(self._finished[places.start : places.stop].sum()), Status(record.status)
-            line = f"{status.name.lower().replace('_', ' ')}: {record.reason}"
-            if status is Status.CONVERGED:
-                measured = 1 - rank_of(record)[1]
-                line = f"converged in {record.iterations} iterations, {measured:.0%} of the nodes measured"
-            progress(done, len(places), f"{self._plan.series.name(self._index(position))}: {line}")
-
-    def _want(self, position: int) -> None:
-        """Have a frame measured, and all that it depends on."""
-        first = None
-        for place in lineage(position):
-            if self._finished[place]:
-                break
-            if self._wanted[place]:
-                return
-            self._wanted[place], first = True, place
-        if first is not None:
-            before = parent(first)
-            self._ready.append((first, Start(displacement=None) if before is None else self._start_after(before)))
-
-    def _start_after(self, position: int) -> Start:
-        """Where a frame starts that follows a finished one: from the last that is measured up to there.
-
-        Where a frame failed all before it are finished, since a key frame that fails waits for the one before it.
-        """
-        table = self._store.table()
-        for kept in table.each(_KEPT, range(position, -1, -1)):
-            if (kept["node_status"] == NodeStatus.MEASURED).any():
-                return following(self._plan, kept, Start(displacement=None))
-        return Start(displacement=None)
+            record = better(first.record, found.record)
+            tried = replace(record, values={**record.values, "tries": 2})
+            found = replace(first if record is first.record else found, record=tried)
+        after = following(self._plan, found.record.values, start)
+        self._sink.keep(place, found, after)
+        self._wanted.discard(place)
+        released = [child for child in children(place, max(self._wanted, default=0) + 1) if child in self._wanted]
+        self._ready += [(one, after) for one in (*released, *self._waiting.pop(place, ()))]
 
 
 def following(plan: Plan, kept: Mapping[str, Any], start: Start) -> Start:
@@ -181,23 +159,3 @@ def following(plan: Plan, kept: Mapping[str, Any], start: Start) -> Start:
     after = start.after(plan.reference.mesh, np.stack([kept["u"], kept["v"]], axis=1), measured)
     updates, best = tuple(kept["reference_updates"].tolist()), float(kept["best_match"])
     return replace(after, reference_updates=updates, best_match=best)
-
-
-def _solution(mesh: Tri3Mesh, lights: int, kept: Mapping[str, Any]) -> Solution:
-    """What a result keeps of a measured frame, as the solution that makes it a reference: the field table undone."""
-    columns: dict[str, list[AnyArray]] = {}
-    for name in _MEASURED:
-        values = kept[name]
-        attribute = QUANTITIES[name].source.partition(".")[0]
-        columns.setdefault(attribute, []).append(values.astype(np.float64) if values.dtype.kind == "f" else values)
-    found: dict[str, Any] = {
-        name: np.stack(parts, axis=1) if len(parts) > 1 else parts[0] for name, parts in columns.items()
-    }
-    return replace(Solution.failed(mesh, lights, "", np.zeros(0)), **found)
-
-
-def _error(future: Future[Measured]) -> BaseException | None:
-    try:
-        return future.exception()
-    except CancelledError:
-        raise RgbmidicError(LOST_CLUSTER) from None

@@ -9,21 +9,18 @@ from __future__ import annotations
 import importlib
 import logging
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Protocol
 
 import cv2
 
 from rgbmidic._kernels.threads import keep_memory, set_threads, threads
 from rgbmidic.correlation import Solution, Start
 from rgbmidic.errors import ConfigurationError, RgbmidicError
-from rgbmidic.pipeline.frame import measure_frame
+from rgbmidic.pipeline.frame import Measured, measure_frame
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.results import FrameRecord
 
 logger = logging.getLogger(__name__)
 
@@ -31,35 +28,18 @@ Updated = Sequence[tuple[int, Solution]]
 """Index and solution of frames that became the reference, see `measure_frame`."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
-    """What a worker gives back of a frame: its record, and what there was to say (level and text)."""
+class Workers(Protocol):
+    """Measure frames, as many at a time as there are slots."""
 
-    record: FrameRecord
-    messages: tuple[tuple[int, str], ...]
+    @property
+    def slots(self) -> int:
+        """How many."""
 
-
-class Workers(ABC):
-    """Measure frames, as many at a time as there are `slots`."""
-
-    slots: int
-
-    @abstractmethod
     def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
         """Have one frame measured."""
 
-    @abstractmethod
-    def close(self) -> None:
-        """Stop; what has not begun is not measured."""
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class Threads(Workers):
+class Threads:
     """Threads of this process, each with a frame; those that share a kernel are divided among the frames.
 
     A single one is the caller's own thread.
@@ -92,7 +72,7 @@ class Threads(Workers):
         cv2.setNumThreads(self._before[1])
 
     def _measured(self, index: int, start: Start, updated: Updated) -> Measured:
-        return Measured(record=measure_frame(self._plan, index, start, updated), messages=())
+        return Measured(record=measure_frame(self._plan, index, start, updated))
 
     def _count(self, more: int) -> None:
         """Divide the threads that share kernels among the frames that are being measured."""
@@ -104,7 +84,7 @@ class Threads(Workers):
                 cv2.setNumThreads(each)
 
 
-class Cluster(Workers):
+class Cluster:
     """The workers of a Dask cluster; what a lost one was doing is done again by another."""
 
     def __init__(self, plan: Plan, address: str) -> None:
@@ -130,7 +110,7 @@ class Cluster(Workers):
         self._executor = self._client.get_executor(pure=False)
 
     @property
-    def slots(self) -> int:  # type: ignore[override]
+    def slots(self) -> int:
         """Threads of all workers there are now.
 
         Raises
@@ -171,7 +151,7 @@ def _answering() -> Iterator[None]:
         raise RgbmidicError(LOST_CLUSTER) from None
 
 
-def open_workers(plan: Plan, count: int, scheduler: str | None = None) -> Workers:
+def open_workers(plan: Plan, count: int, scheduler: str | None = None) -> Threads | Cluster:
     """A Dask cluster where its scheduler is named, else `count` threads of this process."""
     return Threads(plan, count) if scheduler is None else Cluster(plan, scheduler)
 
