@@ -23,7 +23,7 @@ from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import refined
 from rgbmidic.pipeline.field_comparison import Field
-from rgbmidic.pipeline.frame import read_state
+from rgbmidic.pipeline.frame import prepared_frame
 from rgbmidic.pipeline.plan import Choice, Plan
 from rgbmidic.pipeline.size_figures import GaugeFigures, ResolutionStudy, SizeFigures
 from rgbmidic.pipeline.suitability import SPECKLES
@@ -326,8 +326,7 @@ class _KeyFrame:
 def _deformed(plan: Plan, index: int) -> Deformed:
     """The images of a frame, ready to be interpolated."""
     window = plan.window_of()
-    ready = plan.prepared(plan.lights(read_state(plan, index, window)[0], window), index)
-    return Deformed.prepare(*ready, prefilter=plan.solver.prefilter, origin=window.origin)
+    return Deformed.prepare(*prepared_frame(plan, index, window), prefilter=plan.solver.prefilter, origin=window.origin)
 
 
 def _resized(plan: Plan, size: float) -> Plan:

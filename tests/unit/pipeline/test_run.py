@@ -29,7 +29,7 @@ from rgbmidic.frames import read_frame, write_tiff
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.pipeline import Plan, frame, measure, run, workers
 from rgbmidic.pipeline.frame import measure_frame
-from rgbmidic.pipeline.plan import UpdatedReferences
+from rgbmidic.pipeline.plan import ProcessState
 from rgbmidic.results import Maps, Result, finish_result, scale_of
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import TestSettings
@@ -175,7 +175,7 @@ def test_the_frames_of_chains_are_measured_in_step(
 
 
 def test_threads_of_a_process_make_an_updated_reference_once() -> None:
-    updates, made = UpdatedReferences(), list[object]()
+    process, made = ProcessState(), list[object]()
 
     def make() -> Any:
         time.sleep(0.05)
@@ -183,9 +183,9 @@ def test_threads_of_a_process_make_an_updated_reference_once() -> None:
         return made[-1]
 
     with ThreadPoolExecutor(8) as threads:
-        got = list(threads.map(lambda _: updates.get((1, 2), make), range(8)))
+        got = list(threads.map(lambda _: process.reference_update((1, 2), make), range(8)))
     assert got == made * 8
-    assert pickle.loads(pickle.dumps(updates)).get((1, 2), make) is not got[0]
+    assert pickle.loads(pickle.dumps(process)).reference_update((1, 2), make) is not got[0]
     assert len(made) == 2
 
 
