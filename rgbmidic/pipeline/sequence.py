@@ -23,12 +23,11 @@ from rgbmidic.errors import FrameError, InputError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.correlate import solver_settings
+from rgbmidic.pipeline.engine import Schedule, Updated
 from rgbmidic.pipeline.frame import Measured, attempt, next_reference
 from rgbmidic.pipeline.given import check_object, check_type
 from rgbmidic.pipeline.order import STRIDE
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.schedule import Schedule
-from rgbmidic.pipeline.workers import Updated
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.settings import (
     ELEMENT_SIZE,

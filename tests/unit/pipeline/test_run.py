@@ -27,7 +27,7 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, ResultEr
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import read_frame, write_tiff
 from rgbmidic.frames.data import ChannelFrame
-from rgbmidic.pipeline import Plan, frame, measure, run, workers
+from rgbmidic.pipeline import Plan, engine, frame, measure, run
 from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import ProcessState
 from rgbmidic.results import Maps, Result, finish_result, scale_of
@@ -96,7 +96,7 @@ def test_two_workers_give_the_same_bits(movie: Path, whole: Result, tmp_path: Pa
 def test_a_frame_that_kills_every_worker_of_a_cluster_fails_and_the_rest_goes_on(
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Dying(workers.Threads):
+    class Dying(engine.Threads):
         def submit(self, index: int, start: Start, updated: Any = ()) -> Future[frame.Measured]:
             if index != 5:
                 return super().submit(index, start, updated)
@@ -123,9 +123,9 @@ def test_frames_share_the_threads_that_share_a_kernel(movie: Path, monkeypatch: 
     measured = measure_frame(plan, 0, Start(displacement=None))
     before = threads()
     set_threads(4)
-    monkeypatch.setattr(workers, "measure_frame", watched)
+    monkeypatch.setattr(engine, "measure_frame", watched)
     try:
-        with closing(workers.Threads(plan, 2)) as pool:
+        with closing(engine.Threads(plan, 2)) as pool:
             running = [pool.submit(index, Start(displacement=None)) for index in range(2)]
             assert all(one.result(60).record is measured for one in running)
         assert seen == [2, 2]
@@ -158,12 +158,12 @@ def test_the_frames_of_chains_are_measured_in_step(
     """At the end of a test no chain is left alone, which one worker would measure while the others wait."""
     order = list[int]()
 
-    class Watching(workers.Threads):
+    class Watching(engine.Threads):
         def submit(self, index: int, start: Start, updated: Any = ()) -> Future[frame.Measured]:
             order.append(index)
             return super().submit(index, start, updated)
 
-    def two(plan: Plan, *_: Any) -> workers.Threads:
+    def two(plan: Plan, *_: Any) -> engine.Threads:
         found = Watching(plan, 1)
         found.slots = 2
         return found
@@ -364,7 +364,7 @@ def test_frames_that_failed_otherwise_are_measured_again_where_that_is_asked(
         return frame.failed_frame(plan, index, "out of memory") if index == 33 else record
 
     with monkeypatch.context() as patched:
-        patched.setattr("rgbmidic.pipeline.workers.measure_frame", failing)
+        patched.setattr("rgbmidic.pipeline.engine.measure_frame", failing)
         measure(settings(movie), tmp_path / "result")
     measured: list[str] = []
     result = measure(settings(movie), tmp_path / "result", resume=True, progress=counted(measured))
@@ -426,7 +426,7 @@ def test_a_key_frame_that_is_lost_is_measured_from_the_frame_before_it(
         record = measure_frame(plan, index, start, updated)
         return frame.failed_frame(plan, index, "lost") if index == 16 and len(starts) == 17 else record
 
-    monkeypatch.setattr("rgbmidic.pipeline.workers.measure_frame", watched)
+    monkeypatch.setattr("rgbmidic.pipeline.engine.measure_frame", watched)
     result = in_order(settings(movie, last=18), tmp_path / "result")
     tries = [moved for index, moved in starts if index == 16]
     assert tries == pytest.approx([0.0, 1.5], abs=0.1)
