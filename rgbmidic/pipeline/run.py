@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -24,21 +24,19 @@ from rgbmidic.pipeline.plan import Choice, Plan
 from rgbmidic.pipeline.resolution import choose, refine
 from rgbmidic.pipeline.source import FrameSequence
 from rgbmidic.pipeline.suitability import light_levels
-from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore
+from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.results.store import listed, read_mesh
 from rgbmidic.settings import TestSettings, read_test
-from rgbmidic.typing import AnyArray
 from rgbmidic.weights import LightWeights
 
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int, str], None]
 
-_STRAIN = ("exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std")
-_MEASURED = ("u", "v", "u_std", "v_std", *_STRAIN, "node_status", "rigid")
-"""Quantities of a frame that it makes a reference with."""
+_MEASURED = ("u", "v", "u_std", "v_std", "exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std", "rigid")
+"""Quantities of a frame that it makes a reference with, beside the status of its nodes."""
 
 
 def measure(
@@ -129,12 +127,17 @@ def measure(
     kept = read_provenance(Path(out)) if begun else {}
     if settings.element_size == "auto":
         choice = Choice(**kept["element_size"]) if kept.get("element_size") else choose(settings, **given)
-    if settings.mesh_refine is not False and mesh is not None:
+    refines = settings.mesh_refine is not False
+    if refines and mesh is not None:
         raise InputError("mesh.refine is for a mesh made here, and a mesh is given: leave one of them out")
     sized = settings if choice is None else replace(settings, element_size=choice.element_size)
     plan = Plan.from_settings(replace(sized, mesh_refine=False), **given)
-    if settings.mesh_refine is not False:
-        plan = _refined(plan, settings.mesh_refine, Path(out), kept)
+    if refines and "refinement" in kept:
+        stored = read_mesh(Path(out), kept)
+        finer = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
+        plan = replace(plan.on_mesh(finer), refinement=kept["refinement"])
+    elif refines:
+        plan = refine(plan, settings.mesh_refine)
     plan = replace(plan, settings=settings, choice=choice, timings=timings)
     objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
     if settings.weights.method == "images":  # the masks, whatever their files are called
@@ -142,7 +145,14 @@ def measure(
     places = _places(plan.series.chosen, frames)
     if workers is None:
         workers = threads() if separation is None and weights is None else 1
-    with _store(plan, Path(out), places if frames else None, objects, overwrite=overwrite, resume=resume) as store:
+    origin = _origin(plan, objects, kept.get("unread_files", ()))
+    if frames is not None:
+        opened = ResultStore.join(out, origin, frames=places)
+    elif resume:
+        opened = ResultStore.resume(out, origin)
+    else:
+        opened = ResultStore.create(out, origin, overwrite=overwrite)
+    with opened as store:
         if resume and frames is None:
             _take_back(plan, store, retry_failed=retry_failed)
         sink = _Folder(plan, store, places, progress)
@@ -188,15 +198,22 @@ class _Folder:
             return ()
         mesh, lights, chosen = self._plan.reference.mesh, len(self._plan.images.names), self._plan.series.chosen
         blank = Solution.failed(mesh, lights, "", np.zeros(0))
-        found = []
-        for place, kept in zip(places, self._store.table().each(_MEASURED, places), strict=True):
-            columns: dict[str, list[AnyArray]] = {}
-            for name, values in kept.items():
-                exact = values.astype(np.float64) if values.dtype.kind == "f" else values
-                columns.setdefault(QUANTITIES[name].source.partition(".")[0], []).append(exact)
-            stacked = {name: np.stack(some, axis=1) if len(some) > 1 else some[0] for name, some in columns.items()}
-            found.append((chosen[place], replace(blank, **cast(dict[str, Any], stacked))))
-        return found
+
+        def solution(kept: Mapping[str, Any]) -> Solution:
+            exact = {name: kept[name].astype(np.float64) for name in _MEASURED}
+            u, v, u_std, v_std, *strain, rigid = exact.values()
+            return replace(
+                blank,
+                displacement=np.stack([u, v], axis=1),
+                displacement_std=np.stack([u_std, v_std], axis=1),
+                strain=np.stack(strain[:3], axis=1),
+                strain_std=np.stack(strain[3:], axis=1),
+                node_status=kept["node_status"],
+                rigid=rigid,
+            )
+
+        kept = self._store.table().each([*_MEASURED, "node_status"], places)
+        return [(chosen[place], solution(one)) for place, one in zip(places, kept, strict=True)]
 
     def keep(self, place: int, found: Measured, after: Start) -> None:
         """Write a frame, and report what became of it."""
@@ -210,15 +227,6 @@ class _Folder:
         if status is Status.CONVERGED:
             line = f"converged in {record.iterations} iterations, {1 - rank_of(record)[1]:.0%} of the nodes measured"
         self._progress(done, len(places), f"{self._plan.series.name(self._plan.series.chosen[place])}: {line}")
-
-
-def _refined(plan: Plan, frame: int | bool, out: Path, kept: Mapping[str, Any]) -> Plan:
-    """The plan on a mesh refined in a frame, or on that of the result in `out`, with the provenance `kept`."""
-    if "refinement" not in kept:
-        return refine(plan, frame)
-    stored = read_mesh(out, kept)
-    mesh = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
-    return replace(plan.on_mesh(mesh), refinement=kept["refinement"])
 
 
 def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
@@ -249,9 +257,8 @@ def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
     if lost:
         logger.warning("lost to damage and measured again: %s", listed(lost, names))
     if readable:
-        logger.warning(
-            "measured again with what started from it, since it can be read now: %s", listed(readable, names)
-        )
+        words = "measured again with what started from it, since it can be read now: %s"
+        logger.warning(words, listed(readable, names))
     store.discard(again)
 
 
@@ -263,12 +270,11 @@ def _tell_repeated(plan: Plan, store: ResultStore, places: range) -> None:
     if repeated:
         names = [plan.series.name(index) for index in plan.series.chosen]
         what = "all frames repeat" if len(repeated) == len(places) - 1 else "frames that repeat"
-        logger.warning(
+        words = (
             "%s the one before, bit for bit, which camera noise makes impossible: %s; were frames lost and filled up, "
-            "or files copied?",
-            what,
-            listed(repeated, names),
+            "or files copied?"
         )
+        logger.warning(words, what, listed(repeated, names))
 
 
 def _places(chosen: range, frames: range | None) -> range:
@@ -287,14 +293,13 @@ def _places(chosen: range, frames: range | None) -> range:
     return range(places[0], places[-1] + 1)
 
 
-def _store(
-    plan: Plan, out: Path, part: range | None, objects: dict[str, str], *, overwrite: bool, resume: bool
-) -> ResultStore:
-    series = plan.series
-    recording = series.recording
-    begun = (resume or part is not None) and (out / PROVENANCE).exists()
-    fingerprint, unread = series.fingerprint(read_provenance(out).get("unread_files", ()) if begun else ())
-    origin = Origin(
+def _origin(plan: Plan, objects: Mapping[str, str], unread_before: Collection[str]) -> Origin:
+    """What the result keeps of what all frames share; `objects` are descriptions of those that were given."""
+    series, recording = plan.series, plan.series.recording
+    fingerprint, unread = series.fingerprint(unread_before)
+    levels = light_levels(plan.images, plan.region).items()
+    usable = np.isfinite(plan.images.values[:, plan.region.mask]).mean(axis=1)
+    return Origin(
         nodes=plan.reference.mesh.nodes + plan.window.origin,
         elements=plan.reference.mesh.elements,
         names=[series.name(index) for index in series.chosen],
@@ -317,19 +322,10 @@ def _store(
             "unread_files": list(unread),
             "frame_shape": list(plan.window.frame),
             "reference_origin": list(plan.window.origin),
-            "reference_exposure": list(_exposure(plan)),
+            "reference_exposure": [
+                {"light": light, "median": level, "excluded": float(1 - part)}
+                for (light, level), part in zip(levels, usable, strict=True)
+            ],
             "calibration_figures": plan.calibration,
         },
     )
-    if part is not None:
-        return ResultStore.join(out, origin, frames=part)
-    if resume:
-        return ResultStore.resume(out, origin)
-    return ResultStore.create(out, origin, overwrite=overwrite)
-
-
-def _exposure(plan: Plan) -> Iterator[dict[str, Any]]:
-    """Yield of each light the median grey level in the region of the reference, and the part that is not usable."""
-    levels, inside = light_levels(plan.images, plan.region), plan.images.values[:, plan.region.mask]
-    for (light, level), part in zip(levels.items(), inside, strict=True):
-        yield {"light": light, "median": level, "excluded": float(1 - np.isfinite(part).mean())}

@@ -90,7 +90,7 @@ def test_figures_of_a_scene_with_static_frames():
     plan = Plan.from_settings(replace(stated, element_size=25.0), source=FRAMES)
     at_rest = resolution._deformed(plan, 4)  # no frame of the reference: its displacement is all noise
     for size in found.sizes[:2]:
-        solution = resolution._solve(resolution._resized(plan, size.element_size), at_rest, None)
+        solution = resolution.solved(resolution._resized(plan, size.element_size), at_rest, None)
         assert 0.8 < size.scatter / np.sqrt(np.mean(solution.displacement**2)) < 1.25
         assert 0.8 < size.strain.scatter / np.sqrt(np.mean(solution.strain**2)) < 1.25
     for size in found.sizes:
