@@ -11,7 +11,7 @@ J. Comput. Phys. 103, 1992): undoing that shows the error of strain where waves 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -116,14 +116,14 @@ def discretisation_error(
     mesh, measured = reference.mesh, solution.measured
     if not measured.any() or mesh.size < SMALLEST_HALVED:
         return solution
-    halves = _halves(reference)
+    halves, draws = _halves(reference)
     with one_blas_thread():
         values, variance = _finer_field(halves, deformed, solution, options, method)
         std = np.concatenate([solution.displacement_std, solution.strain_std], axis=1)
-        noise = np.sqrt(halves.own_variance * np.column_stack([variance, variance, variance.mean(axis=1)]))
+        noise = np.sqrt(draws.own_variance * np.column_stack([variance, variance, variance.mean(axis=1)]))
         less = noise < _CONSTANTS.chance * std
         own = np.concatenate([solution.displacement, solution.strain], axis=1)
-        error = halves.error(own - values, solution.strain, np.where(less, noise, std))
+        error = halves.error(draws, own - values, solution.strain, np.where(less, noise, std))
         std = np.where(less, noise / np.sqrt(_CONSTANTS.chance), std)
     return replace(
         solution,
@@ -207,8 +207,8 @@ def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Gains:
-    """What noise does, by draws of it.
+class _Draws:
+    """What noise alone does, by draws of it: nothing else about it is assumed.
 
     Attributes
     ----------
@@ -217,10 +217,13 @@ class _Gains:
         over that of strain (3).
     scatter : ndarray, shape (N, 8)
         Relative standard deviation of their mean square over a window.
+    own_variance : ndarray, shape (N, 5)
+        Variance of u, v, exx, eyy, exy over that of the scores in their direction which the finer mesh leaves.
     """
 
     variance: FloatArray
     scatter: FloatArray
+    own_variance: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -239,10 +242,6 @@ class _Halves:
         Mean over each node and those beside it, boundary and interior apart.
     unsmooth
         Takes strain (N, C) to ``(M^-1 L - 1) s``, 0 at the boundary: what recovered slopes of a smooth field have lost.
-    gains
-        Of noise; None before they are found.
-    own_variance : ndarray, shape (N, 5)
-        Variance of u, v, exx, eyy, exy over that of the scores in their direction which the finer mesh leaves.
     """
 
     mesh: Tri3Mesh
@@ -250,8 +249,6 @@ class _Halves:
     ends: npt.NDArray[np.int64]
     around: sp.csr_matrix
     unsmooth: Callable[[FloatArray], FloatArray]
-    gains: _Gains | None = None
-    own_variance: FloatArray = field(default_factory=lambda: np.zeros((0, 5)))
 
     def prolonged(self, nodal: FloatArray) -> FloatArray:
         """Interpolate linearly at the nodes of the finer mesh."""
@@ -292,12 +289,11 @@ class _Halves:
             total, number = self.around @ total, self.around @ number
         return np.asarray(np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0))
 
-    def error(self, difference: FloatArray, strain: FloatArray, std: FloatArray) -> FloatArray:
+    def error(self, draws: _Draws, difference: FloatArray, strain: FloatArray, std: FloatArray) -> FloatArray:
         """Error (N, 5) from the difference of the two fields (N, 5), strain (N, 3) and noise (N, 5)."""
-        assert self.gains is not None
-        noise = np.array(_CONSTANTS.uneven) * self.gains.variance * std[:, _OF] ** 2
+        noise = np.array(_CONSTANTS.uneven) * draws.variance * std[:, _OF] ** 2
         edge = self.mesh.on_boundary[:, None]
-        sure = np.array(_CONSTANTS.sure) * self.gains.scatter * (1 + 2 * edge)
+        sure = np.array(_CONSTANTS.sure) * draws.scatter * (1 + 2 * edge)
         unsmoothed = np.where(edge, np.nan, self.unsmooth(np.nan_to_num(strain)))
         square = self._beyond(np.concatenate([difference, unsmoothed], axis=1), noise, sure)
         square *= np.repeat([_CONSTANTS.of_difference, _CONSTANTS.unsmoothed], [5, 3]) ** 2
@@ -329,8 +325,8 @@ _CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 
 
 @lru_cache(maxsize=1)
-def _halves(reference: Reference) -> _Halves:
-    """Halve the elements of a reference; the last result is kept."""
+def _halves(reference: Reference) -> tuple[_Halves, _Draws]:
+    """Halve the elements of a reference, and find what noise does; the last result is kept."""
     mesh, count = reference.mesh, len(reference.mesh.nodes)
     corners = mesh.elements.astype(np.int64)
     edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
@@ -351,7 +347,7 @@ def _halves(reference: Reference) -> _Halves:
         around=sp.csr_matrix((1 / number[row], (row, column)), shape=(count, count)),
         unsmooth=_unsmoothing(mesh),
     )
-    return _with_noise(halves, reference)
+    return halves, _drawn(halves, reference)
 
 
 def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
@@ -388,8 +384,8 @@ def _unsmoothing(mesh: Tri3Mesh) -> Callable[[FloatArray], FloatArray]:
     return unsmooth
 
 
-def _with_noise(halves: _Halves, reference: Reference) -> _Halves:
-    """Find what noise alone does, from draws: nothing else about it is assumed."""
+def _drawn(halves: _Halves, reference: Reference) -> _Draws:
+    """Find what noise does from random scores with the covariance of the Hessian, and from images of noise."""
     mesh, fine, count, random = halves.mesh, halves.fine, len(halves.mesh.nodes), np.random.default_rng(0)
     finer, coarse = (
         Equations.build(one, one.pixel_weights, np.zeros((one.assembly.size, 0)), np.zeros_like(one.mesh.nodes))
@@ -424,8 +420,7 @@ def _with_noise(halves: _Halves, reference: Reference) -> _Halves:
     if not mesh.is_graded:
         left[:] = left.mean(axis=0)
     own_variance = energy * own / np.column_stack([left, left, left.mean(axis=1)])
-    gains = _Gains(variance=typical / own[:, _OF], scatter=scatter)
-    return replace(halves, gains=gains, own_variance=own_variance)
+    return _Draws(variance=typical / own[:, _OF], scatter=scatter, own_variance=own_variance)
 
 
 def _scores(equations: Equations, random: np.random.Generator) -> FloatArray:

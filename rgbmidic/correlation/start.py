@@ -166,6 +166,8 @@ class Search:
         for reduction in self.reductions if small else self.reductions[:-1]:
             f = self._keypoints(reference.images, reference.weights, here, reduction, self.keypoints)
             g = self._keypoints(images, weights, there, reduction, int(min(as_dense, self.most)))
+            if f is None or g is None:
+                continue
             points, motion = self._pairs(f, replace(g, points=g.points + offset), 2.0 * reduction)
             if not len(points):
                 continue
@@ -199,13 +201,11 @@ class Search:
 
     def _keypoints(
         self, images: FloatImage, weights: FloatImage, part: tuple[slice, slice], reduction: int, most: int
-    ) -> Keypoints:
-        """The `most` strongest keypoints in a part of a state's picture, where a weight (k, H, W) is not 0."""
-        none = np.zeros(0)
-        empty = Keypoints(points=np.zeros((0, 2)), size=none, angle=none, descriptors=np.zeros((0, 128), np.float32))
+    ) -> Keypoints | None:
+        """The `most` strongest keypoints in a part of a state's picture, where a weight (k, H, W) is not 0, if any."""
         picture, seen = self._picture(images, weights, part, reduction)
         if min(picture.shape) < 2 * self.normalise:
-            return empty
+            return None
         grey = np.clip(128 + self.grey * picture, 0, 255).astype(np.uint8)
         # the precise upscale keeps positions free of a bias of a quarter of a pixel
         sift = cv2.SIFT.create(contrastThreshold=self.contrast, enable_precise_upscale=True)
@@ -214,7 +214,7 @@ class Search:
         strength = np.where(seen[rows, columns] > 0, [key.response for key in found], 0.0)
         strongest = np.argsort(-strength, kind="stable")[: min(most, np.count_nonzero(strength))]
         if not len(strongest):
-            return empty
+            return None
         chosen, descriptors = sift.compute(grey, [found[number] for number in strongest])
         points = np.asarray(cv2.KeyPoint.convert(chosen), dtype=np.float64) * reduction + (reduction - 1) / 2
         return Keypoints(
@@ -230,17 +230,14 @@ class Search:
         Pairs are mutually nearest descriptors whose angle and size predict, within `tolerance` px and a fraction of the
         distance, where some of the pairs around them have gone.
         """
-        none = np.zeros((0, 2)), np.zeros((0, 2))
-        if not len(first.points) or not len(second.points):
-            return none
         # sums of products of whole numbers under 2^24: exact in float32, hence the same in any order, on any threads
         likeness = first.descriptors @ second.descriptors.T
         nearest, back = likeness.argmax(axis=1), np.asarray(likeness.argmax(axis=0))
         here = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
         there = nearest[here]
-        if len(here) <= self.votes:
-            return none
         points, motion = first.points[here], second.points[there] - first.points[here]
+        if len(here) <= self.votes:
+            return points[:0], motion[:0]
         around = np.asarray(cKDTree(points).query(points, k=min(self.voters + 1, len(points)))[1])[:, 1:]
         step = points[around] - points[:, None]
         scale, turn = second.size[there] / first.size[here], second.angle[there] - first.angle[here]

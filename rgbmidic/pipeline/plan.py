@@ -405,20 +405,15 @@ def _check_raw(
         # twice as much has a bit more than the level: it is not the camera's, or deliberately low
         if (largest := samples.max()) > 2 * frame.white_level:
             logger.warning(
-                "the samples of the reference (%s) reach %d, far above white_level %g: is it that of the camera, and "
-                "is the order of the bytes (frames.dtype) right?",
-                name,
-                largest,
-                frame.white_level,
+                f"the samples of the reference ({name}) reach {largest}, far above white_level {frame.white_level:g}: "
+                "is it that of the camera, and is the order of the bytes (frames.dtype) right?"
             )
     saturated = saturated_fraction(raw[0], region.mask)
     # with .985 lights were still separated, with .99 no texture was left in two of three frames (measured)
     if saturated > 0.98:
         raise FrameError(f"no light sees the region in the reference ({name}): {exposure_fault(raw[0], region.mask)}")
     if saturated > SATURATED:
-        logger.warning(
-            "%.0f %% of the samples in the region of the reference (%s) are saturated", 100 * saturated, name
-        )
+        logger.warning(f"{100 * saturated:.0f} % of the samples in the region of the reference ({name}) are saturated")
     if calibration is None:
         return
     repeat = raw[1] if len(raw) > 1 else None
@@ -436,11 +431,8 @@ def _check_seen(state: RawState, name: str, images: IlluminationImages, referenc
     off = [f"{light} ({level:.1%})" for light, level in light_levels(images, region).items() if level < DARK]
     if off and not isinstance(state, IlluminationImages):
         logger.warning(
-            "the reference (%s) shows no light of %s: the median in the region is under %.0f %% of the full scale; "
-            "are the lamps on?",
-            name,
-            ", ".join(off),
-            100 * DARK,
+            f"the reference ({name}) shows no light of {', '.join(off)}: the median in the region is under "
+            f"{100 * DARK:.0f} % of the full scale; are the lamps on?"
         )
 
 
@@ -448,10 +440,9 @@ def _tell_no_effect(weights: ThresholdWeights, images: IlluminationImages, regio
     """Warn of a threshold that excludes nothing in the region of the reference."""
     inside = region.mask
     if (weights.reference(images) > 0)[:, inside].sum() == images.valid[:, inside].sum():
+        most = blurred(images, weights.blur)[:, inside].max() / images.full_scale
         logger.warning(
-            "weights.threshold = %.3g excludes nothing in the reference: no light, blurred over %g px, exceeds %.2g of "
-            'the dynamic range in the region. State a lower one, or weights.method = "statistics"',
-            weights.threshold,
-            weights.blur,
-            blurred(images, weights.blur)[:, inside].max() / images.full_scale,
+            f"weights.threshold = {weights.threshold:.3g} excludes nothing in the reference: no light, blurred over "
+            f"{weights.blur:g} px, exceeds {most:.2g} of the dynamic range in the region. State a lower one, or "
+            'weights.method = "statistics"'
         )

@@ -161,9 +161,8 @@ def _mesh_errors(sizes: Sequence[SizeFigures]) -> tuple[SizeFigures, ...]:
         out.append(replace(one, discretisation=float(mesh[0]), strain=strain))
     if fallen > max((one.noise for one in sizes if one.noise > 0), default=np.inf):
         logger.warning(
-            "differences of %.2g px between element sizes fall as the elements grow, as those of reflections: they are "
-            "not counted as the mesh's",
-            fallen,
+            f"differences of {fallen:.2g} px between element sizes fall as the elements grow, as those of reflections: "
+            "they are not counted as the mesh's"
         )
     return tuple(reversed(out))
 

@@ -257,8 +257,8 @@ def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
     if lost:
         logger.warning("lost to damage and measured again: %s", listed(lost, names))
     if readable:
-        words = "measured again with what started from it, since it can be read now: %s"
-        logger.warning(words, listed(readable, names))
+        again_for = listed(readable, names)
+        logger.warning("measured again with what started from it, since it can be read now: %s", again_for)
     store.discard(again)
 
 
@@ -270,11 +270,10 @@ def _tell_repeated(plan: Plan, store: ResultStore, places: range) -> None:
     if repeated:
         names = [plan.series.name(index) for index in plan.series.chosen]
         what = "all frames repeat" if len(repeated) == len(places) - 1 else "frames that repeat"
-        words = (
-            "%s the one before, bit for bit, which camera noise makes impossible: %s; were frames lost and filled up, "
-            "or files copied?"
+        logger.warning(
+            f"{what} the one before, bit for bit, which camera noise makes impossible: {listed(repeated, names)}; were "
+            "frames lost and filled up, or files copied?"
         )
-        logger.warning(words, what, listed(repeated, names))
 
 
 def _places(chosen: range, frames: range | None) -> range:

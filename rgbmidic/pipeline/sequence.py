@@ -215,10 +215,7 @@ class _Live:
             before = self._updates[frames[:-1][-2:]]
             self._updates[frames[-2:]] = next_reference(plan, before, plan.series.chosen[place], self.solution)
         # a later state starts from this one, from the first, or from the last at a multiple of a power of STRIDE
-        needed, step = {0, place}, STRIDE
-        while step <= place:
-            needed.add(place // step * step)
-            step *= STRIDE
+        needed = {place // STRIDE**power * STRIDE**power for power in range(20)}
         self._starts = {one: start for one, start in self._starts.items() if one in needed}
         kept = {(), *(start.reference_updates[-2:] for start in self._starts.values())}
         self._updates = {frames: one for frames, one in self._updates.items() if frames in kept}

@@ -266,6 +266,7 @@ def measure_size(
     part = [1 - (one.mesh.size / mesh.size) ** 3 for one in other]
     apart = [min(np.divide(found, part), default=0.0) for found in field.apart(other)]
     finer.append(field)
+    whole = solution.measured[mesh.elements].all(axis=1)
 
     def errors(name: str, beyond: float) -> dict[str, Any]:
         bias, scatter = _floor([getattr(one, name) for one in still], single)
@@ -276,7 +277,7 @@ def measure_size(
         element_size=plan.element_size,
         speckles=plan.element_size / speckle,
         nodes=len(mesh.nodes),
-        measured=float(mesh.areas @ solution.measured[mesh.elements].all(axis=1) / mesh.areas.sum()),
+        measured=float(mesh.areas[whole].sum() / mesh.areas.sum()),
         strain=ErrorFigures(**errors("strain", apart[1])),
         seconds=seconds,
         gauges=tuple(_gauge_figures(plan, solution, still, gauges)),
