@@ -34,20 +34,9 @@ from rgbmidic.illumination.separation import (
     reference_images,
 )
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh
+from rgbmidic.pipeline import suitability
 from rgbmidic.pipeline.region import finite_elements_of, read_region, region_and_window, window_around
 from rgbmidic.pipeline.source import FrameSequence, Series, open_sequence
-from rgbmidic.pipeline.suitability import (
-    HARDLY_ENOUGH,
-    SATURATED,
-    check_texture,
-    exposure_fault,
-    light_levels,
-    saturated_fraction,
-    shifted_levels,
-    speckle_size,
-    tell_small,
-    too_small,
-)
 from rgbmidic.settings import SolverSettings, TestSettings, grey_levels
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights
@@ -242,10 +231,10 @@ class Plan:
         reference = _reference(images, weights, region, mesh, sigma, solver)
         if isinstance(weights, ThresholdWeights):
             _tell_no_effect(weights, images, region)
-        speckle = speckle_size(images, region)
+        speckle = suitability.speckle_size(images, region)
         if finite_elements is not None:
-            tell_small(mesh, speckle, finite_elements)
-        elif small := too_small(size, speckle, HARDLY_ENOUGH):
+            suitability.tell_small(mesh, speckle, finite_elements)
+        elif small := suitability.too_small(size, speckle, suitability.HARDLY_ENOUGH):
             logger.warning("%s", small)
         _check_seen(states[0], name, images, reference, region)
         return cls(
@@ -259,7 +248,7 @@ class Plan:
             images=images,
             reference=reference,
             speckle=speckle,
-            saturated=saturated_fraction(states[0], region.mask),
+            saturated=suitability.saturated_fraction(states[0], region.mask),
             window=window,
             element_size=size,
             finite_elements=finite_elements,
@@ -400,7 +389,7 @@ def _check_raw(
     if not raw:
         return
     for frame in raw[0]:
-        if shifted := shifted_levels(samples := frame.values[..., region.mask], frame.white_level):
+        if shifted := suitability.shifted_levels(samples := frame.values[..., region.mask], frame.white_level):
             raise FrameError(f"the reference ({name}): {shifted}")
         # twice as much has a bit more than the level: it is not the camera's, or deliberately low
         if (largest := samples.max()) > 2 * frame.white_level:
@@ -408,11 +397,13 @@ def _check_raw(
                 f"the samples of the reference ({name}) reach {largest}, far above white_level {frame.white_level:g}: "
                 "is it that of the camera, and is the order of the bytes (frames.dtype) right?"
             )
-    saturated = saturated_fraction(raw[0], region.mask)
+    saturated = suitability.saturated_fraction(raw[0], region.mask)
     # with .985 lights were still separated, with .99 no texture was left in two of three frames (measured)
     if saturated > 0.98:
-        raise FrameError(f"no light sees the region in the reference ({name}): {exposure_fault(raw[0], region.mask)}")
-    if saturated > SATURATED:
+        raise FrameError(
+            f"no light sees the region in the reference ({name}): {suitability.exposure_fault(raw[0], region.mask)}"
+        )
+    if saturated > suitability.SATURATED:
         logger.warning(f"{100 * saturated:.0f} % of the samples in the region of the reference ({name}) are saturated")
     if calibration is None:
         return
@@ -425,10 +416,12 @@ def _check_raw(
 def _check_seen(state: RawState, name: str, images: IlluminationImages, reference: Reference, region: Region) -> None:
     """Refuse a reference that no light sees or that shows no texture; warn of a light that is off."""
     if not reference.pixel_weights.any():
-        fault = exposure_fault(state, region.mask) or "it is saturated, dark or excluded by the weights"
+        fault = suitability.exposure_fault(state, region.mask) or "it is saturated, dark or excluded by the weights"
         raise FrameError(f"no light sees the region in the reference ({name}): {fault}")
-    check_texture(state, region.mask, name)
-    off = [f"{light} ({level:.1%})" for light, level in light_levels(images, region).items() if level < DARK]
+    suitability.check_texture(state, region.mask, name)
+    off = [
+        f"{light} ({level:.1%})" for light, level in suitability.light_levels(images, region).items() if level < DARK
+    ]
     if off and not isinstance(state, IlluminationImages):
         logger.warning(
             f"the reference ({name}) shows no light of {', '.join(off)}: the median in the region is under "
