@@ -167,10 +167,8 @@ def _finer_field(
     last = compare(problem, values, estimate)
     weights, loss = _weighed(method, last, given)
     equations = Equations.build(fine, weights, functions[:, :0], start, None if method is None else given)
-    lights = zip(weights, last.difference, fine.gradient.swapaxes(0, 1), strict=True)
-    side = fine.assembly.vector(np.sum([fine.projected(*light) for light in lights], axis=0))
     # a robust loss bends less than the weights of one residual state: with these alone noise is followed too little
-    rest = loss[:, None] * equations.solve(side).reshape(-1, 2)
+    rest = loss[:, None] * equations.solve(_right_side(fine, weights, last.difference)).reshape(-1, 2)
     last = replace(last, difference=_left(fine, last.difference, rest).difference)
     found = estimate.displacement + np.einsum("nij,nj->ni", equations.rotation, rest)
     recovery = halves.recovery(children & equations.textured[fine.mesh.elements].all(axis=1), equations)
@@ -178,6 +176,12 @@ def _finer_field(
     known = (equations.textured & ~fine.mesh.beside(~equations.textured))[:count]
     found_here = np.concatenate([recovery.displacement(found), recovery.strain(found)], axis=1)
     return np.where(known[:, None], found_here, np.nan), variance[:count]
+
+
+def _right_side(reference: Reference, weights: FloatImage, difference: FloatImage) -> FloatArray:
+    """Right-hand side (2 N,) of a known difference of all lights (k, P)."""
+    lights = zip(weights, difference, reference.gradient.swapaxes(0, 1), strict=True)
+    return reference.assembly.vector(np.sum([reference.projected(*light) for light in lights], axis=0))
 
 
 def _weighed(method: PrecisionMethod | None, residual: Residual, given: FloatImage) -> tuple[FloatImage, FloatArray]:
@@ -411,8 +415,7 @@ def _drawn(halves: _Halves, reference: Reference) -> _Draws:
     for _ in range(_CONSTANTS.noises):
         white = random.standard_normal((len(fine.values), *fine.pixels.shape), dtype=np.float32)
         noise = fine.pixels.gather(np.stack([apply_prefilter(image, fine.prefilter) for image in white]))
-        lights = zip(fine.pixel_weights, noise, fine.gradient.swapaxes(0, 1), strict=True)
-        side = fine.assembly.vector(np.sum([fine.projected(*light) for light in lights], axis=0))
+        side = _right_side(fine, fine.pixel_weights, noise)
         found = finer.solve(side).reshape(-1, 2)
         residual = halves.straightened(_left(fine, noise, found), fine_recovery, found)
         left += _score_variance(residual, fine.pixel_weights)[:count] / _CONSTANTS.noises

@@ -200,32 +200,40 @@ def run_batch(
         Of each test.
     """
     for test in tests:
-        folder, done = out / test.name, list[tuple[int, int, str]]()
-        report = None if progress is None else progress(test.name)
-
-        def count(*now: Any, report: Progress | None = report, done: list[Any] = done) -> None:
-            done.append(now)
-            if report is not None:
-                report(*now)
-
+        folder = out / test.name
         try:
-            document = test.document
-            sections = read_toml(document, "settings file") if isinstance(document, Path) else document
-            settings = TestSettings.from_mapping(sections, test.base)
-            try:
-                result = measure(settings, folder, resume=is_result(folder), workers=workers, progress=count)
-            except AnotherTestError as error:
-                reason = str(error).rpartition("; ")[0]
-                if not overwrite:
-                    raise ResultError(f"{reason}; --overwrite measures it again") from None
-                logger.warning("%s is measured again: %s", test.name, reason)
-                result = measure(settings, folder, overwrite=True, workers=workers, progress=count)
+            report = progress and progress(test.name)
+            result, settings, now = _measured(test, folder, workers, report, overwrite=overwrite)
             if conclude is not None:
-                conclude(result, settings, bool(done))
-            values = _values(result, settings, elastic)
-            yield Outcome(name=test.name, folder=folder, measured=bool(done), values=values)
+                conclude(result, settings, now)
+            yield Outcome(name=test.name, folder=folder, measured=now, values=_values(result, settings, elastic))
         except (RgbmidicError, OSError) as error:
             yield Outcome(name=test.name, folder=folder, reason=str(error))
+
+
+def _measured(
+    test: BatchTest, folder: Path, workers: int | None, progress: Progress | None, *, overwrite: bool
+) -> tuple[Result, TestSettings, bool]:
+    """Measure a test unless it is measured already; whether it was measured now comes last."""
+    document = test.document
+    sections = read_toml(document, "settings file") if isinstance(document, Path) else document
+    settings, moved = TestSettings.from_mapping(sections, test.base), False
+
+    def count(done: int, total: int, line: str) -> None:
+        nonlocal moved
+        moved = True
+        if progress is not None:
+            progress(done, total, line)
+
+    try:
+        result = measure(settings, folder, resume=is_result(folder), workers=workers, progress=count)
+    except AnotherTestError as error:
+        reason = str(error).rpartition("; ")[0]
+        if not overwrite:
+            raise ResultError(f"{reason}; --overwrite measures it again") from None
+        logger.warning("%s is measured again: %s", test.name, reason)
+        result = measure(settings, folder, overwrite=True, workers=workers, progress=count)
+    return result, settings, moved
 
 
 def _values(result: Result, settings: TestSettings, elastic: tuple[float, float]) -> dict[str, float]:

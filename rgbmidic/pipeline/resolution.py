@@ -151,20 +151,18 @@ def _mesh_errors(sizes: Sequence[SizeFigures]) -> tuple[SizeFigures, ...]:
     A coarser mesh follows no more than a finer one: what falls as elements grow is none of the mesh's. It is, for
     instance, that of reflections, which each element averages.
     """
-    out, least, fallen = list[SizeFigures](), np.array([np.inf, np.inf]), 0.0
-    for one in reversed(sizes):
-        stated = np.array([one.discretisation, one.strain.discretisation])
-        least = np.fmin(least, stated)
-        mesh = np.where(np.isfinite(stated), least, np.nan)
-        fallen = float(np.fmax(fallen, np.sqrt(np.maximum(stated[0] ** 2 - mesh[0] ** 2, 0.0))))
-        strain = replace(one.strain, discretisation=float(mesh[1]))
-        out.append(replace(one, discretisation=float(mesh[0]), strain=strain))
+    stated = np.array([[one.discretisation, one.strain.discretisation] for one in sizes])
+    mesh = np.where(np.isfinite(stated), np.fmin.accumulate(stated[::-1])[::-1], np.nan)
+    fallen = float(np.fmax.reduce(np.sqrt(np.maximum(stated**2 - mesh**2, 0.0))[:, 0], initial=0.0))
     if fallen > max((one.noise for one in sizes if one.noise > 0), default=np.inf):
         logger.warning(
             f"differences of {fallen:.2g} px between element sizes fall as the elements grow, as those of reflections: "
             "they are not counted as the mesh's"
         )
-    return tuple(reversed(out))
+    return tuple(
+        replace(one, discretisation=float(moved), strain=replace(one.strain, discretisation=float(strain)))
+        for one, (moved, strain) in zip(sizes, mesh, strict=True)
+    )
 
 
 def choose(settings: TestSettings, **given: Any) -> Choice:
