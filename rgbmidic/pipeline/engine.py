@@ -237,10 +237,8 @@ class Cluster:
                 "a Dask cluster needs the packages dask and distributed: install rgbmidic[cluster]"
             ) from None
         # what becomes of the cluster is reported here, without its tracebacks; some loggers have levels of their own
-        names = [
-            name for name in logging.root.manager.loggerDict if name.partition(".")[0] in ("distributed", "tornado")
-        ]
-        self._levels = {logging.getLogger(name): logging.getLogger(name).level for name in names}
+        loggers = [logging.getLogger(name) for name in list(logging.root.manager.loggerDict)]
+        self._levels = {log: log.level for log in loggers if log.name.partition(".")[0] in ("distributed", "tornado")}
         for log in self._levels:
             log.setLevel(logging.CRITICAL + 1)
         try:

@@ -116,9 +116,8 @@ def measure_sequence(
     mask = region if isinstance(region, Region) else None
     if settings is None:
         height, width = np.shape(getattr(reference, "values", reference))[-2:]
-        corners: Any = (0, 0, width - 1, height - 1)
-        if region is not None and not isinstance(region, Region):
-            corners = tuple(region)
+        whole = region is None or isinstance(region, Region)
+        corners: Any = (0, 0, width - 1, height - 1) if whole else tuple(cast(Any, region))
         settings = TestSettings(
             frames=FrameSettings(path=(), update_reference=update_reference),
             region=RegionSettings(rectangle=corners),
