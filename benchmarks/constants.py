@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -17,8 +18,13 @@ import cv2
 import numpy as np
 from textures import Affine, Texture
 
-from rgbmidic import Solution, correlate
+from rgbmidic import Region, Solution, SolverSettings, Tri3Mesh
+from rgbmidic.correlation import Deformed, Reference, Start, track
+from rgbmidic.correlation.images import as_light_stack
+from rgbmidic.correlation.start import Search
+from rgbmidic.settings import ELEMENT_SIZE, grey_levels
 from rgbmidic.typing import FloatArray
+from rgbmidic.weights import Statistics, as_weights
 
 from .tables import Row, table
 
@@ -31,14 +37,15 @@ CONSTANTS = {
     "residual": ("_SMOOTHNESS", "_FITTED", "_TURNS"),
     "nodes": ("_WORSE", "_ONE_SIDED", "_NOISY"),
     "solve": ("_STARTED", "_WANDERING", "_SWINGING", "_SETTLED"),
-    "start": ("_NORMALISE", "_FLAT", "_GREY", "_VOTERS", "_TOLERANCE", "_CONTEXT"),
     "light_weights": ("_FREEDOM", "_LEAST_VARIANCE", "_OWN"),
 }
+SEARCH = ("normalise", "flat", "grey", "voters", "tolerance", "context")
+"""Fields of the search for a start."""
 QUICK = ("anchor", "even", "grey", "least variance", "noisy", "range", "smoothness", "swinging")
 """At least one of each module."""
 NOTHING = {"displacement/stated": 1e-3, "stated [%]": 0.01}
 """What is as good as no change: the last iteration of a solve may move the nodes by so much."""
-COARSE = {"_SMOOTHNESS": 10, "_ANCHOR": 10, "_SETTLED": 100, "_VOTERS": 10, "_TOLERANCE": 100}
+COARSE = {"_SMOOTHNESS": 10, "_ANCHOR": 10, "_SETTLED": 100, "voters": 10, "tolerance": 100}
 """Constants of which only the order of magnitude counts, and factors."""
 
 
@@ -57,7 +64,7 @@ def images() -> tuple[FloatArray, FloatArray]:
     return first, second
 
 
-def scenes() -> dict[str, Solution]:
+def scenes(search: Search) -> dict[str, Solution]:
     """Solve the scenes."""
     first, second = images()
     weights = np.ones_like(first)
@@ -71,14 +78,26 @@ def scenes() -> dict[str, Solution]:
     dark = 100 + (moved - 100) * (1 - 0.97 * np.exp(-((x - 120) ** 2 + (y - 100) ** 2) / (2 * 25**2)))
     noisy = [one + rng.normal(0, 3, SHAPE) for one in (rest, another, apart, dark)]
     return {
-        "hole": correlate(noisy[0], noisy[1], region=REGION, element_size=14),
-        "apart": correlate(noisy[0], noisy[2], region=REGION, element_size=14),
-        "shadow": correlate(noisy[0], noisy[3], region=REGION, element_size=14, brightness="local"),
-        "shadow, mean": correlate(noisy[0], noisy[3], region=REGION, element_size=14, brightness="mean"),
-        "lights": correlate(first, second, region=REGION, brightness="local"),
-        "gap": correlate(first, second, region=REGION, weights=weights, element_size=15, rigid="translation"),
-        "one": correlate(first[0], second[0], region=REGION, element_size=12),
+        "hole": pair(search, noisy[0], noisy[1], element_size=14),
+        "apart": pair(search, noisy[0], noisy[2], element_size=14),
+        "shadow": pair(search, noisy[0], noisy[3], element_size=14, brightness="local"),
+        "shadow, mean": pair(search, noisy[0], noisy[3], element_size=14, brightness="mean"),
+        "lights": pair(search, first, second, brightness="local"),
+        "gap": pair(search, first, second, weights=weights, element_size=15, rigid="translation"),
+        "one": pair(search, first[0], second[0], element_size=12),
     }
+
+
+def pair(search: Search, first: FloatArray, second: FloatArray, **options: Any) -> Solution:
+    """What `correlate` gives, with a search for the start of its own."""
+    f, g = as_light_stack(first, "first"), as_light_stack(second, "second")
+    weights = as_weights(options.pop("weights", None), f.shape, "weights")
+    region = Region.from_rectangle(REGION, SHAPE)
+    mesh = Tri3Mesh.from_region(region, options.pop("element_size", ELEMENT_SIZE))
+    _, solver = grey_levels(0.0, SolverSettings(**options), cracked=False)
+    reference = Reference.prepare(f, region, weights, mesh=mesh, prefilter=solver.prefilter)
+    deformed = Deformed.prepare(g, None, prefilter=solver.prefilter)
+    return track(reference, deformed, Start(displacement=None), solver, Statistics(), search)
 
 
 def scaled(value: Any, factor: float) -> Any:
@@ -97,28 +116,39 @@ def constants(quick: bool) -> Iterator[Row]:
     stale = [(name, one) for name, names in CONSTANTS.items() for one in names if not hasattr(modules[name], one)]
     if stale:
         raise AttributeError(f"constants that are not there: {stale}")
-    usual = scenes()
+    usual = scenes(Search())
     for name, names in CONSTANTS.items():
         for constant in names:
             words = constant.strip("_").lower().replace("_", " ")
             if quick and words not in QUICK:
                 continue
-            found, value = [], getattr(modules[name], constant)
+            changed, value = [], getattr(modules[name], constant)
             coarse = 2 if name == "residual" else COARSE.get(constant, 2)
             for factor in (1 / coarse, coarse):
                 setattr(modules[name], constant, scaled(value, factor))
                 try:
-                    found += [change(usual[scene], after) for scene, after in scenes().items()]
+                    changed.append(scenes(Search()))
                 finally:
                     setattr(modules[name], constant, value)
-            displacement, std, nodes = np.max(found, axis=0)
-            yield {
-                "part": f"{rooms[name]}/{name}",
-                "constant": words,
-                "displacement/stated": float(displacement),
-                "stated [%]": 100 * float(std),
-                "nodes [%]": 100 * float(nodes),
-            }
+            yield row(f"{rooms[name]}/{name}", words, usual, changed)
+    for field in SEARCH:
+        if not quick or field in QUICK:
+            value, coarse = getattr(Search(), field), COARSE.get(field, 2)
+            changed = [scenes(replace(Search(), **{field: scaled(value, one)})) for one in (1 / coarse, coarse)]
+            yield row("correlation/start", field, usual, changed)
+
+
+def row(part: str, constant: str, usual: dict[str, Solution], changed: list[dict[str, Solution]]) -> Row:
+    """What a constant changes."""
+    found = [change(usual[scene], after) for one in changed for scene, after in one.items()]
+    displacement, std, nodes = np.max(found, axis=0)
+    return {
+        "part": part,
+        "constant": constant,
+        "displacement/stated": float(displacement),
+        "stated [%]": 100 * float(std),
+        "nodes [%]": 100 * float(nodes),
+    }
 
 
 def change(before: Solution, after: Solution) -> tuple[float, float, float]:

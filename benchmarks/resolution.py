@@ -102,7 +102,7 @@ class Scene:
         deformed = resolution._deformed(plan, 1)
         for size in sizes:
             sized = resolution._resized(plan, size)
-            solution = resolution._solve(sized, deformed, None)
+            solution = resolution.solved(sized, deformed, None)
             found[size] = field_rms(sized.reference.mesh, solution.displacement, field)
         return found
 
@@ -191,7 +191,7 @@ def errors(plan: Plan, states: Array, field: Array) -> tuple[float, ...]:
     """Error of displacement, px, and of strain, 1e-3: rms over the pixels of the region and the components; and the
     99 % quantile of that of a strain component, 1e-3.
     """
-    solution = resolution._solve(plan, resolution._deformed(plan, 1), None)
+    solution = resolution.solved(plan, resolution._deformed(plan, 1), None)
     mesh, nodal = plan.reference.mesh, solution.strain
     (xx, xy), (yx, yy) = (np.gradient(part, axis=(1, 0)) for part in field)
     true = np.stack([xx, yy, (xy + yx) / 2])

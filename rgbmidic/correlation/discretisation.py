@@ -11,8 +11,9 @@ J. Comput. Phys. 103, 1992): undoing that shows the error of strain where waves 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,33 +36,55 @@ from rgbmidic.mesh.quadratic_fit import quadratic_fit
 from rgbmidic.settings import SMALLEST_HALVED, SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-_DRAWS = 16
-"""Random scores from which the variance of the difference is found: averaged over a window to 6 % (derived)."""
-_NOISES = 2
-"""Images of noise from which is found what both fits leave of it: 800 blocks of 13 px in 380 px, to 5 % (derived)."""
-_SPREAD = 4
-"""Times that squares are averaged with those of the nodes beside: a window of standard deviation 1.5 elements."""
-_OF_DIFFERENCE = 1.25
-"""Error over the difference. Of what the mesh loses the halved one loses 1/16 for displacement and 1/4 for strain where
-waves are long, next to nothing at 3 elements: 4/3 to 1.1 for strain (derived). For displacement 1.07, and more for what
-is lost with differences taken for noise; chosen on the DIC Challenge star."""
-_UNSMOOTHED = 0.72
-"""Inverse second moment of the rows of TRI3's mass matrix over h^2/3: what `_Halves.unsmooth` overstates."""
-_EDGE = 1.8
-"""Error of one-sided slopes over that of central ones: 2.5 across the edge, 1 along it (DIC Challenge star)."""
-_SURE = np.repeat([1.2, 4.0, 2.0], [2, 3, 3])
-"""Standard deviations of the mean square of noise alone by which the difference, of displacement and of strain, and
-unsmoothed strain must exceed it. Strain's difference has 3 to 4 times the noise of strain, so that what passes by
-chance would be a multiple of it. Chosen: affine fields come out 15 % larger at most."""
-_UNEVEN = np.array([1.15, 1.15, 1.4, 1.4, 1.4])
-"""Variance of the difference, and of what is unsmoothed, over that with equal weights: a robust loss weighs pixels
-unevenly (measured on affine fields)."""
-_CHANCE = 0.8
-"""Noise by what the finer mesh leaves, over the stated one, from which it is less by chance: both are known to 6 to
-12 % (67 blocks, `SolverConstants.score_range`), and nothing is taken off. Of values below it the mean is too small by
-about half of what is missing (measured: .9)."""
-_HELD = 1e-6
-"""Fraction of the mean texture that is added to that of an element, so that its square root exists (derived)."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiscretisationConstants:
+    """Constants of the estimate.
+
+    Attributes
+    ----------
+    draws
+        Random scores from which the variance of the difference is found: averaged over a window to 6 % (derived).
+    noises
+        Images of noise from which is found what both fits leave of it: 800 blocks of 13 px in 380 px, to 5 % (derived).
+    spread
+        Times that squares are averaged with those of the nodes beside: a window of standard deviation 1.5 elements.
+    of_difference
+        Error over the difference. Of what the mesh loses the halved one loses 1/16 for displacement and 1/4 for strain
+        where waves are long, next to nothing at 3 elements: 4/3 to 1.1 for strain (derived). For displacement 1.07, and
+        more for what is lost with differences taken for noise; chosen on the DIC Challenge star.
+    unsmoothed
+        Inverse second moment of the rows of TRI3's mass matrix over h^2/3: what `_Halves.unsmooth` overstates.
+    edge
+        Error of one-sided slopes over that of central ones: 2.5 across the edge, 1 along it (DIC Challenge star).
+    sure
+        Standard deviations of the mean square of noise alone by which the difference, of displacement (2) and of strain
+        (3), and unsmoothed strain (3) must exceed it. Strain's difference has 3 to 4 times the noise of strain, so that
+        what passes by chance would be a multiple of it. Chosen: affine fields come out 15 % larger at most.
+    uneven
+        Variance of the same over that with equal weights: a robust loss weighs pixels unevenly (measured on affine
+        fields).
+    chance
+        Noise by what the finer mesh leaves, over the stated one, from which it is less by chance: both are known to 6
+        to 12 % (67 blocks, `SolverConstants`), and nothing is taken off. Of values below it the mean is too small by about
+        half of what is missing (measured: .9).
+    held
+        Fraction of the mean texture that is added to that of an element, so that its square root exists (derived).
+    """
+
+    draws: int = 16
+    noises: int = 2
+    spread: int = 4
+    of_difference: float = 1.25
+    unsmoothed: float = 0.72
+    edge: float = 1.8
+    sure: tuple[float, ...] = (1.2, 1.2, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0)
+    uneven: tuple[float, ...] = (1.15, 1.15, 1.4, 1.4, 1.4, 1.4, 1.4, 1.4)
+    chance: float = 0.8
+    held: float = 1e-6
+
+
+_CONSTANTS = DiscretisationConstants()
 
 
 def discretisation_error(
@@ -93,15 +116,15 @@ def discretisation_error(
     mesh, measured = reference.mesh, solution.measured
     if not measured.any() or mesh.size < SMALLEST_HALVED:
         return solution
-    halves = _halves(reference)
+    halves, draws = _halves(reference)
     with one_blas_thread():
         values, variance = _finer_field(halves, deformed, solution, options, method)
         std = np.concatenate([solution.displacement_std, solution.strain_std], axis=1)
-        noise = np.sqrt(halves.own_variance * np.column_stack([variance, variance, variance.mean(axis=1)]))
-        less = noise < _CHANCE * std
+        noise = np.sqrt(draws.own_variance * np.column_stack([variance, variance, variance.mean(axis=1)]))
+        less = noise < _CONSTANTS.chance * std
         own = np.concatenate([solution.displacement, solution.strain], axis=1)
-        error = halves.error(own - values, solution.strain, np.where(less, noise, std))
-        std = np.where(less, noise / np.sqrt(_CHANCE), std)
+        error = halves.error(draws, own - values, solution.strain, np.where(less, noise, std))
+        std = np.where(less, noise / np.sqrt(_CONSTANTS.chance), std)
     return replace(
         solution,
         displacement_std=std[:, :2],
@@ -144,10 +167,8 @@ def _finer_field(
     last = compare(problem, values, estimate)
     weights, loss = _weighed(method, last, given)
     equations = Equations.build(fine, weights, functions[:, :0], start, None if method is None else given)
-    lights = zip(weights, last.difference, fine.gradient.swapaxes(0, 1), strict=True)
-    side = fine.assembly.vector(np.sum([fine.projected(*light) for light in lights], axis=0))
     # a robust loss bends less than the weights of one residual state: with these alone noise is followed too little
-    rest = loss[:, None] * equations.solve(side).reshape(-1, 2)
+    rest = loss[:, None] * equations.solve(_right_side(fine, weights, last.difference)).reshape(-1, 2)
     last = replace(last, difference=_left(fine, last.difference, rest).difference)
     found = estimate.displacement + np.einsum("nij,nj->ni", equations.rotation, rest)
     recovery = halves.recovery(children & equations.textured[fine.mesh.elements].all(axis=1), equations)
@@ -155,6 +176,12 @@ def _finer_field(
     known = (equations.textured & ~fine.mesh.beside(~equations.textured))[:count]
     found_here = np.concatenate([recovery.displacement(found), recovery.strain(found)], axis=1)
     return np.where(known[:, None], found_here, np.nan), variance[:count]
+
+
+def _right_side(reference: Reference, weights: FloatImage, difference: FloatImage) -> FloatArray:
+    """Right-hand side (2 N,) of a known difference of all lights (k, P)."""
+    lights = zip(weights, difference, reference.gradient.swapaxes(0, 1), strict=True)
+    return reference.assembly.vector(np.sum([reference.projected(*light) for light in lights], axis=0))
 
 
 def _weighed(method: PrecisionMethod | None, residual: Residual, given: FloatImage) -> tuple[FloatImage, FloatArray]:
@@ -184,8 +211,8 @@ def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Gains:
-    """What noise does, by draws of it.
+class _Draws:
+    """What noise alone does, by draws of it: nothing else about it is assumed.
 
     Attributes
     ----------
@@ -194,10 +221,13 @@ class _Gains:
         over that of strain (3).
     scatter : ndarray, shape (N, 8)
         Relative standard deviation of their mean square over a window.
+    own_variance : ndarray, shape (N, 5)
+        Variance of u, v, exx, eyy, exy over that of the scores in their direction which the finer mesh leaves.
     """
 
     variance: FloatArray
     scatter: FloatArray
+    own_variance: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -216,10 +246,6 @@ class _Halves:
         Mean over each node and those beside it, boundary and interior apart.
     unsmooth
         Takes strain (N, C) to ``(M^-1 L - 1) s``, 0 at the boundary: what recovered slopes of a smooth field have lost.
-    gains
-        Of noise; None before they are found.
-    own_variance : ndarray, shape (N, 5)
-        Variance of u, v, exx, eyy, exy over that of the scores in their direction which the finer mesh leaves.
     """
 
     mesh: Tri3Mesh
@@ -227,8 +253,6 @@ class _Halves:
     ends: npt.NDArray[np.int64]
     around: sp.csr_matrix
     unsmooth: Callable[[FloatArray], FloatArray]
-    gains: _Gains | None = None
-    own_variance: FloatArray = field(default_factory=lambda: np.zeros((0, 5)))
 
     def prolonged(self, nodal: FloatArray) -> FloatArray:
         """Interpolate linearly at the nodes of the finer mesh."""
@@ -265,20 +289,19 @@ class _Halves:
         """Mean (N, C) over a window of some 1.5 elements; NaN takes no part."""
         known = np.isfinite(values)
         total, number = np.where(known, values, 0), known.astype(np.float64)
-        for _ in range(_SPREAD):
+        for _ in range(_CONSTANTS.spread):
             total, number = self.around @ total, self.around @ number
         return np.asarray(np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0))
 
-    def error(self, difference: FloatArray, strain: FloatArray, std: FloatArray) -> FloatArray:
+    def error(self, draws: _Draws, difference: FloatArray, strain: FloatArray, std: FloatArray) -> FloatArray:
         """Error (N, 5) from the difference of the two fields (N, 5), strain (N, 3) and noise (N, 5)."""
-        assert self.gains is not None
-        noise = np.concatenate([_UNEVEN, _UNEVEN[2:]]) * self.gains.variance * std[:, _OF] ** 2
+        noise = np.array(_CONSTANTS.uneven) * draws.variance * std[:, _OF] ** 2
         edge = self.mesh.on_boundary[:, None]
-        sure = _SURE * self.gains.scatter * (1 + 2 * edge)
+        sure = np.array(_CONSTANTS.sure) * draws.scatter * (1 + 2 * edge)
         unsmoothed = np.where(edge, np.nan, self.unsmooth(np.nan_to_num(strain)))
         square = self._beyond(np.concatenate([difference, unsmoothed], axis=1), noise, sure)
-        square *= np.repeat([_OF_DIFFERENCE, _UNSMOOTHED], [5, 3]) ** 2
-        smooth = np.where(edge, _EDGE**2 * self._inside(square[:, 5:]), square[:, 5:])
+        square *= np.repeat([_CONSTANTS.of_difference, _CONSTANTS.unsmoothed], [5, 3]) ** 2
+        smooth = np.where(edge, _CONSTANTS.edge**2 * self._inside(square[:, 5:]), square[:, 5:])
         return np.asarray(np.sqrt(np.concatenate([square[:, :2], np.fmax(square[:, 2:5], smooth)], axis=1)))
 
     def _beyond(self, values: FloatArray, variance: FloatArray, sure: FloatArray) -> FloatArray:
@@ -306,8 +329,8 @@ _CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 
 
 @lru_cache(maxsize=1)
-def _halves(reference: Reference) -> _Halves:
-    """Halve the elements of a reference; the last result is kept."""
+def _halves(reference: Reference) -> tuple[_Halves, _Draws]:
+    """Halve the elements of a reference, and find what noise does; the last result is kept."""
     mesh, count = reference.mesh, len(reference.mesh.nodes)
     corners = mesh.elements.astype(np.int64)
     edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
@@ -328,7 +351,7 @@ def _halves(reference: Reference) -> _Halves:
         around=sp.csr_matrix((1 / number[row], (row, column)), shape=(count, count)),
         unsmooth=_unsmoothing(mesh),
     )
-    return _with_noise(halves, reference)
+    return halves, _drawn(halves, reference)
 
 
 def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
@@ -343,15 +366,9 @@ def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
             place[:] = geometry.pixels.gather(old.scatter(row))
         return out
 
-    return replace(
-        reference,
-        geometry=geometry,
-        values=moved(reference.values),
-        gradient=moved(reference.gradient),
-        pixel_weights=moved(reference.pixel_weights),
-        texture=moved(reference.texture),
-        channel_specific=moved(reference.channel_specific),
-    )
+    names = ("values", "gradient", "pixel_weights", "texture", "channel_specific")
+    fields: dict[str, Any] = {name: moved(getattr(reference, name)) for name in names}
+    return replace(reference, geometry=geometry, **fields)
 
 
 def _unsmoothing(mesh: Tri3Mesh) -> Callable[[FloatArray], FloatArray]:
@@ -371,8 +388,8 @@ def _unsmoothing(mesh: Tri3Mesh) -> Callable[[FloatArray], FloatArray]:
     return unsmooth
 
 
-def _with_noise(halves: _Halves, reference: Reference) -> _Halves:
-    """Find what noise alone does, from draws: nothing else about it is assumed."""
+def _drawn(halves: _Halves, reference: Reference) -> _Draws:
+    """Find what noise does from random scores with the covariance of the Hessian, and from images of noise."""
     mesh, fine, count, random = halves.mesh, halves.fine, len(halves.mesh.nodes), np.random.default_rng(0)
     finer, coarse = (
         Equations.build(one, one.pixel_weights, np.zeros((one.assembly.size, 0)), np.zeros_like(one.mesh.nodes))
@@ -395,20 +412,18 @@ def _with_noise(halves: _Halves, reference: Reference) -> _Halves:
     own = halves.averaged((fields**2).mean(axis=1))
     scatter = np.sqrt(halves.averaged(means.var(axis=1) / typical**2))
     left, energy = np.zeros((count, 2)), 0.0
-    for _ in range(_NOISES):
+    for _ in range(_CONSTANTS.noises):
         white = random.standard_normal((len(fine.values), *fine.pixels.shape), dtype=np.float32)
         noise = fine.pixels.gather(np.stack([apply_prefilter(image, fine.prefilter) for image in white]))
-        lights = zip(fine.pixel_weights, noise, fine.gradient.swapaxes(0, 1), strict=True)
-        side = fine.assembly.vector(np.sum([fine.projected(*light) for light in lights], axis=0))
+        side = _right_side(fine, fine.pixel_weights, noise)
         found = finer.solve(side).reshape(-1, 2)
         residual = halves.straightened(_left(fine, noise, found), fine_recovery, found)
-        left += _score_variance(residual, fine.pixel_weights)[:count] / _NOISES
-        energy += float(side @ side) / float((right**2).sum()) * _DRAWS / _NOISES
+        left += _score_variance(residual, fine.pixel_weights)[:count] / _CONSTANTS.noises
+        energy += float(side @ side) / float((right**2).sum()) * _CONSTANTS.draws / _CONSTANTS.noises
     if not mesh.is_graded:
         left[:] = left.mean(axis=0)
     own_variance = energy * own / np.column_stack([left, left, left.mean(axis=1)])
-    gains = _Gains(variance=typical / own[:, _OF], scatter=scatter)
-    return replace(halves, gains=gains, own_variance=own_variance)
+    return _Draws(variance=typical / own[:, _OF], scatter=scatter, own_variance=own_variance)
 
 
 def _scores(equations: Equations, random: np.random.Generator) -> FloatArray:
@@ -418,9 +433,9 @@ def _scores(equations: Equations, random: np.random.Generator) -> FloatArray:
     for a in range(2):
         for b in range(2):
             covariance[:, a::2, b::2] = blocks[..., a + b]
-    covariance += _HELD * np.trace(covariance.mean(axis=0)) * np.eye(6)
-    drawn = np.linalg.cholesky(covariance) @ random.standard_normal((len(blocks), 6, _DRAWS))
-    return np.moveaxis(drawn, 2, 0).reshape(_DRAWS, -1, 3, 2)
+    covariance += _CONSTANTS.held * np.trace(covariance.mean(axis=0)) * np.eye(6)
+    drawn = np.linalg.cholesky(covariance) @ random.standard_normal((len(blocks), 6, _CONSTANTS.draws))
+    return np.moveaxis(drawn, 2, 0).reshape(_CONSTANTS.draws, -1, 3, 2)
 
 
 def _fields(recovery: Recovery, fitted: FloatArray) -> FloatArray:

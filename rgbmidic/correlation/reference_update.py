@@ -24,14 +24,6 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.settings import SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-_POOR = 0.95
-"""Correlation coefficient, over the best median, under which an element calls for another reference. Paint of speckles
-of 4 px that changes by 5 % leaves a node of 25 px elements uncertain by 0.3 px, by 10 % nearly by the 0.5 px from which
-it is decorrelated. Measured on paint that changes by 2 % a frame, nodes left after 24 frames: 78 % with 0.95, 47 with
-0.9, 39 with 0.8; without an update none from frame 12 on."""
-_POOR_FRACTION = 0.1
-"""Fraction of the measured elements that must call for it. Chosen: fewer are a glare or a crack that passes."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReferenceUpdate:
@@ -170,7 +162,7 @@ class ReferenceUpdate:
         return np.where(known & (best > -np.inf), best, np.nan)
 
     @staticmethod
-    def is_due(match: FloatArray, best: float) -> bool:
+    def is_due(match: FloatArray, best: float, poor: float = 0.95, fraction: float = 0.1) -> bool:
         """Whether a frame should become the next reference: a tenth of its measured elements match poorly.
 
         Nodes without data call for none: they would be lost for good, where a glare passes and a crack closes.
@@ -181,13 +173,20 @@ class ReferenceUpdate:
             See `match`.
         best
             Largest median of `match` of the frames on this reference: camera noise alone keeps it below 1.
+        poor
+            Correlation coefficient, over `best`, under which an element calls for another reference. Paint of speckles
+            of 4 px that changes by 5 % leaves a node of 25 px elements uncertain by 0.3 px, by 10 % nearly by the 0.5
+            px from which it is decorrelated. Measured on paint that changes by 2 % a frame, nodes left after 24 frames:
+            78 % with 0.95, 47 with 0.9, 39 with 0.8; without an update none from frame 12 on.
+        fraction
+            Of the measured elements that must call for it. Chosen: fewer are a glare or a crack that passes.
 
         Returns
         -------
         bool
         """
         known = np.isfinite(match)
-        return bool(known.any() and (match[known] < _POOR * best).mean() > _POOR_FRACTION)
+        return bool(known.any() and (match[known] < poor * best).mean() > fraction)
 
     def updated(
         self,

@@ -29,55 +29,21 @@ from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import each
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-_NORMALISE = 6.0
-"""Standard deviation of the local mean and contrast, px of the reduced picture. Chosen; with half or twice of it
-results differ by 4e-5 px at most (benchmarks/constants.py)."""
-_FLAT = 0.1
-"""Contrast that is not amplified further, over that of the most contrasted tenth of the picture. Chosen; with half
-or twice of it results differ by 4e-6 px at most (benchmarks/constants.py)."""
-_GREY = 40
-"""Grey levels of the picture's local standard deviation: three of them fit into 8 bits."""
-_CONTRAST = 0.06
-"""SIFT's threshold: lower ones add keypoints that noise makes, at .12 a jittered lattice loses most (measured)."""
-_VOTERS = 30
-"""Pairs around a pair that vote on it..."""
-_VOTES = 4
-"""...and how many must agree: with wrong pairs in a picture of 1 Mpx it happens to one in 1000 by chance."""
-_TOLERANCE = 0.3
-"""Disagreement over distance that angle and size of a keypoint are good for, strains of 20 % included."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Box:
-    """A rectangular part of an image: first row and column, and those after the last."""
+class FoundStart:
+    """An initial guess of the displacement, and its confidence.
 
-    top: int
-    left: int
-    bottom: int
-    right: int
+    Attributes
+    ----------
+    displacement : ndarray, shape (N, 2)
+        px.
+    confidence : float
+        See `Search.confidence`.
+    """
 
-    @classmethod
-    def around(cls, points: FloatArray, margin: float, shape: tuple[int, ...]) -> Box:
-        """Return the part of an image of `shape` (H, W) within `margin` px of points (N, 2) in x and y."""
-        left, top = np.floor(points.min(axis=0) - margin).astype(int)
-        right, bottom = np.ceil(points.max(axis=0) + margin).astype(int) + 1
-        height, width = shape
-        return cls(
-            top=min(max(top, 0), height),
-            left=min(max(left, 0), width),
-            bottom=max(min(bottom, height), 0),
-            right=max(min(right, width), 0),
-        )
-
-    @property
-    def area(self) -> int:
-        """Pixels; 0 for a box beside the image."""
-        return max(self.bottom - self.top, 0) * max(self.right - self.left, 0)
-
-    def cut(self, image: FloatImage, step: int) -> FloatImage:
-        """Cut the box's part out of an image (H, W), its sides whole multiples of `step`."""
-        height, width = (size // step * step for size in (self.bottom - self.top, self.right - self.left))
-        return image[self.top : self.top + height, self.left : self.left + width]
+    displacement: FloatArray
+    confidence: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,160 +65,232 @@ class Keypoints:
     angle: FloatArray
     descriptors: FloatImage
 
-    @classmethod
-    def find(cls, images: FloatImage, weights: FloatImage, box: Box, reduction: int, most: int) -> Keypoints:
-        """Find the strongest keypoints in a part of a state's picture.
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Search:
+    """The search for initial guesses, with its constants.
+
+    Attributes
+    ----------
+    normalise
+        Standard deviation of the local mean and contrast, px of the reduced picture. Chosen; with half or twice of it
+        results differ by 4e-5 px at most (benchmarks/constants.py).
+    flat
+        Contrast that is not amplified further, over that of the most contrasted tenth of the picture. Chosen; with half
+        or twice of it results differ by 4e-6 px at most (benchmarks/constants.py).
+    grey
+        Grey levels of the picture's local standard deviation: three of them fit into 8 bits.
+    contrast
+        SIFT's threshold: lower ones add keypoints that noise makes, at .12 a jittered lattice loses most (measured).
+    voters, votes
+        Pairs around a pair that vote on it, and how many must agree: with wrong pairs in a picture of 1 Mpx it happens
+        to one in 1000 by chance.
+    tolerance
+        Disagreement over distance that angle and size of a keypoint are good for, strains of 20 % included.
+    sure
+        Confidence from which finer pictures are not looked at: at .9, speckles of 3 px may be off by 1.2 px (measured).
+    agrees
+        Correlation coefficient from which the images around a node agree: noise is half of their variance then
+        (derived).
+    still
+        The same at rest, which is not asked of a search: at 0.5, speckles of 7 px were off by 2.6 px.
+    reductions
+        How many times pictures are reduced in turn.
+    small
+        Side (px) of regions up to which pictures of full size are looked at: larger ones have keypoints enough at half.
+    keypoints
+        Most keypoints of the reference: 1500 cost half again as much and were no surer on 1024 px (measured).
+    most
+        Most keypoints of the deformed image, where there are as many per area.
+    context
+        Surroundings (px) of the region in which keypoints are looked for too. Chosen; with half or twice of it results
+        differ by 2e-5 px at most (benchmarks/constants.py).
+    needed
+        Confidence from which an initial guess is worth a solve: another specimen gives at most .1
+        (benchmarks/starts.py).
+    loss
+        Fraction of the nodes whose loss each further guess makes acceptable, half of it at the first: a few may really
+        go, as the 1 to 2 % at the edge of a turning fragment do.
+    turn
+        Turn (degrees) that is found, with strains of 20 % or alone (benchmarks/starts.py).
+    """
+
+    normalise: float = 6.0
+    flat: float = 0.1
+    grey: int = 40
+    contrast: float = 0.06
+    voters: int = 30
+    votes: int = 4
+    tolerance: float = 0.3
+    sure: float = 0.95
+    agrees: float = 0.5
+    still: float = 0.8
+    reductions: tuple[int, ...] = (8, 4, 2, 1)
+    small: float = 300.0
+    keypoints: int = 1000
+    most: int = 5000
+    context: float = 24.0
+    needed: float = 0.15
+    loss: float = 0.04
+    turn: float = 30.0
+
+    def starts(self, reference: Reference, deformed: Deformed, last: FloatArray | None = None) -> Iterator[FoundStart]:
+        """Search for initial guesses in ever finer pictures, each surer than the one before, until one is sure.
+
+        They are looked for within `search_reach` of rest and of the last displacement.
 
         Parameters
         ----------
-        images, weights : ndarray, shape (k, H, W), float32
-            Of the state; a keypoint lies where a weight is not 0.
-        box
-            The part.
-        reduction
-            How many times the picture is reduced.
-        most
-            Number of keypoints.
+        reference, deformed
+            The two states.
+        last : ndarray, shape (N, 2), optional
+            Displacement of the frame before, px; what is found of the motion since is added to it.
+
+        Yields
+        ------
+        FoundStart
+            Rest alone, if that is sure.
         """
-        none = np.zeros(0)
-        empty = cls(points=np.zeros((0, 2)), size=none, angle=none, descriptors=np.zeros((0, 128), dtype=np.float32))
-        picture, seen = _picture(images, weights, box, reduction)
-        if min(picture.shape) < 2 * _NORMALISE:
-            return empty
-        grey = np.clip(128 + _GREY * picture, 0, 255).astype(np.uint8)
+        nodes, offset = reference.mesh.nodes, reference.offset(deformed)
+        known = np.zeros_like(nodes) if last is None else last
+        if last is None and (sure := self.confidence(reference, deformed, known, self.still)) >= self.sure:
+            yield FoundStart(displacement=known, confidence=sure)
+            return
+        small = float(np.ptp(nodes, axis=0).max()) <= self.small
+        slopes = reference.mesh.nodal_gradient(known)
+        here = _part_around(nodes, self.context, reference.images.shape[1:])
+        places = np.concatenate([nodes, nodes + known]) - offset
+        there = _part_around(places, search_reach(nodes), deformed.weights.shape[1:])
+        as_dense = self.keypoints * deformed.weights[0][there].size / reference.weights[0][here].size
+        best, (images, weights) = 0.0, deformed.pictures(reference.registration)
+        for reduction in self.reductions if small else self.reductions[:-1]:
+            f = self._keypoints(reference.images, reference.weights, here, reduction, self.keypoints)
+            g = self._keypoints(images, weights, there, reduction, int(min(as_dense, self.most)))
+            if f is None or g is None:
+                continue
+            points, motion = self._pairs(f, replace(g, points=g.points + offset), 2.0 * reduction)
+            if not len(points):
+                continue
+            # what moves beyond the last displacement is smooth where parts of the specimen turn on their own
+            nearest = np.asarray(cKDTree(nodes).query(points)[1])
+            before = known[nearest] + np.einsum("pij,pj->pi", slopes[nearest], points - nodes[nearest])
+            displacement = known + follow(points, motion - before, reference.mesh, float(reduction))
+            found = self.confidence(reference, deformed, displacement)
+            if found > best:
+                best = found
+                yield FoundStart(displacement=displacement, confidence=found)
+            if best >= self.sure:
+                return
+
+    def confidence(
+        self, reference: Reference, deformed: Deformed, displacement: FloatArray, least: float | None = None
+    ) -> float:
+        """Fraction of the nodes around which the images correlate by `least` (`agrees`) at a displacement (N, 2).
+
+        Nodes count that see something in both states, and at least a tenth of those that do in the reference, so that
+        a few speckles alone make no start.
+        """
+        around = correlation_around(
+            Residual.at(reference, deformed, reference.values, [displacement] * len(reference.images))
+        )
+        weight = reference.sums(reference.pixel_weights, reference.pixel_weights[0])[..., 0].sum(axis=0)
+        seen = reference.mesh.to_nodes(weight) > 0
+        with np.errstate(invalid="ignore"):
+            agrees = around >= (self.agrees if least is None else least)
+        return float(agrees.sum() / max(int(np.isfinite(around).sum()), 0.1 * seen.sum(), 1))
+
+    def _keypoints(
+        self, images: FloatImage, weights: FloatImage, part: tuple[slice, slice], reduction: int, most: int
+    ) -> Keypoints | None:
+        """The `most` strongest keypoints in a part of a state's picture, where a weight (k, H, W) is not 0, if any."""
+        picture, seen = self._picture(images, weights, part, reduction)
+        if min(picture.shape) < 2 * self.normalise:
+            return None
+        grey = np.clip(128 + self.grey * picture, 0, 255).astype(np.uint8)
         # the precise upscale keeps positions free of a bias of a quarter of a pixel
-        sift = cv2.SIFT.create(contrastThreshold=_CONTRAST, enable_precise_upscale=True)
+        sift = cv2.SIFT.create(contrastThreshold=self.contrast, enable_precise_upscale=True)
         found = sift.detect(grey, None)
         columns, rows = np.round(cv2.KeyPoint.convert(found)).astype(int).reshape(-1, 2).T
         strength = np.where(seen[rows, columns] > 0, [key.response for key in found], 0.0)
         strongest = np.argsort(-strength, kind="stable")[: min(most, np.count_nonzero(strength))]
         if not len(strongest):
-            return empty
+            return None
         chosen, descriptors = sift.compute(grey, [found[number] for number in strongest])
-        return cls(
-            points=np.asarray(cv2.KeyPoint.convert(chosen), dtype=np.float64) * reduction
-            + (reduction - 1) / 2
-            + (box.left, box.top),
+        points = np.asarray(cv2.KeyPoint.convert(chosen), dtype=np.float64) * reduction + (reduction - 1) / 2
+        return Keypoints(
+            points=np.add(points, (part[1].start, part[0].start)),
             size=np.array([key.size for key in chosen]),
             angle=np.radians([key.angle for key in chosen]),
             descriptors=np.asarray(descriptors, dtype=np.float32),
         )
 
+    def _pairs(self, first: Keypoints, second: Keypoints, tolerance: float) -> tuple[FloatArray, FloatArray]:
+        """Points (P, 2) of the first state that are paired with some of the second, and their motion, px.
 
-def pairs(first: Keypoints, second: Keypoints, tolerance: float) -> tuple[FloatArray, FloatArray]:
-    """Pair the keypoints of two states.
+        Pairs are mutually nearest descriptors whose angle and size predict, within `tolerance` px and a fraction of the
+        distance, where some of the pairs around them have gone.
+        """
+        # sums of products of whole numbers under 2^24: exact in float32, hence the same in any order, on any threads
+        likeness = first.descriptors @ second.descriptors.T
+        nearest, back = likeness.argmax(axis=1), np.asarray(likeness.argmax(axis=0))
+        here = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
+        there = nearest[here]
+        points, motion = first.points[here], second.points[there] - first.points[here]
+        if len(here) <= self.votes:
+            return points[:0], motion[:0]
+        around = np.asarray(cKDTree(points).query(points, k=min(self.voters + 1, len(points)))[1])[:, 1:]
+        step = points[around] - points[:, None]
+        scale, turn = second.size[there] / first.size[here], second.angle[there] - first.angle[here]
+        cos, sin = (scale * np.cos(turn))[:, None], (scale * np.sin(turn))[:, None]
+        turned = np.stack([cos * step[..., 0] - sin * step[..., 1], sin * step[..., 0] + cos * step[..., 1]], axis=-1)
+        off = np.linalg.norm(motion[around] - motion[:, None] - (turned - step), axis=-1)
+        votes = (off <= tolerance + self.tolerance * np.linalg.norm(step, axis=-1)).sum(axis=1)
+        return points[votes >= self.votes], motion[votes >= self.votes]
 
-    Pairs are mutually nearest descriptors whose angle and size predict, within `tolerance` px and a fraction of the
-    distance, where some of the pairs around them have gone.
+    def _picture(
+        self, images: FloatImage, weights: FloatImage, part: tuple[slice, slice], reduction: int
+    ) -> tuple[FloatImage, FloatImage]:
+        """Mean over the lights of the locally normalised images of a part, reduced, and the sum of the weights."""
+        height, width = (size // reduction for size in images[0][part].shape)
+        total, seen = np.zeros((2, height, width), dtype=np.float32)
+        if not total.size:
+            return total, seen
 
-    Returns
-    -------
-    tuple of ndarray, shape (P, 2)
-        Points of `first` and their motion to `second`, px.
-    """
-    none = np.zeros((0, 2)), np.zeros((0, 2))
-    if not len(first.points) or not len(second.points):
-        return none
-    # sums of products of whole numbers under 2^24: exact in float32, hence the same in any order and on any threads
-    likeness = first.descriptors @ second.descriptors.T
-    nearest, back = likeness.argmax(axis=1), np.asarray(likeness.argmax(axis=0))
-    here = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
-    there = nearest[here]
-    if len(here) <= _VOTES:
-        return none
-    points, motion = first.points[here], second.points[there] - first.points[here]
-    around = np.asarray(cKDTree(points).query(points, k=min(_VOTERS + 1, len(points)))[1])[:, 1:]
-    step = points[around] - points[:, None]
-    scale, turn = second.size[there] / first.size[here], second.angle[there] - first.angle[here]
-    cos, sin = (scale * np.cos(turn))[:, None], (scale * np.sin(turn))[:, None]
-    turned = np.stack([cos * step[..., 0] - sin * step[..., 1], sin * step[..., 0] + cos * step[..., 1]], axis=-1)
-    off = np.linalg.norm(motion[around] - motion[:, None] - (turned - step), axis=-1)
-    votes = (off <= tolerance + _TOLERANCE * np.linalg.norm(step, axis=-1)).sum(axis=1)
-    return points[votes >= _VOTES], motion[votes >= _VOTES]
+        def reduced(image: FloatImage) -> FloatImage:
+            whole = image[: height * reduction, : width * reduction]
+            return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
+        for image, weight in zip(images, weights, strict=True):
+            used = reduced(weight[part])
+            values = reduced(image[part] * weight[part])
+            total += used * self._normalised(np.asarray(values / np.maximum(used, np.float32(1e-6))), used)
+            seen += used
+        return np.asarray(total / np.maximum(seen, np.float32(1e-6))), seen
 
-def _picture(images: FloatImage, weights: FloatImage, box: Box, reduction: int) -> tuple[FloatImage, FloatImage]:
-    """Mean over the lights of the locally normalised images of a box, reduced in size, and the sum of the weights."""
-    height, width = box.cut(images[0], reduction).shape
-    size = (width // reduction, height // reduction)
-    total, seen = np.zeros((2, *size[::-1]), dtype=np.float32)
-    if not total.size:
-        return total, seen
-    for image, weight in zip(images, weights, strict=True):
-        used = box.cut(weight, reduction)
-        part = np.asarray(cv2.resize(used, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-        values = cv2.resize(box.cut(image, reduction) * used, size, interpolation=cv2.INTER_AREA)
-        total += part * _normalised(np.asarray(values / np.maximum(part, np.float32(1e-6))), part)
-        seen += part
-    return np.asarray(total / np.maximum(seen, np.float32(1e-6))), seen
+    def _normalised(self, image: FloatImage, weight: FloatImage) -> FloatImage:
+        """Return an image (H, W) less its local mean, over its local standard deviation."""
 
+        def blur(image: FloatImage) -> FloatImage:
+            smooth = cv2.GaussianBlur(image, (0, 0), self.normalise, borderType=cv2.BORDER_REFLECT_101)
+            return np.asarray(smooth, dtype=np.float32)
 
-def _normalised(image: FloatImage, weight: FloatImage) -> FloatImage:
-    """Return an image (H, W) less its local mean, over its local standard deviation."""
-    norm = _blur(weight) + np.float32(1e-6)
-    centred = image - _blur(image * weight) / norm
-    contrast = np.sqrt(_blur(centred * centred * weight) / norm)
-    return np.asarray(centred / (contrast + np.float32(_FLAT * np.quantile(contrast, 0.9) + 1e-20)), dtype=np.float32)
-
-
-def _blur(image: FloatImage) -> FloatImage:
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), _NORMALISE, borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
+        norm = blur(weight) + np.float32(1e-6)
+        centred = image - blur(image * weight) / norm
+        contrast = np.sqrt(blur(centred * centred * weight) / norm)
+        least = np.float32(self.flat * np.quantile(contrast, 0.9) + 1e-20)
+        return np.asarray(centred / (contrast + least), dtype=np.float32)
 
 
-_SURE = 0.95
-"""Confidence from which finer pictures are not looked at: at .9, speckles of 3 px may be off by 1.2 px (measured)."""
-_AGREES = 0.5
-"""Correlation coefficient from which the images around a node agree: noise is half of their variance then (derived)."""
-_STILL = 0.8
-"""The same at rest, which is not asked of a search: at 0.5, speckles of 7 px were off by 2.6 px."""
-_REDUCTIONS = (8, 4, 2, 1)
-_SMALL = 300.0
-"""Side (px) of regions up to which pictures of full size are looked at: larger ones have keypoints enough at half."""
-_KEYPOINTS = 1000
-"""Most keypoints of the reference: 1500 cost half again as much and were no surer on 1024 px (measured)."""
-_MOST = 5000
-"""Most keypoints of the deformed image, where there are as many per area."""
-_CONTEXT = 24.0
-"""Surroundings (px) of the region in which keypoints are looked for too. Chosen; with half or twice of it results
-differ by 2e-5 px at most (benchmarks/constants.py)."""
-_REACH = 128.0
-"""Motion (px) that is looked for at least; the longer side of the region where that is more. Chosen: 30 speckles."""
+def _part_around(points: FloatArray, margin: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of an image of `shape` (H, W) within `margin` px of points (N, 2) in x and y."""
+    low = np.clip(np.floor(points.min(axis=0) - margin).astype(int)[::-1], 0, shape)
+    high = np.clip(np.ceil(points.max(axis=0) + margin).astype(int)[::-1] + 1, 0, shape)
+    return slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FoundStart:
-    """An initial guess of the displacement, and its confidence.
-
-    Attributes
-    ----------
-    displacement : ndarray, shape (N, 2)
-        px.
-    confidence : float
-        See `confidence`.
-    """
-
-    displacement: FloatArray
-    confidence: float
-
-
-def confidence(reference: Reference, deformed: Deformed, displacement: FloatArray, least: float = _AGREES) -> float:
-    """Fraction of the nodes around which the images correlate by `least` or more at a displacement (N, 2).
-
-    Nodes count that see something in both states, and at least a tenth of those that do in the reference, so that
-    a few speckles alone make no start.
-    """
-    residual = Residual.at(reference, deformed, reference.values, [displacement] * len(reference.images))
-    around = correlation_around(residual)
-    weight = reference.sums(reference.pixel_weights, reference.pixel_weights[0])[..., 0].sum(axis=0)
-    seen = reference.mesh.to_nodes(weight) > 0
-    with np.errstate(invalid="ignore"):
-        agrees = around >= least
-    return float(agrees.sum() / max(int(np.isfinite(around).sum()), 0.1 * seen.sum(), 1))
-
-
-def search_reach(nodes: FloatArray) -> float:
-    """Distance (px) up to which nodes (N, 2) are looked for: the longer side of the region, at least `_REACH`."""
-    return max(float(np.ptp(nodes, axis=0).max()), _REACH)
+def search_reach(nodes: FloatArray, least: float = 128.0) -> float:
+    """Distance (px) up to which nodes (N, 2) are looked for: the longer side of the region, 30 speckles at least."""
+    return max(float(np.ptp(nodes, axis=0).max()), least)
 
 
 def find_start(reference: Reference, deformed: Deformed) -> FoundStart:
@@ -266,57 +304,10 @@ def find_start(reference: Reference, deformed: Deformed) -> FoundStart:
     Returns
     -------
     FoundStart
-        The surest of `find_starts`; rest, with the confidence 0, where there is none.
+        The surest of `Search.starts`; rest, with the confidence 0, where there is none.
     """
     rest = FoundStart(displacement=np.zeros_like(reference.mesh.nodes), confidence=0.0)
-    return max(find_starts(reference, deformed), key=lambda found: found.confidence, default=rest)
-
-
-def find_starts(reference: Reference, deformed: Deformed, last: FloatArray | None = None) -> Iterator[FoundStart]:
-    """Search for initial guesses in ever finer pictures, each surer than the one before, until one is sure.
-
-    They are looked for within the region's longer side, but at least 128 px, of rest and of the last displacement.
-
-    Parameters
-    ----------
-    reference, deformed
-        The two states.
-    last : ndarray, shape (N, 2), optional
-        Displacement of the frame before, px; what is found of the motion since is added to it.
-
-    Yields
-    ------
-    FoundStart
-        Rest alone, if that is sure.
-    """
-    nodes, offset = reference.mesh.nodes, reference.offset(deformed)
-    rest = np.zeros_like(nodes)
-    if last is None and (sure := confidence(reference, deformed, rest, _STILL)) >= _SURE:
-        yield FoundStart(displacement=rest, confidence=sure)
-        return
-    side = float(np.ptp(nodes, axis=0).max())
-    here = Box.around(nodes, _CONTEXT, reference.images.shape[1:])
-    known = rest if last is None else last
-    slopes = reference.mesh.nodal_gradient(known)
-    there = Box.around(np.concatenate([nodes, nodes + known]) - offset, search_reach(nodes), deformed.weights.shape[1:])
-    most = int(min(_KEYPOINTS * there.area / here.area, _MOST))
-    best, (images, weights) = 0.0, deformed.pictures(reference.registration)
-    for reduction in _REDUCTIONS if side <= _SMALL else _REDUCTIONS[:-1]:
-        f = Keypoints.find(reference.images, reference.weights, here, reduction, _KEYPOINTS)
-        g = Keypoints.find(images, weights, there, reduction, most)
-        points, motion = pairs(f, replace(g, points=g.points + offset), 2.0 * reduction)
-        if not len(points):
-            continue
-        # what moves beyond the last displacement is smooth where parts of the specimen turn on their own
-        nearest = np.asarray(cKDTree(nodes).query(points)[1])
-        before = known[nearest] + np.einsum("pij,pj->pi", slopes[nearest], points - nodes[nearest])
-        displacement = known + follow(points, motion - before, reference.mesh, float(reduction))
-        found = FoundStart(displacement=displacement, confidence=confidence(reference, deformed, displacement))
-        if found.confidence > best:
-            best = found.confidence
-            yield found
-        if best >= _SURE:
-            return
+    return max(Search().starts(reference, deformed), key=lambda found: found.confidence, default=rest)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -374,21 +365,13 @@ class Start:
         return replace(self, displacement=filled, unmeasured=float((~measured).mean()))
 
 
-LARGEST_TURN = 30.0
-"""Turn (degrees) that the search finds, with strains of 20 % or alone (benchmarks/starts.py)."""
-NEEDED = 0.15
-"""Confidence from which an initial guess is worth a solve: another specimen gives at most .1 (benchmarks/starts.py)."""
-_LOSS = 0.04
-"""Fraction of the nodes whose loss each further guess makes acceptable, half of it at the first: a few may really go,
-as the 1 to 2 % at the edge of a turning fragment do."""
-
-
 def track(
     reference: Reference,
     deformed: Deformed,
     start: Start,
     options: SolverSettings,
     method: PrecisionMethod | None,
+    search: Search = Search(),
 ) -> Solution:
     """Solve one frame from the last frame's displacement, and from a search where that fails or loses nodes.
 
@@ -400,6 +383,8 @@ def track(
         The last frame's end; without a displacement the initial guess is searched for.
     options, method
         How to solve, see `solve`.
+    search
+        How initial guesses are searched for.
 
     Returns
     -------
@@ -409,25 +394,26 @@ def track(
     best: Solution | None = None
     surest = 0.0
     last = [] if start.displacement is None else [FoundStart(displacement=start.displacement, confidence=np.nan)]
-    for number, found in enumerate(chain(last, each("search", find_starts(reference, deformed, start.displacement)))):
+    searched = each("search", search.starts(reference, deformed, start.displacement))
+    for number, found in enumerate(chain(last, searched)):
         surest = float(np.fmax(surest, found.confidence))
-        if found.confidence < NEEDED:
+        if found.confidence < search.needed:
             continue
         trial = solve(reference, deformed, found.displacement, options, method)
         if best is None or rank(trial.status, trial.node_status) < rank(best.status, best.node_status):
             best = trial
-        if best.status is Status.CONVERGED and best.unmeasured_fraction <= start.unmeasured + (number + 0.5) * _LOSS:
+        acceptable = start.unmeasured + (number + 0.5) * search.loss
+        if best.status is Status.CONVERGED and best.unmeasured_fraction <= acceptable:
             break
     if best is None:  # from rest, for the reason why there is no start
         best = solve(reference, deformed, np.zeros_like(reference.mesh.nodes), options, method)
-    return replace(best, reason=f"{NO_MATCH}; {_looked_for(surest)}") if best.reason == NO_MATCH else best
-
-
-def _looked_for(surest: float) -> str:
-    if surest >= NEEDED:
-        return f"at the start found they agree around {surest:.0%} of the nodes, but the solve did not hold one of them"
-    return (
-        f"no start found: at the best one the images agree around {surest:.0%} of the nodes, of {NEEDED:.0%} needed. "
-        f"Looked for were motions up to the region's longer side, at least 128 px, and turns up to about "
-        f"{LARGEST_TURN:g} degrees: take frames in between"
+    if best.reason != NO_MATCH:
+        return best
+    why = (
+        f"no start found: at the best one the images agree around {surest:.0%} of the nodes, of {search.needed:.0%} "
+        "needed. Looked for were motions up to the region's longer side, at least 128 px, and turns up to about "
+        f"{search.turn:g} degrees: take frames in between"
     )
+    if surest >= search.needed:
+        why = f"at the start found they agree around {surest:.0%} of the nodes, but the solve did not hold one of them"
+    return replace(best, reason=f"{NO_MATCH}; {why}")

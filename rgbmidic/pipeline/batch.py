@@ -12,7 +12,8 @@ import logging
 import math
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,26 +21,18 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, RgbmidicError
-from rgbmidic.pipeline.run import measure
+from rgbmidic.pipeline.run import Progress, measure
 from rgbmidic.results import Histories, Maps, Result, shared_part
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.provenance import is_result
 from rgbmidic.settings import TestSettings, read_toml, regular
-from rgbmidic.typing import FloatArray
 
 logger = logging.getLogger(__name__)
 
-_NAME = re.compile(r"[\w][\w .+-]{0,79}")
-"""What a test may be called: it names a folder."""
 SUMMARIES = ("summary.csv", "summary.html")
 """Table and page of a batch, beside the folders of its tests."""
 _HEADER = ("test", "state", "reason", "result")
-_QUANTILE = 99
-"""Percentile of the nodes that stands for the largest value in a frame: single outliers do not count."""
-_FIELDS = ("magnitude", "e1", "equivalent")
-_LARGE_PART = 0.5
-"""Fraction of the deformed frames that must converge, as of `rgbmidic run`."""
 ELASTIC = (0.0005, 0.0025)
 """Strains between which a modulus is fitted where none are stated: those of ISO 527-1."""
 
@@ -102,12 +95,9 @@ def read_tests(paths: Sequence[Path]) -> list[BatchTest]:
         Two tests would have one name, or a file is missing.
     """
     stems = [path.stem for path in paths]
-    names = [
-        stem if stems.count(stem) == 1 else path.resolve().parent.name for path, stem in zip(paths, stems, strict=True)
-    ]
-    tests = _checked(
-        [BatchTest(name=name, document=path, base=path.parent) for path, name in zip(paths, names, strict=True)]
-    )
+    names = [path.stem if stems.count(path.stem) == 1 else path.resolve().parent.name for path in paths]
+    tests = [BatchTest(name=name, document=path, base=path.parent) for path, name in zip(paths, names, strict=True)]
+    _check_names(tests)
     if missing := [str(path) for path in paths if not path.is_file()]:
         raise InputError(f"there is no settings file {', '.join(missing)}")
     return tests
@@ -151,30 +141,28 @@ def read_table(template: Path, table: Path) -> list[BatchTest]:
             raise InputError(f"row {number} of the table {table} has {len(row)} fields, the header {len(head)}")
         changed = {section: dict(keys) if isinstance(keys, Mapping) else keys for section, keys in document.items()}
         for name, text in zip(head[1:], map(str.strip, row[1:]), strict=True):
+            section, key = name.split(".", 1)
+            with suppress(tomllib.TOMLDecodeError):  # a text may go without quotes
+                changed.setdefault(section, {})[key] = tomllib.loads(f"value = {text}")["value"]
+                continue
             if text:
-                section, key = name.split(".", 1)
-                changed.setdefault(section, {})[key] = _value(text)
+                changed.setdefault(section, {})[key] = text
         tests.append(BatchTest(name=row[0].strip(), document=changed, base=template.parent))
-    return _checked(tests)
+    _check_names(tests)
+    return tests
 
 
-def _value(text: str) -> Any:
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
-
-
-def _checked(tests: list[BatchTest]) -> list[BatchTest]:
+def _check_names(tests: Sequence[BatchTest]) -> None:
     names = [test.name.casefold() for test in tests]  # as file systems without capitals take them
-    for name, folded in zip((test.name for test in tests), names, strict=True):
-        if not _NAME.fullmatch(name) or folded in SUMMARIES:
-            raise InputError(f'"{name}" names no test: letters, digits, . _ + - only, and not {" or ".join(SUMMARIES)}')
+    for test, folded in zip(tests, names, strict=True):
+        if not re.fullmatch(r"[\w][\w .+-]{0,79}", test.name) or folded in SUMMARIES:
+            raise InputError(
+                f'"{test.name}" names no test: letters, digits, . _ + - only, and not {" or ".join(SUMMARIES)}'
+            )
         if names.count(folded) > 1:
-            raise InputError(f'"{name}" is the name of two tests')
+            raise InputError(f'"{test.name}" is the name of two tests')
     if not tests:
         raise InputError("a batch needs one test or more")
-    return tests
 
 
 def run_batch(
@@ -185,7 +173,7 @@ def run_batch(
     elastic: tuple[float, float] = ELASTIC,
     overwrite: bool = False,
     conclude: Callable[[Result, TestSettings, bool], None] | None = None,
-    progress: Callable[[str], Callable[[int, int, str], None]] | None = None,
+    progress: Callable[[str], Progress] | None = None,
 ) -> Iterator[Outcome]:
     """Measure tests one after the other, each into a folder of its name; yield what each gave as it ends.
 
@@ -214,25 +202,22 @@ def run_batch(
     for test in tests:
         folder = out / test.name
         try:
-            yield _outcome(test, folder, workers, elastic, overwrite, conclude, progress and progress(test.name))
+            report = progress and progress(test.name)
+            result, settings, now = _measured(test, folder, workers, report, overwrite=overwrite)
+            if conclude is not None:
+                conclude(result, settings, now)
+            yield Outcome(name=test.name, folder=folder, measured=now, values=_values(result, settings, elastic))
         except (RgbmidicError, OSError) as error:
             yield Outcome(name=test.name, folder=folder, reason=str(error))
 
 
-def _outcome(
-    test: BatchTest,
-    folder: Path,
-    workers: int | None,
-    elastic: tuple[float, float],
-    overwrite: bool,
-    conclude: Callable[[Result, TestSettings, bool], None] | None,
-    progress: Callable[[int, int, str], None] | None,
-) -> Outcome:
-    """Measure a test unless it is measured already, and read it."""
+def _measured(
+    test: BatchTest, folder: Path, workers: int | None, progress: Progress | None, *, overwrite: bool
+) -> tuple[Result, TestSettings, bool]:
+    """Measure a test unless it is measured already; whether it was measured now comes last."""
     document = test.document
     sections = read_toml(document, "settings file") if isinstance(document, Path) else document
-    settings = TestSettings.from_mapping(sections, test.base)
-    moved = False
+    settings, moved = TestSettings.from_mapping(sections, test.base), False
 
     def count(done: int, total: int, line: str) -> None:
         nonlocal moved
@@ -240,45 +225,46 @@ def _outcome(
         if progress is not None:
             progress(done, total, line)
 
-    there = is_result(folder)
     try:
-        result = measure(settings, folder, resume=there, workers=workers, progress=count)
+        result = measure(settings, folder, resume=is_result(folder), workers=workers, progress=count)
     except AnotherTestError as error:
         reason = str(error).rpartition("; ")[0]
         if not overwrite:
             raise ResultError(f"{reason}; --overwrite measures it again") from None
         logger.warning("%s is measured again: %s", test.name, reason)
         result = measure(settings, folder, overwrite=True, workers=workers, progress=count)
-    if conclude is not None:
-        conclude(result, settings, moved)
+    return result, settings, moved
+
+
+def _values(result: Result, settings: TestSettings, elastic: tuple[float, float]) -> dict[str, float]:
+    """What a result gives for the table of a batch."""
     ends = result.status[list(result.deformed)]
     good = float((ends == 0).mean()) if len(ends) else 0.0
-    if good < _LARGE_PART:
+    if good < 0.5:  # as of `rgbmidic run`
         raise ResultError(f"{int((ends != 0).sum())} of {len(ends)} deformed frames failed or did not converge")
     values = {"frames": float(len(ends)), "converged": good} | dict(_peaks(result, settings))
     probed = dict(_probed(result, settings, elastic))
     if both := sorted(values.keys() & probed.keys()):
         raise InputError(f"channels of {settings.channels.file} have the names of measured columns: {', '.join(both)}")
-    values |= probed
-    return Outcome(name=test.name, folder=folder, measured=moved, values=values)
+    return values | probed
 
 
 def _peaks(result: Result, settings: TestSettings) -> Iterator[tuple[str, float]]:
     """Yield the peaks over the frames of fields, each that 99 % of the nodes do not exceed, with its uncertainty."""
     maps = Maps.of(result, settings.scale, measure=settings.probes.measure)
     frames = [frame for frame in result.deformed if result.finished[frame]]
-    for name in _FIELDS:
-        best = (-math.inf, math.nan)
+    for name in ("magnitude", "e1", "equivalent"):
+        peaks = []
         for frame in frames:
             read = maps.read(name, frame)
             known = np.flatnonzero(np.isfinite(read.values))
-            if len(known):
-                at = known[np.argsort(read.values[known])[min(len(known) * _QUANTILE // 100, len(known) - 1)]]
-                best = max(best, (float(read.values[at]), float(read.std[at])))
-        if math.isfinite(best[0]):
+            if len(known):  # single outliers do not count
+                at = known[np.argsort(read.values[known])[min(len(known) * 99 // 100, len(known) - 1)]]
+                peaks.append((float(read.values[at]), float(read.std[at])))
+        if peaks:
             unit = maps.field(name).unit
             label = f"peak_{name}_{unit}" if unit else f"peak_{name}"
-            yield from {label: best[0], f"{label}_std": best[1]}.items()
+            yield from zip((label, f"{label}_std"), max(peaks), strict=True)
 
 
 def _probed(result: Result, settings: TestSettings, elastic: tuple[float, float]) -> Iterator[tuple[str, float]]:
@@ -345,22 +331,22 @@ def summary_rows(outcomes: Sequence[Outcome]) -> tuple[list[str], list[list[str]
         more) and the number of tests of each column.
     """
     names = list(dict.fromkeys(name for outcome in outcomes for name in outcome.values))
+
+    def cells(values: Iterable[float]) -> list[str]:
+        return ["" if math.isnan(value) else f"{value:.6g}" for value in values]
+
     rows = []
     for outcome in outcomes:
         state = "failed" if outcome.reason else "measured" if outcome.measured else "measured before"
-        cells = [_text(outcome.values.get(name, math.nan)) for name in names]
-        rows.append([outcome.name, state, outcome.reason, str(outcome.folder), *cells])
-    table: FloatArray = np.array([[outcome.values.get(name, math.nan) for name in names] for outcome in outcomes])
-    good = [column[np.isfinite(column)] for column in table.T] if names else []
-    deviations = [part.std(ddof=1) if len(part) > 1 else math.nan for part in good]
-    rows.append(["mean", "", "", "", *(_text(float(part.mean()) if len(part) else math.nan) for part in good)])
-    rows.append(["standard deviation", "", "", "", *map(_text, map(float, deviations))])
-    rows.append(["tests", "", "", "", *(str(len(part)) for part in good)])
+        own = cells(outcome.values.get(name, math.nan) for name in names)
+        rows.append([outcome.name, state, outcome.reason, str(outcome.folder), *own])
+    known = [[one.values[name] for one in outcomes if np.isfinite(one.values.get(name, math.nan))] for name in names]
+    means = (float(np.mean(part)) if part else math.nan for part in known)
+    deviations = (float(np.std(part, ddof=1)) if len(part) > 1 else math.nan for part in known)
+    rows.append(["mean", "", "", "", *cells(means)])
+    rows.append(["standard deviation", "", "", "", *cells(deviations)])
+    rows.append(["tests", "", "", "", *(str(len(part)) for part in known)])
     return [*_HEADER, *names], rows
-
-
-def _text(value: float) -> str:
-    return "" if value != value else f"{value:.6g}"
 
 
 def check_summary(out: Path, *, overwrite: bool) -> None:

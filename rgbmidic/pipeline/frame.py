@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import logging
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from rgbmidic.correlation.residual import brightness_change
 from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.data import Window
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.separation import RawState
+from rgbmidic.illumination.separation import RawState, light_images
 from rgbmidic.pipeline.order import STRIDE, is_key
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.suitability import SATURATED, exposure_fault, saturated_fraction, too_small
@@ -33,10 +33,24 @@ from rgbmidic.typing import FloatArray, FloatImage
 
 logger = logging.getLogger(__name__)
 
-_THUMBNAIL = 256
-"""Longest side in px of the picture of the weights that is kept of every frame."""
-_DARK = 0.3
-"""Share of its light in the reference under which a light is told to be failing."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measured:
+    """What measuring a frame gave.
+
+    Attributes
+    ----------
+    record
+        What is kept of it.
+    solution
+        Its solution in full; None where it failed, or was measured in another process.
+    messages
+        Level and text of what was logged in another process.
+    """
+
+    record: FrameRecord
+    solution: Solution | None = None
+    messages: tuple[tuple[int, str], ...] = ()
 
 
 def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[int, Solution]] = ()) -> FrameRecord:
@@ -60,18 +74,32 @@ def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[
     -------
     FrameRecord
     """
+
+    def make() -> ReferenceUpdate:
+        reference_update = ReferenceUpdate.none(plan.reference)
+        for number, solution in updated:
+            reference_update = next_reference(plan, reference_update, number, solution)
+        return reference_update
+
     keep_memory()
+    frames = tuple(number for number, _ in updated)
+    return attempt(plan, index, start, lambda: plan.process.reference_update(frames, make)).record
+
+
+def attempt(plan: Plan, index: int, start: Start, reference: Callable[[], ReferenceUpdate]) -> Measured:
+    """Measure a frame as `measure_frame` on the `reference` that ``start.reference_updates`` make."""
     try:
         with timed(plan.timings) as seconds:
-            values = solve_frame(plan, index, start, _updated_reference(plan, updated))
-        return FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
+            values = solve_frame(plan, index, start, reference())
+        record = FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
+        return Measured(record=record, solution=values["solution"])
     except RgbmidicError as error:
         reason, unread = str(error), isinstance(error, _UnreadError)
         logger.warning("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
     except Exception as error:  # whatever it is, the other frames can be measured
         reason, unread = f"unexpected error: {type(error).__name__}: {error}", False
         logger.exception("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
-    return failed_frame(plan, index, reason, unread=unread)
+    return Measured(record=failed_frame(plan, index, reason, unread=unread))
 
 
 def failed_frame(plan: Plan, index: int, reason: str, *, unread: bool = False) -> FrameRecord:
@@ -102,7 +130,7 @@ def read_state(plan: Plan, index: int, window: Window | None = None) -> tuple[Ra
         They cannot be read.
     """
     try:
-        with plan.reading:
+        with plan.process.reading:
             return plan.series.read(index, window), plan.series.inputs(index, window)
     except (FrameError, OSError) as error:
         raise _UnreadError(str(error)) from error
@@ -140,13 +168,13 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         words = "%s: %.0f %% of the samples in the region are saturated, %.0f %% in the reference: look at the exposure"
         logger.warning(words, name, 100 * share, 100 * plan.saturated)
     with stage("separation"):
-        images = plan.lights(state, window)
+        images = light_images(plan.separation, state, window)
     if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
         raise FrameError(f"{name} has the shape {images.values.shape}, the reference {reference.images.shape}")
     with stage("preparation"):
         ready, weights = plan.prepared(images, index)
         deformed = Deformed.prepare(ready, weights, prefilter=plan.solver.prefilter, origin=window.origin)
-        step = -(-max(plan.window.shape) // _THUMBNAIL)
+        step = -(-max(plan.window.shape) // 256)  # of the pictures of weights and reflections, 256 px at most
         thumbnail = _in_bytes(weights[:, *here][:, ::step, ::step])
         del ready, weights  # a tenth of what a frame needs
     solution = reference_update.track(deformed, start, plan.solver, plan.method)
@@ -162,7 +190,8 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
     moved = solution.displacement - reference.offset(deformed)
     brightness = brightness_change(plan.images.values, images.values, reference, moved)
-    _tell_dark(name, images.names, brightness)
+    for light, gain in _dark(images.names, brightness):
+        logger.warning("%s: %s gives %.0f %% of its light in the reference", name, light, 100 * gain)
     match, best, reference_updates = _compared(plan, index, start, reference_update, deformed, solution)
     reflection = images.reflection_index(step, here)
     samples = (there,) if isinstance(there, IlluminationImages) else there
@@ -191,11 +220,11 @@ def _causes(
     """
     causes = [fault] if (fault := exposure_fault(state, plan.region.mask)) else []
     there = np.where(np.isfinite(solution.displacement), solution.displacement, 0) - offset
-    gains = brightness_change(plan.images.values, images.values, plan.reference, there)[:, 0]
+    brightness = brightness_change(plan.images.values, images.values, plan.reference, there)
     causes += [
         f"{light} shows the speckle with {gain:.0%} of its contrast in the reference: look at lamp and exposure"
-        for light, gain in zip(images.names, gains, strict=True)
-        if gain < _DARK and not fault
+        for light, gain in _dark(images.names, brightness)
+        if not fault
     ]
     if small := too_small(plan.element_size, plan.speckle):
         causes.append(small)
@@ -215,20 +244,13 @@ def next_reference(plan: Plan, before: ReferenceUpdate, index: int, solution: So
         The frame cannot be read, or no element of it is measured.
     """
     window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
-    images = plan.lights(read_state(plan, index, window)[0], window)
-    return before.updated(solution, *plan.prepared(images, index), window.origin)
+    return before.updated(solution, *prepared_frame(plan, index, window), window.origin)
 
 
-def _updated_reference(plan: Plan, updated: Sequence[tuple[int, Solution]]) -> ReferenceUpdate:
-    """The reference that the frames `updated` make in turn."""
-
-    def make() -> ReferenceUpdate:
-        reference_update = ReferenceUpdate.none(plan.reference)
-        for index, solution in updated:
-            reference_update = next_reference(plan, reference_update, index, solution)
-        return reference_update
-
-    return plan.updates.get(tuple(index for index, _ in updated), make)
+def prepared_frame(plan: Plan, index: int, window: Window) -> tuple[FloatImage, FloatImage]:
+    """Grey levels and weights of a window of a frame, (k, H, W) each, see `Plan.prepared`."""
+    state, _ = read_state(plan, index, window)
+    return plan.prepared(light_images(plan.separation, state, window), index)
 
 
 def _compared(
@@ -246,10 +268,9 @@ def _compared(
     return median, 0.0, (*start.reference_updates, plan.series.chosen.index(index))
 
 
-def _tell_dark(name: str, lights: tuple[str, ...], brightness: FloatArray) -> None:
-    for light, gain in zip(lights, brightness[:, 0], strict=True):
-        if gain < _DARK:
-            logger.warning("%s: %s gives %.0f %% of its light in the reference", name, light, 100 * gain)
+def _dark(lights: Sequence[str], brightness: FloatArray, least: float = 0.3) -> list[tuple[str, float]]:
+    """The lights whose lamp seems to fail: they give less than `least` of their light in the reference."""
+    return [(light, gain) for light, gain in zip(lights, brightness[:, 0], strict=True) if gain < least]
 
 
 def _in_bytes(shares: FloatImage) -> npt.NDArray[np.uint8]:

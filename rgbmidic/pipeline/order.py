@@ -17,9 +17,6 @@ from rgbmidic.results import FrameRecord
 
 STRIDE = 16
 """Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
-_LOSS = 0.01
-"""Share of the nodes that a key frame may lose against the one it starts from before it is measured again from the
-frame just before it."""
 
 
 def rank_of(record: FrameRecord) -> tuple[bool, float]:
@@ -27,9 +24,9 @@ def rank_of(record: FrameRecord) -> tuple[bool, float]:
     return rank(int(record.status), record.node_status)
 
 
-def loses(position: int, record: FrameRecord, start: Start) -> bool:
-    """Whether a frame is a key frame that is measured worse than the one it starts from."""
-    return is_key(position) and (record.status != Status.CONVERGED or rank_of(record)[1] > start.unmeasured + _LOSS)
+def loses(position: int, record: FrameRecord, start: Start, most: float = 0.01) -> bool:
+    """Whether a frame is a key frame that has lost more than a fraction of the nodes of the one it starts from."""
+    return is_key(position) and (record.status != Status.CONVERGED or rank_of(record)[1] > start.unmeasured + most)
 
 
 def better(first: FrameRecord, second: FrameRecord) -> FrameRecord:

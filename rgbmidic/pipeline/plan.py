@@ -1,17 +1,16 @@
 """What all frames of a test share, made once before the first is measured.
 
-calibration -> series of frames -> reference frames -> one image per light, averaged -> region and mesh -> weights ->
-reference of the solve.
-
-Why a state cannot be measured: no texture, no light, too much, wrong levels, speckle too coarse for the elements.
+calibration -> series of frames -> reference frames, checked -> one image per light, averaged -> region and mesh ->
+weights -> reference of the solve.
 """
 
 from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from threading import Lock
 from typing import Any
 
@@ -20,17 +19,24 @@ import numpy as np
 from rgbmidic.correlation import PrecisionMethod, Reference
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
-from rgbmidic.errors import ConfigurationError
+from rgbmidic.errors import ConfigurationError, FrameError
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import Window, open_series
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.images import IlluminationImages, correlated
-from rgbmidic.illumination.separation import LightSeparation, RawState, Separation, WindowedSeparation, light_images
+from rgbmidic.illumination.frame_check import check_state
+from rgbmidic.illumination.images import DARK, IlluminationImages, correlated
+from rgbmidic.illumination.separation import (
+    LightSeparation,
+    RawState,
+    Separation,
+    WindowedSeparation,
+    light_images,
+    reference_images,
+)
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh
-from rgbmidic.pipeline.reference_state import ReferenceState
+from rgbmidic.pipeline import suitability
 from rgbmidic.pipeline.region import finite_elements_of, read_region, region_and_window, window_around
 from rgbmidic.pipeline.source import FrameSequence, Series, open_sequence
-from rgbmidic.pipeline.suitability import HARDLY_ENOUGH, saturated_fraction, speckle_size, tell_small, too_small
 from rgbmidic.settings import SolverSettings, TestSettings, grey_levels
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights
@@ -38,44 +44,32 @@ from rgbmidic.weights.threshold import ThresholdWeights, blurred
 
 logger = logging.getLogger(__name__)
 
-_KEPT_UPDATES = 2
-"""Updated references that a process keeps: frames measured side by side follow this one or the last."""
 
+class ProcessState:
+    """What the threads of one process share; a copy that is sent to another process has its own.
 
-class Turns:
-    """A lock that lets one thread in at a time; a copy sent to another process has one of its own."""
-
-    def __init__(self) -> None:
-        self._lock = Lock()
-
-    def __reduce__(self) -> tuple[type[Turns], tuple[()]]:
-        return type(self), ()
-
-    def __enter__(self) -> None:
-        self._lock.acquire()
-
-    def __exit__(self, *_: object) -> None:
-        self._lock.release()
-
-
-class UpdatedReferences(Turns):
-    """The references that frames of one test have become lately, made once for all threads of a process.
-
-    A copy sent to another process begins empty.
+    Attributes
+    ----------
+    reading
+        Frames are read by one thread at a time: a movie has one place at which it is read.
     """
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._kept: deque[tuple[tuple[int, ...], ReferenceUpdate]] = deque(maxlen=_KEPT_UPDATES)
+    def __init__(self, kept: int = 2) -> None:
+        """`kept` updated references stay: frames measured side by side follow this one or the last."""
+        self.reading, self._updating = Lock(), Lock()
+        self._updates: deque[tuple[tuple[int, ...], ReferenceUpdate]] = deque(maxlen=kept)
 
-    def get(self, frames: tuple[int, ...], make: Callable[[], ReferenceUpdate]) -> ReferenceUpdate:
-        """The reference that the `frames` make in turn: a kept one, else what `make` gives."""
-        with self:
-            for known, reference_update in self._kept:
+    def __reduce__(self) -> tuple[type[ProcessState], tuple[()]]:
+        return type(self), ()
+
+    def reference_update(self, frames: tuple[int, ...], make: Callable[[], ReferenceUpdate]) -> ReferenceUpdate:
+        """The reference that the `frames` make in turn: a kept one, else what `make` gives, once for all threads."""
+        with self._updating:
+            for known, reference_update in self._updates:
                 if known == frames:
                     return reference_update
-            self._kept.append((frames, make()))
-            return self._kept[-1][1]
+            self._updates.append((frames, make()))
+            return self._updates[-1][1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,10 +120,8 @@ class Plan:
         Figures of the calibration, for the provenance (`Calibration.figures`).
     timings
         Whether to tell the time that each stage of a frame takes.
-    updates
-        References that later frames have become.
-    reading
-        Frames are read by one thread at a time: a movie has one place at which it is read.
+    process
+        What the threads of a process share.
     """
 
     settings: TestSettings
@@ -151,8 +143,7 @@ class Plan:
     refinement: str | None = None
     calibration: dict[str, Any] = field(default_factory=dict)
     timings: bool = False
-    updates: UpdatedReferences = field(default_factory=UpdatedReferences, repr=False, compare=False)
-    reading: Turns = field(default_factory=Turns, repr=False, compare=False)
+    process: ProcessState = field(default_factory=ProcessState, repr=False, compare=False)
 
     @classmethod
     def from_settings(
@@ -195,8 +186,15 @@ class Plan:
             the settings.
         """
         _check_given(settings, source, separation, weights, mesh)
-        whole_calibration = None if settings.calibration.file is None else Calibration.read(settings.calibration.file)
-        series, calibration = _series_and_calibration(settings, source, whole_calibration)
+        camera = None if settings.calibration.file is None else Calibration.read(settings.calibration.file)
+        series: Series
+        if source is None:
+            series = open_series(settings.frames, settings.base, camera)
+        else:
+            series = open_sequence(source, settings.frames, camera)
+        if settings.scale.camera is not None:
+            CameraCalibration.read(settings.scale.camera).check(series.shape)
+        calibration = camera and camera.cropped(settings.frames.crop_origin, series.shape)
         separate = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
         whole = any(one is not None for one in (source, weights, mesh, region))
         finite_elements, placement = None, None
@@ -208,9 +206,15 @@ class Plan:
             region, window = region_and_window(settings, region, series.shape)
             if mesh is not None:
                 mesh = Tri3Mesh(nodes=mesh.nodes - window.origin, elements=mesh.elements)
-        rest = ReferenceState.read(settings, series, separate, window, region, calibration)
-        if separation is not None and isinstance(rest.states[0], IlluminationImages):
+        indices, name = settings.frames.reference, ", ".join(map(series.name, settings.frames.reference))
+        states = [series.read(index, window) for index in indices[:2]]
+        if separation is not None and isinstance(states[0], IlluminationImages):
             raise ConfigurationError("the source gives images of the lights, which need no separation: give only one")
+        if calibration is not None and not window.is_whole:
+            calibration = calibration.cropped(window.origin, window.shape)
+        _check_raw(states, name, settings, region, calibration)
+        others = (series.read(index, window) for index in indices[2:])
+        images, separate = reference_images(separate, chain(states, others), window)
         size = settings.mesh.side if mesh is None else mesh.size
         if mesh is None:
             mesh = Tri3Mesh.from_region(
@@ -220,38 +224,38 @@ class Plan:
         sigma, solver = grey_levels(settings.illumination.normalise, settings.solver, cracked=cracked)
         weights = weights or prepare_weights(
             settings,
-            rest.images,
+            images,
             region,
             shape=window.frame,
             frames=len(series),
-            images_of=lambda index: light_images(rest.separation, series.read(index, window), window),
+            images_of=lambda index: light_images(separate, series.read(index, window), window),
         )
-        reference = _reference(rest.images, weights, region, mesh, sigma, solver)
+        reference = _reference(images, weights, region, mesh, sigma, solver)
         if isinstance(weights, ThresholdWeights):
-            _tell_no_effect(weights, rest.images, region)
-        speckle = speckle_size(rest.images, region)
+            _tell_no_effect(weights, images, region)
+        speckle = suitability.speckle_size(images, region)
         if finite_elements is not None:
-            tell_small(mesh, speckle, finite_elements)
-        elif small := too_small(size, speckle, HARDLY_ENOUGH):
+            suitability.tell_small(mesh, speckle, finite_elements)
+        elif small := suitability.too_small(size, speckle, suitability.HARDLY_ENOUGH):
             logger.warning("%s", small)
-        rest.check_seen(reference, region)
+        _check_seen(states[0], name, images, reference, region)
         return cls(
             settings=settings,
             normalise=sigma,
             solver=solver,
             series=series,
-            separation=rest.separation,
+            separation=separate,
             region=region,
             weights=weights,
-            images=rest.images,
+            images=images,
             reference=reference,
             speckle=speckle,
-            saturated=saturated_fraction(rest.states[0], region.mask),
+            saturated=suitability.saturated_fraction(states[0], region.mask),
             window=window,
             element_size=size,
             finite_elements=finite_elements,
             placement=placement,
-            calibration=whole_calibration.figures() if whole_calibration else {},
+            calibration=camera.figures() if camera else {},
         )
 
     @property
@@ -273,22 +277,6 @@ class Plan:
         """
         reference = _reference(self.images, self.weights, self.region, mesh, self.normalise, self.solver)
         return replace(self, reference=reference)
-
-    def lights(self, state: RawState, window: Window) -> IlluminationImages:
-        """One image per light of a state, or of a `window` of it.
-
-        Parameters
-        ----------
-        state
-            Raw frames of the state.
-        window
-            The part of it that is wanted.
-
-        Returns
-        -------
-        IlluminationImages
-        """
-        return light_images(self.separation, state, window)
 
     def prepared(self, images: IlluminationImages, index: int) -> tuple[FloatImage, FloatImage]:
         """What the solve takes of the images of frame `index`: grey levels and weights, (k, H, W) each.
@@ -395,28 +383,61 @@ def _check_given(
         )
 
 
-def _series_and_calibration(
-    settings: TestSettings, source: FrameSequence | None, calibration: Calibration | None
-) -> tuple[Series, Calibration | None]:
-    """The frames, of the settings or a `source`, and the calibration cropped to them."""
-    series: Series
-    if source is None:
-        series = open_series(settings.frames, settings.base, calibration)
-    else:
-        series = open_sequence(source, settings.frames, calibration)
-    if settings.scale.camera is not None:
-        CameraCalibration.read(settings.scale.camera).check(series.shape)
-    return series, calibration and calibration.cropped(settings.frames.crop_origin, series.shape)
+def _check_raw(
+    states: Sequence[RawState], name: str, settings: TestSettings, region: Region, calibration: Calibration | None
+) -> None:
+    """Refuse raw frames of the reference that contradict the stated levels or their calibration; warn of doubts."""
+    raw = [state for state in states if not isinstance(state, IlluminationImages)]
+    if not raw:
+        return
+    for frame in raw[0]:
+        if shifted := suitability.shifted_levels(samples := frame.values[..., region.mask], frame.white_level):
+            raise FrameError(f"the reference ({name}): {shifted}")
+        # twice as much has a bit more than the level: it is not the camera's, or deliberately low
+        if (largest := samples.max()) > 2 * frame.white_level:
+            logger.warning(
+                f"the samples of the reference ({name}) reach {largest}, far above white_level {frame.white_level:g}: "
+                "is it that of the camera, and is the order of the bytes (frames.dtype) right?"
+            )
+    saturated = suitability.saturated_fraction(raw[0], region.mask)
+    # with .985 lights were still separated, with .99 no texture was left in two of three frames (measured)
+    if saturated > 0.98:
+        raise FrameError(
+            f"no light sees the region in the reference ({name}): {suitability.exposure_fault(raw[0], region.mask)}"
+        )
+    if saturated > suitability.SATURATED:
+        logger.warning(f"{100 * saturated:.0f} % of the samples in the region of the reference ({name}) are saturated")
+    if calibration is None:
+        return
+    repeat = raw[1] if len(raw) > 1 else None
+    for found in check_state(raw[0], calibration, region.mask, name, accept=settings.calibration.accept, repeat=repeat):
+        if not found.certain:
+            logger.warning("%s may not be what %s calibrates: %s", name, settings.calibration.file, found.text)
+
+
+def _check_seen(state: RawState, name: str, images: IlluminationImages, reference: Reference, region: Region) -> None:
+    """Refuse a reference that no light sees or that shows no texture; warn of a light that is off."""
+    if not reference.pixel_weights.any():
+        fault = suitability.exposure_fault(state, region.mask) or "it is saturated, dark or excluded by the weights"
+        raise FrameError(f"no light sees the region in the reference ({name}): {fault}")
+    suitability.check_texture(state, region.mask, name)
+    off = [
+        f"{light} ({level:.1%})" for light, level in suitability.light_levels(images, region).items() if level < DARK
+    ]
+    if off and not isinstance(state, IlluminationImages):
+        logger.warning(
+            f"the reference ({name}) shows no light of {', '.join(off)}: the median in the region is under "
+            f"{100 * DARK:.0f} % of the full scale; are the lamps on?"
+        )
 
 
 def _tell_no_effect(weights: ThresholdWeights, images: IlluminationImages, region: Region) -> None:
     """Warn of a threshold that excludes nothing in the region of the reference."""
     inside = region.mask
     if (weights.reference(images) > 0)[:, inside].sum() == images.valid[:, inside].sum():
+        most = blurred(images, weights.blur)[:, inside].max() / images.full_scale
         logger.warning(
-            "weights.threshold = %.3g excludes nothing in the reference: no light, blurred over %g px, exceeds %.2g of "
-            'the dynamic range in the region. State a lower one, or weights.method = "statistics"',
-            weights.threshold,
-            weights.blur,
-            blurred(images, weights.blur)[:, inside].max() / images.full_scale,
+            f"weights.threshold = {weights.threshold:.3g} excludes nothing in the reference: no light, blurred over "
+            f"{weights.blur:g} px, exceeds {most:.2g} of the dynamic range in the region. State a lower one, or "
+            'weights.method = "statistics"'
         )

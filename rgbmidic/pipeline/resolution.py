@@ -9,64 +9,40 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from rgbmidic.correlation import Deformed, Solution, Start, Status, track
+from rgbmidic.correlation import Deformed, Solution, Status
 from rgbmidic.correlation.discretisation import discretisation_error
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionError, RgbmidicError
-from rgbmidic.fields import NodalCovariance, Places, StrainGauges
+from rgbmidic.fields import Places
 from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import refined
-from rgbmidic.pipeline.field_comparison import Field
-from rgbmidic.pipeline.frame import read_state
+from rgbmidic.pipeline.frame import prepared_frame
 from rgbmidic.pipeline.plan import Choice, Plan
-from rgbmidic.pipeline.size_figures import GaugeFigures, ResolutionStudy, SizeFigures
+from rgbmidic.pipeline.size_figures import CONSTANTS, Field, ResolutionStudy, SizeFigures, measure_size, rms, solved
 from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.settings import ELEMENT_SIZE, TestSettings
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import FloatArray
 
 logger = logging.getLogger(__name__)
 
 SIZES = (10.0, 16.0, 25.0, 40.0, 63.0)
 """Element sizes (px) that are tried where none are stated: the default (the paper's) and steps of 1.6, which change the
 noise by as much and the discretisation error of a smooth field by 4 (its third power)."""
-_LEAST = 4.0
-"""Smallest elements, px (`Tri3Mesh.from_region`)."""
-_FEWEST = 3.0
-"""Elements across the region: fewer have no node with neighbours on all sides, and no virtual strain gauge."""
-_CANDIDATES = 5
-"""Frames among which the key frame is looked for. Chosen: fifths of a test."""
-_STATIC = 5
-"""Static frames that the noise floor is taken from at most: 100 nodes in 5 frames give it to 4 %."""
 
-_LARGEST = 0.99
-"""Quantile over the nodes and components that stands for the largest strain: the very largest is one node's noise."""
-_EQUAL = 0.1
-"""How much shorter than three elements a gauge may be, as `StrainGauges` has it."""
-_FINER = 1.4
-"""Ratio of element sizes from which their fields are compared: mesh errors of nearer ones are too much alike. Chosen:
-those of neighbours among `SIZES` are compared."""
-_PASSES = 3
-"""Bisections in a row at most: legs of 25 px become 9 px."""
-_WORTH = 2.0
-"""Discretisation error of strain over its noise from which bisecting an element makes strain better: the one falls as
-the area of the elements, the other rises as its inverse, e^2/4 + 4 n^2 < e^2 + n^2 (derived). Displacement does not
-decide: with it affine fields and waves had more nodes and no smaller errors (measured)."""
-_EXACT = 2.0**-16
-"""Places of refined nodes are multiples of it, px: where they begin to count can then be shifted without rounding."""
 
 Progress = Callable[[int, int, str], None]
 
 
 def largest_size(plan: Plan) -> float:
-    """Largest elements (px) of which `_FEWEST` lie side by side across the region, in x and in y."""
+    """Largest elements (px) of which three lie side by side across the region, in x and in y."""
     spans = [np.flatnonzero(plan.region.mask.any(axis=axis)) for axis in (0, 1)]
-    return min(float(span[-1] - span[0]) for span in spans) / _FEWEST
+    return min(float(span[-1] - span[0]) for span in spans) / CONSTANTS.fewest
 
 
 def sizes_to_try(plan: Plan) -> tuple[float, ...]:
@@ -77,11 +53,11 @@ def sizes_to_try(plan: Plan) -> tuple[float, ...]:
     RegionError
         The region is too small for any.
     """
-    least, most = max(SPECKLES * (plan.speckle or 0.0), _LEAST), largest_size(plan)
-    if most < _LEAST:
+    least, most = max(SPECKLES * (plan.speckle or 0.0), CONSTANTS.least), largest_size(plan)
+    if most < CONSTANTS.least:
         raise RegionError(
-            f"the region is too small to compare element sizes: {_FEWEST:g} elements of {_LEAST:g} px must lie across "
-            "it; state mesh.element_size"
+            f"the region is too small to compare element sizes: {CONSTANTS.fewest:g} elements of {CONSTANTS.least:g} "
+            "px must lie across it; state mesh.element_size"
         )
     return tuple(size for size in SIZES if least <= size <= most) or (float(np.floor(min(least, most))),)
 
@@ -129,18 +105,18 @@ def study_sizes(
     if settings.mesh.file is not None or given.get("mesh") is not None:
         what = "a mesh is given" if settings.mesh.file is None else f"mesh.file names {settings.mesh.file}"
         raise ConfigurationError(f"{what}, whose elements have their sizes: one is found for a mesh made here only")
-    if sizes and min(sizes) < _LEAST:
-        raise InputError(f"elements of {min(sizes):g} px are too small: {_LEAST:g} px are the least")
+    if sizes and min(sizes) < CONSTANTS.least:
+        raise InputError(f"elements of {min(sizes):g} px are too small: {CONSTANTS.least:g} px are the least")
     middle = min(sizes, key=lambda size: abs(size - ELEMENT_SIZE), default=ELEMENT_SIZE)
     plan = Plan.from_settings(replace(settings, mesh=replace(settings.mesh, element_size=middle)), **given)
     sizes = tuple(sorted(sizes)) or sizes_to_try(plan)
     if max(sizes) > (most := largest_size(plan)):
         raise InputError(
             f"elements of {max(sizes):g} px are too large for the region: {most:.0f} px are the largest of which "
-            f"{_FEWEST:g} lie across it"
+            f"{CONSTANTS.fewest:g} lie across it"
         )
     lengths = [SHORTEST * size for size in sizes] if gauges is None else sorted(gauges)
-    if lengths and max(lengths) < (shortest := SHORTEST * min(sizes) * (1 - _EQUAL)):
+    if lengths and max(lengths) < (shortest := SHORTEST * min(sizes) * (1 - CONSTANTS.equal)):
         raise InputError(
             f"strain gauges of {max(lengths):g} px at most are too short: {shortest:g} px is the least, "
             f"{SHORTEST:g} elements of {min(sizes):g} px"
@@ -148,13 +124,14 @@ def study_sizes(
     report = progress or (lambda done, total, line: None)
     report(0, len(sizes) + 1, "looking for the key frame")
     key = _KeyFrame.find(plan, frames)
-    at_rest = settings.frames.reference[:_STATIC] if static and len(settings.frames.reference) > 1 else ()
+    at_rest = settings.frames.reference[: CONSTANTS.static] if static and len(settings.frames.reference) > 1 else ()
     rest = [_deformed(plan, index) for index in at_rest]
     figures, finer = [], list[Field]()
     for number, size in enumerate(sizes):
         report(number + 1, len(sizes) + 1, f"elements of {size:g} px")
         try:
-            figures.append(_figures(_resized(plan, size), key, rest, lengths, finer))
+            sized = _resized(plan, size)
+            figures.append(measure_size(sized, key.deformed, key.start(sized.reference.mesh), rest, lengths, finer))
         except RgbmidicError as error:
             logger.warning("elements of %g px: %s", size, error)
             figures.append(SizeFigures(element_size=size, reason=str(error)))
@@ -174,20 +151,18 @@ def _mesh_errors(sizes: Sequence[SizeFigures]) -> tuple[SizeFigures, ...]:
     A coarser mesh follows no more than a finer one: what falls as elements grow is none of the mesh's. It is, for
     instance, that of reflections, which each element averages.
     """
-    out, least, fallen = list[SizeFigures](), np.array([np.inf, np.inf]), 0.0
-    for one in reversed(sizes):
-        stated = np.array([one.discretisation, one.strain_discretisation])
-        least = np.fmin(least, stated)
-        mesh = np.where(np.isfinite(stated), least, np.nan)
-        fallen = float(np.fmax(fallen, np.sqrt(np.maximum(stated[0] ** 2 - mesh[0] ** 2, 0.0))))
-        out.append(replace(one, discretisation=float(mesh[0]), strain_discretisation=float(mesh[1])))
+    stated = np.array([[one.discretisation, one.strain.discretisation] for one in sizes])
+    mesh = np.where(np.isfinite(stated), np.fmin.accumulate(stated[::-1])[::-1], np.nan)
+    fallen = float(np.fmax.reduce(np.sqrt(np.maximum(stated**2 - mesh**2, 0.0))[:, 0], initial=0.0))
     if fallen > max((one.noise for one in sizes if one.noise > 0), default=np.inf):
         logger.warning(
-            "differences of %.2g px between element sizes fall as the elements grow, as those of reflections: they are "
-            "not counted as the mesh's",
-            fallen,
+            f"differences of {fallen:.2g} px between element sizes fall as the elements grow, as those of reflections: "
+            "they are not counted as the mesh's"
         )
-    return tuple(reversed(out))
+    return tuple(
+        replace(one, discretisation=float(moved), strain=replace(one.strain, discretisation=float(strain)))
+        for one, (moved, strain) in zip(sizes, mesh, strict=True)
+    )
 
 
 def choose(settings: TestSettings, **given: Any) -> Choice:
@@ -243,33 +218,28 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
         key = _KeyFrame.find(plan, () if frame is True else (int(frame),))
     except (FrameError, InputError) as error:
         raise type(error)(f"mesh.refine: {error}") from error
-    least, counts = max(SPECKLES * (plan.speckle or 0.0), _LEAST), [len(plan.reference.mesh.nodes)]
-    while len(counts) <= _PASSES:
+    least, counts = max(SPECKLES * (plan.speckle or 0.0), CONSTANTS.least), [len(plan.reference.mesh.nodes)]
+    while len(counts) <= CONSTANTS.passes:
         mesh = plan.reference.mesh
-        solution = _solve(plan, key.deformed, key.start(mesh))
+        solution = solved(plan, key.deformed, key.start(mesh))
         known = discretisation_error(plan.reference, key.deformed, solution, plan.solver, plan.method)
-        finer = refined(mesh, _worth(mesh, known), least)
+        error, noise = (  # the squares at the corners of each element; NaN takes no part
+            np.nan_to_num(part[mesh.elements] ** 2).sum(axis=(1, 2)) for part in (known.strain_error, known.strain_std)
+        )
+        finer = refined(mesh, error > CONSTANTS.worth**2 * noise, least)
         if finer is mesh:
             break
-        nodes = np.round(finer.nodes / _EXACT) * _EXACT
+        nodes = np.round(finer.nodes / CONSTANTS.exact) * CONSTANTS.exact
         plan = plan.on_mesh(Tri3Mesh(nodes=nodes, elements=finer.elements))
         counts.append(len(nodes))
     name = plan.series.name(key.index)
-    worth = f"the discretisation error of strain in {name} is more than {_WORTH:g} times its noise"
+    worth = f"the discretisation error of strain in {name} is more than {CONSTANTS.worth:g} times its noise"
     text = f"no element: there is none where {worth} and parts would have legs of {least:.3g} px or more"
     if counts[1:]:
         text = f"from {counts[0]} to {counts[-1]} nodes in {len(counts) - 1} steps, where {worth}; no leg is shorter "
         text += f"than {least:.3g} px"
     logger.info("refined: %s", text)
     return replace(plan, refinement=text)
-
-
-def _worth(mesh: Tri3Mesh, known: Solution) -> BoolArray:
-    """Elements (E,) whose strain gets better by bisection: by the squares at their corners; NaN takes no part."""
-    error, noise = (
-        np.nan_to_num(part[mesh.elements] ** 2).sum(axis=(1, 2)) for part in (known.strain_error, known.strain_std)
-    )
-    return np.asarray(error > _WORTH**2 * noise)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -293,14 +263,14 @@ class _KeyFrame:
         all_ = [index for index in chosen if index not in reference]
         if not all_:
             raise FrameError("the test has no deformed frame, which shows what elements cannot follow")
-        spread = np.unique(np.linspace(0, len(all_) - 1, _CANDIDATES + 1).round().astype(int)[1:])
+        spread = np.unique(np.linspace(0, len(all_) - 1, CONSTANTS.candidates + 1).round().astype(int)[1:])
         found, most, reasons = None, -1.0, []
         for index in frames or [all_[place] for place in spread]:
             before = time.process_time()
             try:
                 deformed = _deformed(plan, index)
                 seconds = time.process_time() - before
-                solution = _solve(plan, deformed, None)
+                solution = solved(plan, deformed, None)
                 if solution.status is Status.FAILED:
                     raise FrameError(solution.reason)
             except RgbmidicError as error:
@@ -326,8 +296,7 @@ class _KeyFrame:
 def _deformed(plan: Plan, index: int) -> Deformed:
     """The images of a frame, ready to be interpolated."""
     window = plan.window_of()
-    ready = plan.prepared(plan.lights(read_state(plan, index, window)[0], window), index)
-    return Deformed.prepare(*ready, prefilter=plan.solver.prefilter, origin=window.origin)
+    return Deformed.prepare(*prepared_frame(plan, index, window), prefilter=plan.solver.prefilter, origin=window.origin)
 
 
 def _resized(plan: Plan, size: float) -> Plan:
@@ -336,94 +305,9 @@ def _resized(plan: Plan, size: float) -> Plan:
     return replace(plan.on_mesh(Tri3Mesh.from_region(plan.region, size, cracks)), element_size=size)
 
 
-def _solve(plan: Plan, deformed: Deformed, start: FloatArray | None) -> Solution:
-    return track(plan.reference, deformed, Start(displacement=start), plan.solver, plan.method)
-
-
 def _beyond_affine(solution: Solution) -> float:
     """What no affine motion follows of a displacement: rms over the measured nodes, px."""
     known = solution.measured
     basis = np.column_stack([np.ones(known.sum()), solution.nodes[known]])
     moved = solution.displacement[known]
-    return _rms(np.asarray(moved - basis @ np.linalg.lstsq(basis, moved, rcond=None)[0]))
-
-
-def _rms(values: FloatArray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
-
-
-def _figures(
-    plan: Plan, key: _KeyFrame, rest: Sequence[Deformed], gauges: Sequence[float], finer: list[Field]
-) -> SizeFigures:
-    """The figures of the size of a plan's elements; its field is added to those of `finer` elements."""
-    mesh, speckle = plan.reference.mesh, plan.speckle or float("nan")
-    before = time.process_time()
-    solution = _solve(plan, key.deformed, key.start(mesh))
-    seconds = time.process_time() - before
-    if solution.status is Status.FAILED:
-        raise FrameError(solution.reason)
-    still = [_solve(plan, deformed, np.zeros_like(mesh.nodes)) for deformed in rest]
-    single = np.sqrt(1 + 1 / len(plan.settings.frames.reference))
-    moved, strain = (_floor([getattr(one, name) for one in still], single) for name in ("displacement", "strain"))
-    known = discretisation_error(plan.reference, key.deformed, solution, plan.solver, plan.method)
-    field = Field.of(mesh, known)
-    errors = [_rms(known.displacement_error), _rms(known.strain_error)]
-    other = [one for one in finer if _FINER * one.mesh.size <= mesh.size]
-    # it differs from all of them, each of which has an error of its own (in proportion to the size's third power);
-    # reflections, which every size averages in its own way, hardly differ from the next
-    part = [1 - (one.mesh.size / mesh.size) ** 3 for one in other]
-    apart = [min(np.divide(found, part), default=0.0) for found in field.apart(other)]
-    errors = [float(np.fmax(error, far)) for error, far in zip(errors, apart, strict=True)]
-    finer.append(field)
-    return SizeFigures(
-        element_size=plan.element_size,
-        speckles=plan.element_size / speckle,
-        nodes=len(mesh.nodes),
-        measured=float(mesh.areas @ solution.measured[mesh.elements].all(axis=1) / mesh.areas.sum()),
-        bias=moved[0],
-        scatter=moved[1],
-        strain_bias=strain[0],
-        strain_scatter=strain[1],
-        stated=_rms(known.displacement_std),
-        strain_stated=_rms(known.strain_std),
-        discretisation=errors[0],
-        strain_discretisation=errors[1],
-        seconds=seconds,
-        gauges=tuple(_gauge_figures(plan, solution, still, gauges)),
-    )
-
-
-def _floor(fields: Sequence[FloatArray], single: float) -> tuple[float, float]:
-    """Bias and scatter of fields (N, C) of static frames, as of a `single` frame against the reference.
-
-    They are differences among these frames, which do not depend on the reference: one frame scatters against the mean
-    of n by sqrt(1 + 1/n) more than they do around their own mean.
-    """
-    if len(fields) < 2:
-        return float("nan"), float("nan")
-    stack = np.stack(fields)
-    apart = (stack - stack.mean(axis=0)) * single * np.sqrt(len(fields) / (len(fields) - 1))
-    mean = np.nanmean(apart, axis=1, keepdims=True)
-    return _rms(mean), _rms(apart - mean)
-
-
-def _gauge_figures(
-    plan: Plan, solution: Solution, still: Sequence[Solution], lengths: Sequence[float]
-) -> Iterator[GaugeFigures]:
-    """Figures of the virtual strain gauges that are not too short for the elements."""
-    mesh, measure = plan.reference.mesh, plan.settings.probes.measure
-    fit = [length for length in lengths if length >= SHORTEST * plan.element_size * (1 - _EQUAL)]
-    covariance = NodalCovariance.from_mesh(mesh) if fit else None
-    single = np.sqrt(1 + 1 / len(plan.settings.frames.reference))
-    for length in fit:
-        assert covariance is not None
-        gauge = StrainGauges.at_nodes(covariance, length)
-        strains = [gauge.strain(*one.displacement.T, *one.displacement_std.T, measure=measure) for one in still]
-        loaded = gauge.strain(*solution.displacement.T, *solution.displacement_std.T, measure=measure)
-        floor = _floor([one.components for one in strains], single)[1]
-        size = np.abs(loaded.components)
-        largest = float(np.quantile(size[np.isfinite(size)], _LARGEST)) if np.isfinite(size).any() else float("nan")
-        yield GaugeFigures(
-            length=length, noise=floor if np.isfinite(floor) else _rms(loaded.components_std), largest=largest
-        )
+    return rms(np.asarray(moved - basis @ np.linalg.lstsq(basis, moved, rcond=None)[0]))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,19 +12,18 @@ from typing import Any
 import numpy as np
 
 from rgbmidic._kernels.threads import threads
-from rgbmidic.correlation import Status
+from rgbmidic.correlation import NodeStatus, Solution, Start, Status
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.frame import read_state
+from rgbmidic.pipeline.engine import Schedule, Updated, following, open_workers
+from rgbmidic.pipeline.frame import Measured, read_state
 from rgbmidic.pipeline.given import check_object, check_type, describe
-from rgbmidic.pipeline.order import dependants
+from rgbmidic.pipeline.order import dependants, rank_of
 from rgbmidic.pipeline.plan import Choice, Plan
 from rgbmidic.pipeline.resolution import choose, refine
-from rgbmidic.pipeline.schedule import Schedule
 from rgbmidic.pipeline.source import FrameSequence
 from rgbmidic.pipeline.suitability import light_levels
-from rgbmidic.pipeline.workers import open_workers
 from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
@@ -35,6 +34,9 @@ from rgbmidic.weights import LightWeights
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int, str], None]
+
+_MEASURED = ("u", "v", "u_std", "v_std", "exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std", "rigid")
+"""Quantities of a frame that it makes a reference with, beside the status of its nodes."""
 
 
 def measure(
@@ -125,12 +127,17 @@ def measure(
     kept = read_provenance(Path(out)) if begun else {}
     if settings.mesh.element_size == "auto":
         choice = Choice(**kept["element_size"]) if kept.get("element_size") else choose(settings, **given)
-    if settings.mesh.refine is not False and mesh is not None:
+    refines = settings.mesh.refine is not False
+    if refines and mesh is not None:
         raise InputError("mesh.refine is for a mesh made here, and a mesh is given: leave one of them out")
     sized = settings.mesh if choice is None else replace(settings.mesh, element_size=choice.element_size)
     plan = Plan.from_settings(replace(settings, mesh=replace(sized, refine=False)), **given)
-    if settings.mesh.refine is not False:
-        plan = _refined(plan, settings.mesh.refine, Path(out), kept)
+    if refines and "refinement" in kept:
+        stored = read_mesh(Path(out), kept)
+        finer = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
+        plan = replace(plan.on_mesh(finer), refinement=kept["refinement"])
+    elif refines:
+        plan = refine(plan, settings.mesh.refine)
     plan = replace(plan, settings=settings, choice=choice, timings=timings)
     objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
     if settings.weights.method == "images":  # the masks, whatever their files are called
@@ -138,30 +145,88 @@ def measure(
     places = _places(plan.series.chosen, frames)
     if workers is None:
         workers = threads() if separation is None and weights is None else 1
-    with _store(plan, Path(out), places if frames else None, objects, overwrite=overwrite, resume=resume) as store:
+    origin = _origin(plan, objects, kept.get("unread_files", ()))
+    if frames is not None:
+        opened = ResultStore.join(out, origin, frames=places)
+    elif resume:
+        opened = ResultStore.resume(out, origin)
+    else:
+        opened = ResultStore.create(out, origin, overwrite=overwrite)
+    with opened as store:
         if resume and frames is None:
             _take_back(plan, store, retry_failed=retry_failed)
-        schedule = Schedule(plan, store, places)
+        sink = _Folder(plan, store, places, progress)
+        schedule = Schedule(plan, sink, places)
         if schedule.done and frames is None and "finished" in read_provenance(store.path):
             logger.warning("%s is finished and whole: nothing is left to be measured", out)
             return Result.open(out)
         store.reopen()
         if not schedule.done:
-            with open_workers(plan, min(workers, len(places)), scheduler) as others:
-                schedule.run(others, progress)
+            with closing(open_workers(plan, min(workers, len(places)), scheduler)) as others:
+                schedule.run(others)
         _tell_repeated(plan, store, places)
         if frames is None:
             store.finish()
     return Result.open(out, partial=frames is not None, check=False)
 
 
-def _refined(plan: Plan, frame: int | bool, out: Path, kept: Mapping[str, Any]) -> Plan:
-    """The plan on a mesh refined in a frame, or on that of the result in `out`, with the provenance `kept`."""
-    if "refinement" not in kept:
-        return refine(plan, frame)
-    stored = read_mesh(out, kept)
-    mesh = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
-    return replace(plan.on_mesh(mesh), refinement=kept["refinement"])
+class _Folder:
+    """The sink of a result folder."""
+
+    def __init__(self, plan: Plan, store: ResultStore, places: range, progress: Progress | None) -> None:
+        self._plan, self._store, self._places, self._progress = plan, store, places, progress
+        self._finished = store.finished()
+
+    def is_finished(self, place: int) -> bool:
+        """Whether a frame is in the folder."""
+        return bool(self._finished[place])
+
+    def start_after(self, place: int) -> Start:
+        """Initial guess after a finished frame: from the last that is measured up to there.
+
+        Where a frame failed all before it are finished, since a key frame that fails waits for the one before it.
+        """
+        names = ("u", "v", "node_status", "reference_updates", "best_match")
+        for kept in self._store.table().each(names, range(place, -1, -1)):
+            if (kept["node_status"] == NodeStatus.MEASURED).any():
+                return following(self._plan, kept, Start(displacement=None))
+        return Start(displacement=None)
+
+    def updated(self, places: Sequence[int]) -> Updated:
+        """Indices and solutions of the frames that became the reference, as the folder holds them."""
+        if not places:
+            return ()
+        mesh, lights, chosen = self._plan.reference.mesh, len(self._plan.images.names), self._plan.series.chosen
+        blank = Solution.failed(mesh, lights, "", np.zeros(0))
+
+        def solution(kept: Mapping[str, Any]) -> Solution:
+            exact = {name: kept[name].astype(np.float64) for name in _MEASURED}
+            u, v, u_std, v_std, *strain, rigid = exact.values()
+            return replace(
+                blank,
+                displacement=np.stack([u, v], axis=1),
+                displacement_std=np.stack([u_std, v_std], axis=1),
+                strain=np.stack(strain[:3], axis=1),
+                strain_std=np.stack(strain[3:], axis=1),
+                node_status=kept["node_status"],
+                rigid=rigid,
+            )
+
+        kept = self._store.table().each([*_MEASURED, "node_status"], places)
+        return [(chosen[place], solution(one)) for place, one in zip(places, kept, strict=True)]
+
+    def keep(self, place: int, found: Measured, after: Start) -> None:
+        """Write a frame, and report what became of it."""
+        record, places = found.record, self._places
+        self._store.write_frame(place, record)
+        self._finished[place] = True
+        if self._progress is None:
+            return
+        done, status = int(self._finished[places.start : places.stop].sum()), Status(record.status)
+        line = f"{status.name.lower().replace('_', ' ')}: {record.reason}"
+        if status is Status.CONVERGED:
+            line = f"converged in {record.iterations} iterations, {1 - rank_of(record)[1]:.0%} of the nodes measured"
+        self._progress(done, len(places), f"{self._plan.series.name(self._plan.series.chosen[place])}: {line}")
 
 
 def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
@@ -192,9 +257,8 @@ def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
     if lost:
         logger.warning("lost to damage and measured again: %s", listed(lost, names))
     if readable:
-        logger.warning(
-            "measured again with what started from it, since it can be read now: %s", listed(readable, names)
-        )
+        again_for = listed(readable, names)
+        logger.warning("measured again with what started from it, since it can be read now: %s", again_for)
     store.discard(again)
 
 
@@ -207,10 +271,8 @@ def _tell_repeated(plan: Plan, store: ResultStore, places: range) -> None:
         names = [plan.series.name(index) for index in plan.series.chosen]
         what = "all frames repeat" if len(repeated) == len(places) - 1 else "frames that repeat"
         logger.warning(
-            "%s the one before, bit for bit, which camera noise makes impossible: %s; were frames lost and filled up, "
-            "or files copied?",
-            what,
-            listed(repeated, names),
+            f"{what} the one before, bit for bit, which camera noise makes impossible: {listed(repeated, names)}; were "
+            "frames lost and filled up, or files copied?"
         )
 
 
@@ -230,14 +292,13 @@ def _places(chosen: range, frames: range | None) -> range:
     return range(places[0], places[-1] + 1)
 
 
-def _store(
-    plan: Plan, out: Path, part: range | None, objects: dict[str, str], *, overwrite: bool, resume: bool
-) -> ResultStore:
-    series = plan.series
-    recording = series.recording
-    begun = (resume or part is not None) and (out / PROVENANCE).exists()
-    fingerprint, unread = series.fingerprint(read_provenance(out).get("unread_files", ()) if begun else ())
-    origin = Origin(
+def _origin(plan: Plan, objects: Mapping[str, str], unread_before: Collection[str]) -> Origin:
+    """What the result keeps of what all frames share; `objects` are descriptions of those that were given."""
+    series, recording = plan.series, plan.series.recording
+    fingerprint, unread = series.fingerprint(unread_before)
+    levels = light_levels(plan.images, plan.region).items()
+    usable = np.isfinite(plan.images.values[:, plan.region.mask]).mean(axis=1)
+    return Origin(
         nodes=plan.reference.mesh.nodes + plan.window.origin,
         elements=plan.reference.mesh.elements,
         names=[series.name(index) for index in series.chosen],
@@ -260,19 +321,10 @@ def _store(
             "unread_files": list(unread),
             "frame_shape": list(plan.window.frame),
             "reference_origin": list(plan.window.origin),
-            "reference_exposure": list(_exposure(plan)),
+            "reference_exposure": [
+                {"light": light, "median": level, "excluded": float(1 - part)}
+                for (light, level), part in zip(levels, usable, strict=True)
+            ],
             "calibration_figures": plan.calibration,
         },
     )
-    if part is not None:
-        return ResultStore.join(out, origin, frames=part)
-    if resume:
-        return ResultStore.resume(out, origin)
-    return ResultStore.create(out, origin, overwrite=overwrite)
-
-
-def _exposure(plan: Plan) -> Iterator[dict[str, Any]]:
-    """Yield of each light the median grey level in the region of the reference, and the part that is not usable."""
-    levels, inside = light_levels(plan.images, plan.region), plan.images.values[:, plan.region.mask]
-    for (light, level), part in zip(levels.items(), inside, strict=True):
-        yield {"light": light, "median": level, "excluded": float(1 - np.isfinite(part).mean())}

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, Literal, Unpack, cast
@@ -18,16 +19,15 @@ import numpy.typing as npt
 from rgbmidic.correlation import Solution, Start
 from rgbmidic.correlation.images import unmasked
 from rgbmidic.correlation.reference_update import ReferenceUpdate
-from rgbmidic.errors import FrameError, InputError, RgbmidicError
+from rgbmidic.errors import FrameError, InputError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.correlate import solver_settings
-from rgbmidic.pipeline.frame import failed_frame, next_reference, solve_frame
+from rgbmidic.pipeline.engine import Schedule, Updated
+from rgbmidic.pipeline.frame import Measured, attempt, next_reference
 from rgbmidic.pipeline.given import check_object, check_type
-from rgbmidic.pipeline.order import STRIDE, better, loses, parent
+from rgbmidic.pipeline.order import STRIDE
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.schedule import following
-from rgbmidic.results import FrameRecord
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.settings import (
     ELEMENT_SIZE,
@@ -117,9 +117,8 @@ def measure_sequence(
     mask = region if isinstance(region, Region) else None
     if settings is None:
         height, width = np.shape(getattr(reference, "values", reference))[-2:]
-        corners: Any = (0, 0, width - 1, height - 1)
-        if region is not None and not isinstance(region, Region):
-            corners = tuple(region)
+        whole = region is None or isinstance(region, Region)
+        corners: Any = (0, 0, width - 1, height - 1) if whole else tuple(cast(Any, region))
         settings = TestSettings(
             frames=FrameSettings(path=(), update_reference=update_reference),
             region=RegionSettings(rectangle=corners),
@@ -165,45 +164,58 @@ class _Latest:
 
 
 def _solutions(plan: Plan, latest: _Latest, states: Iterable[Any]) -> Iterator[Solution]:
-    """The solution of each state, from the starts and with the second tries of `Schedule`."""
-    starts: dict[int, Start] = {}
-    updates: dict[tuple[int, ...], ReferenceUpdate] = {(): ReferenceUpdate.none(plan.reference)}
-    last = NO_CHECKSUM
-    for position, latest.state in enumerate(states):
-        index, before = plan.series.chosen[position], parent(position)
-        start = Start(displacement=None) if before is None else starts[before]
-        record, solution = _measured(plan, index, start, updates)
-        if loses(position, record, start):
-            start = starts[position - 1]
-            again, closer = _measured(plan, index, start, updates)
-            if better(record, again) is again:
-                record, solution = again, closer
-        checksum = record.values["checksum"]
-        if checksum == last != NO_CHECKSUM:
-            logger.warning("state %d repeats the one before, bit for bit", position)
-        last = checksum
-        starts[position] = following(plan, record.values, start)
-        if (frames := starts[position].reference_updates)[-2:] not in updates:
-            updates[frames[-2:]] = next_reference(plan, updates[frames[:-1][-2:]], index, solution)
-        # a later state starts from this one, from the first, or from the last at a multiple of a power of STRIDE
-        needed, step = {0, position}, STRIDE
-        while step <= position:
-            needed.add(position // step * step)
-            step *= STRIDE
-        starts = {place: one for place, one in starts.items() if place in needed}
-        kept = {(), *(one.reference_updates[-2:] for one in starts.values())}
-        updates = {frames: one for frames, one in updates.items() if frames in kept}
-        yield solution
+    """The solution of each state, in the order and with the second tries of `Schedule`."""
+    live = _Live(plan)
+    schedule = Schedule(plan, live)
+    for place, latest.state in enumerate(states):
+        schedule.want(place)
+        schedule.run(live)
+        yield live.solution
 
 
-def _measured(
-    plan: Plan, index: int, start: Start, updates: dict[tuple[int, ...], ReferenceUpdate]
-) -> tuple[FrameRecord, Solution]:
-    """Record and solution of the latest state from a start."""
-    try:
-        values = solve_frame(plan, index, start, updates[start.reference_updates[-2:]])
-    except RgbmidicError as error:
-        logger.warning("%s failed: %s", plan.series.name(index), error)
+class _Live:
+    """Measures the latest state at once, and keeps of all before it what a later one may start from."""
+
+    slots = 1
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan, self._starts, self._checksum = plan, dict[int, Start](), NO_CHECKSUM
+        self._updates: dict[tuple[int, ...], ReferenceUpdate] = {(): ReferenceUpdate.none(plan.reference)}
+        self.solution: Solution
+
+    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
+        """Measure a state from a start."""
+        done: Future[Measured] = Future()
+        done.set_result(attempt(self._plan, index, start, lambda: self._updates[start.reference_updates[-2:]]))
+        return done
+
+    def is_finished(self, place: int) -> bool:
+        """Whether it is one of those that are kept."""
+        return place in self._starts
+
+    def start_after(self, place: int) -> Start:
+        """Initial guess of the states that follow one."""
+        return self._starts[place]
+
+    def updated(self, places: Sequence[int]) -> Updated:
+        """References are made here while their state is there."""
+        return ()
+
+    def keep(self, place: int, found: Measured, after: Start) -> None:
+        """Take a state's solution, and forget what no later state starts from."""
+        plan, record = self._plan, found.record
         mesh, lights = plan.reference.mesh, len(plan.images.names)
-        return failed_frame(plan, index, str(error)), Solution.failed(mesh, lights, str(error), np.zeros(0))
-    return FrameRecord.from_solution(**values), values["solution"]
+        self.solution = found.solution or Solution.failed(mesh, lights, record.reason, np.zeros(0))
+        checksum = record.values["checksum"]
+        if checksum == self._checksum != NO_CHECKSUM:
+            logger.warning("state %d repeats the one before, bit for bit", place)
+        self._checksum = checksum
+        self._starts[place] = after
+        if (frames := after.reference_updates)[-2:] not in self._updates:
+            before = self._updates[frames[:-1][-2:]]
+            self._updates[frames[-2:]] = next_reference(plan, before, plan.series.chosen[place], self.solution)
+        # a later state starts from this one, from the first, or from the last at a multiple of a power of STRIDE
+        needed = {place // STRIDE**power * STRIDE**power for power in range(20)}
+        self._starts = {one: start for one, start in self._starts.items() if one in needed}
+        kept = {(), *(start.reference_updates[-2:] for start in self._starts.values())}
+        self._updates = {frames: one for frames, one in self._updates.items() if frames in kept}

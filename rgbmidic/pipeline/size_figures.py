@@ -2,19 +2,81 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from rgbmidic.pipeline.plan import Choice
+from rgbmidic.correlation import Deformed, Solution, Start, Status, discretisation_error, track
+from rgbmidic.errors import FrameError
+from rgbmidic.fields import NodalCovariance, Places, StrainGauges
+from rgbmidic.fields.strain import SHORTEST
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.mesh.quadratic_fit import quadratic_fit
+from rgbmidic.pipeline.plan import Choice, Plan
 from rgbmidic.pipeline.suitability import SPECKLES
+from rgbmidic.typing import FloatArray
 
-_MEASURED = 0.97
-"""Area that a size must measure, of the size that measures most: what it loses is where its error would be the largest,
-such as a steep bump beside one node. Chosen: a node of elements of 40 px on 250 px is 8 %."""
-_ALIKE = 1.05
-"""Total errors of the displacement within this factor count as the same, and those of strain decide: an estimate of the
-discretisation error is no better than that."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResolutionConstants:
+    """Constants of the choice of element sizes.
+
+    Attributes
+    ----------
+    least
+        Smallest elements, px (`Tri3Mesh.from_region`).
+    fewest
+        Elements across the region: fewer have no node with neighbours on all sides, and no virtual strain gauge.
+    candidates
+        Frames among which the key frame is looked for. Chosen: fifths of a test.
+    static
+        Static frames that the noise floor is taken from at most: 100 nodes in 5 frames give it to 4 %.
+    largest
+        Quantile over the nodes and components that stands for the largest strain: the very largest is one node's noise.
+    equal
+        How much shorter than three elements a gauge may be, as `StrainGauges` has it.
+    finer
+        Ratio of element sizes from which their fields are compared: mesh errors of nearer ones are too much alike.
+        Chosen: those of neighbours among `SIZES` are compared.
+    passes
+        Bisections in a row at most: legs of 25 px become 9 px.
+    worth
+        Discretisation error of strain over its noise from which bisecting an element makes strain better: the one falls
+        as the area of the elements, the other rises as its inverse, e^2/4 + 4 n^2 < e^2 + n^2 (derived). Displacement
+        does not decide: with it affine fields and waves had more nodes and no smaller errors (measured).
+    exact
+        Places of refined nodes are multiples of it, px: where they begin to count can then be shifted without rounding.
+    measured
+        Area that a size must measure, of the size that measures most: what it loses is where its error would be the
+        largest, such as a steep bump beside one node. Chosen: a node of elements of 40 px on 250 px is 8 %.
+    alike
+        Total errors of the displacement within this factor count as the same, and those of strain decide: an estimate
+        of the discretisation error is no better than that.
+    sure, independent
+        Standard deviations by which the mean square of a difference must exceed that of noise, and independent values
+        in a nodal one, whose neighbours are correlated. Chosen.
+    """
+
+    least: float = 4.0
+    fewest: float = 3.0
+    candidates: int = 5
+    static: int = 5
+    largest: float = 0.99
+    equal: float = 0.1
+    finer: float = 1.4
+    passes: int = 3
+    worth: float = 2.0
+    exact: float = 2.0**-16
+    sure: float = 2.0
+    independent: float = 0.5
+    measured: float = 0.97
+    alike: float = 1.05
+
+
+CONSTANTS = ResolutionConstants()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,10 +99,38 @@ class GaugeFigures:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SizeFigures:
-    """Elements of one size on a test's own frames; what is not known is NaN.
+class ErrorFigures:
+    """Errors of displacement or strain, rms over the measured nodes and the components; what is not known is NaN.
 
-    All errors are rms over the measured nodes and over the components: u, v in px; exx, eyy, exy at the nodes.
+    Attributes
+    ----------
+    bias, scatter
+        Noise floor: rms over the static frames of the mean over the nodes, and the scatter about it.
+    stated
+        Standard uncertainty from noise in the key frame.
+    discretisation
+        What the mesh and the recovery leave out in the key frame.
+    """
+
+    bias: float = float("nan")
+    scatter: float = float("nan")
+    stated: float = float("nan")
+    discretisation: float = float("nan")
+
+    @property
+    def noise(self) -> float:
+        """Noise as stated in the key frame, or the noise floor where that is more."""
+        return float(np.fmax(self.stated, self.scatter))
+
+    @property
+    def total(self) -> float:
+        """Root of the squares of noise and discretisation error."""
+        return float(np.hypot(self.noise, self.discretisation))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SizeFigures(ErrorFigures):
+    """Elements of one size on a test's own frames: errors of u and v, px, and what goes with them.
 
     Attributes
     ----------
@@ -52,12 +142,8 @@ class SizeFigures:
         Number of nodes.
     measured
         Fraction of the area whose nodes the key frame measures.
-    bias, scatter, strain_bias, strain_scatter
-        Noise floor: rms over the static frames of the mean over the nodes, and the scatter about it.
-    stated, strain_stated
-        Standard uncertainty from noise in the key frame.
-    discretisation, strain_discretisation
-        What the mesh and the recovery leave out in the key frame.
+    strain
+        Errors of exx, eyy, exy at the nodes.
     seconds
         CPU seconds of the solve of the key frame.
     gauges
@@ -70,37 +156,10 @@ class SizeFigures:
     speckles: float = float("nan")
     nodes: int = 0
     measured: float = 0.0
-    bias: float = float("nan")
-    scatter: float = float("nan")
-    strain_bias: float = float("nan")
-    strain_scatter: float = float("nan")
-    stated: float = float("nan")
-    strain_stated: float = float("nan")
-    discretisation: float = float("nan")
-    strain_discretisation: float = float("nan")
+    strain: ErrorFigures = ErrorFigures()
     seconds: float = float("nan")
     gauges: tuple[GaugeFigures, ...] = ()
     reason: str = ""
-
-    @property
-    def noise(self) -> float:
-        """Noise of the displacement, px: as stated in the key frame, or the noise floor where that is more."""
-        return float(np.fmax(self.stated, self.scatter))
-
-    @property
-    def strain_noise(self) -> float:
-        """Noise of the strain at the nodes, as `noise`."""
-        return float(np.fmax(self.strain_stated, self.strain_scatter))
-
-    @property
-    def total(self) -> float:
-        """Error of the displacement, px: root of the squares of noise and discretisation error."""
-        return float(np.hypot(self.noise, self.discretisation))
-
-    @property
-    def strain_total(self) -> float:
-        """Error of the strain at the nodes, as `total`."""
-        return float(np.hypot(self.strain_noise, self.strain_discretisation))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,14 +192,14 @@ class ResolutionStudy:
         """The size of the least total error among those that hold and measure enough; None where none is known."""
         most = max((one.measured for one in self.sizes), default=0.0)
         few = [one for one in self.sizes if one.speckles < SPECKLES]
-        usable = [one for one in self.sizes if one not in few and one.measured >= _MEASURED * most]
+        usable = [one for one in self.sizes if one not in few and one.measured >= CONSTANTS.measured * most]
         usable = sorted((one for one in usable if np.isfinite(one.total)), key=lambda one: one.element_size)
         if not usable:
             return None
         least = min(one.total for one in usable)
         best = min(
-            (one for one in usable if one.total <= _ALIKE * least),
-            key=lambda one: np.nan_to_num(one.strain_total, nan=np.inf),
+            (one for one in usable if one.total <= CONSTANTS.alike * least),
+            key=lambda one: np.nan_to_num(one.strain.total, nan=np.inf),
         )
         smaller, larger = usable[: usable.index(best)][-1:], usable[usable.index(best) + 1 :][:1]
         lead = "the least" if best.total == least else "within 5 % of the least"
@@ -155,3 +214,153 @@ class ResolutionStudy:
             names = ", ".join(f"{one.element_size:g}" for one in few)
             parts.append(f"{names} px are less than {SPECKLES:g} speckles of {self.speckle:.1f} px")
         return Choice(element_size=best.element_size, reason="; ".join(parts))
+
+
+def solved(plan: Plan, deformed: Deformed, start: FloatArray | None) -> Solution:
+    """Solution of a frame from an initial guess (N, 2), or from a search."""
+    return track(plan.reference, deformed, Start(displacement=start), plan.solver, plan.method)
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square of the finite values; NaN where there are none."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+
+
+def measure_size(
+    plan: Plan,
+    deformed: Deformed,
+    start: FloatArray,
+    rest: Sequence[Deformed],
+    gauges: Sequence[float],
+    finer: list[Field],
+) -> SizeFigures:
+    """Measure the figures of the size of a plan's elements.
+
+    Parameters
+    ----------
+    plan
+        The test with elements of this size.
+    deformed, start
+        The key frame and its initial guess (N, 2).
+    rest
+        Static frames.
+    gauges
+        Lengths of virtual strain gauges, px; those too short for the elements are left out.
+    finer
+        Fields on finer elements, to which that on these is added.
+    """
+    mesh, speckle = plan.reference.mesh, plan.speckle or float("nan")
+    before = time.process_time()
+    solution = solved(plan, deformed, start)
+    seconds = time.process_time() - before
+    if solution.status is Status.FAILED:
+        raise FrameError(solution.reason)
+    still = [solved(plan, static, np.zeros_like(mesh.nodes)) for static in rest]
+    single = np.sqrt(1 + 1 / len(plan.settings.frames.reference))
+    known = discretisation_error(plan.reference, deformed, solution, plan.solver, plan.method)
+    field = Field.of(mesh, known)
+    other = [one for one in finer if CONSTANTS.finer * one.mesh.size <= mesh.size]
+    # it differs from all of them, each of which has an error of its own (in proportion to the size's third power);
+    # reflections, which every size averages in its own way, hardly differ from the next
+    part = [1 - (one.mesh.size / mesh.size) ** 3 for one in other]
+    apart = [min(np.divide(found, part), default=0.0) for found in field.apart(other)]
+    finer.append(field)
+    whole = solution.measured[mesh.elements].all(axis=1)
+
+    def errors(name: str, beyond: float) -> dict[str, Any]:
+        bias, scatter = _floor([getattr(one, name) for one in still], single)
+        stated, error = (rms(getattr(known, f"{name}_{kind}")) for kind in ("std", "error"))
+        return {"bias": bias, "scatter": scatter, "stated": stated, "discretisation": float(np.fmax(error, beyond))}
+
+    return SizeFigures(
+        element_size=plan.element_size,
+        speckles=plan.element_size / speckle,
+        nodes=len(mesh.nodes),
+        measured=float(mesh.areas[whole].sum() / mesh.areas.sum()),
+        strain=ErrorFigures(**errors("strain", apart[1])),
+        seconds=seconds,
+        gauges=tuple(_gauge_figures(plan, solution, still, gauges)),
+        **errors("displacement", apart[0]),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Field:
+    """Displacement and strain (N, 5) on a mesh, and their noise."""
+
+    mesh: Tri3Mesh
+    values: FloatArray
+    noise: FloatArray
+
+    @classmethod
+    def of(cls, mesh: Tri3Mesh, solution: Solution) -> Field:
+        """Those of a solution, the noise without the misfit of the elements."""
+        values = np.hstack([solution.displacement, solution.strain])
+        return cls(mesh=mesh, values=values, noise=np.hstack([solution.displacement_std, solution.strain_std]))
+
+    def at(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The field at points (P, 2), by the quadratics through the nodes around each node (`at_pixels`), and noise."""
+        used = np.asarray(np.isfinite(self.values)[self.mesh.elements].all(axis=(1, 2)))
+        known = np.nan_to_num(self.values)
+        _, x, y, xx, xy, yy = (operator @ known for operator in quadratic_fit(self.mesh, used))
+        places = Places.of(self.mesh, points)
+        node, weight = self.mesh.elements[places.element], places.barycentric
+        dx, dy = np.moveaxis(points[:, None] - self.mesh.nodes[node], -1, 0)[..., None]
+        bent = xx[node] * dx * dx / 2 + xy[node] * dx * dy + yy[node] * dy * dy / 2
+        out = np.einsum("pc,pci->pi", weight, self.values[node] + x[node] * dx + y[node] * dy + bent)
+        noise = np.sqrt(np.einsum("pc,pci->pi", weight, self.noise[node] ** 2))
+        return np.where(places.inside[:, None] & used[places.element][:, None], out, np.nan), noise
+
+    def apart(self, finer: Sequence[Field]) -> tuple[list[float], list[float]]:
+        """How far this field is from each of `finer` elements beyond the noise of both, at the nodes of those.
+
+        Halved elements show little of what is far smaller than they are, or lies between their nodes; the finer sizes
+        of a study have measured it. Of displacement and strain.
+        """
+        found: tuple[list[float], list[float]] = ([], [])
+        for other in finer:
+            here, noise = self.at(other.mesh.nodes)
+            square, variance = (here - other.values) ** 2, noise**2 + other.noise**2
+            for errors, part in zip(found, (slice(2), slice(2, 5)), strict=True):
+                known = np.isfinite(square[:, part] + variance[:, part])
+                beyond, expected = (square - variance)[:, part][known], variance[:, part][known]
+                plain = beyond.sum() > CONSTANTS.sure * np.sqrt(2 * (expected**2).sum() / CONSTANTS.independent)
+                errors.append(float(np.sqrt(beyond.mean())) if plain else 0.0)
+        return found
+
+
+def _floor(fields: Sequence[FloatArray], single: float) -> tuple[float, float]:
+    """Bias and scatter of fields (N, C) of static frames, as of a `single` frame against the reference.
+
+    They are differences among these frames, which do not depend on the reference: one frame scatters against the mean
+    of n by sqrt(1 + 1/n) more than they do around their own mean.
+    """
+    if len(fields) < 2:
+        return float("nan"), float("nan")
+    stack = np.stack(fields)
+    apart = (stack - stack.mean(axis=0)) * single * np.sqrt(len(fields) / (len(fields) - 1))
+    mean = np.nanmean(apart, axis=1, keepdims=True)
+    return rms(mean), rms(apart - mean)
+
+
+def _gauge_figures(
+    plan: Plan, solution: Solution, still: Sequence[Solution], lengths: Sequence[float]
+) -> Iterator[GaugeFigures]:
+    """Figures of the virtual strain gauges that are not too short for the elements."""
+    mesh, measure = plan.reference.mesh, plan.settings.probes.measure
+    fit = [length for length in lengths if length >= SHORTEST * plan.element_size * (1 - CONSTANTS.equal)]
+    if not fit:
+        return
+    covariance = NodalCovariance.from_mesh(mesh)
+    single = np.sqrt(1 + 1 / len(plan.settings.frames.reference))
+    for length in fit:
+        gauge = StrainGauges.at_nodes(covariance, length)
+        strains = [gauge.strain(*one.displacement.T, *one.displacement_std.T, measure=measure) for one in still]
+        loaded = gauge.strain(*solution.displacement.T, *solution.displacement_std.T, measure=measure)
+        floor = _floor([one.components for one in strains], single)[1]
+        size = np.abs(loaded.components)
+        known = size[np.isfinite(size)]
+        largest = float(np.quantile(known, CONSTANTS.largest)) if known.size else float("nan")
+        noise = floor if np.isfinite(floor) else rms(loaded.components_std)
+        yield GaugeFigures(length=length, noise=noise, largest=largest)

@@ -1,7 +1,8 @@
 """Frames that a script gives: whatever has a length and a frame by index is read as a series of files is.
 
 `FrameSequence` is the protocol; a numpy stack, an HDF5 dataset, a camera maker's library and the series of files that
-`rgbmidic.frames.open_series` makes are implementations of it. `SourceSeries` is what the pipeline reads it through.
+`rgbmidic.frames.open_series` makes are implementations of it. `SourceSeries` is what the pipeline reads it through,
+unless it can itself what a series of files can.
 """
 
 from __future__ import annotations
@@ -18,13 +19,12 @@ import numpy as np
 from rgbmidic.correlation.images import unmasked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RgbmidicError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.series import chosen_frames
+from rgbmidic.frames.series import FrameSeries, chosen_frames
 from rgbmidic.frames.stored import Camera, StoredFrame, raw_frame
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.pipeline.given import class_name, describe
 from rgbmidic.settings import FrameSettings
-from rgbmidic.typing import AnyArray
 
 
 class FrameSequence(Protocol):
@@ -57,54 +57,6 @@ class FrameSequence(Protocol):
         IlluminationImages, or ndarray of floats, shape (H, W) or (k, H, W)
             One image per light, which needs no separation; NaN where not valid.
         """
-
-
-class Series(Protocol):
-    """What the pipeline reads frames from: a `SourceSeries`, or a source that can all this itself.
-
-    The series of files that `rgbmidic.frames.open_series` makes is one; it reads parts of frames.
-    """
-
-    @property
-    def numbers(self) -> Sequence[int]:
-        """Number of each frame, with gaps where frames are missing."""
-
-    @property
-    def chosen(self) -> range:
-        """The frames that are to be measured."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of every frame."""
-
-    @property
-    def recording(self) -> Recording:
-        """How the frames were recorded."""
-
-    @property
-    def lost(self) -> int:
-        """Number of frames missing between the first and the last chosen."""
-
-    def __len__(self) -> int:
-        """Number of states."""
-
-    def read(self, index: int, window: Window | None = None) -> Any:
-        """State `index` or a `window` of it: raw frames, or one image per light."""
-
-    def gone(self) -> str:
-        """What exists no more and all frames are read from; empty where all is there."""
-
-    def name(self, index: int) -> str:
-        """Name of state `index`."""
-
-    def time_ns(self, index: int) -> int | None:
-        """When state `index` was taken, in ns; None where that is not known."""
-
-    def inputs(self, index: int, window: Window | None = None) -> dict[str, str]:
-        """Path and fingerprint of every file that state `index` comes from."""
-
-    def fingerprint(self, unread: Collection[str] = ()) -> tuple[str, tuple[str, ...]]:
-        """A text that changes with the frames, and the names of those whose content it leaves out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -219,42 +171,41 @@ class SourceSeries:
         states = tuple(state) if isinstance(state, tuple | list) else (state,)
         if states and all(isinstance(one, Mosaic | ChannelFrame) for one in states):
             return states
-        values = unmasked(state)
-        if values.dtype.kind == "f" and np.asarray(state).dtype.kind in "ui":
+        values, where = unmasked(state), f"{name} of {class_name(self.source)}"
+        kind = values.dtype.kind
+        if kind == "f" and np.asarray(state).dtype.kind in "ui":
             raise FrameError(
-                f"{name} of {class_name(self.source)} has masked samples, which a raw frame cannot have: give it "
-                "saturated there, or images of the lights as floats"
+                f"{where} has masked samples, which a raw frame cannot have: give it saturated there, or images of the "
+                "lights as floats"
             )
-        if values.dtype.kind != "f" or values.ndim not in (2, 3):
-            return (self._raw(values, name),)
+        if kind not in "uif" or values.ndim not in (2, 3):
+            raise FrameError(
+                f"{where} is {values.dtype} of shape {values.shape}; allowed are whole numbers (H, W) or (C, H, W), "
+                "floats (H, W) or (k, H, W), Mosaic, ChannelFrame and IlluminationImages"
+            )
+        if kind != "f":
+            if values.dtype not in (np.uint8, np.uint16) and (values.min() < 0 or values.max() > 65535):
+                raise FrameError(f"{where} has grey levels outside 0 to 65535")
+            samples = values if values.dtype == np.uint8 else values.astype(np.uint16, copy=False)
+            channels_last = np.ascontiguousarray(np.moveaxis(samples, 0, -1) if samples.ndim == 3 else samples)
+            return (raw_frame(StoredFrame.plain(channels_last, Path(name)), self.stated, Path(name), self.camera),)
         stated = {"frames.kind": self.stated.kind, "frames.cfa": self.stated.cfa, "calibration.file": self.camera}
         of_raw = [key for key, value in stated.items() if value not in (None, "monochrome")]
         if of_raw:
             raise ConfigurationError(
-                f"{name} of {class_name(self.source)} is {values.dtype}: arrays of floats are images of the "
-                f"lights, and {' and '.join(of_raw)} {'is' if len(of_raw) == 1 else 'are'} stated, of raw frames: give "
-                "whole numbers, which are raw frames, or leave that out"
+                f"{where} is {values.dtype}: arrays of floats are images of the lights, and {' and '.join(of_raw)} "
+                f"{'is' if len(of_raw) == 1 else 'are'} stated, of raw frames: give whole numbers, which are raw "
+                "frames, or leave that out"
             )
-        values = values if values.ndim == 3 else values[None]
+        values = values.reshape(-1, *values.shape[-2:])
         lights = getattr(self.source, "lights", None) or [f"light {light + 1}" for light in range(len(values))]
         valid = np.isfinite(values)
         return IlluminationImages(values=values, valid=valid, names=tuple(lights), full_scale=self.full_scale)
 
-    def _raw(self, values: AnyArray, name: str) -> Mosaic | ChannelFrame:
-        """Whole numbers (H, W) or (C, H, W) as the raw frame that ``[frames]`` says they are."""
-        if values.dtype.kind not in "ui" or values.ndim not in (2, 3):
-            raise FrameError(
-                f"{name} of {class_name(self.source)} is {values.dtype} of shape {values.shape}; allowed are whole "
-                "numbers (H, W) or (C, H, W), floats (H, W) or (k, H, W), Mosaic, ChannelFrame and IlluminationImages"
-            )
-        if values.dtype not in (np.uint8, np.uint16):
-            if values.min() < 0 or values.max() > np.iinfo(np.uint16).max:
-                raise FrameError(f"{name} of {class_name(self.source)} has grey levels outside 0 to 65535")
-            values = values.astype(np.uint16)
-        if values.ndim == 3:
-            values = np.moveaxis(values, 0, -1)
-        path = Path(name)
-        return raw_frame(StoredFrame.plain(np.ascontiguousarray(values), path), self.stated, path, self.camera)
+
+Series = FrameSeries | SourceSeries
+"""What the pipeline reads frames from: a series of files, a source as `SourceSeries`, or a source that can all this
+itself, such as read parts of frames."""
 
 
 def open_sequence(source: FrameSequence | Series, stated: FrameSettings, camera: Camera | None) -> Series:
@@ -267,8 +218,8 @@ def open_sequence(source: FrameSequence | Series, stated: FrameSettings, camera:
     FrameError
         A reference frame, or the first or last frame, does not exist or cannot be read.
     """
-    # isinstance does not see what `__getattr__` of a wrapper gives, from Python 3.12 on
-    if all(hasattr(source, name) for name in vars(Series) if not name.startswith("_")):
+    members = {name for name in set(dir(FrameSeries)) & set(dir(SourceSeries)) if not name.startswith("_")}
+    if all(hasattr(source, name) for name in members):  # also by `__getattr__` of a wrapper
         return cast(Series, source)
     if not (hasattr(source, "__len__") and hasattr(source, "__getitem__")):
         raise InputError(

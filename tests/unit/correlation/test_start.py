@@ -9,7 +9,7 @@ from textures import Affine, Texture
 
 from rgbmidic import Region, Tri3Mesh
 from rgbmidic.correlation import Deformed, Reference
-from rgbmidic.correlation.start import confidence, find_start, find_starts
+from rgbmidic.correlation.start import Search, find_start
 
 SHAPE = (260, 320)
 RECTANGLE = (80, 60, 240, 200)
@@ -109,10 +109,10 @@ def test_confidence_is_the_share_that_correlates():
     texture = Texture.random(7)
     reference, deformed = prepared(texture.image(SHAPE), texture.image(SHAPE, Affine(shift=(20.0, 0.0))))
     displacement = np.tile([20.0, 0.0], (len(reference.mesh.nodes), 1))
-    assert confidence(reference, deformed, displacement) == 1
+    assert Search().confidence(reference, deformed, displacement) == 1
     left = reference.mesh.nodes[:, 0] < 160
     displacement[left] += 12
-    assert confidence(reference, deformed, displacement) == pytest.approx(1 - left.mean(), abs=0.15)
+    assert Search().confidence(reference, deformed, displacement) == pytest.approx(1 - left.mean(), abs=0.15)
 
 
 def test_starts_are_surer_and_surer_and_the_same_on_any_threads():
@@ -122,7 +122,7 @@ def test_starts_are_surer_and_surer_and_the_same_on_any_threads():
     try:
         for count in (1, 4):
             cv2.setNumThreads(count)
-            every.append(list(find_starts(reference, deformed)))
+            every.append(list(Search().starts(reference, deformed)))
     finally:
         cv2.setNumThreads(threads)
     for one, four in zip(*every, strict=True):

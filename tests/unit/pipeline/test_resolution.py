@@ -19,7 +19,7 @@ from rgbmidic.errors import AnotherTestError, ConfigurationError, FrameError, In
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import Plan, measure, measure_sequence, resolution
 from rgbmidic.pipeline.resolution import study_sizes
-from rgbmidic.pipeline.size_figures import ResolutionStudy, SizeFigures
+from rgbmidic.pipeline.size_figures import ErrorFigures, ResolutionStudy, SizeFigures
 from rgbmidic.report.setup import analysis_rows
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import MeshSettings, TestSettings
@@ -40,9 +40,9 @@ def study(*sizes: SizeFigures) -> ResolutionStudy:
 
 
 def one(size: float, noise: float, error: float, *, speckles: float = 5.0, measured: float = 1.0) -> SizeFigures:
-    strain = {"strain_stated": noise / size, "strain_discretisation": error / size}
+    strain = ErrorFigures(stated=noise / size, discretisation=error / size)
     return SizeFigures(
-        element_size=size, speckles=speckles, measured=measured, stated=noise, discretisation=error, **strain
+        element_size=size, speckles=speckles, measured=measured, stated=noise, discretisation=error, strain=strain
     )
 
 
@@ -86,13 +86,13 @@ def test_figures_of_a_scene_with_static_frames():
     assert (found.frame, found.static) == (3, 3)  # of two candidates the one that is deformed
     fine, middle, coarse = found.sizes
     assert fine.scatter > 1.3 * middle.scatter > 1.3**2 * coarse.scatter
-    assert fine.strain_scatter > 1.6 * middle.strain_scatter > 1.6**2 * coarse.strain_scatter
+    assert fine.strain.scatter > 1.6 * middle.strain.scatter > 1.6**2 * coarse.strain.scatter
     plan = Plan.from_settings(replace(stated, mesh=MeshSettings(element_size=25.0)), source=FRAMES)
     at_rest = resolution._deformed(plan, 4)  # no frame of the reference: its displacement is all noise
     for size in found.sizes[:2]:
-        solution = resolution._solve(resolution._resized(plan, size.element_size), at_rest, None)
+        solution = resolution.solved(resolution._resized(plan, size.element_size), at_rest, None)
         assert 0.8 < size.scatter / np.sqrt(np.mean(solution.displacement**2)) < 1.25
-        assert 0.8 < size.strain_scatter / np.sqrt(np.mean(solution.strain**2)) < 1.25
+        assert 0.8 < size.strain.scatter / np.sqrt(np.mean(solution.strain**2)) < 1.25
     for size in found.sizes:
         assert size.bias < 0.5 * size.scatter
         assert size.measured == 1
@@ -117,7 +117,7 @@ def test_what_is_smaller_than_the_elements_is_known_from_the_finer_ones():
 
 def test_without_static_frames_the_noise_is_as_stated():
     found = study_sizes(settings(), (16,), frames=(3,), source=FRAMES)
-    assert np.isnan([found.sizes[0].scatter, found.sizes[0].bias, found.sizes[0].strain_scatter]).all()
+    assert np.isnan([found.sizes[0].scatter, found.sizes[0].bias, found.sizes[0].strain.scatter]).all()
     assert found.sizes[0].noise == found.sizes[0].stated > 0
     assert found.static == 0
 

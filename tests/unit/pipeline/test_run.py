@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from threading import Barrier, Lock
@@ -26,9 +27,9 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, ResultEr
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import read_frame, write_tiff
 from rgbmidic.frames.data import ChannelFrame
-from rgbmidic.pipeline import Plan, measure, run, schedule, workers
+from rgbmidic.pipeline import Plan, engine, frame, measure, run
 from rgbmidic.pipeline.frame import measure_frame
-from rgbmidic.pipeline.plan import UpdatedReferences
+from rgbmidic.pipeline.plan import ProcessState
 from rgbmidic.results import Maps, Result, finish_result, scale_of
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import TestSettings
@@ -95,11 +96,11 @@ def test_two_workers_give_the_same_bits(movie: Path, whole: Result, tmp_path: Pa
 def test_a_frame_that_kills_every_worker_of_a_cluster_fails_and_the_rest_goes_on(
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Dying(workers.Threads):
-        def submit(self, index: int, start: Start, updated: Any = ()) -> Future[workers.Measured]:
+    class Dying(engine.Threads):
+        def submit(self, index: int, start: Start, updated: Any = ()) -> Future[frame.Measured]:
             if index != 5:
                 return super().submit(index, start, updated)
-            dead: Future[workers.Measured] = Future()
+            dead: Future[frame.Measured] = Future()
             dead.set_exception(RuntimeError("the cluster gave up"))  # as distributed's KilledWorker
             return dead
 
@@ -122,9 +123,9 @@ def test_frames_share_the_threads_that_share_a_kernel(movie: Path, monkeypatch: 
     measured = measure_frame(plan, 0, Start(displacement=None))
     before = threads()
     set_threads(4)
-    monkeypatch.setattr(workers, "measure_frame", watched)
+    monkeypatch.setattr(engine, "measure_frame", watched)
     try:
-        with workers.Threads(plan, 2) as pool:
+        with closing(engine.Threads(plan, 2)) as pool:
             running = [pool.submit(index, Start(displacement=None)) for index in range(2)]
             assert all(one.result(60).record is measured for one in running)
         assert seen == [2, 2]
@@ -157,12 +158,12 @@ def test_the_frames_of_chains_are_measured_in_step(
     """At the end of a test no chain is left alone, which one worker would measure while the others wait."""
     order = list[int]()
 
-    class Watching(workers.Threads):
-        def submit(self, index: int, start: Start, updated: Any = ()) -> Future[workers.Measured]:
+    class Watching(engine.Threads):
+        def submit(self, index: int, start: Start, updated: Any = ()) -> Future[frame.Measured]:
             order.append(index)
             return super().submit(index, start, updated)
 
-    def two(plan: Plan, *_: Any) -> workers.Workers:
+    def two(plan: Plan, *_: Any) -> engine.Threads:
         found = Watching(plan, 1)
         found.slots = 2
         return found
@@ -174,7 +175,7 @@ def test_the_frames_of_chains_are_measured_in_step(
 
 
 def test_threads_of_a_process_make_an_updated_reference_once() -> None:
-    updates, made = UpdatedReferences(), list[object]()
+    process, made = ProcessState(), list[object]()
 
     def make() -> Any:
         time.sleep(0.05)
@@ -182,9 +183,9 @@ def test_threads_of_a_process_make_an_updated_reference_once() -> None:
         return made[-1]
 
     with ThreadPoolExecutor(8) as threads:
-        got = list(threads.map(lambda _: updates.get((1, 2), make), range(8)))
+        got = list(threads.map(lambda _: process.reference_update((1, 2), make), range(8)))
     assert got == made * 8
-    assert pickle.loads(pickle.dumps(updates)).get((1, 2), make) is not got[0]
+    assert pickle.loads(pickle.dumps(process)).reference_update((1, 2), make) is not got[0]
     assert len(made) == 2
 
 
@@ -360,10 +361,10 @@ def test_frames_that_failed_otherwise_are_measured_again_where_that_is_asked(
 ) -> None:
     def failing(plan: Any, index: int, start: Start, updated: Any) -> Any:
         record = measure_frame(plan, index, start, updated)
-        return schedule.failed_frame(plan, index, "out of memory") if index == 33 else record
+        return frame.failed_frame(plan, index, "out of memory") if index == 33 else record
 
     with monkeypatch.context() as patched:
-        patched.setattr("rgbmidic.pipeline.workers.measure_frame", failing)
+        patched.setattr("rgbmidic.pipeline.engine.measure_frame", failing)
         measure(settings(movie), tmp_path / "result")
     measured: list[str] = []
     result = measure(settings(movie), tmp_path / "result", resume=True, progress=counted(measured))
@@ -423,9 +424,9 @@ def test_a_key_frame_that_is_lost_is_measured_from_the_frame_before_it(
         moved = np.inf if start.displacement is None else float(start.displacement[:, 1].mean())
         starts.append((index, moved))
         record = measure_frame(plan, index, start, updated)
-        return schedule.failed_frame(plan, index, "lost") if index == 16 and len(starts) == 17 else record
+        return frame.failed_frame(plan, index, "lost") if index == 16 and len(starts) == 17 else record
 
-    monkeypatch.setattr("rgbmidic.pipeline.workers.measure_frame", watched)
+    monkeypatch.setattr("rgbmidic.pipeline.engine.measure_frame", watched)
     result = in_order(settings(movie, last=18), tmp_path / "result")
     tries = [moved for index, moved in starts if index == 16]
     assert tries == pytest.approx([0.0, 1.5], abs=0.1)

@@ -1,0 +1,320 @@
+"""The engine: frames are measured in the order of `rgbmidic.pipeline.order`, by workers, into a sink.
+
+`rgbmidic.measure` runs it with threads or a Dask cluster and a result folder, `rgbmidic.measure_sequence` with the
+latest state alone and a few initial guesses.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from heapq import nsmallest
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from rgbmidic._kernels.threads import keep_memory, set_threads, threads
+from rgbmidic.correlation import NodeStatus, Solution, Start
+from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError
+from rgbmidic.pipeline.frame import Measured, failed_frame, measure_frame
+from rgbmidic.pipeline.order import STRIDE, better, children, lineage, loses, parent
+from rgbmidic.pipeline.plan import Plan
+
+logger = logging.getLogger(__name__)
+
+Updated = Sequence[tuple[int, Solution]]
+"""Index and solution of frames that became the reference, see `measure_frame`."""
+
+
+class Workers(Protocol):
+    """Measure frames, as many at a time as there are slots."""
+
+    @property
+    def slots(self) -> int:
+        """How many."""
+
+    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
+        """Have one frame measured."""
+
+
+class Sink(Protocol):
+    """Where measured frames go, by their places in the result."""
+
+    def is_finished(self, place: int) -> bool:
+        """Whether a frame is there already."""
+
+    def start_after(self, place: int) -> Start:
+        """Initial guess of the frames that follow a finished one."""
+
+    def updated(self, places: Sequence[int]) -> Updated:
+        """Frames that became the reference, for workers that make it of them."""
+
+    def keep(self, place: int, found: Measured, after: Start) -> None:
+        """Take a frame, and the initial guess of those that follow it."""
+
+
+class Schedule:
+    """The frames that are still to be measured.
+
+    A frame starts from its parent in the tree, or, where that one failed, from where it started. A key frame that is
+    not measured well from there is measured once more from the frame just before it, and the better of both is kept.
+    """
+
+    def __init__(self, plan: Plan, sink: Sink, places: Iterable[int] = ()) -> None:
+        self._plan, self._sink = plan, sink
+        self._ready = list[tuple[int, Start]]()
+        self._wanted = set[int]()
+        self._waiting: dict[int, list[int]] = {}
+        self._first_tries: dict[int, Measured] = {}
+        for place in places:
+            self.want(place)
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing is left to be measured."""
+        return not self._ready
+
+    def want(self, place: int) -> None:
+        """Have a frame measured, and all that it depends on."""
+        first = None
+        for ancestor in lineage(place):
+            if self._sink.is_finished(ancestor):
+                break
+            if ancestor in self._wanted:
+                return
+            self._wanted.add(ancestor)
+            first = ancestor
+        if first is not None:
+            before = parent(first)
+            self._ready.append((first, Start(displacement=None) if before is None else self._sink.start_after(before)))
+
+    def run(self, workers: Workers) -> None:
+        """Have workers measure the frames, and give each to the sink as it finishes.
+
+        Raises
+        ------
+        ResultError
+            The sink cannot be written.
+        FrameError
+            All files of the frames are gone.
+        """
+        running: dict[Future[Measured], tuple[int, Start]] = {}
+        while self._ready or running:
+            while self._ready and len(running) < workers.slots:
+                place, start = self._next(workers.slots)
+                last = start.reference_updates[-2:]  # all that the reference which they make depends on
+                running[workers.submit(self._index(place), start, self._sink.updated(last))] = place, start
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                place, start = running.pop(future)
+                self._take(place, start, self._outcome(future, place))
+
+    def _next(self, slots: int) -> tuple[int, Start]:
+        """Take the frame that is to be measured next out of those that can be.
+
+        Of the earliest chains, one more than several frames are measured at a time, it is that of the chain which is
+        behind: at the end of a test none is left alone.
+        """
+        chains = nsmallest(slots + (slots > 1), self._ready, key=lambda one: one[0])
+        found = min(chains, key=lambda one: one[0] % STRIDE)
+        self._ready.remove(found)
+        return found
+
+    def _index(self, place: int) -> int:
+        """Place in the series of a frame of the result."""
+        return self._plan.series.chosen[place]
+
+    def _outcome(self, future: Future[Measured], place: int) -> Measured:
+        """What a worker found, or why it found nothing."""
+        try:
+            found = future.result()
+        except CancelledError:
+            raise RgbmidicError(LOST_CLUSTER) from None
+        except Exception as error:  # a worker of a cluster that died over the frame more often than the cluster allows
+            index, kind = self._index(place), type(error).__name__
+            name = self._plan.series.name(index)
+            logger.warning("a worker died while %s was measured (%s)", name, str(error) or kind)
+            return Measured(record=failed_frame(self._plan, index, f"its worker died: {kind}"))
+        for level, text in found.messages:
+            logger.log(level, "%s", text)
+        return found
+
+    def _take(self, place: int, start: Start, found: Measured) -> None:
+        """Keep a frame, or have it measured again, and release what waits for it."""
+        if found.record.unread and (gone := self._plan.series.gone()):
+            raise FrameError(f"the frames are gone: {gone}; go on with --resume when they are there again")
+        first = self._first_tries.pop(place, None)
+        if first is None and loses(place, found.record, start):
+            self._first_tries[place] = found
+            before = place - 1  # it may have to be measured first
+            if self._sink.is_finished(before):
+                self._ready.append((place, self._sink.start_after(before)))
+            else:
+                self._waiting.setdefault(before, []).append(place)
+                self.want(before)
+            return
+        if first is not None:
+            record = better(first.record, found.record)
+            tried = replace(record, values={**record.values, "tries": 2})
+            found = replace(first if record is first.record else found, record=tried)
+        after = following(self._plan, found.record.values, start)
+        self._sink.keep(place, found, after)
+        self._wanted.discard(place)
+        released = [child for child in children(place, max(self._wanted, default=0) + 1) if child in self._wanted]
+        self._ready += [(one, after) for one in (*released, *self._waiting.pop(place, ()))]
+
+
+def following(plan: Plan, kept: Mapping[str, Any], start: Start) -> Start:
+    """Where a frame starts that follows one that started from `start` and of which this is kept."""
+    measured = kept["node_status"] == NodeStatus.MEASURED
+    if not measured.any():
+        return start
+    after = start.after(plan.reference.mesh, np.stack([kept["u"], kept["v"]], axis=1), measured)
+    updates, best = tuple(kept["reference_updates"].tolist()), float(kept["best_match"])
+    return replace(after, reference_updates=updates, best_match=best)
+
+
+class Threads:
+    """Threads of this process, each with a frame; those that share a kernel are divided among the frames.
+
+    Kernels, numpy and OpenCV let go of the interpreter's lock, which a frame holds for 2 to 6 % of its time (measured),
+    so threads measure side by side what processes would, share the plan and the kernels, and start at once. A single
+    one is the caller's own thread.
+    """
+
+    def __init__(self, plan: Plan, count: int) -> None:
+        import numba  # noqa: F401  of two threads that import it at once, one may find half of it
+
+        keep_memory()
+        self.slots, self._plan, self._running = count, plan, 0
+        self._lock, self._before = threading.Lock(), (threads(), cv2.getNumThreads())
+        self._executor = ThreadPoolExecutor(count, thread_name_prefix="rgbmidic-frames") if count > 1 else None
+
+    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
+        """Have one frame measured, at once where there is one thread."""
+        if self._executor is None:
+            done: Future[Measured] = Future()
+            done.set_result(self._measured(index, start, updated))
+            return done
+        self._count(1)
+        future = self._executor.submit(self._measured, index, start, updated)
+        future.add_done_callback(lambda _: self._count(-1))
+        return future
+
+    def close(self) -> None:
+        """Wait for the frames that have begun."""
+        if self._executor is not None:
+            self._executor.shutdown(cancel_futures=True)
+        set_threads(self._before[0])
+        cv2.setNumThreads(self._before[1])
+
+    def _measured(self, index: int, start: Start, updated: Updated) -> Measured:
+        return Measured(record=measure_frame(self._plan, index, start, updated))
+
+    def _count(self, more: int) -> None:
+        """Divide the threads that share kernels among the frames that are being measured."""
+        with self._lock:
+            self._running += more
+            each = max(self._before[0] // max(self._running, 1), 1)
+            if each != threads():
+                set_threads(each)
+                cv2.setNumThreads(each)
+
+
+class Cluster:
+    """The workers of a Dask cluster; what a lost one was doing is done again by another."""
+
+    def __init__(self, plan: Plan, address: str) -> None:
+        try:
+            distributed: Any = importlib.import_module("distributed")
+        except ImportError:
+            raise ConfigurationError(
+                "a Dask cluster needs the packages dask and distributed: install rgbmidic[cluster]"
+            ) from None
+        # what becomes of the cluster is reported here, without its tracebacks; some loggers have levels of their own
+        loggers = [logging.getLogger(name) for name in list(logging.root.manager.loggerDict)]
+        self._levels = {log: log.level for log in loggers if log.name.partition(".")[0] in ("distributed", "tornado")}
+        for log in self._levels:
+            log.setLevel(logging.CRITICAL + 1)
+        try:
+            self._client = distributed.Client(address, timeout=30, set_as_default=False)
+            self._client.wait_for_workers(1, timeout=120)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise ConfigurationError(f"no Dask scheduler with workers answers at {address}: {error}") from None
+        self._plan = self._client.scatter(plan, broadcast=True, hash=False)
+        self._executor = self._client.get_executor(pure=False)
+
+    @property
+    def slots(self) -> int:
+        """Threads of all workers there are now.
+
+        Raises
+        ------
+        RgbmidicError
+            The scheduler does not answer any more.
+        """
+        with _answering():
+            return max(sum(map(int, self._client.nthreads().values())), 1)
+
+    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
+        """Have one frame measured by some worker."""
+        with _answering():
+            future: Future[Measured] = self._executor.submit(_measure_elsewhere, self._plan, index, start, updated)
+        return future
+
+    def close(self) -> None:
+        """Leave the cluster to others, without waiting for what is not finished."""
+        self._executor.shutdown(wait=False)
+        alive = self._client.status == "running"
+        with suppress(OSError, RuntimeError, TimeoutError, CancelledError):  # a scheduler that is gone has let go of it
+            self._client.close()
+        if alive:  # else its threads complain for some time yet
+            for log, level in self._levels.items():
+                log.setLevel(level)
+
+
+LOST_CLUSTER = "the Dask scheduler and its workers no longer answer; what was finished is kept: go on with --resume"
+
+
+@contextmanager
+def _answering() -> Iterator[None]:
+    """Turn the errors of a scheduler that has gone into one of ours."""
+    try:
+        yield
+    except (OSError, RuntimeError, CancelledError) as error:
+        logger.debug("the Dask scheduler does not answer: %s", error)
+        raise RgbmidicError(LOST_CLUSTER) from None
+
+
+def open_workers(plan: Plan, count: int, scheduler: str | None = None) -> Threads | Cluster:
+    """A Dask cluster where its scheduler is named, else `count` threads of this process."""
+    return Threads(plan, count) if scheduler is None else Cluster(plan, scheduler)
+
+
+class _Messages(logging.Handler):
+    """Keeps what one thread logs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.thread, self.kept = threading.get_ident(), list[tuple[int, str]]()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.thread == self.thread:
+            self.kept.append((record.levelno, self.format(record)))
+
+
+def _measure_elsewhere(plan: Plan, index: int, start: Start, updated: Updated) -> Measured:
+    """Measure a frame in a worker of a cluster, on one thread; nobody reads its log."""
+    cv2.setNumThreads(1)
+    set_threads(1)
+    logger, handler = logging.getLogger("rgbmidic"), _Messages()
+    logger.addHandler(handler)
+    try:
+        return Measured(record=measure_frame(plan, index, start, updated), messages=tuple(handler.kept))
+    finally:
+        logger.removeHandler(handler)
