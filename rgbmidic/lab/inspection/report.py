@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
-from rgbmidic.lab import check_folder, number_or_none, write_findings
+from rgbmidic.lab import plain, write_findings
 from rgbmidic.lab.inspection import Inspection, Spread
 from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal
 from rgbmidic.typing import AnyArray
@@ -35,8 +36,8 @@ def write_inspection(inspection: Inspection, out: Path, *, overwrite: bool = Fal
     ResultError
         An inspection is already there, or the folder cannot be written.
     """
-    check_folder(out, FILES, overwrite=overwrite)
-    write_findings(out, "inspection", inspection_document(inspection), _inspection_figure(inspection))
+    contents = inspection_document(inspection), _inspection_figure(inspection)
+    write_findings(out, dict(zip(FILES, contents, strict=True)), overwrite=overwrite)
 
 
 def channel_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
@@ -76,8 +77,8 @@ def _text(value: float, digits: int) -> str:
 
 def inspection_document(inspection: Inspection) -> dict[str, Any]:
     """Return the figures as plain values, for inspection.json; a number that is not known is null."""
-    texture = inspection.texture
-    return {
+    texture, expected = inspection.texture, inspection.prediction
+    document = {
         "schema": "rgbmidic-inspection",
         "rgbmidic": __version__,
         "frame": inspection.name,
@@ -86,27 +87,26 @@ def inspection_document(inspection: Inspection) -> dict[str, Any]:
         "element_size_px": inspection.element_size,
         "crosstalk_known": inspection.crosstalk_known,
         "noise_known": inspection.noise_known,
-        "speckle_px": number_or_none(inspection.speckle_px),
+        "speckle_px": inspection.speckle_px,
         "texture": texture
         and {
-            "diameter_px": number_or_none(texture.diameter),
+            "diameter_px": texture.diameter,
             "agreement_of_colours": texture.correlation,
             "channel_specific_fraction": texture.specific,
         },
         "reflects_from_index": REFLECTING,
-        "channels": [_plain(channel) for channel in inspection.channels],
-        "lights": [_plain(light) | {"alone_std_px": _plain(light.alone)} for light in inspection.lights],
-        "std_px": _plain(Spread.of(inspection.prediction.std)),
-        "std_from_noise_px": _plain(Spread.of(inspection.prediction.noise)),
-        "std_from_mosaic_px": _plain(Spread.of(inspection.prediction.mosaic)),
+        "channels": inspection.channels,
+        "lights": [
+            {("alone_std_px" if name == "alone" else name): value for name, value in asdict(light).items()}
+            for light in inspection.lights
+        ],
+        "std_px": Spread.of(expected.std),
+        "std_from_noise_px": Spread.of(expected.noise),
+        "std_from_mosaic_px": Spread.of(expected.mosaic),
         "nodes_not_measured": inspection.unmeasured,
-        "warnings": [{"code": finding.code, "text": finding.text} for finding in inspection.findings],
+        "warnings": inspection.findings,
     }
-
-
-def _plain(summary: Any) -> dict[str, Any]:
-    values = {name: getattr(summary, name) for name in summary.__dataclass_fields__ if name != "alone"}
-    return {name: number_or_none(value) if isinstance(value, float) else value for name, value in values.items()}
+    return plain(document)  # type: ignore[no-any-return]
 
 
 def _inspection_figure(inspection: Inspection) -> Figure:
