@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any
 
 import cv2
@@ -19,6 +20,7 @@ from textures import Affine, Texture
 
 from rgbmidic import Solution, correlate
 from rgbmidic.typing import FloatArray
+from rgbmidic.weights import Statistics
 
 from .tables import Row, table
 
@@ -32,8 +34,9 @@ CONSTANTS = {
     "nodes": ("_WORSE", "_ONE_SIDED", "_NOISY"),
     "solve": ("_STARTED", "_WANDERING", "_SWINGING", "_SETTLED"),
     "start": ("_NORMALISE", "_FLAT", "_GREY", "_VOTERS", "_TOLERANCE", "_CONTEXT"),
-    "light_weights": ("_FREEDOM", "_LEAST_VARIANCE", "_OWN"),
 }
+STATISTICS = ("freedom", "least_variance", "own")
+"""Fields of `rgbmidic.weights.Statistics`."""
 QUICK = ("anchor", "even", "grey", "least variance", "noisy", "range", "smoothness", "swinging")
 """At least one of each module."""
 NOTHING = {"displacement/stated": 1e-3, "stated [%]": 0.01}
@@ -57,8 +60,9 @@ def images() -> tuple[FloatArray, FloatArray]:
     return first, second
 
 
-def scenes() -> dict[str, Solution]:
+def scenes(statistics: Statistics | None = None) -> dict[str, Solution]:
     """Solve the scenes."""
+    solve = partial(correlate, statistics=statistics or True)
     first, second = images()
     weights = np.ones_like(first)
     weights[:, 90:130, 150:200] = 0
@@ -71,13 +75,13 @@ def scenes() -> dict[str, Solution]:
     dark = 100 + (moved - 100) * (1 - 0.97 * np.exp(-((x - 120) ** 2 + (y - 100) ** 2) / (2 * 25**2)))
     noisy = [one + rng.normal(0, 3, SHAPE) for one in (rest, another, apart, dark)]
     return {
-        "hole": correlate(noisy[0], noisy[1], region=REGION, element_size=14),
-        "apart": correlate(noisy[0], noisy[2], region=REGION, element_size=14),
-        "shadow": correlate(noisy[0], noisy[3], region=REGION, element_size=14, brightness="local"),
-        "shadow, mean": correlate(noisy[0], noisy[3], region=REGION, element_size=14, brightness="mean"),
-        "lights": correlate(first, second, region=REGION, brightness="local"),
-        "gap": correlate(first, second, region=REGION, weights=weights, element_size=15, rigid="translation"),
-        "one": correlate(first[0], second[0], region=REGION, element_size=12),
+        "hole": solve(noisy[0], noisy[1], region=REGION, element_size=14),
+        "apart": solve(noisy[0], noisy[2], region=REGION, element_size=14),
+        "shadow": solve(noisy[0], noisy[3], region=REGION, element_size=14, brightness="local"),
+        "shadow, mean": solve(noisy[0], noisy[3], region=REGION, element_size=14, brightness="mean"),
+        "lights": solve(first, second, region=REGION, brightness="local"),
+        "gap": solve(first, second, region=REGION, weights=weights, element_size=15, rigid="translation"),
+        "one": solve(first[0], second[0], region=REGION, element_size=12),
     }
 
 
@@ -92,8 +96,7 @@ def constants(quick: bool) -> Iterator[Row]:
     root mean square change of the displacement over its stated uncertainty, change of the median stated uncertainty,
     and of the fraction of nodes measured; the larger of the two, in the scene where it is largest.
     """
-    rooms = {name: "weights" if name == "light_weights" else "correlation" for name in CONSTANTS}
-    modules = {name: importlib.import_module(f"rgbmidic.{room}.{name}") for name, room in rooms.items()}
+    modules = {name: importlib.import_module(f"rgbmidic.correlation.{name}") for name in CONSTANTS}
     stale = [(name, one) for name, names in CONSTANTS.items() for one in names if not hasattr(modules[name], one)]
     if stale:
         raise AttributeError(f"constants that are not there: {stale}")
@@ -111,14 +114,25 @@ def constants(quick: bool) -> Iterator[Row]:
                     found += [change(usual[scene], after) for scene, after in scenes().items()]
                 finally:
                     setattr(modules[name], constant, value)
-            displacement, std, nodes = np.max(found, axis=0)
-            yield {
-                "part": f"{rooms[name]}/{name}",
-                "constant": words,
-                "displacement/stated": float(displacement),
-                "stated [%]": 100 * float(std),
-                "nodes [%]": 100 * float(nodes),
-            }
+            yield row(f"correlation/{name}", words, found)
+    for constant in STATISTICS:
+        words, value = constant.replace("_", " "), getattr(Statistics(), constant)
+        if not quick or words in QUICK:
+            varied = [scenes(replace(Statistics(), **{constant: scaled(value, factor)})) for factor in (0.5, 2)]
+            found = [change(usual[scene], after) for one in varied for scene, after in one.items()]
+            yield row("weights/light_weights", words, found)
+
+
+def row(part: str, constant: str, found: list[tuple[float, float, float]]) -> Row:
+    """The largest changes over the scenes."""
+    displacement, std, nodes = np.max(found, axis=0)
+    return {
+        "part": part,
+        "constant": constant,
+        "displacement/stated": float(displacement),
+        "stated [%]": 100 * float(std),
+        "nodes [%]": 100 * float(nodes),
+    }
 
 
 def change(before: Solution, after: Solution) -> tuple[float, float, float]:

@@ -326,20 +326,6 @@ def prepare_weights(
     return ThresholdWeights(threshold=weights.threshold, blur=weights.blur)
 
 
-_FREEDOM = 4.0
-"""Degrees of freedom of the Student distribution taken for the residual (Lange et al., J. Am. Stat. Assoc. 84, 1989,
-who found 4 to work well). With 2 or 8 lights under a reflection differ by 2e-3 px at most, beside a gap by 4e-2, their
-uncertainty by 11 % (benchmarks/constants.py)."""
-_LEAST_VARIANCE = 0.1
-"""Least variance of a light's residual that is believed, over the median of all. Chosen; with half or twice of it
-lights under a reflection do not change, those beside a gap by half their uncertainty, that by 59 %
-(benchmarks/constants.py)."""
-_ROUNDING = 1e-6
-"""Least variance of a residual, over that of the grey levels, where two images are the same: none is 0."""
-_OWN = 0.1
-"""Fraction of its variance that each light's residual is taken to have for itself: .03 to .3 measure the same."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ValidPixels:
     """Every valid pixel counts fully: no weighting. A `LightWeights`."""
@@ -357,7 +343,28 @@ class ValidPixels:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Statistics(ValidPixels):
-    """Every valid pixel counts by what the residual around it shows. A `LightWeights` and a `PrecisionMethod`."""
+    """Every valid pixel counts by what the residual around it shows. A `LightWeights` and a `PrecisionMethod`.
+
+    Attributes
+    ----------
+    freedom
+        Degrees of freedom of the Student distribution taken for the residual (Lange et al., J. Am. Stat. Assoc. 84,
+        1989, who found 4 to work well). With 2 or 8 lights under a reflection differ by 2e-3 px at most, beside a gap
+        by 4e-2, their uncertainty by 11 % (benchmarks/constants.py).
+    least_variance
+        Least variance of a light's residual that is believed, over the median of all. Chosen; with half or twice of it
+        lights under a reflection do not change, those beside a gap by half their uncertainty, that by 59 %
+        (benchmarks/constants.py).
+    rounding
+        Least variance of a residual, over that of the grey levels, where two images are the same: none is 0.
+    own
+        Fraction of its variance that each light's residual is taken to have for itself: .03 to .3 measure the same.
+    """
+
+    freedom: float = 4.0
+    least_variance: float = 0.1
+    rounding: float = 1e-6
+    own: float = 0.1
 
     def precision(self, residual: Residual) -> Precision:
         """Weights of the lights' best mean around each pixel, from their residuals.
@@ -386,15 +393,15 @@ class Statistics(ValidPixels):
         typical = _typical(covariance[lights, lights])
         if typical <= 0:
             return Precision(factor=np.ones_like(weights), bend=np.ones_like(weights[0]))
-        floor = np.float32(max(_LEAST_VARIANCE * typical, _ROUNDING * residual.contrast))
-        factor = spread(pixels, _best_fractions(covariance, floor))
+        floor = np.float32(max(self.least_variance * typical, self.rounding * residual.contrast))
+        factor = spread(pixels, _best_fractions(covariance, floor, self.own))
         mean, used, bend = np.empty((3, factor.shape[1]), dtype=np.float32)
         best_mean(factor, weights, residual.difference, mean, used, bend)
         variance, least = window_means(pixels, bend[None], used[None]), floor / len(factor)
         around = spread(pixels, np.maximum(variance, least))[0]
         displacing = displacing_fraction(residual.reference, mean, used / around)
         unit = max(np.float32(_typical(variance)), least)
-        robust_weights(mean, around, displacing, unit, np.float32(_FREEDOM), factor, bend)
+        robust_weights(mean, around, displacing, unit, np.float32(self.freedom), factor, bend)
         return Precision(factor=factor, bend=bend)
 
 
@@ -405,17 +412,17 @@ def _typical(variance: FloatImage) -> float:
     return float(np.median(known)) if known.size else 0.0
 
 
-def _best_fractions(covariance: FloatImage, least: np.float32) -> FloatImage:
+def _best_fractions(covariance: FloatImage, least: np.float32, own: float) -> FloatImage:
     """Solve ``C x = 1`` for the lights' fractions (k, h, w) of the mean of least variance, up to a factor.
 
-    C is the residuals' `covariance` (k, k, h, w), with variances of `least` or more.
+    C is the residuals' `covariance` (k, k, h, w), with variances of `least` or more and each light's `own` fraction.
     """
     lights = range(len(covariance))
     matrices = covariance.copy()
     matrices[lights, lights] = np.maximum(matrices[lights, lights], least)
     for a, b in combinations(lights, 2):
-        most = (1 - _OWN) * np.sqrt(matrices[a, a] * matrices[b, b])
-        matrices[a, b] = matrices[b, a] = np.clip((1 - _OWN) * matrices[a, b], -most, most)
+        most = (1 - own) * np.sqrt(matrices[a, a] * matrices[b, b])
+        matrices[a, b] = matrices[b, a] = np.clip((1 - own) * matrices[a, b], -most, most)
     fractions: FloatImage = np.ones_like(matrices[0])
     # elimination on whole grids: ten times as fast as a LAPACK call for each block
     for a, b in combinations(lights, 2):

@@ -9,7 +9,7 @@ from rgbmidic.correlation import Precision
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.mesh import Region
 from rgbmidic.weights import MaskWeights, Statistics
-from rgbmidic.weights.light_weights import _OWN, _best_fractions
+from rgbmidic.weights.light_weights import _best_fractions
 
 SIDE = 160
 REGION = (15, 15, SIDE - 16, SIDE - 16)
@@ -79,9 +79,11 @@ def test_the_best_fractions_are_the_inverse_covariance_times_one(lights):
     covariance = residuals @ residuals.swapaxes(2, 3)
     bounded = covariance.copy()
     own = np.broadcast_to(np.eye(lights, dtype=bool), covariance.shape)
-    bounded[~own] *= 1 - _OWN
+    bounded[~own] *= 1 - Statistics().own
     wanted = np.linalg.solve(bounded, np.ones((lights, 1)))[..., 0]
-    found = _best_fractions(np.moveaxis(covariance, (2, 3), (0, 1)).astype(np.float32), np.float32(1e-3))
+    found = _best_fractions(
+        np.moveaxis(covariance, (2, 3), (0, 1)).astype(np.float32), np.float32(1e-3), Statistics().own
+    )
     np.testing.assert_allclose(np.moveaxis(found, 0, 2), wanted, rtol=1e-3, atol=1e-6)
 
 
