@@ -43,12 +43,6 @@ from rgbmidic.scene.zones import Zones, facet_variance, slope_variance
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-WRINKLE_AREA = 0.085
-"""Area over which the erratic part of a reflection is correlated, in units of the wrinkles' spacing squared (measured,
-see the tests, at a lobe of 4 and slopes of 6 degrees; 0.06 at 3 and 8 degrees, 0.11 at 6 and 4)."""
-_SATURATED = 0.98
-"""Fraction of full scale from which the white paint is taken to saturate a channel: noise does the rest."""
-
 
 @cache
 def node_constant() -> float:
@@ -176,6 +170,11 @@ class Instrument:
         Of a pixel, and of the right-hand side per pixel.
     dome_pull
         Mean product of the gradients of texture and domes, px^-1.
+    wrinkle_area
+        Area over which the erratic part of a reflection is correlated, in units of the wrinkles' spacing squared
+        (measured, see the tests, at a lobe of 4 and slopes of 6 degrees; 0.06 at 3 and 8 degrees, 0.11 at 6 and 4).
+    saturation
+        Fraction of full scale from which the white paint is taken to saturate a channel: noise does the rest.
     """
 
     scene: Scene
@@ -184,6 +183,8 @@ class Instrument:
     residual: Energies
     score: Energies
     dome_pull: float
+    wrinkle_area: float = 0.085
+    saturation: float = 0.98
 
     @classmethod
     def of(
@@ -358,7 +359,7 @@ class Instrument:
             * other.fraction
             for one, other in ((before, before), (after, after), (before, after))
         ]
-        area = WRINKLE_AREA * (self.scene.surface.white.spacing / pixel_size(self.scene)) ** 2
+        area = self.wrinkle_area * (self.scene.surface.white.spacing / pixel_size(self.scene)) ** 2
         return np.asarray(area * np.maximum(parts[0] + parts[1] - 2 * common * parts[2], 0))
 
     def _dome_factor(self, zones: Zones) -> FloatArray:
@@ -383,7 +384,7 @@ class Instrument:
     def saturated(self, zones: Zones) -> BoolArray:
         """Where white paint is expected to saturate a channel that the light needs, (k, ...)."""
         mixing = _channel_mixing(self.scene)
-        full = _channels(mixing, self.white_level(zones)) > _SATURATED * self.scene.camera.full_scale
+        full = _channels(mixing, self.white_level(zones)) > self.saturation * self.scene.camera.full_scale
         unmixing = np.abs(np.linalg.pinv(mixing))
         needed = unmixing > NEGLIGIBLE * unmixing.max(axis=1, keepdims=True)
         return np.asarray(np.einsum("jc,c...->j...", needed.astype(float), full.astype(float)) > 0)

@@ -20,9 +20,6 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.typing import FloatArray, FloatImage
 
-LIMIT_DEG = 15.0
-"""Angle between the light and the mirror direction within which the reflection corrupts the image (paper, Fig. 9)."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reflectance:
@@ -125,30 +122,25 @@ def reflection(points: FloatArray, normals: FloatArray, lamps: npt.ArrayLike) ->
             f"points and normals have shape (3, ...), lamps (k, 3); given are {points.shape}, {normals.shape}, "
             f"{positions.shape}"
         )
-    view = _unit(-points)
-    parts = [_one(points, normals, view, lamp) for lamp in positions]
-    slopes, lambert, half, deviation = (np.stack(part) for part in zip(*parts, strict=True))
-    return Reflection(slopes=slopes, lambert=lambert, half=half, deviation_deg=deviation)
-
-
-def _one(
-    points: FloatArray, normals: FloatArray, view: FloatArray, lamp: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    light = _unit(lamp.reshape(3, *[1] * (points.ndim - 1)) - points)
-    lambert, facing = (normals * light).sum(axis=0), (normals * view).sum(axis=0)
-    halfway = _unit(light + view)
-    cosine = (normals * halfway).sum(axis=0)
+    view, light = _unit(-points), _unit(positions.reshape(-1, 3, *[1] * (points.ndim - 1)) - points, axis=1)
+    halfway = _unit(light + view, axis=1)
+    lambert, facing = (normals * light).sum(axis=1), (normals * view).sum(axis=0)
     mirror = 2 * facing * normals - view
-    deviation = np.degrees(np.arccos(np.clip((mirror * light).sum(axis=0), -1, 1)))
-    seen = (lambert > 0) & (facing > 0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        slopes = halfway / cosine - normals
-    half = (view * halfway).sum(axis=0)
-    return tuple(np.where(seen, part, np.nan) for part in (slopes, lambert, half, deviation))  # type: ignore[return-value]
+        slopes = halfway / (normals * halfway).sum(axis=1, keepdims=True) - normals
+    seen = (lambert > 0) & (facing > 0)
+    return Reflection(
+        slopes=np.where(seen[:, None], slopes, np.nan),
+        lambert=np.where(seen, lambert, np.nan),
+        half=np.where(seen, (view * halfway).sum(axis=1), np.nan),
+        deviation_deg=np.where(seen, np.degrees(np.arccos(np.clip((mirror * light).sum(axis=1), -1, 1))), np.nan),
+    )
 
 
-def angle_weights(deviation_deg: FloatArray, limit_deg: float = LIMIT_DEG) -> FloatImage:
+def angle_weights(deviation_deg: FloatArray, limit_deg: float = 15.0) -> FloatImage:
     """Binary weights: 0 within `limit_deg` of the mirror direction and where the deviation is NaN, 1 elsewhere.
+
+    By default the limit is that within which the reflection corrupts the image (paper, Fig. 9).
 
     Raises
     ------
@@ -196,6 +188,6 @@ def surface_from_heights(
     return points, _unit(np.cross(down, right, axis=0))
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
+def _unit(vectors: FloatArray, axis: int = 0) -> FloatArray:
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(vectors / np.linalg.norm(vectors, axis=0))
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=axis, keepdims=True))

@@ -20,10 +20,6 @@ from rgbmidic.typing import FloatArray
 
 REFLECTS = 0.2
 """Specular fraction from which a light counts as reflecting at a point (chosen; the forecast does not use it)."""
-_DOME_SLOPE = 4 / 3
-"""Mean square slope of a droplet's dome h (1 - r^2/R^2)^2 over its disc, in units of (h/R)^2 (its integral)."""
-_MARGIN = 20.0
-"""Pixels between the frame's edge and the nearest point of a region that the scene does not state."""
 
 
 def material_points(
@@ -147,7 +143,7 @@ def intersect(scene: Scene, state: State, x: FloatArray, y: FloatArray) -> Float
 
 
 def region_in_view(
-    x: FloatArray, y: FloatArray, displacement: FloatArray, shape: tuple[int, int]
+    x: FloatArray, y: FloatArray, displacement: FloatArray, shape: tuple[int, int], margin: float = 20.0
 ) -> tuple[float, float, float, float]:
     """Return the largest rectangle about the middle on the body and, with a margin, in the frame in all states.
 
@@ -159,6 +155,8 @@ def region_in_view(
         Of these points in every state, px; NaN off the body.
     shape
         Rows and columns of the frame.
+    margin
+        px between the frame's edge and the region's nearest point in any state.
 
     Returns
     -------
@@ -173,7 +171,7 @@ def region_in_view(
     height, width = shape
     seen = np.asarray(np.isfinite(displacement[:, 0]).all(axis=0))
     largest = np.abs(displacement[:, :, seen]).max(axis=(0, 2)) if seen.any() else np.zeros(2)
-    left, top = (float(np.ceil(value)) + _MARGIN for value in largest)
+    left, top = (float(np.ceil(value)) + margin for value in largest)
     middle = (width - 1) / 2, (height - 1) / 2
     while 2 * left < width - 8 and 2 * top < height - 8:
         inside = (abs(x - middle[0]) <= middle[0] - left) & (abs(y - middle[1]) <= middle[1] - top)
@@ -189,7 +187,8 @@ def macroscopic(surface: Surface) -> Reflectance:
     A facet's Gaussian lobe of variance b^2 convolved with slopes of variance a^2 per axis is a Gaussian of variance
     ``a^2 + b^2`` whose peak is lower by ``b^2/(a^2 + b^2)``. Where the paints differ the lobe keeps peak and volume.
     """
-    dome = _DOME_SLOPE * (surface.dome / (surface.droplet / 2)) ** 2 / 2
+    # per axis, half of the mean square slope of the dome h (1 - r^2/R^2)^2 over its disc: 4/3 (h/R)^2, its integral
+    dome = 4 / 3 * (surface.dome / (surface.droplet / 2)) ** 2 / 2
     parts = ((surface.white, 0.0, 1 - surface.coverage), (surface.black, dome, surface.coverage))
     diffuse = sum(paint.albedo * area for paint, _, area in parts)
     volume = sum(paint.gloss * facet_variance(paint) * area for paint, _, area in parts)
