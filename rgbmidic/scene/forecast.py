@@ -32,7 +32,7 @@ import scipy.sparse as sp
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.equations import SEEN
 from rgbmidic.correlation.nodes import LOST
-from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std, linear_fit_offset, mass_matrix
+from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std, linear_fit_offset
 from rgbmidic.illumination.crosstalk import NEGLIGIBLE
 from rgbmidic.illumination.linear import QUANTISATION
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -48,18 +48,15 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 def node_constant() -> float:
     """Variance of an inner node's value per unit of white noise density and element area: about 1.1.
 
-    On a regular mesh the linear fit has the inverse of the consistent mass matrix (2.6 on its diagonal); the
-    recovery of the nodal values reduces it.
+    `expected_std` of a regular mesh: the linear fit has the inverse of the consistent mass matrix (2.6 on its
+    diagonal); the recovery of the nodal values reduces it.
     """
     side = 16
     mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 10 * side, 10 * side), (10 * side + 1,) * 2), 10)
-    everywhere = np.ones(len(mesh.elements), dtype=bool)
-    recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes)), linear_fit_offset(mesh))
-    value = recovery.value.toarray()
-    variance = np.einsum("ij,ij->i", value @ np.linalg.inv(mass_matrix(mesh).toarray()), value)
+    (std,) = expected_std(mesh, *np.ones((2, len(mesh.elements))))
     # an even number of rows and columns: as many nodes with eight triangles as with four
     inner = (np.abs(mesh.nodes / 10 - side / 2 + 0.5) < side / 4).all(axis=1)
-    return float(variance[inner].mean() * mesh.size**2)
+    return float((std[inner] ** 2).mean() * mesh.size**2)
 
 
 def light_pull(contrast: npt.NDArray[Floating], residual: npt.NDArray[Floating]) -> npt.NDArray[Floating]:
@@ -427,12 +424,8 @@ def _facet_covariance(first: FloatArray, second: FloatArray, a2: float, b2: floa
 
     The part that is linear in the facets' slopes is left out.
     """
-    middle, apart = (first + second) / 2, first - second
-
-    def square(vector: FloatArray) -> FloatArray:
-        return np.asarray((vector**2).sum(axis=1))
-
-    mean = 2 * math.log(b2 / (a2 + b2)) - (square(first) + square(second)) / (2 * (a2 + b2))
-    product = math.log(b2 / (2 * a2 + b2)) - square(apart) / (4 * b2) - square(middle) / (2 * a2 + b2)
-    linear = (first * second).sum(axis=1) * a2 / (a2 + b2) ** 2
-    return np.asarray(np.exp(np.minimum(product - mean, 50.0)) - 1 - linear)
+    squares, product = (first**2 + second**2).sum(axis=1), (first * second).sum(axis=1)
+    means = 2 * math.log(b2 / (a2 + b2)) - squares / (2 * (a2 + b2))
+    apart, middle = squares - 2 * product, (squares + 2 * product) / 4
+    together = math.log(b2 / (2 * a2 + b2)) - apart / (4 * b2) - middle / (2 * a2 + b2)
+    return np.asarray(np.exp(np.minimum(together - means, 50.0)) - 1 - product * a2 / (a2 + b2) ** 2)
