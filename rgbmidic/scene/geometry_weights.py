@@ -9,13 +9,13 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.scene.forecast import Instrument
-from rgbmidic.scene.reflection import angle_weights, surface_from_heights
 from rgbmidic.scene.scene import Scene, State, read_scene
-from rgbmidic.scene.zones import Zones, material_points, predict_zones, zones_on_surface
+from rgbmidic.scene.zones import Zones, material_points, predict_zones, unit, zones_on_surface
 from rgbmidic.settings import TestSettings, regular
 from rgbmidic.typing import FloatArray, FloatImage
 
@@ -191,3 +191,54 @@ def _read_surface(path: Path, scene: Scene, step: int) -> tuple[FloatArray, Floa
         np.minimum(place, limit).astype(int) for place, limit in zip(_grid(camera.shape, step), limits, strict=True)
     )
     return points[:, rows, columns], normals[:, rows, columns]
+
+
+def angle_weights(deviation_deg: FloatArray, limit_deg: float = 15.0) -> FloatImage:
+    """Binary weights: 0 within `limit_deg` of the mirror direction and where the deviation is NaN, 1 elsewhere.
+
+    By default the limit is that within which the reflection corrupts the image (paper, Fig. 9).
+
+    Raises
+    ------
+    InputError
+        The limit is not an angle between 0 and 180 degrees.
+    """
+    if not 0 < limit_deg < 180:
+        raise InputError(f"the limit angle lies between 0 and 180 degrees, not {limit_deg!r}")
+    return (deviation_deg > limit_deg).astype(np.float32)
+
+
+def surface_from_heights(
+    heights: npt.ArrayLike, *, distance: float, focal_px: float, centre: tuple[float, float]
+) -> tuple[FloatArray, FloatArray]:
+    """Points and normals of a surface given as a height map over the pixels of the reference image.
+
+    Parameters
+    ----------
+    heights : array_like, shape (H, W)
+        Height (mm) towards the camera over the plane at `distance`, at every pixel; NaN where not known. Smooth at the
+        scale of the speckle: droplets and wrinkles belong to the reflectance.
+    distance
+        Distance (mm) of that plane from the camera.
+    focal_px, centre
+        Focal length and principal point (x, y) in px.
+
+    Returns
+    -------
+    points, normals : ndarray, shape (3, H, W)
+
+    Raises
+    ------
+    InputError
+        Not one image, or a height that reaches the camera.
+    """
+    height = np.asarray(heights, dtype=np.float64)
+    if height.ndim != 2 or min(height.shape) < 2:
+        raise InputError(f"a height map is one image (H, W), not an array of shape {height.shape}")
+    depth = distance - height
+    if not np.nanmin(depth, initial=np.inf) > 0:
+        raise InputError(f"heights must stay below the distance of {distance:g} mm to the camera")
+    rows, columns = np.mgrid[: height.shape[0], : height.shape[1]]
+    points = np.stack([depth * (columns - centre[0]) / focal_px, depth * (rows - centre[1]) / focal_px, depth])
+    down, right = np.gradient(points, axis=(1, 2))
+    return points, unit(np.cross(down, right, axis=0))

@@ -17,7 +17,7 @@ from rgbmidic.illumination.crosstalk import align
 from rgbmidic.illumination.demosaicing import SMALLEST_FRAME
 from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
-from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel, linearise
+from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection.prediction import LocalContrast, Prediction, predict, separated
 from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
@@ -35,7 +35,6 @@ from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatImage
 
 Frame = Mosaic | ChannelFrame
-Linear = Sequence[LinearMosaic | LinearChannels]
 Progress = Callable[[int, int, str], None]
 
 
@@ -190,8 +189,12 @@ def inspect_frame(
     texture, local = state.texture or speckle, replace(mesh, nodes=mesh.nodes - window.origin)
     prediction = predict(local, region, shown, errors, texture=texture, prefilter=prefilter)
     report(3, 3, "done")
-    first = linear[0]
+    first, greens = linear[0], 0.0
     single = not isinstance(first, LinearMosaic) and len(first.values) == 1
+    if isinstance(first, LinearMosaic):
+        green = sampled_channels(first.cfa, first.values.shape) == 1
+        means = [float(first.values[row::2][green[row::2]].mean()) for row in (0, 1)]
+        greens = abs(means[0] - means[1]) / max(sum(means) / 2, 1e-6)
     return Inspection(
         name=name,
         kind="bayer" if isinstance(first, LinearMosaic) else "monochrome" if single else "rgb",
@@ -213,7 +216,7 @@ def inspect_frame(
         element_size=element_size,
         mesh=mesh,
         prediction=prediction,
-        greens=_green_difference(first) if isinstance(first, LinearMosaic) else 0.0,
+        greens=greens,
     )
 
 
@@ -322,10 +325,3 @@ def _light_summaries(
             )
         )
     return tuple(summaries)
-
-
-def _green_difference(mosaic: LinearMosaic) -> float:
-    """Difference of the means of the two greens of a mosaic over their mean."""
-    green = sampled_channels(mosaic.cfa, mosaic.values.shape) == 1
-    first, second = (float(mosaic.values[row::2][green[row::2]].mean()) for row in (0, 1))
-    return abs(first - second) / max((first + second) / 2, 1e-6)

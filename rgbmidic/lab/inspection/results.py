@@ -192,36 +192,13 @@ class Inspection:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """The warnings, the gravest first."""
-        return tuple(findings(self))
+        return (*_of_set_up(self), *_of_exposure(self), *_of_speckle(self), *_of_region(self))
 
     @property
     def speckle_px(self) -> float:
         """Speckle size: the median over the channels; px, NaN where there is no texture."""
         sizes = [channel.speckle_px for channel in self.channels if np.isfinite(channel.speckle_px)]
         return float(np.median(sizes)) if sizes else float("nan")
-
-
-def findings(inspection: Inspection) -> Iterator[Finding]:
-    """Warnings that an inspection gives rise to."""
-    yield from _of_set_up(inspection)
-    yield from _of_exposure(inspection)
-    yield from _of_speckle(inspection)
-    hidden, dark = (float(where[inspection.region].mean()) for where in (inspection.hidden, inspection.background))
-    if hidden > CONSTANTS.hidden:
-        what, why = (
-            ("no light shows", "all lights reflect or saturate there") if len(inspection.lights) > 1 else _ONE_LIGHT
-        )
-        reasons = []
-        if dark > CONSTANTS.hidden:
-            reasons.append(f"it holds dark background ({dark:.1%}), draw it inside the specimen")
-        if hidden - dark > CONSTANTS.hidden or not reasons:
-            reasons.append(f"{why}, or there is no paint")
-        yield Finding("hidden", f"{what} the texture on {hidden:.1%} of the region: {'; '.join(reasons)}")
-    if inspection.unmeasured > 0:
-        yield Finding("not measured", f"{inspection.unmeasured:.1%} of the nodes will not be measured")
-
-
-_ONE_LIGHT = "the light does not show", "it reflects or saturates there"
 
 
 def _of_set_up(inspection: Inspection) -> Iterator[Finding]:
@@ -292,3 +269,19 @@ def _of_speckle(inspection: Inspection) -> Iterator[Finding]:
             f"speckles of {size:.1f} px are coarse for elements of {inspection.element_size:g} px: at least "
             f"{SPECKLES:g} per side, so element_size = {np.ceil(SPECKLES * size):.0f} or finer speckle",
         )
+
+
+def _of_region(inspection: Inspection) -> Iterator[Finding]:
+    hidden, dark = (float(where[inspection.region].mean()) for where in (inspection.hidden, inspection.background))
+    if hidden > CONSTANTS.hidden:
+        what, why = "the light does not show", "it reflects or saturates there"
+        if len(inspection.lights) > 1:
+            what, why = "no light shows", "all lights reflect or saturate there"
+        reasons = []
+        if dark > CONSTANTS.hidden:
+            reasons.append(f"it holds dark background ({dark:.1%}), draw it inside the specimen")
+        if hidden - dark > CONSTANTS.hidden or not reasons:
+            reasons.append(f"{why}, or there is no paint")
+        yield Finding("hidden", f"{what} the texture on {hidden:.1%} of the region: {'; '.join(reasons)}")
+    if inspection.unmeasured > 0:
+        yield Finding("not measured", f"{inspection.unmeasured:.1%} of the nodes will not be measured")
