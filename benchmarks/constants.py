@@ -8,9 +8,8 @@ shows another texture, two bodies move apart, a shadow takes nearly all contrast
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -19,8 +18,8 @@ import numpy as np
 from textures import Affine, Texture
 
 from rgbmidic import Region, Solution, SolverSettings, Tri3Mesh
-from rgbmidic.correlation import Deformed, Reference, Start, track
-from rgbmidic.correlation.images import as_light_stack
+from rgbmidic.correlation import Deformed, Reference, SolverConstants, Start, track
+from rgbmidic.correlation.images import SlidingWindow, as_light_stack
 from rgbmidic.correlation.start import Search
 from rgbmidic.settings import ELEMENT_SIZE, grey_levels
 from rgbmidic.typing import FloatArray
@@ -29,24 +28,51 @@ from rgbmidic.weights import Statistics, as_weights
 from .tables import Row, table
 
 SHAPE, REGION = (200, 240), (15, 15, 222, 182)
-CONSTANTS = {
-    "equations": ("_SMOOTHNESS", "_LONGEST_STEP", "_PATIENCE"),
-    "assembly": ("_ANCHOR",),
-    "uncertainty": ("_EVEN", "_SCORE_RANGE", "_PRIOR"),
-    "images": ("_RANGE",),
-    "residual": ("_SMOOTHNESS", "_FITTED", "_TURNS"),
-    "nodes": ("_WORSE", "_ONE_SIDED", "_NOISY"),
-    "solve": ("_STARTED", "_WANDERING", "_SWINGING", "_SETTLED"),
-    "light_weights": ("_FREEDOM", "_LEAST_VARIANCE", "_OWN"),
+VARIED = {
+    "solver": (
+        *("smoothness", "longest_step", "patience", "anchor", "even", "score_range", "prior", "gain_smoothness"),
+        *("worse", "one_sided", "noisy", "begun", "wandering", "swinging", "settled"),
+    ),
+    "window": ("sigma",),
+    "search": ("normalise", "flat", "grey", "voters", "tolerance", "context"),
+    "statistics": ("freedom", "least_variance", "own"),
 }
-SEARCH = ("normalise", "flat", "grey", "voters", "tolerance", "context")
-"""Fields of the search for a start."""
-QUICK = ("anchor", "even", "grey", "least variance", "noisy", "range", "smoothness", "swinging")
-"""At least one of each module."""
+"""Constants of each part of the method."""
+QUICK = ("anchor", "even", "grey", "least_variance", "noisy", "sigma", "smoothness", "swinging")
+"""At least one of each part."""
 NOTHING = {"displacement/stated": 1e-3, "stated [%]": 0.01}
 """What is as good as no change: the last iteration of a solve may move the nodes by so much."""
-COARSE = {"_SMOOTHNESS": 10, "_ANCHOR": 10, "_SETTLED": 100, "voters": 10, "tolerance": 100}
+COARSE = {"smoothness": 10, "anchor": 10, "settled": 100, "voters": 10, "tolerance": 100}
 """Constants of which only the order of magnitude counts, and factors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """The parts of the method that have constants."""
+
+    solver: SolverConstants = field(default_factory=SolverConstants)
+    window: SlidingWindow = field(default_factory=SlidingWindow)
+    search: Search = field(default_factory=Search)
+    statistics: Statistics = field(default_factory=Statistics)
+
+    def scaled(self, part: str, name: str, factor: float) -> Method:
+        """The method with one constant times a factor, a whole one rounded."""
+        value = getattr(getattr(self, part), name)
+        other = max(1, round(value * factor)) if isinstance(value, int) else value * factor
+        return replace(self, **{part: replace(getattr(self, part), **{name: other})})
+
+    def solve(self, first: FloatArray, second: FloatArray, **options: Any) -> Solution:
+        """What `correlate` gives with this method."""
+        f, g = as_light_stack(first, "first"), as_light_stack(second, "second")
+        weights = as_weights(options.pop("weights", None), f.shape, "weights")
+        region = Region.from_rectangle(REGION, SHAPE)
+        mesh = Tri3Mesh.from_region(region, options.pop("element_size", ELEMENT_SIZE))
+        _, settings = grey_levels(0.0, SolverSettings(**options), cracked=False)
+        prefilter = settings.prefilter
+        reference = Reference.prepare(f, region, weights, mesh=mesh, prefilter=prefilter, constants=self.solver)
+        deformed = Deformed.prepare(g, None, prefilter=prefilter)
+        statistics = replace(self.statistics, window=self.window)
+        return track(reference, deformed, Start(displacement=None), settings, statistics, self.search)
 
 
 @cache
@@ -64,7 +90,7 @@ def images() -> tuple[FloatArray, FloatArray]:
     return first, second
 
 
-def scenes(search: Search) -> dict[str, Solution]:
+def scenes(method: Method) -> dict[str, Solution]:
     """Solve the scenes."""
     first, second = images()
     weights = np.ones_like(first)
@@ -78,31 +104,14 @@ def scenes(search: Search) -> dict[str, Solution]:
     dark = 100 + (moved - 100) * (1 - 0.97 * np.exp(-((x - 120) ** 2 + (y - 100) ** 2) / (2 * 25**2)))
     noisy = [one + rng.normal(0, 3, SHAPE) for one in (rest, another, apart, dark)]
     return {
-        "hole": pair(search, noisy[0], noisy[1], element_size=14),
-        "apart": pair(search, noisy[0], noisy[2], element_size=14),
-        "shadow": pair(search, noisy[0], noisy[3], element_size=14, brightness="local"),
-        "shadow, mean": pair(search, noisy[0], noisy[3], element_size=14, brightness="mean"),
-        "lights": pair(search, first, second, brightness="local"),
-        "gap": pair(search, first, second, weights=weights, element_size=15, rigid="translation"),
-        "one": pair(search, first[0], second[0], element_size=12),
+        "hole": method.solve(noisy[0], noisy[1], element_size=14),
+        "apart": method.solve(noisy[0], noisy[2], element_size=14),
+        "shadow": method.solve(noisy[0], noisy[3], element_size=14, brightness="local"),
+        "shadow, mean": method.solve(noisy[0], noisy[3], element_size=14, brightness="mean"),
+        "lights": method.solve(first, second, brightness="local"),
+        "gap": method.solve(first, second, weights=weights, element_size=15, rigid="translation"),
+        "one": method.solve(first[0], second[0], element_size=12),
     }
-
-
-def pair(search: Search, first: FloatArray, second: FloatArray, **options: Any) -> Solution:
-    """What `correlate` gives, with a search for the start of its own."""
-    f, g = as_light_stack(first, "first"), as_light_stack(second, "second")
-    weights = as_weights(options.pop("weights", None), f.shape, "weights")
-    region = Region.from_rectangle(REGION, SHAPE)
-    mesh = Tri3Mesh.from_region(region, options.pop("element_size", ELEMENT_SIZE))
-    _, solver = grey_levels(0.0, SolverSettings(**options), cracked=False)
-    reference = Reference.prepare(f, region, weights, mesh=mesh, prefilter=solver.prefilter)
-    deformed = Deformed.prepare(g, None, prefilter=solver.prefilter)
-    return track(reference, deformed, Start(displacement=None), solver, Statistics(), search)
-
-
-def scaled(value: Any, factor: float) -> Any:
-    """Return a number times a factor, a whole one rounded."""
-    return max(1, round(value * factor)) if isinstance(value, int) else value * factor
 
 
 @table("constants", page="explanation/uncertainty", cost=20, keys=2, seed=3, within=NOTHING)
@@ -111,44 +120,22 @@ def constants(quick: bool) -> Iterator[Row]:
     root mean square change of the displacement over its stated uncertainty, change of the median stated uncertainty,
     and of the fraction of nodes measured; the larger of the two, in the scene where it is largest.
     """
-    rooms = {name: "weights" if name == "light_weights" else "correlation" for name in CONSTANTS}
-    modules = {name: importlib.import_module(f"rgbmidic.{room}.{name}") for name, room in rooms.items()}
-    stale = [(name, one) for name, names in CONSTANTS.items() for one in names if not hasattr(modules[name], one)]
-    if stale:
-        raise AttributeError(f"constants that are not there: {stale}")
-    usual = scenes(Search())
-    for name, names in CONSTANTS.items():
-        for constant in names:
-            words = constant.strip("_").lower().replace("_", " ")
-            if quick and words not in QUICK:
+    usual = scenes(Method())
+    for part, names in VARIED.items():
+        for name in names:
+            if quick and name not in QUICK:
                 continue
-            changed, value = [], getattr(modules[name], constant)
-            coarse = 2 if name == "residual" else COARSE.get(constant, 2)
-            for factor in (1 / coarse, coarse):
-                setattr(modules[name], constant, scaled(value, factor))
-                try:
-                    changed.append(scenes(Search()))
-                finally:
-                    setattr(modules[name], constant, value)
-            yield row(f"{rooms[name]}/{name}", words, usual, changed)
-    for field in SEARCH:
-        if not quick or field in QUICK:
-            value, coarse = getattr(Search(), field), COARSE.get(field, 2)
-            changed = [scenes(replace(Search(), **{field: scaled(value, one)})) for one in (1 / coarse, coarse)]
-            yield row("correlation/start", field, usual, changed)
-
-
-def row(part: str, constant: str, usual: dict[str, Solution], changed: list[dict[str, Solution]]) -> Row:
-    """What a constant changes."""
-    found = [change(usual[scene], after) for one in changed for scene, after in one.items()]
-    displacement, std, nodes = np.max(found, axis=0)
-    return {
-        "part": part,
-        "constant": constant,
-        "displacement/stated": float(displacement),
-        "stated [%]": 100 * float(std),
-        "nodes [%]": 100 * float(nodes),
-    }
+            coarse = COARSE.get(name, 2)
+            changed = [scenes(Method().scaled(part, name, factor)) for factor in (1 / coarse, coarse)]
+            found = [change(usual[scene], after) for one in changed for scene, after in one.items()]
+            displacement, std, nodes = np.max(found, axis=0)
+            yield {
+                "part": part,
+                "constant": name.replace("_", " "),
+                "displacement/stated": float(displacement),
+                "stated [%]": 100 * float(std),
+                "nodes [%]": 100 * float(nodes),
+            }
 
 
 def change(before: Solution, after: Solution) -> tuple[float, float, float]:

@@ -22,9 +22,9 @@ from rgbmidic.lab.virtual import Camera, State, record, render, truth, turned
 from rgbmidic.lab.virtual.rendering import sphere_scene
 from rgbmidic.mesh import Region
 from rgbmidic.scene.forecast import Instrument, trace_change
+from rgbmidic.scene.geometry_weights import GeometryWeights
 from rgbmidic.scene.zones import material_points, predict_zones
 from rgbmidic.typing import FloatArray, FloatImage
-from rgbmidic.weights.geometry import GeometryWeights
 
 from .demosaicing import NAMED, Case, errors
 from .tables import table
@@ -158,7 +158,7 @@ def geometry_weights(quick: bool) -> Iterator[dict[str, object]]:
             exact, cells = truth(scene, state), {}
             known: dict[str, Any] = {
                 "scene": scene, "states": (State(), state), "reference_frames": (0,), "order": (0, 1, 2),
-                "instrument": Instrument.of(scene),
+                "instrument": Instrument.of(scene), "step": 4,
             }  # fmt: skip
             ways = {
                 "geometry": GeometryWeights(limit_deg=None, **known),

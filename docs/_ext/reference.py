@@ -43,7 +43,7 @@ MODULES = [
     "rgbmidic.scene.scene",
     "rgbmidic.scene.camera",
     "rgbmidic.scene.surface",
-    "rgbmidic.scene.reflection",
+    "rgbmidic.scene.geometry_weights",
     "rgbmidic.scene.speckle",
     "rgbmidic.scene.zones",
     "rgbmidic.scene.forecast",

@@ -66,7 +66,7 @@ class DiscretisationConstants:
         fields).
     chance
         Noise by what the finer mesh leaves, over the stated one, from which it is less by chance: both are known to 6
-        to 12 % (67 blocks, `SolverConstants`), and nothing is taken off. Of values below it the mean is too small by about
+        to 12 % (67 blocks), and nothing is taken off. Of values below it the mean is too small by about
         half of what is missing (measured: .9).
     held
         Fraction of the mean texture that is added to that of an element, so that its square root exists (derived).

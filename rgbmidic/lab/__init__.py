@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ from rgbmidic.errors import ResultError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["check_folder", "number_or_none", "write_findings"]
+__all__ = ["check_folder", "plain", "write_findings"]
 
 
 def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
@@ -42,46 +43,54 @@ def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
         )
 
 
-def number_or_none(value: float) -> float | None:
-    """Return a number for a JSON document, which has neither NaN nor infinity: None for these.
+def plain(value: Any) -> Any:
+    """Return a value as JSON holds it: dataclasses as objects, None for a number that is not known.
 
     Parameters
     ----------
     value
-        The number.
+        A number, a text, a dataclass, or a mapping or sequence of such.
 
     Returns
     -------
-    float or None
+    object
     """
-    return float(value) if math.isfinite(value) else None
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    if isinstance(value, Mapping):
+        return {key: plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write_findings(out: Path, name: str, document: Mapping[str, Any], figure: Figure) -> None:
-    """Write a document as NAME.json and a figure as NAME.png into a folder, which is made where it does not exist.
+def write_findings(out: Path, contents: Mapping[str, Mapping[str, Any] | str | Figure], *, overwrite: bool) -> None:
+    """Write documents (JSON), texts and figures into a folder, which is made where it does not exist.
 
     Parameters
     ----------
     out
         The folder.
-    name
-        Name of both files, without ending.
-    document
-        Content of the JSON file.
-    figure
-        Figure of matplotlib.
+    contents
+        By the names of the files.
+    overwrite
+        Whether files of these names may be replaced.
 
     Raises
     ------
     ResultError
-        A file cannot be written.
+        A file is already there, or cannot be written.
     """
     from rgbmidic.report.style import save_figure
 
-    path = out / f"{name}.json"
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise ResultError(f"{path} cannot be written: {error.strerror or error}") from None
-    save_figure(figure, path.with_suffix(".png"))
+    check_folder(out, list(contents), overwrite=overwrite)
+    for path, content in ((out / name, content) for name, content in contents.items()):
+        if not isinstance(content, str | Mapping):
+            save_figure(content, path)
+            continue
+        text = content if isinstance(content, str) else json.dumps(content, indent=2, allow_nan=False) + "\n"
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise ResultError(f"{path} cannot be written: {error.strerror or error}") from None

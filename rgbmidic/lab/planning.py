@@ -12,7 +12,7 @@ the fourth power of its diffuse fraction, the weighting of a user who trusts no 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import permutations
 
@@ -28,23 +28,44 @@ from rgbmidic.scene.zones import REFLECTS, Zones, material_points, predict_zones
 from rgbmidic.settings import IlluminationSettings
 from rgbmidic.typing import BoolArray, FloatArray
 
-AZIMUTH_STEP = 15.0
-"""Degrees about the optical axis between the directions that are tried."""
-INCLINATIONS = (20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)
-"""Degrees from the optical axis: not before the lens, not so oblique that wrinkles throw shadows."""
-APART = 20.0
-"""Least angle (degrees) between two lamps, seen from the specimen."""
-_POINTS = 300
-"""Points of the field at which lamps are compared; chosen for the time that it takes."""
-_STATES = 6
-"""States at which they are compared; chosen for the time that it takes."""
-_DIFFUSE_POWER = 4
-"""Power of the diffuse fraction in the cost (see above); chosen."""
-_WORTHWHILE = 1.02
-"""Gain from which lamps are moved; chosen: less is not worth mounting."""
-_AFFORDABLE = 1.2
-"""Largest growth of the expected uncertainty for lamps that are moved, which then stand more obliquely: a reflection
-that hardly adds to the uncertainty need not be avoided at any price; chosen."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanningConstants:
+    """Constants of planning.
+
+    Attributes
+    ----------
+    grid_points
+        Points of the prediction along the longer side of the frame; chosen: zones are far wider than a step.
+    points, states
+        Points of the field, and states, at which lamps are compared; chosen for the time that it takes.
+    azimuth_step
+        Degrees about the optical axis between the directions that are tried.
+    inclinations
+        Degrees from the optical axis: not before the lens, not so oblique that wrinkles throw shadows.
+    apart
+        Least angle (degrees) between two lamps, seen from the specimen.
+    diffuse_power
+        Power of the diffuse fraction in the cost; chosen.
+    worthwhile
+        Gain from which lamps are moved; chosen: less is not worth mounting.
+    affordable
+        Largest growth of the expected uncertainty for lamps that are moved, which then stand more obliquely: a
+        reflection that hardly adds to the uncertainty need not be avoided at any price; chosen.
+    """
+
+    grid_points: int = 80
+    points: int = 300
+    states: int = 6
+    azimuth_step: float = 15.0
+    inclinations: tuple[float, ...] = (20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)
+    apart: float = 20.0
+    diffuse_power: int = 4
+    worthwhile: float = 1.02
+    affordable: float = 1.2
+
+
+CONSTANTS = PlanningConstants()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,22 +91,25 @@ class Proposal:
 
 def propose_colours(plan: Plan) -> Proposal:
     """Return the present lamp directions with the colours exchanged for the best."""
-    compared = _Compared.of(plan, _directions(plan.scene))
-    orders = permutations(range(len(plan.scene.lights)))
-    return compared.proposal(plan, min(orders, key=compared.cost), affordable=1.0)
+    search = _Search.of(plan, _directions(plan.scene))
+    return search.proposal(plan, min(permutations(range(len(plan.scene.lights))), key=search.cost), affordable=1.0)
 
 
 def propose_lamps(plan: Plan) -> Proposal:
     """Return the best directions of a grid over azimuth and inclination, with the best colour for each."""
+    angles = np.arange(0, 360, CONSTANTS.azimuth_step), np.array(CONSTANTS.inclinations)
+    azimuth, inclination = np.radians(np.meshgrid(*angles, indexing="ij")).reshape(2, -1)
+    across = np.sin(inclination)
+    grid = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), -np.cos(inclination)], axis=1)
     present = _directions(plan.scene)
-    compared = _Compared.of(plan, np.concatenate([present, _grid()]))
+    search = _Search.of(plan, np.concatenate([present, grid]))
     orders = list(permutations(range(len(present))))
-    guesses = sorted(orders, key=compared.cost)[:2] + [compared.greedy(order) for order in orders[:6]]
-    return compared.proposal(plan, min(map(compared.descend, guesses), key=compared.cost), _AFFORDABLE)
+    guesses = sorted(orders, key=search.cost)[:2] + [search.greedy(order) for order in orders[:6]]
+    return search.proposal(plan, min(map(search.descend, guesses), key=search.cost), CONSTANTS.affordable)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Compared:
+class _Search:
     """Directions with the information that each light would give from each.
 
     `information` (k, directions, states, points); `directions` (directions, 3), unit vectors from the specimen.
@@ -95,21 +119,37 @@ class _Compared:
     information: FloatArray
 
     @classmethod
-    def of(cls, plan: Plan, directions: FloatArray) -> _Compared:
-        scene, instrument = plan.scene, plan.instrument
+    def of(cls, plan: Plan, directions: FloatArray) -> _Search:
+        """Inverse variance of each light's pull, times the fourth power of its diffuse fraction."""
+        scene = plan.scene
         rows, columns = np.nonzero(plan.inside)
-        some = slice(None, None, max(1, rows.size // _POINTS))
+        some = slice(None, None, max(1, rows.size // CONSTANTS.points))
         pixels = plan.x[rows[some], columns[some]], plan.y[rows[some], columns[some]]
         material = material_points(scene, None, pixels)
-        index = np.unique(np.linspace(0, len(plan.outlooks) - 1, _STATES).round().astype(int))
-        states = [plan.outlooks[i].state for i in index]
+        index = np.unique(np.linspace(0, len(plan.outlooks) - 1, CONSTANTS.states).round().astype(int))
         brightness = np.nan_to_num(np.nanmean(plan.reference.level[:, plan.inside], axis=1))
+
+        def clear(light: int, before: Zones, after: Zones) -> FloatArray:
+            variance = plan.instrument.light_variance(light, before, after, brightness)
+            with np.errstate(invalid="ignore"):
+                diffuse = 1 - np.fmax(before.fraction, after.fraction)
+                levels = np.fmax(*(plan.instrument.white_level(zones) for zones in (before, after)))
+                seen = levels < scene.camera.full_scale
+                return np.nan_to_num(np.where(seen, diffuse**CONSTANTS.diffuse_power / variance, 0.0))
+
         information = []
         for light, lamp in enumerate(scene.lights):
+            # one light in all its places, seen as brightly as the camera sees its colour
+            camera = replace(scene.camera, crosstalk=None, sensitivities=None)
+            alone = replace(scene, lights=(lamp,), camera=camera)
+            response = scene.camera.response(scene.lights).max(axis=0)[light]
             candidates = tuple(_placed(lamp, scene, direction) for direction in directions)
-            before, *after = (_zones(scene, candidates, light, material, state) for state in (State(), *states))
-            clear = [_clear(instrument, light, before, one, brightness) for one in after]
-            information.append(np.stack(clear, axis=1))
+            predicted = [
+                predict_zones(alone, state, material=material, lights=candidates)
+                for state in (State(), *(plan.outlooks[i].state for i in index))
+            ]
+            before, *after = (replace(zones, irradiance=zones.irradiance * response) for zones in predicted)
+            information.append(np.stack([clear(light, before, zones) for zones in after], axis=1))
         return cls(directions=directions, information=np.stack(information))
 
     def cost(self, choice: Iterable[int]) -> float:
@@ -117,31 +157,28 @@ class _Compared:
         total = sum(self.information[light, place] for light, place in enumerate(choice))
         return float(np.sqrt(np.mean(1 / np.maximum(total, 1e-9))))
 
-    def allowed(self, light: int, choice: tuple[int, ...]) -> list[int]:
-        """Directions for a light that keep clear of the other lights' chosen ones."""
-        others = [place for other, place in enumerate(choice) if other != light]
-        near = self.directions @ self.directions[others].T > np.cos(np.radians(APART))
-        return [int(place) for place in np.flatnonzero(~near.any(axis=1))]
+    def best(self, light: int, others: Mapping[int, int]) -> int:
+        """Direction in which a light adds most to `others` (light to direction), at an angle from all of them."""
+        total = self.information[light] + sum(self.information[other, place] for other, place in others.items())
+        costs = np.mean(1 / np.maximum(total, 1e-9), axis=(1, 2))
+        near = self.directions @ self.directions[list(others.values())].T > np.cos(np.radians(CONSTANTS.apart))
+        return int(np.where(near.any(axis=1), np.inf, costs).argmin())
 
     def greedy(self, order: tuple[int, ...]) -> tuple[int, ...]:
         """One light after the other where it adds most."""
         choice: dict[int, int] = {}
         for light in order:
-            taken = [self.directions[place] for place in choice.values()]
-            total = sum((self.information[other, place] for other, place in choice.items()), np.zeros(1))
-            costs = np.mean(1 / np.maximum(total + self.information[light], 1e-9), axis=(1, 2))
-            for direction in taken:
-                costs[self.directions @ direction > np.cos(np.radians(APART))] = np.inf
-            choice[light] = int(costs.argmin())
-        return tuple(choice[light] for light in range(len(self.information)))
+            choice[light] = self.best(light, choice)
+        return tuple(choice[light] for light in sorted(choice))
 
     def descend(self, choice: tuple[int, ...]) -> tuple[int, ...]:
         """Move one light at a time to its best direction until none gains."""
         while True:
             before = self.cost(choice)
             for light in range(len(choice)):
-                trials = [(*choice[:light], place, *choice[light + 1 :]) for place in self.allowed(light, choice)]
-                choice = min([choice, *trials], key=self.cost)
+                others = {other: place for other, place in enumerate(choice) if other != light}
+                moved = (*choice[:light], self.best(light, others), *choice[light + 1 :])
+                choice = min(choice, moved, key=self.cost)
             if not self.cost(choice) < before * (1 - 1e-6):
                 return choice
 
@@ -151,35 +188,15 @@ class _Compared:
         The uncertainty must not grow by more than the factor `affordable`.
         """
         gain = self.cost(range(len(choice))) / self.cost(choice)
-        if gain < _WORTHWHILE:
-            return Proposal(plan=plan, gain=1.0)
-        scene, chosen = plan.scene, self.directions[list(choice)]
-        lights = tuple(_placed(light, scene, direction) for light, direction in zip(scene.lights, chosen, strict=True))
-        better = plan.with_lamps(replace(scene, lights=lights))
-        if better.std > affordable * plan.std:
-            return Proposal(plan=plan, gain=1.0)
-        return Proposal(plan=better, gain=gain)
-
-
-def _zones(scene: Scene, candidates: tuple[Light, ...], light: int, material: FloatArray, state: State) -> Zones:
-    """Zones of one light from many places; `light` is its index, for its colour."""
-    camera = replace(scene.camera, crosstalk=None, sensitivities=None)
-    alone = replace(scene, lights=(scene.lights[light],), camera=camera)
-    zones = predict_zones(alone, state, material=material, lights=candidates)
-    response = scene.camera.response(scene.lights).max(axis=0)[light]
-    return replace(zones, irradiance=zones.irradiance * response)
-
-
-def _clear(instrument: Instrument, light: int, before: Zones, after: Zones, brightness: FloatArray) -> FloatArray:
-    """Inverse variance (directions, points) of the pull of a light, times the fourth power of its diffuse fraction."""
-    variance = instrument.light_variance(light, before, after, brightness)
-    with np.errstate(invalid="ignore"):
-        clear = (1 - np.fmax(before.fraction, after.fraction)) ** _DIFFUSE_POWER / variance
-    full = instrument.scene.camera.full_scale
-    for zones in (before, after):
-        with np.errstate(invalid="ignore"):
-            clear = np.where(instrument.white_level(zones) < full, clear, 0.0)
-    return np.nan_to_num(clear)
+        if gain >= CONSTANTS.worthwhile:
+            scene, chosen = plan.scene, self.directions[list(choice)]
+            lights = tuple(
+                _placed(lamp, scene, direction) for lamp, direction in zip(scene.lights, chosen, strict=True)
+            )
+            better = plan.with_lamps(replace(scene, lights=lights))
+            if better.std <= affordable * plan.std:
+                return Proposal(plan=better, gain=gain)
+        return Proposal(plan=plan, gain=1.0)
 
 
 def _directions(scene: Scene) -> FloatArray:
@@ -188,24 +205,11 @@ def _directions(scene: Scene) -> FloatArray:
     return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
 
 
-def _grid() -> FloatArray:
-    azimuth, inclination = np.radians(
-        np.meshgrid(np.arange(0, 360, AZIMUTH_STEP), np.array(INCLINATIONS), indexing="ij")
-    ).reshape(2, -1)
-    across = np.sin(inclination)
-    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), -np.cos(inclination)], axis=1)
-
-
 def _placed(light: Light, scene: Scene, direction: FloatArray) -> Light:
     """Return the light at its distance from the body's front point, in another direction."""
     front = np.array(scene.body.front)
-    distance = np.linalg.norm(np.array(light.position) - front)
-    x, y, z = (front + distance * direction).tolist()
+    x, y, z = (front + np.linalg.norm(np.array(light.position) - front) * direction).tolist()
     return replace(light, position=(x, y, z))
-
-
-_PLAN_POINTS = 80
-"""Points of the prediction along the longer side of the frame; chosen: zones are far wider than a step."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -222,8 +226,8 @@ class Outlook:
         px.
     reflects : ndarray, shape (k, h, w), bool
         Whether the light's specular fraction exceeds `rgbmidic.scene.zones.REFLECTS` in the reference or in this state.
-    lit : ndarray, shape (k, h, w), bool
-        Whether the light reaches the point in both.
+    clean : ndarray, shape (h, w), int
+        Number of lights that reach the point in both and do not reflect.
     saturated : ndarray, shape (k, h, w), bool
         Whether white paint saturates in either.
     forecast
@@ -234,14 +238,9 @@ class Outlook:
     zones: Zones
     displacement: FloatArray
     reflects: BoolArray
-    lit: BoolArray
+    clean: npt.NDArray[np.int64]
     saturated: BoolArray
     forecast: Forecast
-
-    @property
-    def clean(self) -> npt.NDArray[np.int64]:
-        """Number of lights (h, w) that are there and do not reflect."""
-        return np.asarray((self.lit & ~self.saturated & ~self.reflects).sum(axis=0))
 
     @property
     def std(self) -> FloatArray:
@@ -319,7 +318,7 @@ def make_plan(experiment: Experiment) -> Plan:
         scene, element_size=experiment.output.element_size, demosaic=IlluminationSettings().demosaic
     )
     height, width = scene.camera.shape
-    step = max(height, width) / _PLAN_POINTS
+    step = max(height, width) / CONSTANTS.grid_points
     x, y = np.meshgrid(np.arange(0, width - 0.5, step), np.arange(0, height - 0.5, step))
     reference, outlooks = _predict(scene, instrument, x, y, states)
     motion = np.stack([outlook.displacement for outlook in outlooks])
@@ -352,14 +351,16 @@ def _predict(
         displacement = truth(scene, state, None, (x, y))
         with np.errstate(invalid="ignore"):
             reflects = np.fmax(reference.fraction, zones.fraction) > REFLECTS
+        saturated = instrument.saturated(reference) | instrument.saturated(zones)
+        clean = np.isfinite(reference.fraction + zones.fraction) & ~saturated & ~reflects
         outlooks.append(
             Outlook(
                 state=state,
                 zones=zones,
                 displacement=displacement,
                 reflects=reflects,
-                lit=np.isfinite(reference.fraction) & np.isfinite(zones.fraction),
-                saturated=instrument.saturated(reference) | instrument.saturated(zones),
+                clean=clean.sum(axis=0),
+                saturated=saturated,
                 forecast=instrument.forecast(reference, zones, _around(trace_change(displacement), reach)),
             )
         )

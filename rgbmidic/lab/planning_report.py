@@ -11,7 +11,7 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.errors import InputError
-from rgbmidic.lab import check_folder, number_or_none, write_findings
+from rgbmidic.lab import plain, write_findings
 from rgbmidic.lab.planning import Outlook, Plan, Proposal
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal
 from rgbmidic.scene.scene import Scene
@@ -49,8 +49,8 @@ def write_plan(
     ResultError
         A plan is already there, or the folder cannot be written.
     """
-    check_folder(out, FILES, overwrite=overwrite)
-    write_findings(out, "plan", plan_document(plan, proposals, distance), plan_figure(plan, proposals))
+    contents = plan_document(plan, proposals, distance), plan_figure(plan, proposals)
+    write_findings(out, dict(zip(FILES, contents, strict=True)), overwrite=overwrite)
 
 
 def zone_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
@@ -70,7 +70,7 @@ def uncertainty_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
     for label, state in _labelled(plan):
         std = state["std_px"]
         values = [std["median"], std["q95"], state["random_px"], state["feigned_by_domes_px"]]
-        rows.append([label, *("-" if value is None else f"{value:.4f}" for value in values)])
+        rows.append([label, *(f"{value:.4f}" if math.isfinite(value) else "-" for value in values)])
     return ["state", "median", "95 %", "random", "feigned"], rows
 
 
@@ -138,29 +138,28 @@ def out_of_plane(plan: Plan, distance: float | None = None) -> dict[str, Any]:
     x0, y0, x1, y1 = plan.field
     x, y = plan.scene.camera.centre
     edge = math.hypot(max(x - x0, x1 - x), max(y - y0, y1 - y)) / distance
-    unseen = number_or_none(plan.std / edge)
-    return {"stand_off_mm": distance, "strain_per_mm": 1 / distance, "edge_px_per_mm": edge, "unseen_mm": unseen}
+    figures = {"stand_off_mm": distance, "strain_per_mm": 1 / distance, "edge_px_per_mm": edge}
+    return plain(figures | {"unseen_mm": plan.std / edge})  # type: ignore[no-any-return]
 
 
 def plan_document(plan: Plan, proposals: dict[str, Proposal], distance: float | None = None) -> dict[str, Any]:
     """Return the plan as plain values, for plan.json; fractions are of the field, an unknown number is null."""
-    return {
+    document = {
         "schema": "rgbmidic-plan",
         "rgbmidic": __version__,
-        "field_px": list(plan.field),
+        "field_px": plan.field,
         "element_size_px": plan.instrument.element_size,
         "reflects_from_specular_fraction": REFLECTS,
         "out_of_plane": out_of_plane(plan, distance),
         **_arrangement(plan),
-        "proposals": {
-            name: {"gain": proposal.gain, **_arrangement(proposal.plan)} for name, proposal in proposals.items()
-        },
+        "proposals": {name: {"gain": better.gain, **_arrangement(better.plan)} for name, better in proposals.items()},
     }
+    return plain(document)  # type: ignore[no-any-return]
 
 
 def _arrangement(plan: Plan) -> dict[str, Any]:
     states = [_state(plan, outlook) for outlook in plan.outlooks]
-    return {"lights": _lamps(plan), "std_px": number_or_none(plan.std), "states": states}
+    return {"lights": _lamps(plan), "std_px": plan.std, "states": states}
 
 
 def _lamps(plan: Plan) -> list[dict[str, Any]]:
@@ -168,21 +167,27 @@ def _lamps(plan: Plan) -> list[dict[str, Any]]:
     lamps = []
     for light in plan.scene.lights:
         x, y, z = (a - b for a, b in zip(light.position, plan.scene.body.front, strict=True))
-        angles = math.degrees(math.atan2(y, x)) % 360, math.degrees(math.atan2(math.hypot(x, y), -z))
-        lamp = {"name": light.name, "position_mm": list(light.position)}
-        lamps.append({**lamp, "azimuth_deg": angles[0], "inclination_deg": angles[1], "power": light.power})
+        lamps.append(
+            {
+                "name": light.name,
+                "position_mm": light.position,
+                "azimuth_deg": math.degrees(math.atan2(y, x)) % 360,
+                "inclination_deg": math.degrees(math.atan2(math.hypot(x, y), -z)),
+                "power": light.power,
+            }
+        )
     return lamps
 
 
 def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
-    inside, state = plan.inside, outlook.state
-    std = outlook.std[inside]
-    known = std[np.isfinite(std)]
-    quantiles = [float(np.quantile(known, level)) if known.size else None for level in (0.5, 0.95, 1.0)]
-    names = [light.name for light in plan.scene.lights]
+    inside, names = plan.inside, [light.name for light in plan.scene.lights]
+    std, random, feigned = (
+        values[inside & np.isfinite(values)] for values in (outlook.std, outlook.forecast.std, outlook.forecast.bias)
+    )
+    quantiles = np.quantile(std, [0.5, 0.95, 1.0]).tolist() if std.size else [math.nan] * 3
     return {
-        "angle_deg": state.angle_deg,
-        "translation_mm": list(state.translation),
+        "angle_deg": outlook.state.angle_deg,
+        "translation_mm": outlook.state.translation,
         "largest_motion_px": float(np.hypot(*outlook.displacement[:, inside]).max()),
         "reflecting": {name: plan.fraction(mask) for name, mask in zip(names, outlook.reflects, strict=True)},
         "all_reflect": plan.fraction(np.asarray(outlook.reflects.all(axis=0))),
@@ -190,14 +195,13 @@ def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
         "no_light": plan.fraction(outlook.clean == 0),
         "saturated": plan.fraction(np.asarray(outlook.saturated.any(axis=0))),
         "std_px": dict(zip(("median", "q95", "largest"), quantiles, strict=True)),
-        "random_px": _rms(outlook.forecast.std[inside]),
-        "feigned_by_domes_px": _rms(outlook.forecast.bias[inside]),
+        "random_px": _rms(random),
+        "feigned_by_domes_px": _rms(feigned),
     }
 
 
-def _rms(values: FloatArray) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else None
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
 
 
 def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:

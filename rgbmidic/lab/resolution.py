@@ -11,7 +11,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,11 +21,10 @@ from scipy.sparse.linalg import splu
 
 from rgbmidic._version import __version__
 from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
-from rgbmidic.errors import ResultError
 from rgbmidic.fields import NodalCovariance, StrainGauges
-from rgbmidic.lab import check_folder, number_or_none, write_findings
+from rgbmidic.lab import plain, write_findings
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.size_figures import ResolutionStudy, SizeFigures
+from rgbmidic.pipeline.size_figures import ResolutionStudy
 from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.typing import FloatArray
 
@@ -36,14 +34,6 @@ if TYPE_CHECKING:
 
 FILES = ("resolution.csv", "resolution.json", "resolution.png")
 """What `write_study` writes."""
-_KEPT = 0.9
-"""Fraction of a wave's amplitude at the spatial resolution (DIC Challenge 2.0)."""
-_PERIODS = np.geomspace(2, 40, 48)
-"""Periods that are tried, in elements: from the shortest that a mesh can hold to that of the longest gauge below."""
-_LONGEST_GAUGE = 12.0
-"""Elements; the cut-off of a longer gauge, a disc on a fine grid, is in proportion to its length."""
-_PARTS = 6
-"""Parts of an element's side that integrals of a wave are summed over: 1e-3 of its amplitude at a period of 2."""
 
 
 def cut_offs(gauges: Sequence[float]) -> tuple[float, float, FloatArray]:
@@ -61,39 +51,46 @@ def cut_offs(gauges: Sequence[float]) -> tuple[float, float, FloatArray]:
     gauges : ndarray, shape (G,)
         The same of the strain of each gauge.
     """
-    lengths = np.minimum(np.asarray(gauges, dtype=np.float64), _LONGEST_GAUGE)
+    periods = np.geomspace(2, 40, 48)  # from the shortest that a mesh can hold to that of the longest gauge below
+    # the cut-off of a longer gauge, a disc on a fine grid, is in proportion to its length
+    lengths = np.minimum(np.asarray(gauges, dtype=np.float64), 12.0)
     count = int(np.ceil(max(lengths, default=0.0))) + 14  # half a gauge and the reach of the recovery on either side
     mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 8 * count, 8 * count), (8 * count + 1,) * 2), 8.0)
-    number = 2 * np.pi / (8.0 * _PERIODS)
-    fitted = splu(mass_matrix(mesh)).solve(_integrals(mesh, number))
+    fitted = splu(mass_matrix(mesh)).solve(_integrals(mesh, 2 * np.pi / (8.0 * periods)))
     recovery = Recovery.over(mesh, np.ones(len(mesh.elements), bool), np.ones(len(mesh.nodes)), linear_fit_offset(mesh))
     field = recovery.value @ fitted
-    shown = [_cut_off(mesh, number, field, 3.0), _cut_off(mesh, number, recovery.slope_x @ fitted, 3.0, slope=True)]
+    shown = [_cut_off(mesh, periods, field, 3.0), _cut_off(mesh, periods, recovery.slope_x @ fitted, 3.0, slope=True)]
     covariance = NodalCovariance.from_mesh(mesh)
     for length in lengths:
         gauge = StrainGauges.at_nodes(covariance, 8 * length)
         slope = sp.csr_matrix((gauge.whole[0], (gauge.rows, gauge.nodes)), shape=(len(mesh.nodes),) * 2)
-        shown.append(_cut_off(mesh, number, slope @ field, length / 2 + 2, slope=True))
+        shown.append(_cut_off(mesh, periods, slope @ field, length / 2 + 2, slope=True))
     scale = np.asarray(gauges, dtype=np.float64) / lengths
     return shown[0], shown[1], scale * np.asarray(shown[2:])
 
 
-def _integrals(mesh: Tri3Mesh, number: FloatArray) -> FloatArray:
-    """Integrals (N, 2 P) of each shape function times cosine and sine of wave numbers (P,) along x."""
-    i, j = np.indices((_PARTS, _PARTS)).reshape(2, -1)
-    low, high = i + j < _PARTS, i + j < _PARTS - 1  # the parts as the element lies, and those upside down between them
-    b, c = (np.concatenate([one[low] + 1 / 3, one[high] + 2 / 3]) / _PARTS for one in (i, j))
+def _integrals(mesh: Tri3Mesh, number: FloatArray, parts: int = 6) -> FloatArray:
+    """Integrals (N, 2 P) of each shape function times cosine and sine of wave numbers (P,) along x.
+
+    They are summed over so many `parts` of an element's side: 1e-3 of the amplitude at a period of two elements.
+    """
+    i, j = np.indices((parts, parts)).reshape(2, -1)
+    low, high = i + j < parts, i + j < parts - 1  # the parts as the element lies, and those upside down between them
+    b, c = (np.concatenate([one[low] + 1 / 3, one[high] + 2 / 3]) / parts for one in (i, j))
     shape = np.stack([1 - b - c, b, c], axis=1)
     x = mesh.nodes[mesh.elements, 0] @ shape.T
     phase = x[..., None] * number
     wave = np.concatenate([np.cos(phase), np.sin(phase)], axis=-1)
-    parts = np.einsum("qa,eqp->eap", shape, wave) * (mesh.areas / len(b))[:, None, None]
+    sums = np.einsum("qa,eqp->eap", shape, wave) * (mesh.areas / len(b))[:, None, None]
     rows = sp.csr_matrix((np.ones(mesh.elements.size), (mesh.elements.ravel(), np.arange(mesh.elements.size))))
-    return np.asarray(rows @ parts.reshape(mesh.elements.size, -1))
+    return np.asarray(rows @ sums.reshape(mesh.elements.size, -1))
 
 
-def _cut_off(mesh: Tri3Mesh, number: FloatArray, found: FloatArray, rim: float, *, slope: bool = False) -> float:
-    """Period, in elements, below which less than `_KEPT` is found of cosine and sine (N, 2 P) inside the `rim`."""
+def _cut_off(
+    mesh: Tri3Mesh, periods: FloatArray, found: FloatArray, rim: float, *, slope: bool = False, kept: float = 0.9
+) -> float:
+    """Period, in elements, below which less than `kept` is found of cosine and sine (N, 2 P) inside the `rim`."""
+    number = 2 * np.pi / (8.0 * periods)
     low, high = mesh.nodes.min(axis=0) + 8 * rim, mesh.nodes.max(axis=0) - 8 * rim
     inner = ((mesh.nodes >= low - 1e-9) & (mesh.nodes <= high + 1e-9)).all(axis=1)
     phase = mesh.nodes[inner, :1] * number
@@ -101,13 +98,13 @@ def _cut_off(mesh: Tri3Mesh, number: FloatArray, found: FloatArray, rim: float, 
     if slope:
         cosine, sine = sine / number, -cosine / number
     gain = (cosine * np.cos(phase) + sine * np.sin(phase)).mean(axis=0)
-    below = np.flatnonzero(gain < _KEPT)
+    below = np.flatnonzero(gain < kept)
     if not below.size:
-        return float(_PERIODS[0])
+        return float(periods[0])
     last = below[-1]
     if last + 1 == len(gain):
         return float("nan")
-    return float(np.interp(_KEPT, gain[last : last + 2], _PERIODS[last : last + 2]))
+    return float(np.interp(kept, gain[last : last + 2], periods[last : last + 2]))
 
 
 SIZE_WORDS = {
@@ -131,7 +128,7 @@ GAUGE_WORDS = {
 def size_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
     """Headings and one row per element size."""
     rows = []
-    for one in map(_plain, study.sizes, _gauge_cut_offs(study)):
+    for one in _documents(study):
         micro = [1e6 * one[f"strain_{key}"] for key in ("noise", "discretisation", "total")]
         cells = [_text(one["speckles"]), f"{one['nodes']}", f"{one['measured']:.0%}"]
         cells += [", ".join(_text(one[key]) for key in ("bias_px", "scatter_px"))]
@@ -145,7 +142,7 @@ def size_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
 def gauge_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
     """Headings and one row per element size and virtual strain gauge."""
     rows = []
-    for one in map(_plain, study.sizes, _gauge_cut_offs(study)):
+    for one in _documents(study):
         for gauge in one["gauges"]:
             length, noise, largest, at = gauge.values()
             cells = [f"{length:g} px", _text(1e6 * noise), _text(1e6 * largest), f"{at:.0f}"]
@@ -165,20 +162,7 @@ def write_study(study: ResolutionStudy, out: Path, *, overwrite: bool = False) -
     ResultError
         A study is already there, or the folder cannot be written.
     """
-    check_folder(out, FILES, overwrite=overwrite)
-    sizes = [_plain(one, lengths) for one, lengths in zip(study.sizes, _gauge_cut_offs(study), strict=True)]
-    choice = study.choice
-    document = {
-        "schema": "rgbmidic-resolution",
-        "rgbmidic": __version__,
-        "key_frame": {"index": study.frame, "name": study.name},
-        "static_frames": study.static,
-        "speckle_px": study.speckle,
-        "preparation_cpu_s": study.preparation,
-        "recommendation": None if choice is None else asdict(choice),
-        "sizes": sizes,
-    }
-    write_findings(out, "resolution", _without_nan(document), _figure(study))
+    sizes = _documents(study)
     text = io.StringIO()
     lines = csv.writer(text, lineterminator="\n")
     headings = [key for key, value in sizes[0].items() if not isinstance(value, str | list)]
@@ -186,65 +170,54 @@ def write_study(study: ResolutionStudy, out: Path, *, overwrite: bool = False) -
     for one in sizes:
         for gauge in one["gauges"] or [_NO_GAUGE]:
             lines.writerow([f"{value:.6g}" for value in (*(one[key] for key in headings), *gauge.values())])
-    try:
-        (out / "resolution.csv").write_text(text.getvalue(), encoding="utf-8")
-    except OSError as error:
-        raise ResultError(f"{out / 'resolution.csv'} cannot be written: {error.strerror or error}") from None
+    document = {
+        "schema": "rgbmidic-resolution",
+        "rgbmidic": __version__,
+        "key_frame": {"index": study.frame, "name": study.name},
+        "static_frames": study.static,
+        "speckle_px": study.speckle,
+        "preparation_cpu_s": study.preparation,
+        "recommendation": study.choice,
+        "sizes": sizes,
+    }
+    contents = text.getvalue(), plain(document), _figure(study)
+    write_findings(out, dict(zip(FILES, contents, strict=True)), overwrite=overwrite)
 
 
+_ERRORS = ("bias", "scatter", "stated", "noise", "discretisation", "total")
+"""Figures of a size that displacement and strain both have."""
 _NO_GAUGE = dict.fromkeys(("length_px", "noise", "largest", "cut_off_px"), float("nan"))
 
 
 @lru_cache(maxsize=1)
-def _gauge_cut_offs(study: ResolutionStudy) -> list[FloatArray]:
-    """Cut-off in px of the displacement, of the strain at the nodes, and of each gauge, of every element size."""
+def _documents(study: ResolutionStudy) -> list[dict[str, Any]]:
+    """Figures of every size with their units in their names, cut-offs and gauges included."""
     ratios = [[gauge.length / one.element_size for gauge in one.gauges] for one in study.sizes]
     asked = sorted({ratio for some in ratios for ratio in some})
     moved, strain, found = cut_offs(asked)
     at = dict(zip(asked, found.tolist(), strict=True))
-    return [
-        one.element_size * np.array([moved, strain, *(at[ratio] for ratio in some)])
-        for one, some in zip(study.sizes, ratios, strict=True)
-    ]
-
-
-def _plain(one: SizeFigures, lengths: FloatArray) -> dict[str, Any]:
-    """Figures of a size with their units in their names."""
-    return {
-        "element_size_px": one.element_size,
-        "speckles": one.speckles,
-        "nodes": one.nodes,
-        "measured": one.measured,
-        "bias_px": one.bias,
-        "scatter_px": one.scatter,
-        "stated_px": one.stated,
-        "noise_px": one.noise,
-        "discretisation_px": one.discretisation,
-        "total_px": one.total,
-        "strain_bias": one.strain.bias,
-        "strain_scatter": one.strain.scatter,
-        "strain_stated": one.strain.stated,
-        "strain_noise": one.strain.noise,
-        "strain_discretisation": one.strain.discretisation,
-        "strain_total": one.strain.total,
-        "cut_off_px": float(lengths[0]),
-        "strain_cut_off_px": float(lengths[1]),
-        "solve_cpu_s": one.seconds,
-        "reason": one.reason,
-        "gauges": [
-            dict(zip(_NO_GAUGE, (gauge.length, gauge.noise, gauge.largest, float(at)), strict=True))
-            for gauge, at in zip(one.gauges, lengths[2:], strict=True)
-        ],
-    }
-
-
-def _without_nan(value: Any) -> Any:
-    """Return a value as JSON holds it: None for a number that is not known."""
-    if isinstance(value, dict):
-        return {key: _without_nan(part) for key, part in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(part) for part in value]
-    return number_or_none(value) if isinstance(value, float) else value
+    documents = []
+    for one, some in zip(study.sizes, ratios, strict=True):
+        side = one.element_size
+        gauges = [
+            (gauge.length, gauge.noise, gauge.largest, side * at[x]) for gauge, x in zip(one.gauges, some, strict=True)
+        ]
+        documents.append(
+            {
+                "element_size_px": side,
+                "speckles": one.speckles,
+                "nodes": one.nodes,
+                "measured": one.measured,
+                **{f"{name}_px": getattr(one, name) for name in _ERRORS},
+                **{f"strain_{name}": getattr(one.strain, name) for name in _ERRORS},
+                "cut_off_px": side * moved,
+                "strain_cut_off_px": side * strain,
+                "solve_cpu_s": one.seconds,
+                "reason": one.reason,
+                "gauges": [dict(zip(_NO_GAUGE, gauge, strict=True)) for gauge in gauges],
+            }
+        )
+    return documents
 
 
 def _figure(study: ResolutionStudy) -> Figure:

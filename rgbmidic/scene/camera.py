@@ -21,6 +21,10 @@ from rgbmidic.typing import FloatArray
 
 NOMINAL_DISTANCE = 600.0
 """Distance (mm) at which a light of power 1 gives an ideal white the camera's `exposure`."""
+DISTANCE = 600.0
+"""mm from the camera to the object's front point."""
+PIXEL = 0.055
+"""mm per px on the object."""
 
 Vector = tuple[float, float, float]
 Floating = TypeVar("Floating", bound=np.floating)
@@ -171,10 +175,6 @@ MEASURED_CROSSTALK = ((1.0, 0.10, 0.05), (0.10, 1.0, 0.33), (0.01, 0.29, 1.0))
 `rgbmidic-calibrate design` predicts from its sensitivities, measured at the National Physical Laboratory (Darrodi et
 al., J. Opt. Soc. Am. A 32, 2015) and shipped by colour-science (BSD-3-Clause). The median of nine measured cameras has
 .24 and .33 between green and blue."""
-PIXEL = 0.055
-"""mm per px on the object."""
-DISTANCE = 600.0
-"""mm from the camera to the object's front point."""
 
 CameraKind = Literal["bayer", "rgb", "monochrome"]
 
@@ -219,7 +219,7 @@ class Camera:
     """
 
     shape: tuple[int, int]
-    focal_px: float = 600 / 0.055
+    focal_px: float = DISTANCE / PIXEL
     lens_blur: float = 0.45
     kind: CameraKind = "bayer"
     cfa: str = "RGGB"
@@ -366,10 +366,9 @@ def reference_camera(shape: tuple[int, int], **changes: object) -> Camera:
     -------
     Camera
     """
-    camera = Camera(shape=shape, focal_px=DISTANCE / PIXEL)
     if changes.get("kind") != "monochrome" and "sensitivities" not in changes:
-        camera = replace(camera, crosstalk=np.array(REFERENCE_CROSSTALK))
-    return replace(camera, **changes)  # type: ignore[arg-type]
+        changes = {"crosstalk": np.array(REFERENCE_CROSSTALK), **changes}
+    return Camera(shape=shape, **changes)  # type: ignore[arg-type]
 
 
 def mosaic_samples(channels: npt.NDArray[Floating], cfa: str) -> npt.NDArray[Floating]:

@@ -31,7 +31,7 @@ import scipy.sparse as sp
 
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.constants import USUAL
-from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std, linear_fit_offset, mass_matrix
+from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std, linear_fit_offset
 from rgbmidic.illumination.crosstalk import NEGLIGIBLE
 from rgbmidic.illumination.linear import QUANTISATION
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -42,29 +42,20 @@ from rgbmidic.scene.zones import Zones, facet_variance, slope_variance
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
-WRINKLE_AREA = 0.085
-"""Area over which the erratic part of a reflection is correlated, in units of the wrinkles' spacing squared (measured,
-see the tests, at a lobe of 4 and slopes of 6 degrees; 0.06 at 3 and 8 degrees, 0.11 at 6 and 4)."""
-_SATURATED = 0.98
-"""Fraction of full scale from which the white paint is taken to saturate a channel: noise does the rest."""
-
 
 @cache
 def node_constant() -> float:
     """Variance of an inner node's value per unit of white noise density and element area: about 1.1.
 
-    On a regular mesh the linear fit has the inverse of the consistent mass matrix (2.6 on its diagonal); the
-    recovery of the nodal values reduces it.
+    `expected_std` of a regular mesh: the linear fit has the inverse of the consistent mass matrix (2.6 on its
+    diagonal); the recovery of the nodal values reduces it.
     """
     side = 16
     mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 10 * side, 10 * side), (10 * side + 1,) * 2), 10)
-    everywhere = np.ones(len(mesh.elements), dtype=bool)
-    recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes)), linear_fit_offset(mesh))
-    value = recovery.value.toarray()
-    variance = np.einsum("ij,ij->i", value @ np.linalg.inv(mass_matrix(mesh).toarray()), value)
+    (std,) = expected_std(mesh, *np.ones((2, len(mesh.elements))))
     # an even number of rows and columns: as many nodes with eight triangles as with four
     inner = (np.abs(mesh.nodes / 10 - side / 2 + 0.5) < side / 4).all(axis=1)
-    return float(variance[inner].mean() * mesh.size**2)
+    return float((std[inner] ** 2).mean() * mesh.size**2)
 
 
 def light_pull(contrast: npt.NDArray[Floating], residual: npt.NDArray[Floating]) -> npt.NDArray[Floating]:
@@ -176,6 +167,11 @@ class Instrument:
         Of a pixel, and of the right-hand side per pixel.
     dome_pull
         Mean product of the gradients of texture and domes, px^-1.
+    wrinkle_area
+        Area over which the erratic part of a reflection is correlated, in units of the wrinkles' spacing squared
+        (measured, see the tests, at a lobe of 4 and slopes of 6 degrees; 0.06 at 3 and 8 degrees, 0.11 at 6 and 4).
+    saturation
+        Fraction of full scale from which the white paint is taken to saturate a channel: noise does the rest.
     """
 
     scene: Scene
@@ -184,6 +180,8 @@ class Instrument:
     residual: Energies
     score: Energies
     dome_pull: float
+    wrinkle_area: float = 0.085
+    saturation: float = 0.98
 
     @classmethod
     def of(
@@ -252,17 +250,17 @@ class Instrument:
         Forecast
             At these points.
         """
-        residual = self.variance(self.residual, before, after, change)
-        seen = np.isfinite(residual) & ~self.saturated(before) & ~self.saturated(after)
-        contrast = np.where(seen, 1 - (before.fraction + after.fraction) / 2, 0.0)
-        pull = light_pull(contrast, residual)
+        residual, score = (self._covariance(one, before, after, change) for one in (self.residual, self.score))
+        variance = np.einsum("jj...->j...", residual)
+        contrast = np.where(self._seen(variance, before, after), 1 - (before.fraction + after.fraction) / 2, 0.0)
+        pull = light_pull(contrast, variance)
         information = self.energy * pull * contrast
         total = information.sum(axis=0)
-        domes = self._dome_factor(after) - self._dome_factor(before)
-        drag = np.nan_to_num(domes * pull[:, None]).sum(axis=0) * self.dome_pull
+        drag = np.nan_to_num((self._dome_factor(after) - self._dome_factor(before)) * pull[:, None]).sum(axis=0)
+        square = np.einsum("jk...,j...,k...->...", np.nan_to_num(score), pull, pull)
         with np.errstate(invalid="ignore", divide="ignore"):
-            std = np.sqrt(node_constant() * self._score(before, after, change, pull)) / (self.element_size * total)
-            bias = np.sqrt((drag**2).sum(axis=0) / 2) / total
+            std = np.sqrt(node_constant() * square) / (self.element_size * total)
+            bias = self.dome_pull * np.sqrt((drag**2).sum(axis=0) / 2) / total
             fraction = information / total
         sees = total > 0
         return Forecast(
@@ -289,36 +287,11 @@ class Instrument:
         ndarray, shape (k, ...), float32
         """
         change = np.full((3, *before.fraction.shape[1:]), 2.0)
-        variance = self.variance(self.score, before, after, change, common=float(known))
-        seen = np.isfinite(variance) & ~self.saturated(before) & ~self.saturated(after)
+        covariance = self._covariance(self.score, before, after, change, common=float(known))
+        variance = np.einsum("jj...->j...", covariance)
+        seen = self._seen(variance, before, after)
         inverse = np.where(seen, 1 / np.where(seen, variance, 1.0), 0.0)
         return (inverse / max(float(inverse.max()), 1e-30)).astype(np.float32)
-
-    def variance(
-        self, energies: Energies, before: Zones, after: Zones, change: FloatArray, common: float = 1.0
-    ) -> FloatArray:
-        """Variance of the change of each light's image (k, ...), in units of its local mean.
-
-        Parameters
-        ----------
-        energies
-            `residual` or `score`.
-        before, after
-            Predictions at the same material points.
-        change : ndarray, shape (3, ...)
-            See `trace_change`.
-        common
-            1: the two states share their reflections as predicted; 0: they have nothing in common.
-
-        Returns
-        -------
-        ndarray, shape (k, ...)
-        """
-        variance = self._reflections(energies, before, after, common)
-        variance += np.einsum("cjj,c...->j...", energies.mosaic, change)
-        for zones in (before, after):
-            variance += np.einsum("cjj,c...->j...", energies.noise, self._sample_variance(zones)) / zones.level**2
-        return np.asarray(variance)
 
     def light_variance(self, light: int, before: Zones, after: Zones, brightness: FloatArray) -> FloatArray:
         """Variance of the pull (n, ...) of one light that is tried in n places, the others as bright as they are.
@@ -337,8 +310,7 @@ class Instrument:
         ndarray, shape (n, ...)
             In units of the local mean.
         """
-        variance = self._reflections(self.score, before, after)
-        variance += 2 * float(self.score.mosaic[:, light, light].sum())
+        variance = self._reflections(self.score, before, after, 1.0) + 2 * self.score.mosaic[:, light, light].sum()
         mixing = _channel_mixing(self.scene)
         others = mixing @ np.where(np.arange(len(brightness)) == light, 0.0, brightness)
         for zones in (before, after):
@@ -347,17 +319,23 @@ class Instrument:
                 variance += factor * (samples + QUANTISATION) / zones.level**2
         return np.asarray(variance)
 
-    def _score(self, before: Zones, after: Zones, change: FloatArray, pull: FloatArray) -> FloatArray:
-        """Variance density (...) of the right-hand side with the pull (k, ...) of each light on the displacement."""
-        square = (np.nan_to_num(self._reflections(self.score, before, after)) * pull**2).sum(axis=0)
-        square += np.einsum("cjk,c...,j...,k...->...", self.score.mosaic, change, pull, pull)
-        for zones in (before, after):
-            relative = np.where(pull > 0, pull / zones.level, 0.0)
-            samples = np.nan_to_num(self._sample_variance(zones))
-            square += np.einsum("cjk,c...,j...,k...->...", self.score.noise, samples, relative, relative)
-        return np.asarray(square)
+    def _covariance(
+        self, energies: Energies, before: Zones, after: Zones, change: FloatArray, common: float = 1.0
+    ) -> FloatArray:
+        """Covariance (k, k, ...) of the changes of the lights' images, in units of their local means.
 
-    def _reflections(self, energies: Energies, before: Zones, after: Zones, common: float = 1.0) -> FloatArray:
+        `common` is 1 where the two states share their reflections as predicted, 0 where they have nothing in common.
+        """
+        covariance = np.einsum("cjk,c...->jk...", energies.mosaic, change)
+        for zones in (before, after):
+            levels = _channels(_channel_mixing(self.scene), zones.level)
+            samples = self.scene.camera.noise.variance(levels) + QUANTISATION  # of each colour at the mean, DN squared
+            covariance += np.einsum("cjk,c...->jk...", energies.noise, samples) / (zones.level[:, None] * zones.level)
+        lights = range(len(covariance))
+        covariance[lights, lights] += self._reflections(energies, before, after, common)
+        return np.asarray(covariance)
+
+    def _reflections(self, energies: Energies, before: Zones, after: Zones, common: float) -> FloatArray:
         """Variance (k, ...) that comes from a change of the reflections; between the lights it is independent."""
         first, second = self._dome_factor(before), self._dome_factor(after)
         domes = (first**2 + second**2 - 2 * common * first * second).sum(axis=1)
@@ -372,12 +350,13 @@ class Instrument:
         q between the half-way slopes h of two states is an integral of Gaussians. The part linear in the slopes is
         finer than the pixel and is left out: wrinkles have no slope on average.
         """
-        a2, b2 = self._roughness
         parts = [
-            _facet_covariance(one.geometry.slopes, other.geometry.slopes, a2, b2) * one.fraction * other.fraction
+            _facet_covariance(one.geometry.slopes, other.geometry.slopes, *self._roughness)
+            * one.fraction
+            * other.fraction
             for one, other in ((before, before), (after, after), (before, after))
         ]
-        area = WRINKLE_AREA * (self.scene.surface.white.spacing / pixel_size(self.scene)) ** 2
+        area = self.wrinkle_area * (self.scene.surface.white.spacing / pixel_size(self.scene)) ** 2
         return np.asarray(area * np.maximum(parts[0] + parts[1] - 2 * common * parts[2], 0))
 
     def _dome_factor(self, zones: Zones) -> FloatArray:
@@ -395,23 +374,23 @@ class Instrument:
         slope = (1 - cover) * slope_variance(surface.white) + cover * slope_variance(surface.black)
         return slope, (1 - cover) * facet_variance(surface.white) + cover * facet_variance(surface.black)
 
+    def _seen(self, variance: FloatArray, before: Zones, after: Zones) -> BoolArray:
+        """Where each light (k, ...) reaches the surface and saturates nothing in both states."""
+        return np.isfinite(variance) & ~self.saturated(before) & ~self.saturated(after)
+
     def saturated(self, zones: Zones) -> BoolArray:
         """Where white paint is expected to saturate a channel that the light needs, (k, ...)."""
-        channels = _channels(_channel_mixing(self.scene), self.white_level(zones))
-        full = channels > _SATURATED * self.scene.camera.full_scale
-        unmixing = np.abs(np.linalg.pinv(_channel_mixing(self.scene)))
+        mixing = _channel_mixing(self.scene)
+        full = _channels(mixing, self.white_level(zones)) > self.saturation * self.scene.camera.full_scale
+        unmixing = np.abs(np.linalg.pinv(mixing))
         needed = unmixing > NEGLIGIBLE * unmixing.max(axis=1, keepdims=True)
         return np.asarray(np.einsum("jc,c...->j...", needed.astype(float), full.astype(float)) > 0)
 
     def white_level(self, zones: Zones) -> FloatArray:
         """Grey level (k, ...) of the white paint under each light, DN above black."""
-        albedo = self.scene.surface.white.albedo
-        return zones.irradiance * (albedo * zones.geometry.lambert + zones.geometry.specular(zones.reflectance))
-
-    def _sample_variance(self, zones: Zones) -> FloatArray:
-        """Noise variance (C, ...) of one sample of each colour at the mean grey level, DN squared."""
-        levels = _channels(_channel_mixing(self.scene), zones.level)
-        return np.asarray(self.scene.camera.noise.variance(levels) + QUANTISATION)
+        return zones.irradiance * (
+            self.scene.surface.white.albedo * zones.geometry.lambert + zones.geometry.specular(zones.reflectance)
+        )
 
 
 def trace_change(displacement: FloatArray) -> FloatArray:
@@ -445,12 +424,8 @@ def _facet_covariance(first: FloatArray, second: FloatArray, a2: float, b2: floa
 
     The part that is linear in the facets' slopes is left out.
     """
-    middle, apart = (first + second) / 2, first - second
-
-    def square(vector: FloatArray) -> FloatArray:
-        return np.asarray((vector**2).sum(axis=1))
-
-    mean = 2 * math.log(b2 / (a2 + b2)) - (square(first) + square(second)) / (2 * (a2 + b2))
-    product = math.log(b2 / (2 * a2 + b2)) - square(apart) / (4 * b2) - square(middle) / (2 * a2 + b2)
-    linear = (first * second).sum(axis=1) * a2 / (a2 + b2) ** 2
-    return np.asarray(np.exp(np.minimum(product - mean, 50.0)) - 1 - linear)
+    squares, product = (first**2 + second**2).sum(axis=1), (first * second).sum(axis=1)
+    means = 2 * math.log(b2 / (a2 + b2)) - squares / (2 * (a2 + b2))
+    apart, middle = squares - 2 * product, (squares + 2 * product) / 4
+    together = math.log(b2 / (2 * a2 + b2)) - apart / (4 * b2) - middle / (2 * a2 + b2)
+    return np.asarray(np.exp(np.minimum(together - means, 50.0)) - 1 - product * a2 / (a2 + b2) ** 2)

@@ -328,7 +328,6 @@ BODIES: dict[str, type[Sphere] | type[Cylinder] | type[Plate]] = {
 }
 Target = Literal["white", "speckled"]
 """Targets of the calibration captures."""
-_SIZE = (640, 640)
 _FIELD_KEYS = ("displacement_gradient", "displacement_offset", "displacement_file")
 
 
@@ -452,7 +451,7 @@ def _camera(table: dict[str, Any], body: Body, base: Path) -> Camera:
     pixel = convert_value(table.pop("mm_per_pixel", PIXEL), float, "camera.mm_per_pixel", base)
     if not pixel > 0:
         raise ConfigurationError(f"camera.mm_per_pixel must be positive, not {pixel}")
-    table.setdefault("shape", list(_SIZE))
+    table.setdefault("shape", [640, 640])
     table.setdefault("focal_px", body.front[2] / pixel)
     camera = read_section(Camera, "camera", table, base, **ready)
     if ready["crosstalk"] is None and ready["sensitivities"] is None and camera.kind != "monochrome":

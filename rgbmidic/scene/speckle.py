@@ -26,16 +26,6 @@ from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.surface import BOUND, Surface
 from rgbmidic.typing import FloatArray, FloatImage
 
-_LEVEL = 0.25
-"""Fraction of full scale of the mean of each light's image: no sample saturates."""
-_NOISE = 0.005
-"""Standard deviation of the probing noise, in units of full scale."""
-_RIM = 8
-"""Pixels at the edge of the piece that are left out."""
-_SUBSAMPLES = 3
-_CARRIERS = ((1, -1, 1, -1), (1, 1, -1, -1), (1, -1, -1, 1))
-"""Signs of the parts that alternate along x, along y and along both, in the phases (0, 0), (0, 1), (1, 0), (1, 1)."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpecklePatch:
@@ -53,12 +43,12 @@ class SpecklePatch:
     domes: FloatArray
 
     @classmethod
-    def of(cls, scene: Scene, size: int) -> SpecklePatch:
+    def of(cls, scene: Scene, size: int, subsamples: int = 3) -> SpecklePatch:
         """Return a piece of `size` x `size` px of a scene's paint, faced at the distance of the body's front point."""
         camera, surface = scene.camera, scene.surface
         pixel = scene.body.front[2] / camera.focal_px
         white, black = (replace(paint, slope_deg=0.0) for paint in (surface.white, surface.black))
-        place = (np.arange(size * _SUBSAMPLES) + 0.5) / _SUBSAMPLES * pixel
+        place = (np.arange(size * subsamples) + 0.5) / subsamples * pixel
         cover, height = replace(surface, white=white, black=black).on_plate(place, place)
         albedo = surface.white.albedo + cover * (surface.black.albedo - surface.white.albedo)
         texture = _seen(albedo, size, camera.lens_blur)
@@ -67,7 +57,7 @@ class SpecklePatch:
 
 def _seen(fine: FloatArray, size: int, blur: float) -> FloatArray:
     """Fine samples averaged over the pixels and blurred by the lens."""
-    whole = fine.reshape(size, _SUBSAMPLES, size, _SUBSAMPLES).mean(axis=(1, 3))
+    whole = fine.reshape(size, len(fine) // size, size, -1).mean(axis=(1, 3))
     line = np.exp(-2 * (np.pi * blur * np.fft.fftfreq(size)) ** 2)
     return np.asarray(np.fft.ifft2(np.fft.fft2(whole) * np.outer(line, line)).real)
 
@@ -93,7 +83,7 @@ def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tupl
         and both), in units of each light's mean; lights of equal brightness.
     """
     camera, crosstalk = scene.camera, scene.camera.true_crosstalk(scene.lights)
-    level, amplitude = _LEVEL * camera.full_scale, _NOISE * camera.full_scale
+    level, amplitude = 0.25 * camera.full_scale, 0.005 * camera.full_scale  # no sample saturates
     channels = level * crosstalk.matrix.sum(axis=1)[:, None, None] * texture
 
     def lights(samples: FloatArray, cfa: str) -> FloatArray:
@@ -112,7 +102,9 @@ def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tupl
     for colour in range(3):
         noisy = samples + np.where(colours == colour, random.normal(scale=amplitude, size=samples.shape), 0)
         noise.append(cross_spectra((lights(noisy, camera.cfa) - phases[0]) / amplitude))
-    carriers = [np.tensordot(np.array(signs) / 4, phases / level, axes=1) for signs in _CARRIERS]
+    # signs, in the four phases, of the parts that alternate along x, along y and along both
+    signs = np.array([[1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]])
+    carriers = np.tensordot(signs / 4, phases / level, axes=1)
     return np.stack(noise), np.stack([cross_spectra(carrier) for carrier in carriers])
 
 
@@ -143,19 +135,15 @@ def separated_phases(
     return np.stack([lights(mosaic_samples(channels, pattern), pattern) for pattern in patterns])
 
 
-def cross_spectra(fields: FloatArray) -> FloatArray:
-    """Cross spectra (k, k, n, n) of fields (k, n, n), their rims faded out."""
+def cross_spectra(fields: FloatArray, rim: int = 8) -> FloatArray:
+    """Cross spectra (k, k, n, n) of fields (k, n, n), their rims of so many pixels left out and as many faded out."""
     size = fields.shape[-1]
-    ramp = np.clip((np.arange(size) + 0.5 - _RIM) / _RIM, 0, 1)
+    ramp = np.clip((np.arange(size) + 0.5 - rim) / rim, 0, 1)
     line = np.sin(np.pi / 2 * np.minimum(ramp, ramp[::-1])) ** 2
     window = np.outer(line, line)
     transform = np.fft.fft2(np.nan_to_num(fields - np.nanmean(fields, axis=(1, 2), keepdims=True)) * window)
     products = transform[:, None] * transform[None].conj()
     return np.asarray(products.real / (window**2).sum())
-
-
-_FINE = 4
-"""Samples per pixel on which the droplets' covariance is tabulated."""
 
 
 def cover_covariance(surface: Surface, distance: FloatArray) -> FloatArray:
@@ -196,15 +184,18 @@ class SpeckleSpectrum:
     prefilter: FloatArray
 
     @classmethod
-    def of(cls, surface: Surface, *, pixel: float, blur: float, prefilter: str) -> SpeckleSpectrum:
-        """Spectrum of a painted surface; `pixel` in mm, `blur` the lens blur in px."""
+    def of(cls, surface: Surface, *, pixel: float, blur: float, prefilter: str, samples: int = 4) -> SpeckleSpectrum:
+        """Spectrum of a painted surface; `pixel` in mm, `blur` the lens blur in px.
+
+        The droplets' covariance is tabulated on so many `samples` per pixel.
+        """
         if not surface.coverage > 0:
             raise InputError("a surface without droplets (coverage 0) has no texture to correlate")
         widest = surface.droplet * math.exp(BOUND * surface.spread) / pixel
         n = int(np.clip(2 ** math.ceil(math.log2(6 * widest)), 128, 1024))
-        step = np.fft.fftfreq(n * _FINE, 1 / n)
+        step = np.fft.fftfreq(n * samples, 1 / n)
         distance = pixel * np.hypot(step[:, None], step)
-        fine = np.maximum(np.fft.fft2(cover_covariance(surface, distance)).real, 0) / _FINE**2
+        fine = np.maximum(np.fft.fft2(cover_covariance(surface, distance)).real, 0) / samples**2
         inside = np.r_[: n // 2, -(n // 2) : 0]
         frequency = np.asarray(np.fft.fftfreq(n), dtype=np.float64)
         edge = surface.softness / pixel / math.sqrt(20)  # standard deviation of a smooth step's derivative

@@ -227,10 +227,6 @@ def _poisson_table(mean: float) -> FloatArray:
 InPlaneField = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 """Displacement (ux, uy) in mm of a plate's material points (x, y) in mm, in the plate's own axes; vectorised."""
 
-INVERSION_TOLERANCE = 1e-8
-"""Accuracy (mm) of the material point found from a spatial one."""
-_ELEMENTS_PER_BIN = 2
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AffineField:
@@ -347,10 +343,13 @@ class MeshField:
         return _interpolate(x, y, self.nodes + self.displacement, self.elements, self.nodes)
 
 
-def material_from_spatial(field: InPlaneField | None, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+def material_from_spatial(
+    field: InPlaneField | None, x: FloatArray, y: FloatArray, accuracy: float = 1e-8
+) -> tuple[FloatArray, FloatArray]:
     """Material points X of spatial points x = X + u(X).
 
-    A general function is inverted by the iteration X <- x - u(X), which converges where its gradient is below 1.
+    A general function is inverted to an `accuracy` (mm) by the iteration X <- x - u(X), which converges where its
+    gradient is below 1.
 
     Raises
     ------
@@ -367,7 +366,7 @@ def material_from_spatial(field: InPlaneField | None, x: FloatArray, y: FloatArr
         nx, ny = x - ux, y - uy
         change = np.maximum(abs(nx - mx), abs(ny - my))
         mx, my = nx, ny
-        if not (change > INVERSION_TOLERANCE).any():
+        if not (change > accuracy).any():
             return mx, my
     raise InputError("the plate's displacement field cannot be inverted: its gradient must stay below 1 everywhere")
 
@@ -389,11 +388,11 @@ def _interpolate(
 def _bins(
     nodes: FloatArray, elements: npt.NDArray[np.int64]
 ) -> tuple[FloatArray, npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Square bins over the mesh, and for each the elements whose bounding box meets it."""
+    """Square bins over the mesh, two elements each, and for each the elements whose bounding box meets it."""
     corners = nodes[elements]
     low, high = corners.min(axis=1), corners.max(axis=1)
     origin, span = low.min(axis=0), high.max(axis=0) - low.min(axis=0)
-    side = float(np.sqrt(span[0] * span[1] * _ELEMENTS_PER_BIN / len(elements)))
+    side = float(np.sqrt(span[0] * span[1] * 2 / len(elements)))
     columns, rows = (int(length / side) + 1 for length in span)
     start = ((low - origin) / side).astype(np.int64)
     count = ((high - origin) / side).astype(np.int64) - start + 1

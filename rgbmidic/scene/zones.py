@@ -1,7 +1,14 @@
 """Geometry of a scene, exact and without rendering: material points, displacement, and the zones where lights reflect.
 
 The material point that a pixel sees, its place in another state and its displacement in the image follow from the
-pin-hole camera and the body's pose; the zones from the reflectance of the paint (`rgbmidic.scene.reflection`).
+pin-hole camera and the body's pose; the zones from the reflectance of the paint. It is rough: facets with a narrow
+specular lobe, tilted at random by the wrinkles. At the scale of the speckle it reflects into the facets' lobe convolved
+with the law of the slopes (P. Beckmann and A. Spizzichino, The Scattering of Electromagnetic Waves from Rough Surfaces,
+1963; R. Cook and K. Torrance, ACM Transactions on Graphics 1, 1982). That lobe is smooth and predictable; the erratic
+part within it (paper, section 2.3) is not, which is why the prediction serves to weight the lights and not to correct
+the images.
+
+The camera stands in the origin and looks along +z; x to the right, y downwards, lengths in mm.
 """
 
 from __future__ import annotations
@@ -10,20 +17,16 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.scene.camera import NOMINAL_DISTANCE, Light
-from rgbmidic.scene.reflection import Reflectance, Reflection, reflection
 from rgbmidic.scene.scene import Cylinder, Plate, Scene, Sphere, State
 from rgbmidic.scene.surface import Finish, Surface, material_from_spatial
 from rgbmidic.typing import FloatArray
 
 REFLECTS = 0.2
 """Specular fraction from which a light counts as reflecting at a point (chosen; the forecast does not use it)."""
-_DOME_SLOPE = 4 / 3
-"""Mean square slope of a droplet's dome h (1 - r^2/R^2)^2 over its disc, in units of (h/R)^2 (its integral)."""
-_MARGIN = 20.0
-"""Pixels between the frame's edge and the nearest point of a region that the scene does not state."""
 
 
 def material_points(
@@ -147,7 +150,7 @@ def intersect(scene: Scene, state: State, x: FloatArray, y: FloatArray) -> Float
 
 
 def region_in_view(
-    x: FloatArray, y: FloatArray, displacement: FloatArray, shape: tuple[int, int]
+    x: FloatArray, y: FloatArray, displacement: FloatArray, shape: tuple[int, int], margin: float = 20.0
 ) -> tuple[float, float, float, float]:
     """Return the largest rectangle about the middle on the body and, with a margin, in the frame in all states.
 
@@ -159,6 +162,8 @@ def region_in_view(
         Of these points in every state, px; NaN off the body.
     shape
         Rows and columns of the frame.
+    margin
+        px between the frame's edge and the region's nearest point in any state.
 
     Returns
     -------
@@ -173,7 +178,7 @@ def region_in_view(
     height, width = shape
     seen = np.asarray(np.isfinite(displacement[:, 0]).all(axis=0))
     largest = np.abs(displacement[:, :, seen]).max(axis=(0, 2)) if seen.any() else np.zeros(2)
-    left, top = (float(np.ceil(value)) + _MARGIN for value in largest)
+    left, top = (float(np.ceil(value)) + margin for value in largest)
     middle = (width - 1) / 2, (height - 1) / 2
     while 2 * left < width - 8 and 2 * top < height - 8:
         inside = (abs(x - middle[0]) <= middle[0] - left) & (abs(y - middle[1]) <= middle[1] - top)
@@ -183,13 +188,136 @@ def region_in_view(
     raise InputError("the body leaves the middle of the frame: state output.region = [x0, y0, x1, y1]")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reflectance:
+    """How a painted surface reflects, at the scale of the speckle.
+
+    Radiance under unit irradiance: ``diffuse n.l + specular exp(-t^2/(2 width^2)) / (v.h)``, with t the tangent of the
+    angle between the surface's normal n and the half-way vector h of the light's and the camera's directions l and v.
+
+    Attributes
+    ----------
+    diffuse
+        Mean diffuse reflection (albedo).
+    specular
+        Peak of the specular lobe, in the same unit.
+    width_deg
+        Standard deviation of the lobe, as the angle of the half-way vector: half of that by which the light turns.
+    """
+
+    diffuse: float
+    specular: float
+    width_deg: float
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not (self.diffuse > 0 and self.specular >= 0 and 0 < self.width_deg < 45):
+            raise InputError(
+                f"a reflectance has a positive diffuse and a non-negative specular part and a width of 0 to 45 degrees;"
+                f" given are {self.diffuse}, {self.specular}, {self.width_deg}"
+            )
+
+    @classmethod
+    def from_goniometry(cls, *, diffuse: float, specular: float, width_deg: float) -> Reflectance:
+        """From a lobe measured while the light turns about a fixed specimen (`rgbmidic.lab.measures.Lobe`).
+
+        Parameters
+        ----------
+        diffuse, specular
+            Grey levels at normal incidence and at the lobe's peak.
+        width_deg
+            Standard deviation of the lobe in the angle of the light, twice that of the half-way vector.
+        """
+        return cls(diffuse=diffuse, specular=specular, width_deg=width_deg / 2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reflection:
+    """Where lights reflect, at points of a surface; NaN where a light or the camera does not see the surface.
+
+    Attributes
+    ----------
+    slopes : ndarray, shape (k, 3, ...)
+        The half-way vector relative to the normal, ``h/(n.h) - n``: the slope that a facet needs to be a mirror.
+    lambert : ndarray, shape (k, ...)
+        Cosine between normal and light.
+    half : ndarray, shape (k, ...)
+        Cosine v.h between the camera and the half-way vector.
+    deviation_deg : ndarray, shape (k, ...)
+        Angle between the light and the mirror direction of the camera's ray.
+    """
+
+    slopes: FloatArray
+    lambert: FloatArray
+    half: FloatArray
+    deviation_deg: FloatArray
+
+    def diffuse(self, reflectance: Reflectance) -> FloatArray:
+        """Radiance (k, ...) of the diffuse light under unit irradiance across the rays."""
+        return reflectance.diffuse * self.lambert
+
+    def specular(self, reflectance: Reflectance) -> FloatArray:
+        """Return the expected radiance (k, ...) of the specular light under unit irradiance across the rays."""
+        square = (self.slopes**2).sum(axis=1)
+        lobe = np.exp(-square / (2 * math.radians(reflectance.width_deg) ** 2))
+        return np.asarray(reflectance.specular * lobe / self.half)
+
+    def fraction(self, reflectance: Reflectance) -> FloatArray:
+        """Return the expected specular fraction q/(d + q) of the light that reaches the camera, (k, ...), 0 to 1."""
+        q = self.specular(reflectance)
+        return np.asarray(q / (self.diffuse(reflectance) + q))
+
+
+def reflection(points: FloatArray, normals: FloatArray, lamps: npt.ArrayLike) -> Reflection:
+    """Where lamps reflect on a surface seen from the origin.
+
+    Parameters
+    ----------
+    points, normals : ndarray, shape (3, ...)
+        Positions (mm) and outward unit normals; NaN off the surface.
+    lamps : array_like, shape (k, 3)
+        Positions (mm).
+
+    Raises
+    ------
+    InputError
+        The shapes do not fit.
+    """
+    positions = np.asarray(lamps, dtype=np.float64)
+    if points.shape != normals.shape or len(points) != 3 or positions.ndim != 2 or positions.shape[1] != 3:
+        raise InputError(
+            f"points and normals have shape (3, ...), lamps (k, 3); given are {points.shape}, {normals.shape}, "
+            f"{positions.shape}"
+        )
+    view, light = unit(-points), unit(positions.reshape(-1, 3, *[1] * (points.ndim - 1)) - points, axis=1)
+    halfway = unit(light + view, axis=1)
+    lambert, facing = (normals * light).sum(axis=1), (normals * view).sum(axis=0)
+    mirror = 2 * facing * normals - view
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slopes = halfway / (normals * halfway).sum(axis=1, keepdims=True) - normals
+    seen = (lambert > 0) & (facing > 0)
+    return Reflection(
+        slopes=np.where(seen[:, None], slopes, np.nan),
+        lambert=np.where(seen, lambert, np.nan),
+        half=np.where(seen, (view * halfway).sum(axis=1), np.nan),
+        deviation_deg=np.where(seen, np.degrees(np.arccos(np.clip((mirror * light).sum(axis=1), -1, 1))), np.nan),
+    )
+
+
+def unit(vectors: FloatArray, axis: int = 0) -> FloatArray:
+    """Vectors of length 1 in the same directions; the components are along an axis."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=axis, keepdims=True))
+
+
 def macroscopic(surface: Surface) -> Reflectance:
     """Reflectance of a painted surface at the scale of the speckle, averaged over white and black paint.
 
     A facet's Gaussian lobe of variance b^2 convolved with slopes of variance a^2 per axis is a Gaussian of variance
     ``a^2 + b^2`` whose peak is lower by ``b^2/(a^2 + b^2)``. Where the paints differ the lobe keeps peak and volume.
     """
-    dome = _DOME_SLOPE * (surface.dome / (surface.droplet / 2)) ** 2 / 2
+    # per axis, half of the mean square slope of the dome h (1 - r^2/R^2)^2 over its disc: 4/3 (h/R)^2, its integral
+    dome = 4 / 3 * (surface.dome / (surface.droplet / 2)) ** 2 / 2
     parts = ((surface.white, 0.0, 1 - surface.coverage), (surface.black, dome, surface.coverage))
     diffuse = sum(paint.albedo * area for paint, _, area in parts)
     volume = sum(paint.gloss * facet_variance(paint) * area for paint, _, area in parts)

@@ -10,6 +10,7 @@ precision around each pixel is a factor on that in the next one.
 from __future__ import annotations
 
 import hashlib
+import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -259,6 +260,13 @@ def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str)
     return np.ascontiguousarray(np.broadcast_to(values, shape), dtype=np.float32)
 
 
+METHODS_OF_TOOLS = {"geometry": "rgbmidic.scene.geometry_weights:GeometryWeights.prepare"}
+"""Methods that stand on a tool above the core, named as entry points are: a test that states one loads it.
+
+Called with the settings, the names of the lights, the shape (H, W) of the frames and their number.
+"""
+
+
 def prepare_weights(
     settings: TestSettings,
     reference: IlluminationImages,
@@ -298,13 +306,13 @@ def prepare_weights(
         A mask cannot be read.
     """
     weights = settings.weights
-    if weights.method == "geometry":
-        from rgbmidic.weights.geometry import GeometryWeights  # the scene, which no other method needs
-
-        return GeometryWeights.prepare(settings, lights=reference.names, shape=shape or reference.shape, frames=frames)
+    frame = shape or reference.shape
+    if weights.method in METHODS_OF_TOOLS:
+        prepare = pkgutil.resolve_name(METHODS_OF_TOOLS[weights.method])
+        return prepare(settings, lights=reference.names, shape=frame, frames=frames)  # type: ignore[no-any-return]
     if weights.method == "images":
         masks = MaskWeights.read(weights.images)
-        given, frame = np.asarray(masks.masks), shape or reference.shape
+        given = np.asarray(masks.masks)
         if given.shape != (len(reference.names), *frame):
             raise ConfigurationError(
                 f"weights.images must name one mask per light ({', '.join(reference.names)}), of the frames' "

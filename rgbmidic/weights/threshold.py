@@ -3,16 +3,11 @@
 The paper's second method: blur the image so that the speckle vanishes, and exclude what is brighter than a fraction of
 the dynamic range.
 
-The weighting threshold of a set-up, found as in paper section 3.2 from the first measurement without weights.
-
-Where the perturbation is half as large again as elsewhere, the reflection disturbs. The grey level of the blurred image
-on the contour of that zone is the level above which the light is excluded.
-
-The weighting threshold of a test, found from its own first deformed frame (paper, section 3.2).
-
-Every light is first correlated alone and without weights. Where its reflection disturbs the displacement, the grey
-level on the contour of the disturbed zone becomes the threshold of all lights and frames. The paper looks at one light;
-here the one whose reflection disturbs most is taken, as the others' may lie outside the region.
+The threshold of a set-up is found as there, from the first measurement without weights. Where the perturbation P is
+half as large again as elsewhere, the reflection disturbs; the grey level of the blurred image on the contour of that
+zone is the level above which the light is excluded. For a test (``"auto"``) every light is correlated alone with its
+own first deformed frame. The paper looks at one light; here the one whose reflection disturbs most is taken, as the
+others' may lie outside the region.
 """
 
 from __future__ import annotations
@@ -34,6 +29,9 @@ from rgbmidic.settings import ELEMENT_SIZE, SolverSettings, TestSettings
 from rgbmidic.typing import FloatArray, FloatImage
 
 logger = logging.getLogger(__name__)
+
+FALLBACK = 2 / 3
+"""Threshold where no reflection disturbs the first deformed frame: the paper's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +59,7 @@ class ThresholdWeights:
         return threshold_weights(images, threshold=self.threshold, blur=self.blur)
 
 
-def threshold_weights(images: IlluminationImages, *, threshold: float = 2 / 3, blur: float = 10.0) -> FloatImage:
+def threshold_weights(images: IlluminationImages, *, threshold: float = FALLBACK, blur: float = 10.0) -> FloatImage:
     """Binary weights: 0 where the blurred image exceeds a fraction of the dynamic range, 1 elsewhere.
 
     Parameters
@@ -78,8 +76,7 @@ def threshold_weights(images: IlluminationImages, *, threshold: float = 2 / 3, b
     ndarray, shape (k, H, W), float32
         Invalid (saturated) pixels count as full scale in the blur and have weight 0.
     """
-    limit = threshold * images.full_scale
-    bright = blurred(images, blur) > limit
+    bright = blurred(images, blur) > threshold * images.full_scale
     return (images.valid & ~bright).astype(np.float32)
 
 
@@ -101,21 +98,39 @@ def blurred(images: IlluminationImages, blur: float) -> FloatImage:
     return np.stack([cv2.GaussianBlur(image, (0, 0), blur, borderType=cv2.BORDER_REFLECT_101) for image in filled])
 
 
-DISTURBED = 1.5
-"""The zone ends where P has fallen to this multiple of its value on an unaffected zone (paper: 150 %)."""
-MARGIN = 0.03
-"""Share of the dynamic range by which the threshold lies below the level on the contour (paper: 69 % and 66 %)."""
-RING = 40.0
-"""Width (px) of the rings over which P is taken; the disc in their middle holds eight elements of 25 px."""
-_FAR = 0.6
-"""The unaffected zone, where none is given: rings farther from the reflection than this share of the farthest."""
-_NEAR = 0.5
-"""The disturbance is looked for nearer than this share of the farthest pixel."""
-_ACCIDENT = 1e-3
-"""Probability of a disturbed zone where there is none. Chosen."""
-_INDEPENDENT = 0.5
-"""Independent values in an element, whose neighbours are correlated: with twice as many, 1 of 40 shots of a mat sphere
-showed a zone (measured)."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ZoneConstants:
+    """Constants by which a disturbed zone and its threshold are found.
+
+    Attributes
+    ----------
+    disturbed
+        The zone ends where P has fallen to this multiple of its value on an unaffected zone (paper: 150 %).
+    margin
+        Fraction of the dynamic range by which the threshold lies below the level on the contour (paper: 69 % and 66 %).
+    ring
+        Width (px) of the rings over which P is taken; the disc in their middle holds eight elements of 25 px.
+    far
+        The unaffected zone: rings farther from the reflection than this fraction of the farthest.
+    near
+        The disturbance is looked for nearer than this fraction of the farthest pixel.
+    accident
+        Probability of a disturbed zone where there is none. Chosen.
+    independent
+        Independent values in an element, whose neighbours are correlated: with twice as many, 1 of 40 shots of a mat
+        sphere showed a zone (measured).
+    """
+
+    disturbed: float = 1.5
+    margin: float = 0.03
+    ring: float = 40.0
+    far: float = 0.6
+    near: float = 0.5
+    accident: float = 1e-3
+    independent: float = 0.5
+
+
+CONSTANTS = ZoneConstants()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -191,25 +206,26 @@ def disturbed_zone(
     """
     rows, columns = np.nonzero(np.isfinite(high_passed))
     distance = np.hypot(columns - centre[0], rows - centre[1])
-    if not rows.size or distance.max() < 3 * RING:
-        raise InputError(f"the measured field does not reach {3 * RING:g} px from the reflection at {centre}")
-    ring = (distance / RING).astype(int)
+    farthest, width = distance.max(initial=0), CONSTANTS.ring
+    if farthest < 3 * width:
+        raise InputError(f"the measured field does not reach {3 * width:g} px from the reflection at {centre}")
+    ring = (distance / width).astype(int)
     count = np.bincount(ring)
-    full = count >= RING**2  # rings that hold enough pixels to tell
+    full = count >= width**2  # rings that hold enough pixels to tell
     radii = np.bincount(ring, weights=distance)[full] / count[full]
     profile = np.sqrt(np.bincount(ring, weights=high_passed[rows, columns] ** 2)[full] / count[full])
-    unaffected = float(np.median(profile[radii > _FAR * distance.max()]))
-    near = max(1, int((radii < _NEAR * distance.max()).sum()))
+    unaffected = float(np.median(profile[radii > CONSTANTS.far * farthest]))
+    near = max(1, int((radii < CONSTANTS.near * farthest).sum()))
     peak = int(profile[:near].argmax())
-    independent = _INDEPENDENT * count[full][peak] / element_size**2
+    independent = CONSTANTS.independent * count[full][peak] / element_size**2
     return DisturbedZone(
         centre=centre,
-        radius=_first_crossing(radii, profile, DISTURBED * unaffected, peak),
+        radius=_first_crossing(radii, profile, CONSTANTS.disturbed * unaffected, peak),
         unaffected=unaffected,
         radii=radii,
         profile=profile,
         contrast=float(profile[peak] / unaffected),
-        chance=float(np.sqrt(chdtri(independent, _ACCIDENT / near) / independent)),
+        chance=float(np.sqrt(chdtri(independent, CONSTANTS.accident / near) / independent)),
     )
 
 
@@ -255,7 +271,7 @@ def set_up_threshold(
     smooth = np.where(np.isfinite(high_passed), blurred(images, 2 * blur)[light], -np.inf)
     row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
     zone = disturbed_zone(high_passed, (float(column), float(row)), element_size)
-    if zone.contrast <= (least := max(DISTURBED, zone.chance)):
+    if zone.contrast <= (least := max(CONSTANTS.disturbed, zone.chance)):
         raise InputError(
             f"no disturbed zone around {zone.centre}: P is {zone.contrast * zone.unaffected:.2g} px there and "
             f"{zone.unaffected:.2g} px away from it, less than {least:.2g} times as much"
@@ -264,23 +280,19 @@ def set_up_threshold(
     angle = np.linspace(0, 2 * np.pi, max(16, int(2 * np.pi * zone.radius)), endpoint=False)
     place = [zone.centre[1] + zone.radius * np.sin(angle), zone.centre[0] + zone.radius * np.cos(angle)]
     level = float(np.nanmean(map_coordinates(image, place, order=1, mode="constant", cval=np.nan)))
-    return SetUpThreshold(zone=zone, contour=level, value=level - MARGIN)
+    return SetUpThreshold(zone=zone, contour=level, value=level - CONSTANTS.margin)
 
 
 def _first_crossing(radii: FloatArray, profile: FloatArray, limit: float, peak: int) -> float:
     """Radius beyond the peak at which the profile first falls below a limit; 0 where the peak does not exceed it."""
     if not profile[peak] > limit:
         return 0.0
-    for inner in range(peak, len(profile) - 1):
-        here, following = profile[inner], profile[inner + 1]
-        if following <= limit:
-            share = (here - limit) / (here - following)
-            return float(radii[inner] + share * (radii[inner + 1] - radii[inner]))
-    return float(radii[-1])
-
-
-FALLBACK = 2 / 3
-"""Threshold where no reflection disturbs the first deformed frame: the paper's."""
+    below = np.flatnonzero(profile[peak:] <= limit)
+    if not below.size:
+        return float(radii[-1])
+    outer = peak + int(below[0])
+    (here, following), (near, far) = profile[outer - 1 : outer + 1], radii[outer - 1 : outer + 1]
+    return float(near + (here - limit) / (here - following) * (far - near))
 
 
 def automatic_weights(
@@ -342,10 +354,17 @@ def automatic_threshold(
     prefilter
         Of the correlation; a Bayer mosaic needs ``"binomial"``.
     """
-    found = []
+    mesh, found = Tri3Mesh.from_region(region, element_size), list[SetUpThreshold]()
     typical = float(np.median(blurred(reference, blur)[:, region.mask], axis=1).max()) / reference.full_scale
     for light, name in enumerate(reference.names):
-        for component, shown in _displacement(reference, deformed, region, light, element_size, prefilter):
+        before = Reference.prepare(reference.values[light : light + 1], region, mesh=mesh, prefilter=prefilter)
+        after = Deformed.prepare(deformed.values[light : light + 1], prefilter=prefilter)
+        solution = track(before, after, Start(displacement=None), SolverSettings(), None)
+        if solution.status is Status.FAILED:
+            logger.info("%s alone, without weights: %s", name, solution.reason)
+            continue
+        # of u and v the smaller shows a disturbance best
+        for component, shown in zip("uv", at_pixels(mesh, solution.displacement, reference.shape), strict=True):
             try:
                 ripple = high_pass(shown)
                 threshold = set_up_threshold(ripple, reference, light=light, blur=blur, element_size=element_size)
@@ -353,28 +372,8 @@ def automatic_threshold(
                 logger.info("%s alone, without weights, %s: %s", name, component, error)
                 continue
             values = [value for value in (threshold.value, threshold.contour) if typical < value <= 1]
-            if not values:
+            if values:
+                found.append(replace(threshold, value=values[0]))
+            else:
                 logger.info("%s alone, %s: the disturbed zone is not brighter than the rest", name, component)
-                continue
-            found.append(replace(threshold, value=values[0]))
     return max(found, key=lambda threshold: threshold.zone.contrast, default=None)
-
-
-def _displacement(
-    reference: IlluminationImages,
-    deformed: IlluminationImages,
-    region: Region,
-    light: int,
-    element_size: float,
-    prefilter: str,
-) -> list[tuple[str, FloatImage]]:
-    """Displacement u and v (H, W) of one light alone, without weights; the smaller shows a disturbance best."""
-    mesh = Tri3Mesh.from_region(region, element_size)
-    before = Reference.prepare(reference.values[light : light + 1], region, mesh=mesh, prefilter=prefilter)
-    after = Deformed.prepare(deformed.values[light : light + 1], prefilter=prefilter)
-    solution = track(before, after, Start(displacement=None), SolverSettings(), None)
-    if solution.status is Status.FAILED:
-        logger.info("%s alone, without weights: %s", reference.names[light], solution.reason)
-        return []
-    fields = at_pixels(mesh, solution.displacement, reference.shape)
-    return list(zip("uv", fields, strict=True))

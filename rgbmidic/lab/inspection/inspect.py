@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,33 +13,28 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames import open_series, open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.crosstalk import Crosstalk, align, unmix
-from rgbmidic.illumination.demosaicing import SMALLEST_FRAME, ReflectionAwareDemosaicer
+from rgbmidic.illumination.crosstalk import align
+from rgbmidic.illumination.demosaicing import SMALLEST_FRAME
 from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
-from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel, linearise
-from rgbmidic.illumination.separation import DEFAULT_METHOD, reconstructed_lights, separate
+from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.lab.inspection.prediction import (
-    CONTRAST_WIDTH,
+from rgbmidic.lab.inspection.prediction import LocalContrast, Prediction, predict, separated
+from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
+from rgbmidic.lab.inspection.samples import (
+    CONSTANTS,
     Channel,
-    LocalContrast,
-    Prediction,
-    SeparationErrors,
     channels_of,
     noise_estimate,
-    predict,
     speckle_texture,
     surroundings,
 )
-from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.region import finite_elements_of, read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatImage
 
 Frame = Mosaic | ChannelFrame
-Linear = Sequence[LinearMosaic | LinearChannels]
 Progress = Callable[[int, int, str], None]
 
 
@@ -181,26 +176,29 @@ def inspect_frame(
     linear = [linearise(shot, known.noise) for shot in cut]
     report(0, 3, "exposure, speckle and noise")
     channels = channels_of(linear)
-    samples = SampleSummary.of(channels, region.mask, known.noise, linear[0].full_scale)
+    summaries, noise, speckle = _summarised(channels, region.mask, known.noise, linear[0].full_scale)
     report(1, 3, "lights, and the errors of their separation")
-    separated, errors = _separated(linear, known, demosaic, samples.noise, np.random.default_rng(seed))
-    images = align(replace(separated, registration=known.registration))
+    state, errors = separated(linear, known, demosaic, noise, np.random.default_rng(seed))
+    images = align(replace(state, registration=known.registration))
     report(2, 3, "uncertainty to expect")
-    sizes = [channel.speckle_px for channel in samples.channels]
-    shown = LocalContrast.of(images, sizes, region.mask, samples.noise)
-    index = separated.reflection_index()
+    shown = LocalContrast.of(images, [channel.speckle_px for channel in summaries], region.mask, noise)
+    index = state.reflection_index()
     if index is None and len(images.names) > 1:  # the contrast that a light lacks to the best one
         best = np.maximum(shown.contrast.max(axis=0), 1e-6)
         index = np.asarray(1 - shown.contrast / best, dtype=np.float32)
-    texture, local = separated.texture or samples.texture, replace(mesh, nodes=mesh.nodes - window.origin)
+    texture, local = state.texture or speckle, replace(mesh, nodes=mesh.nodes - window.origin)
     prediction = predict(local, region, shown, errors, texture=texture, prefilter=prefilter)
     report(3, 3, "done")
-    first = linear[0]
+    first, greens = linear[0], 0.0
     single = not isinstance(first, LinearMosaic) and len(first.values) == 1
+    if isinstance(first, LinearMosaic):
+        green = sampled_channels(first.cfa, first.values.shape) == 1
+        means = [float(first.values[row::2][green[row::2]].mean()) for row in (0, 1)]
+        greens = abs(means[0] - means[1]) / max(sum(means) / 2, 1e-6)
     return Inspection(
         name=name,
         kind="bayer" if isinstance(first, LinearMosaic) else "monochrome" if single else "rgb",
-        channels=samples.channels,
+        channels=summaries,
         lights=_light_summaries(images, shown.contrast, index, prediction, region.mask),
         frame_shape=shape,
         origin=window.origin,
@@ -210,15 +208,15 @@ def inspect_frame(
         region=region.mask,
         hidden=shown.hidden(region.mask),
         background=shown.background(region.mask),
-        texture=separated.texture,
-        noise=samples.noise,
+        texture=state.texture,
+        noise=noise,
         noise_known=known.noise is not None,
         contradictions=contradictions,
         crosstalk_known=single or known.crosstalk is not None,
         element_size=element_size,
         mesh=mesh,
         prediction=prediction,
-        greens=_green_difference(first) if isinstance(first, LinearMosaic) else 0.0,
+        greens=greens,
     )
 
 
@@ -253,31 +251,6 @@ def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) ->
     return FrameSettings(path=("frame",) * (count if given.get("kind") == "monochrome" else 1), **given)
 
 
-def _separated(
-    linear: Linear, known: Calibration, method: str, noise: NoiseModel, random: np.random.Generator
-) -> tuple[IlluminationImages, SeparationErrors]:
-    """Separate a state as the test would, and draw the errors of that.
-
-    Reflection index and speckle of a mosaic are those of the default method.
-    """
-    first, crosstalk = linear[0], known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
-    if isinstance(first, LinearMosaic):
-        model = ReflectionAwareDemosaicer(crosstalk=crosstalk).reconstruct(first)
-        images = reconstructed_lights(model, crosstalk)
-        if method not in ("auto", DEFAULT_METHOD):
-            other = separate(first, crosstalk, method)
-            images = replace(other, reflection=images.reflection, texture=images.texture)
-        return images, SeparationErrors.of_mosaic(first, model, crosstalk, method, noise, random)
-    full = [frame for frame in linear if isinstance(frame, LinearChannels)]
-    names = known.registration.lights if known.registration else ()
-
-    def lights(frames: Sequence[LinearChannels]) -> IlluminationImages:
-        single = len(frames[0].values) == 1
-        return IlluminationImages.in_succession(frames, names) if single else unmix(frames[0], crosstalk)
-
-    return lights(full), SeparationErrors.of_channels(full, lights, noise, random)
-
-
 def _checked_shape(frames: Sequence[Frame]) -> tuple[int, int]:
     """Rows and columns of frames that can be inspected."""
     first, shapes = frames[0], {frame.values.shape for frame in frames}
@@ -293,63 +266,39 @@ def _checked_shape(frames: Sequence[Frame]) -> tuple[int, int]:
     return rows, columns
 
 
-@dataclass(frozen=True, slots=True)
-class SampleSummary:
-    """Figures of the samples of the channels, the camera noise, and the autocorrelation of the speckle."""
+def _summarised(
+    channels: list[Channel], inside: BoolArray, calibrated: NoiseModel | None, full_scale: float
+) -> tuple[tuple[ChannelSummary, ...], NoiseModel, TextureModel | None]:
+    """Figures of the channels' samples inside the region, the camera noise, and the autocorrelation of the speckle.
 
-    channels: tuple[ChannelSummary, ...]
-    noise: NoiseModel
-    texture: TextureModel | None
-
-    @classmethod
-    def of(
-        cls, channels: list[Channel], inside: BoolArray, calibrated: NoiseModel | None, full_scale: float
-    ) -> SampleSummary:
-        """Summarise the samples inside the region.
-
-        Parameters
-        ----------
-        channels
-            As they were sampled.
-        inside : ndarray, shape (H, W), bool
-            The region.
-        calibrated
-            The noise where it is known; None: it is estimated.
-        full_scale
-            DN.
-
-        Returns
-        -------
-        SampleSummary
-
-        Raises
-        ------
-        InputError
-            A channel without a sample in the region; all samples saturated, or every channel constant.
-        """
-        samples = [channel.values[inside & np.isfinite(channel.values)] for channel in channels]
-        saturated = [int(channel.saturated[inside].sum()) for channel in channels]
-        if not all(values.size for values in samples):
-            raise InputError("the region holds no sample of some channel: it must be larger than a cell of the pattern")
-        if saturated == [values.size for values in samples]:
-            raise InputError("every sample of the region is saturated: there is nothing to inspect")
-        if all(float(np.ptp(values)) == 0 for values in samples):
-            raise InputError("every channel of the region is constant: there is nothing to inspect")
-        textures = [speckle_texture(channel, inside, calibrated) for channel in channels]
-        estimates = noise_estimate(channels, inside) if calibrated is None else []
-        known = [estimate for estimate in estimates if np.isfinite(estimate)]
-        typical = float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
-        noise = calibrated or NoiseModel(gain=float("inf"), read_noise=typical)
-        summaries = []
-        for number, (channel, texture) in enumerate(zip(channels, textures, strict=True)):
-            values = samples[number] / full_scale
-            level = float(values.mean())
-            low, high = np.quantile(values, [0.05, 0.95]).tolist()
-            std = estimates[number] if estimates else float(noise.variance(np.array(level * full_scale))) ** 0.5
-            clipped, size = saturated[number] / values.size, float("nan") if texture is None else texture.diameter
-            summaries.append(ChannelSummary(channel.name, level, low, high, clipped, size, std))
-        sharpest = sorted((texture for texture in textures if texture), key=lambda texture: texture.diameter)
-        return cls(tuple(summaries), noise, sharpest[len(sharpest) // 2] if sharpest else None)
+    Raises
+    ------
+    InputError
+        A channel without a sample in the region; all samples saturated, or every channel constant.
+    """
+    samples = [channel.values[inside & np.isfinite(channel.values)] for channel in channels]
+    saturated = [int(channel.saturated[inside].sum()) for channel in channels]
+    if not all(values.size for values in samples):
+        raise InputError("the region holds no sample of some channel: it must be larger than a cell of the pattern")
+    if saturated == [values.size for values in samples]:
+        raise InputError("every sample of the region is saturated: there is nothing to inspect")
+    if all(float(np.ptp(values)) == 0 for values in samples):
+        raise InputError("every channel of the region is constant: there is nothing to inspect")
+    textures = [speckle_texture(channel, inside, calibrated) for channel in channels]
+    estimates = noise_estimate(channels, inside) if calibrated is None else []
+    known = [estimate for estimate in estimates if np.isfinite(estimate)]
+    typical = float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
+    noise = calibrated or NoiseModel(gain=float("inf"), read_noise=typical)
+    summaries = []
+    for number, (channel, texture) in enumerate(zip(channels, textures, strict=True)):
+        values = samples[number] / full_scale
+        level = float(values.mean())
+        low, high = np.quantile(values, [0.05, 0.95]).tolist()
+        std = estimates[number] if estimates else float(noise.variance(np.array(level * full_scale))) ** 0.5
+        clipped, size = saturated[number] / values.size, float("nan") if texture is None else texture.diameter
+        summaries.append(ChannelSummary(channel.name, level, low, high, clipped, size, std))
+    sharpest = sorted((texture for texture in textures if texture), key=lambda texture: texture.diameter)
+    return tuple(summaries), noise, sharpest[len(sharpest) // 2] if sharpest else None
 
 
 def _light_summaries(
@@ -363,7 +312,7 @@ def _light_summaries(
     summaries = []
     for j, light in enumerate(images.names):
         values, valid = images.values[j][inside], images.valid[j][inside]
-        mean = local_mean(images.values[j], CONTRAST_WIDTH[0])[inside]
+        mean = local_mean(images.values[j], CONSTANTS.contrast_widths[0])[inside]
         summaries.append(
             LightSummary(
                 name=light,
@@ -376,10 +325,3 @@ def _light_summaries(
             )
         )
     return tuple(summaries)
-
-
-def _green_difference(mosaic: LinearMosaic) -> float:
-    """Difference of the means of the two greens of a mosaic over their mean."""
-    green = sampled_channels(mosaic.cfa, mosaic.values.shape) == 1
-    first, second = (float(mosaic.values[row::2][green[row::2]].mean()) for row in (0, 1))
-    return abs(first - second) / max((first + second) / 2, 1e-6)

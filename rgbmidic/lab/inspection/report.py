@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
@@ -11,10 +12,9 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
-from rgbmidic.lab import check_folder, number_or_none, write_findings
+from rgbmidic.lab import plain, write_findings
 from rgbmidic.lab.inspection import Inspection, Spread
-from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal
-from rgbmidic.typing import AnyArray
+from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal, shade, show_image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,9 +22,8 @@ if TYPE_CHECKING:
 
 FILES = ("inspection.json", "inspection.png")
 """What `write_inspection` writes."""
-_BOX: dict[str, Any] = {"frameon": True, "framealpha": 0.85, "edgecolor": "none", "borderpad": 0.3}
-_PICTURE = 700
-"""Longest side (px) of an image in the figure."""
+_UNKNOWN = "#e8590c"
+"""Colour of what is not known of a light's image."""
 
 
 def write_inspection(inspection: Inspection, out: Path, *, overwrite: bool = False) -> None:
@@ -35,8 +34,8 @@ def write_inspection(inspection: Inspection, out: Path, *, overwrite: bool = Fal
     ResultError
         An inspection is already there, or the folder cannot be written.
     """
-    check_folder(out, FILES, overwrite=overwrite)
-    write_findings(out, "inspection", inspection_document(inspection), _inspection_figure(inspection))
+    contents = inspection_document(inspection), _inspection_figure(inspection)
+    write_findings(out, dict(zip(FILES, contents, strict=True)), overwrite=overwrite)
 
 
 def channel_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
@@ -76,8 +75,8 @@ def _text(value: float, digits: int) -> str:
 
 def inspection_document(inspection: Inspection) -> dict[str, Any]:
     """Return the figures as plain values, for inspection.json; a number that is not known is null."""
-    texture = inspection.texture
-    return {
+    texture, expected = inspection.texture, inspection.prediction
+    document = {
         "schema": "rgbmidic-inspection",
         "rgbmidic": __version__,
         "frame": inspection.name,
@@ -86,27 +85,26 @@ def inspection_document(inspection: Inspection) -> dict[str, Any]:
         "element_size_px": inspection.element_size,
         "crosstalk_known": inspection.crosstalk_known,
         "noise_known": inspection.noise_known,
-        "speckle_px": number_or_none(inspection.speckle_px),
+        "speckle_px": inspection.speckle_px,
         "texture": texture
         and {
-            "diameter_px": number_or_none(texture.diameter),
+            "diameter_px": texture.diameter,
             "agreement_of_colours": texture.correlation,
             "channel_specific_fraction": texture.specific,
         },
         "reflects_from_index": REFLECTING,
-        "channels": [_plain(channel) for channel in inspection.channels],
-        "lights": [_plain(light) | {"alone_std_px": _plain(light.alone)} for light in inspection.lights],
-        "std_px": _plain(Spread.of(inspection.prediction.std)),
-        "std_from_noise_px": _plain(Spread.of(inspection.prediction.noise)),
-        "std_from_mosaic_px": _plain(Spread.of(inspection.prediction.mosaic)),
+        "channels": inspection.channels,
+        "lights": [
+            {("alone_std_px" if name == "alone" else name): value for name, value in asdict(light).items()}
+            for light in inspection.lights
+        ],
+        "std_px": Spread.of(expected.std),
+        "std_from_noise_px": Spread.of(expected.noise),
+        "std_from_mosaic_px": Spread.of(expected.mosaic),
         "nodes_not_measured": inspection.unmeasured,
-        "warnings": [{"code": finding.code, "text": finding.text} for finding in inspection.findings],
+        "warnings": inspection.findings,
     }
-
-
-def _plain(summary: Any) -> dict[str, Any]:
-    values = {name: getattr(summary, name) for name in summary.__dataclass_fields__ if name != "alone"}
-    return {name: number_or_none(value) if isinstance(value, float) else value for name, value in values.items()}
+    return plain(document)  # type: ignore[no-any-return]
 
 
 def _inspection_figure(inspection: Inspection) -> Figure:
@@ -123,16 +121,15 @@ def _inspection_figure(inspection: Inspection) -> Figure:
         figure.set_layout_engine("constrained", w_pad=0.02, h_pad=0.06)
         grid = figure.add_gridspec(rows, columns + 1, width_ratios=[*[1.0] * columns, 0.05])
         for column, (light, image) in enumerate(zip(inspection.lights, inspection.images.values, strict=True)):
-            known = _reduced(image)[np.isfinite(_reduced(image))]
-            low, high = np.percentile(known, [1, 99]) if known.size else (0, 1)
-            look = {"cmap": "gray", "vmin": low, "vmax": max(high, low + 1e-6), "interpolation": "auto"}
-            title = f"light {literal(light.name)}" if lights > 1 else "image"
-            _draw_image(figure.add_subplot(grid[0, column]), inspection, image, title, **look)
+            axis = figure.add_subplot(grid[0, column], facecolor=_UNKNOWN)
+            show_image(axis, image, inspection.origin)
+            _finish(axis, inspection, f"light {literal(light.name)}" if lights > 1 else "image")
         if inspection.reflection_index is not None:
-            look = {"cmap": "inferno", "vmin": 0, "vmax": 1, "interpolation": "auto"}
             for column, (light, index) in enumerate(zip(inspection.lights, inspection.reflection_index, strict=True)):
-                title = f"{literal(light.name)} reflects on {light.reflecting:.0%}"
-                shown = _draw_image(figure.add_subplot(grid[1, column]), inspection, index, title, **look)
+                axis = figure.add_subplot(grid[1, column], facecolor=_UNKNOWN)
+                extent = _extent(inspection)
+                shown = axis.imshow(index, cmap="inferno", vmin=0, vmax=1, interpolation="auto", extent=extent)
+                _finish(axis, inspection, f"{literal(light.name)} reflects on {light.reflecting:.0%}")
             figure.colorbar(shown, cax=figure.add_subplot(grid[1, -1]), label="reflection index")
         _draw_trouble(figure.add_subplot(grid[-1, 0]), inspection)
         _draw_std(figure, figure.add_subplot(grid[-1, columns - 1]), figure.add_subplot(grid[-1, -1]), inspection)
@@ -142,42 +139,24 @@ def _inspection_figure(inspection: Inspection) -> Figure:
     return figure
 
 
-def _draw_image(axis: Axes, inspection: Inspection, image: AnyArray, title: str, **look: Any) -> Any:
-    """An image of the part that is looked at, with the outline of the region; colour for what is unknown."""
-    axis.set_facecolor("#e8590c")
-    picture = axis.imshow(_reduced(image), extent=_extent(inspection), **look)
-    axis.set_title(title)
-    _frame_axis(axis, inspection)
-    return picture
-
-
 def _draw_trouble(axis: Axes, inspection: Inspection) -> None:
     """Saturated samples, and where no light shows the texture, over the mean of the lights."""
-    from matplotlib.colors import to_rgb
-    from matplotlib.lines import Line2D
     from scipy.ndimage import maximum_filter
 
-    mean = np.nan_to_num(inspection.images.values).mean(axis=0)
-    low, high = np.percentile(mean, [1, 99])
-    grey = np.clip((_reduced(mean) - low) / max(high - low, 1e-6), 0, 1)
-    picture = np.repeat(0.35 + 0.6 * grey[..., None], 3, axis=2)
+    show_image(axis, np.nan_to_num(inspection.images.values).mean(axis=0), inspection.origin)
+    inside, step = inspection.region, max(1, max(inspection.region.shape) // 700)
     # grown by a pixel and more, so that single samples stay visible in a reduced picture
-    grown = maximum_filter(inspection.saturated, size=2 * _step(inspection.saturated.shape) + 1)
-    marks = {
-        "saturated": (grown, "#c8102e"),
-        "no light shows it": (inspection.hidden, "#1f5fbf"),
-    }
-    handles = []
-    for label, (mask, colour) in marks.items():
-        where = _reduced(mask & inspection.region)
-        picture[where] = 0.25 * picture[where] + 0.75 * np.array(to_rgb(colour))
-        fraction = (inspection.saturated if label == "saturated" else mask)[inspection.region].mean()
-        style: dict[str, Any] = {"marker": "s", "linestyle": "", "markersize": 5}
-        handles.append(Line2D([], [], color=colour, label=f"{label}: {fraction:.1%}", **style))
-    axis.imshow(picture, extent=_extent(inspection), interpolation="nearest")
-    axis.set_title("samples in the region")
-    axis.legend(handles=handles, loc="upper left", fontsize=8, handletextpad=0.2, **_BOX)
-    _frame_axis(axis, inspection)
+    grown = maximum_filter(inspection.saturated, size=2 * step + 1)
+    for label, mask, drawn, colour in (
+        ("saturated", inspection.saturated, grown, "#c8102e"),
+        ("no light shows it", inspection.hidden, inspection.hidden, "#1f5fbf"),
+    ):
+        cover = (drawn & inside)[::step, ::step].astype(np.float32)
+        shade(axis, cover, step, inspection.origin, colour)
+        axis.plot([], [], "s", color=colour, markersize=5, label=f"{label}: {mask[inside].mean():.1%}")
+    box: dict[str, Any] = {"frameon": True, "framealpha": 0.85, "edgecolor": "none", "borderpad": 0.3}
+    axis.legend(loc="upper left", fontsize=8, handletextpad=0.2, **box)
+    _finish(axis, inspection, "samples in the region")
 
 
 def _draw_std(figure: Figure, axis: Axes, bar: Axes, inspection: Inspection) -> None:
@@ -186,9 +165,8 @@ def _draw_std(figure: Figure, axis: Axes, bar: Axes, inspection: Inspection) -> 
 
     std, mesh = inspection.prediction.std, inspection.mesh
     known = np.isfinite(std)
-    axis.set_title("predicted uncertainty")
     axis.set_facecolor("0.85")
-    _frame_axis(axis, inspection)
+    _finish(axis, inspection, "predicted uncertainty")
     if not known.any():
         axis.text(0.5, 0.5, "nothing can be measured", transform=axis.transAxes, ha="center", va="center")
         bar.axis("off")
@@ -224,22 +202,14 @@ def _write_summary(axis: Axes, inspection: Inspection) -> None:
     axis.text(0.02, 0.98, text, transform=axis.transAxes, va="top", fontsize=8, linespacing=1.5, parse_math=False)
 
 
-def _step(shape: tuple[int, ...]) -> int:
-    return max(1, max(shape) // _PICTURE)
-
-
-def _reduced(image: AnyArray) -> AnyArray:
-    step = _step(image.shape)
-    return image[::step, ::step]
-
-
 def _extent(inspection: Inspection) -> tuple[float, float, float, float]:
     (height, width), (x, y) = inspection.region.shape, inspection.origin
     return (x - 0.5, x + width - 0.5, y + height - 0.5, y - 0.5)
 
 
-def _frame_axis(axis: Axes, inspection: Inspection) -> None:
-    """Pixel axes, and the outline of the region where it is not the whole frame."""
+def _finish(axis: Axes, inspection: Inspection, title: str) -> None:
+    """Title, pixel axes, and the outline of the region where it is not the whole frame."""
+    axis.set_title(title)
     left, right, bottom, top = _extent(inspection)
     if not inspection.region.all():
         places = np.arange(left + 0.5, right), np.arange(top + 0.5, bottom)

@@ -12,15 +12,10 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.prediction import Prediction
+from rgbmidic.lab.inspection.samples import CONSTANTS
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
-
-TOO_FINE = 0.75
-"""Agreement of neighbouring colours below which the speckle is too fine for the colour lattice (docs: inspect)."""
-SATURATED, DARK, HIDDEN, NEGATIVE, GREENS = 0.01, 0.1, 0.01, 0.01, 0.05
-"""Fractions (chosen) from which a warning is given: of saturated samples; of the full scale at the 95 % quantile of a
-channel; of the region that no light shows; of pixels where a light is negative; between the two greens."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +57,7 @@ class ChannelSummary:
     saturated : float
         Fraction of the samples that are saturated.
     speckle_px : float
-        Full width at half maximum of the autocorrelation, px (`rgbmidic.lab.inspection.prediction.speckle_texture`).
+        Full width at half maximum of the autocorrelation, px (`rgbmidic.lab.inspection.samples.speckle_texture`).
     noise_dn : float
         Standard deviation of the camera noise of a sample at the mean level, DN; estimated from the frame where the
         calibration does not know the noise.
@@ -197,7 +192,7 @@ class Inspection:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """The warnings, the gravest first."""
-        return tuple(findings(self))
+        return (*_of_set_up(self), *_of_exposure(self), *_of_speckle(self), *_of_region(self))
 
     @property
     def speckle_px(self) -> float:
@@ -206,33 +201,10 @@ class Inspection:
         return float(np.median(sizes)) if sizes else float("nan")
 
 
-def findings(inspection: Inspection) -> Iterator[Finding]:
-    """Warnings that an inspection gives rise to."""
-    yield from _of_set_up(inspection)
-    yield from _of_exposure(inspection)
-    yield from _of_speckle(inspection)
-    hidden, dark = (float(where[inspection.region].mean()) for where in (inspection.hidden, inspection.background))
-    if hidden > HIDDEN:
-        what, why = (
-            ("no light shows", "all lights reflect or saturate there") if len(inspection.lights) > 1 else _ONE_LIGHT
-        )
-        reasons = []
-        if dark > HIDDEN:
-            reasons.append(f"it holds dark background ({dark:.1%}), draw it inside the specimen")
-        if hidden - dark > HIDDEN or not reasons:
-            reasons.append(f"{why}, or there is no paint")
-        yield Finding("hidden", f"{what} the texture on {hidden:.1%} of the region: {'; '.join(reasons)}")
-    if inspection.unmeasured > 0:
-        yield Finding("not measured", f"{inspection.unmeasured:.1%} of the nodes will not be measured")
-
-
-_ONE_LIGHT = "the light does not show", "it reflects or saturates there"
-
-
 def _of_set_up(inspection: Inspection) -> Iterator[Finding]:
     for found in inspection.contradictions:
         yield Finding(f"not calibrated: {found.check}", found.text)
-    if inspection.greens > GREENS:
+    if inspection.greens > CONSTANTS.greens:
         difference = f"{inspection.greens:.0%}"
         yield Finding(
             "pattern", f"the two greens of the pattern differ by {difference}: check cfa, they are one colour"
@@ -250,7 +222,7 @@ def _of_set_up(inspection: Inspection) -> Iterator[Finding]:
             "times too high for speckle under 4 px and in reflections; rgbmidic-calibrate noise",
         )
     for light in inspection.lights:
-        if light.negative > NEGATIVE:
+        if light.negative > CONSTANTS.negative:
             yield Finding(
                 "negative light",
                 f"light {light.name} is negative on {light.negative:.0%} of the region: crosstalk, pattern or "
@@ -260,13 +232,13 @@ def _of_set_up(inspection: Inspection) -> Iterator[Finding]:
 
 def _of_exposure(inspection: Inspection) -> Iterator[Finding]:
     for channel in inspection.channels:
-        if channel.saturated > SATURATED:
+        if channel.saturated > CONSTANTS.saturated:
             yield Finding(
                 "saturated",
                 f"channel {channel.name}: {channel.saturated:.1%} of the samples are saturated and will not be "
                 "measured; less exposure, or another place of the lamp",
             )
-        if channel.high < DARK:
+        if channel.high < CONSTANTS.dark:
             yield Finding(
                 "dark",
                 f"channel {channel.name} is dark: 95 % of its samples are below {channel.high:.1%} of the full "
@@ -282,12 +254,12 @@ def _of_speckle(inspection: Inspection) -> Iterator[Finding]:
             f"the colours do not show one texture (agreement {texture.correlation:.2f}): a coloured specimen, or "
             "speckle far too fine; each colour has only its own lattice, so speckles need 6 px and more",
         )
-    elif texture is not None and texture.correlation < TOO_FINE:
+    elif texture is not None and texture.correlation < CONSTANTS.too_fine:
         yield Finding(
             "fine speckle",
-            f"the speckle is too fine for the colour lattice: neighbouring colours agree to "
-            f"{texture.correlation:.2f}, {TOO_FINE} is needed (speckles of about 2.0 px); displacements will be pulled "
-            "towards whole pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer lens",
+            f"the speckle is too fine for the colour lattice: neighbouring colours agree to {texture.correlation:.2f}, "
+            f"{CONSTANTS.too_fine} is needed (speckles of about 2.0 px); displacements will be pulled towards whole "
+            "pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer lens",
         )
     if np.isnan(size):
         yield Finding("no texture", "no speckle is seen: its autocorrelation has no width")
@@ -297,3 +269,19 @@ def _of_speckle(inspection: Inspection) -> Iterator[Finding]:
             f"speckles of {size:.1f} px are coarse for elements of {inspection.element_size:g} px: at least "
             f"{SPECKLES:g} per side, so element_size = {np.ceil(SPECKLES * size):.0f} or finer speckle",
         )
+
+
+def _of_region(inspection: Inspection) -> Iterator[Finding]:
+    hidden, dark = (float(where[inspection.region].mean()) for where in (inspection.hidden, inspection.background))
+    if hidden > CONSTANTS.hidden:
+        what, why = "the light does not show", "it reflects or saturates there"
+        if len(inspection.lights) > 1:
+            what, why = "no light shows", "all lights reflect or saturate there"
+        reasons = []
+        if dark > CONSTANTS.hidden:
+            reasons.append(f"it holds dark background ({dark:.1%}), draw it inside the specimen")
+        if hidden - dark > CONSTANTS.hidden or not reasons:
+            reasons.append(f"{why}, or there is no paint")
+        yield Finding("hidden", f"{what} the texture on {hidden:.1%} of the region: {'; '.join(reasons)}")
+    if inspection.unmeasured > 0:
+        yield Finding("not measured", f"{inspection.unmeasured:.1%} of the nodes will not be measured")

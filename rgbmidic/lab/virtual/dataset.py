@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -128,13 +128,10 @@ def _write_frame(folder: Path, index: int, frame: Frame, settings: DatasetSettin
 def _write_captures(out: Path, scene: Scene, settings: DatasetSettings, at_rest: FloatImage, seeds: list[int]) -> None:
     count = settings.calibration_frames
     single = single_light_frames(scene, count=count, seed=seeds[0], target=settings.target)
-    flat, check = flat_frames(scene, seed=seeds[2]), _check_frames(scene, at_rest, seed=seeds[3])
-    groups = {
-        **{f"light_{name}": frames for name, frames in single.items()},
-        "dark": dark_frames(scene, count=count, seed=seeds[1]),
-        **{f"flat_{number}": frames for number, frames in enumerate(flat, start=1)},
-        **{f"check/{name}": frames for name, frames in check.items()},
-    }
+    groups = {f"light_{name}": frames for name, frames in single.items()}
+    groups |= {"dark": dark_frames(scene, count=count, seed=seeds[1])}
+    groups |= {f"flat_{number}": frames for number, frames in enumerate(flat_frames(scene, seed=seeds[2]), start=1)}
+    groups |= {f"check/{name}": frames for name, frames in _check_frames(scene, at_rest, seed=seeds[3]).items()}
     for folder, frames in groups.items():
         for index, frame in enumerate(frames):
             _write_frame(out / folder, index, frame, settings)
@@ -205,13 +202,13 @@ def single_light_frames(scene: Scene, *, count: int = 3, seed: int, target: Targ
     dict
         Light name to its frames.
     """
-    images = render(target_scene(scene, target))
-    generator = np.random.SeedSequence(seed)
-    frames: dict[str, list[Frame]] = {light.name: [] for light in scene.lights}
-    for name, taken in frames.items():
+    images, generator = render(target_scene(scene, target)), np.random.SeedSequence(seed)
+
+    def dimmed(name: str) -> Iterator[Frame]:
         for step, child in enumerate(generator.spawn(count), start=1):
-            taken += _shots(scene, images * np.float32(step / count), child.generate_state(1), (name,))
-    return frames
+            yield from _shots(scene, images * np.float32(step / count), child.generate_state(1), (name,))
+
+    return {light.name: list(dimmed(light.name)) for light in scene.lights}
 
 
 def dark_frames(scene: Scene, *, count: int = 3, seed: int) -> list[Frame]:
@@ -231,12 +228,13 @@ def flat_frames(scene: Scene, *, count: int = 2, seed: int) -> list[list[Frame]]
 
 def _check_frames(scene: Scene, images: FloatImage, *, count: int = 2, seed: int) -> dict[str, list[Frame]]:
     """Frames of the specimen at rest, `images` (k, H, W): each light alone, all together ("all"), and "dark"."""
-    lit = {light.name: (light.name,) for light in scene.lights} | {"all": tuple(light.name for light in scene.lights)}
+    lit = {light.name: (light.name,) for light in scene.lights} | {"all": None}
     *steps, last = np.random.SeedSequence(seed).spawn(len(lit) + 1)
-    frames = {"dark": dark_frames(scene, count=count, seed=int(last.generate_state(1)[0]))}
-    for (name, on), step in zip(lit.items(), steps, strict=True):
-        frames[name] = _shots(scene, images, step.generate_state(count), on)
-    return frames
+    frames = {
+        name: _shots(scene, images, step.generate_state(count), on)
+        for (name, on), step in zip(lit.items(), steps, strict=True)
+    }
+    return frames | {"dark": dark_frames(scene, count=count, seed=int(last.generate_state(1)[0]))}
 
 
 def _shots(

@@ -16,14 +16,9 @@ from scipy.special import erf
 from rgbmidic._kernels.render import trace_rows
 from rgbmidic.scene.camera import DISTANCE, NOMINAL_DISTANCE, PIXEL, Light, Vector, reference_camera, three_lights
 from rgbmidic.scene.scene import Plate, Scene, Sphere, State
-from rgbmidic.scene.surface import AffineField, Finish, Surface, material_from_spatial
-from rgbmidic.scene.zones import intersect, truth
+from rgbmidic.scene.surface import AffineField, Finish, Surface
+from rgbmidic.scene.zones import material_points, truth
 from rgbmidic.typing import FloatArray, FloatImage
-
-BAND = 64
-"""Pixel rows traced at a time: bounds the memory; the images do not depend on it."""
-LONGEST_STEP = 0.25
-"""Motion (px) between two of the poses over which a moving body is averaged: a quarter of the pixel's own aperture."""
 
 
 def samples_needed(scene: Scene) -> int:
@@ -61,10 +56,9 @@ def render(scene: Scene, state: State | None = None) -> FloatImage:
     state, duration = state or State(), scene.camera.exposure_time
     poses = [state]
     if duration > 0 and state.moves:
-        # the middles of equal parts of the exposure, each shorter than `LONGEST_STEP` px of motion
+        # the middles of equal parts of the exposure, each shorter in motion than a quarter of the pixel's own aperture
         swept = np.hypot(*truth(scene, state.after(duration / 2), state.after(-duration / 2)))
-        length = float(np.nanmax(swept, initial=0.0))
-        parts = max(1, math.ceil(length / LONGEST_STEP))
+        parts = max(1, math.ceil(4 * float(np.nanmax(swept, initial=0.0))))
         poses = [state.after(duration * ((i + 0.5) / parts - 0.5)) for i in range(parts)]
     out = _trace(scene, poses[0])
     for pose in poses[1:]:
@@ -99,8 +93,9 @@ def _trace_together(scene: Scene, state: State, lights: tuple[Light, ...]) -> Fl
     pad, taps = _aperture(camera.lens_blur, n)
     height, width = camera.shape
     out = np.empty((len(lights), height, width), dtype=np.float32)
-    for top in range(0, height, BAND):
-        bottom = min(top + BAND, height)
+    band = 64  # rows traced at a time: bounds the memory; the images do not depend on it
+    for top in range(0, height, band):
+        bottom = min(top + band, height)
         rows = np.empty((len(lights), bottom - top + 2 * pad, n, width), dtype=np.float32)
         first = n * (top - pad)
         material = np.empty((0, 0, 2))
@@ -128,16 +123,16 @@ def _aperture(blur: float, samples: int) -> tuple[int, FloatArray]:
     return pad, (weights / weights.sum()).astype(np.float32)
 
 
-def _subpixel_material(scene: Scene, state: State, light: Light, first: int, rows: int, pad: int) -> FloatArray:
-    """Material point (rows, columns, 2) of every sub-pixel sample; NaN off the plate."""
+def _subpixel_material(scene: Scene, state: State, light: Light, first: int, count: int, pad: int) -> FloatArray:
+    """Material point (count, columns, 2) of every sub-pixel sample; NaN off the plate."""
     n, camera = samples_needed(scene), scene.camera
     zoom = 1 + light.magnification
     x = (np.arange(n * (camera.shape[1] + 2 * pad)) + 0.5) / n - 0.5 - pad
-    y = (np.arange(first, first + rows) + 0.5) / n - 0.5
+    y = (np.arange(first, first + count) + 0.5) / n - 0.5
     x = (x - camera.centre[0] - light.shift[0]) / zoom + camera.centre[0]
     y = (y - camera.centre[1] - light.shift[1]) / zoom + camera.centre[1]
-    spatial = intersect(scene, state, *np.meshgrid(x, y))
-    return np.stack(material_from_spatial(state.displacement, spatial[0], spatial[1]), axis=-1)
+    columns, rows = np.meshgrid(x, y)
+    return np.ascontiguousarray(np.moveaxis(material_points(scene, state, (columns, rows))[:2], 0, -1))
 
 
 def paint(*, gloss: float = 1.5, lobe_deg: float = 4.0, **settings: Any) -> Surface:

@@ -11,8 +11,8 @@ from rgbmidic.errors import InputError
 from rgbmidic.lab.measures import Lobe
 from rgbmidic.lab.virtual import Camera, Sphere
 from rgbmidic.lab.virtual.rendering import plate_scene, sphere_scene
-from rgbmidic.scene.reflection import Reflectance, angle_weights, reflection, surface_from_heights
-from rgbmidic.scene.zones import material_points, placed
+from rgbmidic.scene.geometry_weights import angle_weights, surface_from_heights
+from rgbmidic.scene.zones import Reflectance, material_points, placed, reflection
 
 PAINT = Reflectance(diffuse=0.5, specular=0.7, width_deg=6.0)
 POINT, NORMAL = np.array([0.0, 0.0, 600.0]), np.array([0.0, 0.0, -1.0])

@@ -12,8 +12,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.lab.virtual import Cylinder, Plate, Scene, State, Surface, render, turned
 from rgbmidic.lab.virtual.rendering import paint, sphere_scene
 from rgbmidic.scene.camera import reference_camera, three_lights
-from rgbmidic.scene.reflection import Reflectance
-from rgbmidic.scene.zones import REFLECTS, macroscopic, material_points, predict_zones
+from rgbmidic.scene.zones import REFLECTS, Reflectance, macroscopic, material_points, predict_zones
 
 OVERLAP = 0.9
 """Common part of predicted and rendered zone over both together; the zone's edge moves by a few pixels."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import InputError
-from rgbmidic.lab.planning import APART, Plan, make_plan, propose_colours, propose_lamps
+from rgbmidic.lab.planning import CONSTANTS, Plan, make_plan, propose_colours, propose_lamps
 from rgbmidic.lab.virtual import Cylinder, Light, Plate, Scene, State, turned
 from rgbmidic.lab.virtual.rendering import paint, sphere_scene
 from rgbmidic.scene.camera import reference_camera, three_lights
@@ -105,7 +105,7 @@ def test_moved_lamps_overlap_less_keep_their_distance_and_stay_apart():
     np.testing.assert_allclose([np.linalg.norm(t) for t in towards], 550.0)
     unit = np.array([t / np.linalg.norm(t) for t in towards])
     cosines = (unit @ unit.T)[np.triu_indices(3, 1)]
-    assert cosines.max() <= np.cos(np.radians(APART)) + 1e-9
+    assert cosines.max() <= np.cos(np.radians(CONSTANTS.apart)) + 1e-9
     # the proposal's figures are those of a plan made for it
     again = plan(replace(scene, lights=proposal.lights), turned(1.0), turned(4.0))
     assert again.std == pytest.approx(proposal.plan.std)

@@ -1,30 +1,205 @@
-"""The painted surface: how it reflects (goniometry) and how rough it is (topography).
+"""How the paper judges a set-up and a specimen, for any data: perturbation, goniometry, topography.
 
-Goniometry (paper, section 2.3 and Fig. 9): grey level of chosen pixels of a fixed specimen before a fixed camera
-against the angle of a light that turns about it. Topography (section 2.4): form taken off a height map of a confocal
-sensor, local slopes, distance between wrinkles.
+Perturbation P (paper, section 2.2): the displacement minus its Gaussian-filtered copy, and its standard deviation over
+areas; beside it the residual in percent of the dynamic range. Goniometry (section 2.3 and Fig. 9): grey level of chosen
+pixels of a fixed specimen before a fixed camera against the angle of a light that turns about it. Topography (section
+2.4): form taken off a height map of a confocal sensor, local slopes, distance between wrinkles.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass, replace
+from itertools import pairwise, product
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
+from rgbmidic.fields import SIGMA, high_pass
 from rgbmidic.typing import BoolArray, FloatArray
 
-VISIBLE = 0.05
-"""The reflection is erratic where the pixels' spread exceeds this fraction of the white paint's diffuse level."""
-_GROUPS = 10
-"""Groups of pixels left out in turn to find the lobe's uncertainty."""
-_BEYOND = 2.5
-"""Beyond this many standard deviations of the lobe the light is taken to be diffuse."""
+AREA_SIZE = (50.0, 100.0)
+"""Width and height (px) of the paper's areas."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Area:
+    """A rectangle of the reference image over which the perturbation is assessed.
+
+    Attributes
+    ----------
+    name
+        For instance ``"A0"``.
+    centre
+        (x, y) in px.
+    size
+        (width, height) in px.
+    """
+
+    name: str
+    centre: tuple[float, float]
+    size: tuple[float, float] = AREA_SIZE
+
+    @property
+    def rectangle(self) -> tuple[float, float, float, float]:
+        """(x0, y0, x1, y1) in px."""
+        (x, y), (width, height) = self.centre, self.size
+        return x - width / 2, y - height / 2, x + width / 2, y + height / 2
+
+    def cut(self, image: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+        """Return the pixels of an image whose centres lie in the area.
+
+        Parameters
+        ----------
+        image
+            Shape (..., H, W).
+
+        Returns
+        -------
+        ndarray, shape (..., h, w)
+
+        Raises
+        ------
+        InputError
+            The area is not wholly inside the image.
+        """
+        height, width = image.shape[-2:]
+        x0, y0, x1, y1 = self.rectangle
+        if not (0 <= x0 < x1 <= width - 1 and 0 <= y0 < y1 <= height - 1):
+            raise InputError(f"area {self.name} {self.rectangle} does not lie in the image of {width} x {height} px")
+        return image[..., int(np.ceil(y0)) : int(y1) + 1, int(np.ceil(x0)) : int(x1) + 1]
+
+
+def areas_along_x(
+    first: tuple[float, float], *, pitch: float = 100.0, count: int = 5, size: tuple[float, float] = AREA_SIZE
+) -> tuple[Area, ...]:
+    """Areas A0, A1, ... in a row along x, as on the paper's Fig. 4.
+
+    Parameters
+    ----------
+    first
+        Centre (x, y) of A0 in px.
+    pitch
+        Distance between the centres in px; a negative one runs to the left.
+    count
+        How many.
+    size
+        (width, height) of each in px.
+
+    Returns
+    -------
+    tuple of Area
+    """
+    return tuple(Area(name=f"A{i}", centre=(first[0] + i * pitch, first[1]), size=size) for i in range(count))
+
+
+def perturbation(field: npt.ArrayLike, areas: Sequence[Area], *, sigma: float = SIGMA) -> FloatArray:
+    """Perturbation P (paper, section 2.2): standard deviation in each area of a displacement without its long waves.
+
+    Parameters
+    ----------
+    field : array_like, shape (H, W)
+        A component of the displacement in px, NaN where not measured (`rgbmidic.fields.at_pixels`).
+    areas
+        Where P is assessed.
+    sigma
+        Standard deviation in px of the Gaussian of `rgbmidic.fields.high_pass`.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        P in px; NaN where less than half of the area is measured.
+
+    Raises
+    ------
+    InputError
+        An area does not lie in the image, or there is nothing to filter.
+    """
+    return area_stds(high_pass(field, sigma), areas)
+
+
+def residual_percent(reference: npt.ArrayLike, deformed: npt.ArrayLike, displacement: FloatArray) -> float:
+    """Residual of a measurement in % of the effective dynamic range (paper, section 2.2).
+
+    Standard deviation of the difference between the reference image and the deformed image warped by the
+    displacement (cubic spline interpolation), over the largest minus the smallest grey level of the two images.
+
+    Parameters
+    ----------
+    reference, deformed
+        Images (H, W) of one light; NaN where invalid.
+    displacement
+        (u, v) in px at the pixels of the reference image, shape (2, H, W); NaN where not measured.
+
+    Returns
+    -------
+    float
+        %.
+
+    Raises
+    ------
+    InputError
+        The shapes do not fit, or nothing is measured.
+    """
+    from scipy.ndimage import map_coordinates
+
+    f, g = np.asarray(reference, dtype=np.float64), np.asarray(deformed, dtype=np.float64)
+    rows, columns = np.nonzero(np.isfinite(displacement[0]) & np.isfinite(f))
+    if f.shape != g.shape or displacement.shape != (2, *f.shape) or not rows.size:
+        raise InputError(f"images and displacement do not fit: {f.shape}, {g.shape}, {displacement.shape}")
+    there = displacement[:, rows, columns]
+    unknown = ~np.isfinite(g)
+    place = np.stack([rows + there[1], columns + there[0]])
+    back = map_coordinates(np.where(unknown, np.nanmean(g), g), place, order=3, mode="constant", cval=np.nan)
+    if unknown.any():
+        back[map_coordinates(unknown.astype(np.float32), place, order=1) > 0] = np.nan
+    used = f[rows, columns]
+    span = max(used.max(), np.nanmax(back)) - min(used.min(), np.nanmin(back))
+    return float(100 * np.nanstd(back - used) / span)
+
+
+def _over_areas(image: FloatArray, areas: Sequence[Area], statistic: Callable[[FloatArray], float]) -> FloatArray:
+    cuts = [area.cut(image) for area in areas]
+    return np.array([statistic(cut) if np.isfinite(cut).mean() >= 0.5 else np.nan for cut in cuts], dtype=np.float64)
+
+
+def area_stds(high_passed: FloatArray, areas: Sequence[Area]) -> FloatArray:
+    """Return the standard deviation of an image in each area.
+
+    Parameters
+    ----------
+    high_passed : ndarray, shape (H, W)
+        For P: `rgbmidic.fields.high_pass` of a displacement in px; NaN where not measured.
+    areas
+        n areas.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        In the unit of the image; NaN where less than half of the area is measured.
+    """
+    return _over_areas(high_passed, areas, np.nanstd)
+
+
+def area_means(field: FloatArray, areas: Sequence[Area]) -> FloatArray:
+    """Mean of an image in each area.
+
+    Parameters
+    ----------
+    field : ndarray, shape (H, W)
+        NaN where not measured.
+    areas
+        n areas.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        In the unit of the image; NaN where less than half of the area is measured.
+    """
+    return _over_areas(field, areas, np.nanmean)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,8 +224,7 @@ class Lobe:
 
     def __call__(self, angles_deg: npt.ArrayLike) -> FloatArray:
         """Grey level at light angles in degrees from the surface's normal."""
-        values = (self.diffuse, self.specular, self.centre_deg, self.width_deg)
-        return _lobe(np.asarray(angles_deg, dtype=np.float64), *values)
+        return _lobe(np.asarray(angles_deg, dtype=np.float64), *astuple(self)[:4])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,7 +329,7 @@ def fit_lobe(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, std: npt.ArrayLik
     return Lobe(diffuse=diffuse, specular=specular, centre_deg=centre, width_deg=width, std=(a, b, c, d))
 
 
-def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, visible: float = VISIBLE) -> Goniometry:
+def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, visible: float = 0.05) -> Goniometry:
     """Diffuse light, specular lobe and erratic band of a series of grey levels.
 
     Every pixel has its own diffuse level, found where the light is far from the reflection; the excess over it is
@@ -187,7 +361,7 @@ def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, visible: flo
     angles, values = angles[order], values[order]
     cosine = np.maximum(np.cos(np.radians(angles)), 0)
     lobe = _lobe_of_pixels(angles, values)
-    clear = (abs(angles - lobe.centre_deg) > _BEYOND * lobe.width_deg) & (cosine > 0)
+    clear = (abs(angles - lobe.centre_deg) > 2.5 * lobe.width_deg) & (cosine > 0)  # 4 % of the lobe's peak and less
     if clear.sum() < 3:
         raise InputError(
             "fewer than 3 of the angles lie clear of the reflection: the diffuse light cannot be separated"
@@ -205,18 +379,18 @@ def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, visible: flo
     return Goniometry(angles_deg=angles, levels=values, white=white, lobe=lobe, spread=spread, band=band)
 
 
-def _lobe_of_pixels(angles: FloatArray, levels: FloatArray) -> Lobe:
-    """Lobe of the mean of m pixels; its uncertainty from leaving out groups of them (jackknife).
+def _lobe_of_pixels(angles: FloatArray, levels: FloatArray, most_groups: int = 10) -> Lobe:
+    """Lobe of the mean of m pixels; its uncertainty from leaving out groups of them in turn (jackknife).
 
     The residual of the fit does not show it: a pixel's deviation is the same at neighbouring angles.
     """
     whole = fit_lobe(angles, levels.mean(axis=1))
-    groups = min(_GROUPS, levels.shape[1])
+    groups = min(most_groups, levels.shape[1])
     if groups < 2:
         return whole
     members = np.arange(levels.shape[1]) % groups
     trials = [fit_lobe(angles, levels[:, members != group].mean(axis=1)) for group in range(groups)]
-    values = np.array([(one.diffuse, one.specular, one.centre_deg, one.width_deg) for one in trials])
+    values = np.array([astuple(one)[:4] for one in trials])
     a, b, c, d = map(float, np.hypot(values.std(axis=0) * np.sqrt(groups - 1), whole.std))
     return replace(whole, std=(a, b, c, d))
 
@@ -224,12 +398,6 @@ def _lobe_of_pixels(angles: FloatArray, levels: FloatArray) -> Lobe:
 def _lobe(angles: FloatArray, diffuse: float, specular: float, centre: float, width: float) -> FloatArray:
     lambert = np.maximum(np.cos(np.radians(angles)), 0)
     return np.asarray(diffuse * lambert + specular * np.exp(-((angles - centre) ** 2) / (2 * width**2)))
-
-
-_OCTAVE = 0.1
-"""Standard deviation, in the logarithm of the frequency, of the window that smooths the spectrum."""
-_BLOCKS = 3
-"""The map is cut into this many blocks along each side to find the uncertainty of the spacing."""
 
 
 def detrend(height: npt.ArrayLike, order: int = 4) -> FloatArray:
@@ -402,15 +570,11 @@ def wrinkle_spacing(height: npt.ArrayLike, pitch: float, *, longest: float = 0.0
             f"a map of {values.shape} points {pitch} apart does not show wrinkles up to {longest}: it must be at least "
             f"10 times as long and {longest / 4} or finer"
         )
-    frequency, power = _ring_spectrum(values, pitch, longest)
-    peak = _peak(frequency, power)
-    rows, columns = (np.linspace(0, n, _BLOCKS + 1).astype(int) for n in values.shape)
-    parts = [
-        _peak(*_ring_spectrum(values[a:b, c:d], pitch, longest))
-        for a, b in pairwise(rows)
-        for c, d in pairwise(columns)
-    ]
-    return 1 / peak, float(np.std(1 / np.array(parts), ddof=1) / _BLOCKS)
+    blocks = 3  # along each side, for the uncertainty
+    rows, columns = (pairwise(np.linspace(0, n, blocks + 1).astype(int)) for n in values.shape)
+    parts = [values, *(values[a:b, c:d] for (a, b), (c, d) in product(rows, columns))]
+    whole, *spacings = (1 / _peak(*_ring_spectrum(part, pitch, longest)) for part in parts)
+    return whole, float(np.std(spacings, ddof=1) / blocks)
 
 
 def _as_map(values: npt.ArrayLike) -> FloatArray:
@@ -435,15 +599,18 @@ def _ring_spectrum(values: FloatArray, pitch: float, longest: float) -> tuple[Fl
     return frequency[seen], ring[seen]
 
 
-def _peak(frequency: FloatArray, power: FloatArray) -> float:
-    """Peak of a noisy spectrum: vertex of the parabola through its logarithm, smoothed over `_OCTAVE` of frequency."""
+def _peak(frequency: FloatArray, power: FloatArray, width: float = 0.1) -> float:
+    """Peak of a noisy spectrum: vertex of the parabola through its logarithm.
+
+    It is smoothed over `width`, a standard deviation in the logarithm of the frequency.
+    """
     position = np.log(frequency)
-    kernel = np.exp(-0.5 * ((position[:, None] - position) / _OCTAVE) ** 2)
+    kernel = np.exp(-0.5 * ((position[:, None] - position) / width) ** 2)
     smooth = kernel @ power / kernel.sum(axis=1)
     top = int(smooth.argmax())
-    near = np.abs(position - position[top]) <= _OCTAVE
+    near = np.abs(position - position[top]) <= width
     if near.sum() < 3:
         return float(frequency[top])
     bend, slope, _ = np.polyfit(position[near] - position[top], np.log(smooth[near] + 1e-300), 2)
     shift = -slope / (2 * bend) if bend < 0 else 0.0
-    return float(frequency[top] * np.exp(np.clip(shift, -_OCTAVE, _OCTAVE)))
+    return float(frequency[top] * np.exp(np.clip(shift, -width, width)))

@@ -12,10 +12,10 @@ import pytest
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.virtual import State
+from rgbmidic.scene.geometry_weights import GeometryWeights
 from rgbmidic.scene.scene import read_scene
 from rgbmidic.scene.zones import material_points, placed, predict_zones
 from rgbmidic.settings import TestSettings
-from rgbmidic.weights.geometry import GeometryWeights
 
 SCENE = """
 [body]

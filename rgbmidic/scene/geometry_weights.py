@@ -9,18 +9,15 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.scene.forecast import Instrument
-from rgbmidic.scene.reflection import angle_weights, surface_from_heights
 from rgbmidic.scene.scene import Scene, State, read_scene
-from rgbmidic.scene.zones import Zones, material_points, predict_zones, zones_on_surface
+from rgbmidic.scene.zones import Zones, material_points, predict_zones, unit, zones_on_surface
 from rgbmidic.settings import TestSettings, regular
 from rgbmidic.typing import FloatArray, FloatImage
-
-_STEP = 4
-"""Pixels between the points of the prediction; in between it is interpolated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +38,8 @@ class GeometryWeights:
         Angle of binary weights; None: soft weights, the inverse of the variance that is expected.
     instrument
         For the soft weights.
+    step
+        Pixels between the points of the prediction; in between it is interpolated.
     surface
         Points and normals (3, h, w) on the grid of the prediction, from a height map; None: the scene's body.
     """
@@ -53,11 +52,12 @@ class GeometryWeights:
     order: tuple[int, ...]
     limit_deg: float | None
     instrument: Instrument
+    step: int
     surface: tuple[FloatArray, FloatArray] | None = None
 
     @classmethod
     def prepare(
-        cls, settings: TestSettings, *, lights: Sequence[str], shape: tuple[int, int], frames: int
+        cls, settings: TestSettings, *, lights: Sequence[str], shape: tuple[int, int], frames: int, step: int = 4
     ) -> GeometryWeights:
         """Read the scene that the settings name and check that it is that of the test.
 
@@ -67,6 +67,8 @@ class GeometryWeights:
             With ``weights.method = "geometry"``.
         lights, shape, frames
             Names of the lights, size of the frames (H, W) and their number.
+        step
+            Pixels between the points of the prediction: reflections are far wider.
 
         Raises
         ------
@@ -86,8 +88,7 @@ class GeometryWeights:
                 f"{weights.geometry}: frame 0 shows the body at rest and every other frame one of the [[states]]; "
                 f"there are {frames} frames and {len(experiment.states)} states. State all of them or none"
             )
-        surface = None if weights.height_map is None else _read_surface(weights.height_map, scene)
-        if surface is not None and experiment.states:
+        if weights.height_map is not None and experiment.states:
             raise ConfigurationError(f"{weights.geometry}: weights.height_map shows one pose; remove the [[states]]")
         return cls(
             scene=scene,
@@ -101,7 +102,8 @@ class GeometryWeights:
                 demosaic=settings.illumination.demosaic,
                 prefilter=settings.solver.prefilter,
             ),
-            surface=surface,
+            step=step,
+            surface=None if weights.height_map is None else _read_surface(weights.height_map, scene, step),
         )
 
     def reference(self, images: IlluminationImages) -> FloatImage:
@@ -112,24 +114,23 @@ class GeometryWeights:
         valid = images.valid.astype(np.float32)
         if self.limit_deg is None:
             return valid
-        each = [self._binary(self._state(index), images) for index in self.reference_frames]
+        each = [self._binary(self._state(index), images, self.limit_deg) for index in self.reference_frames]
         return np.asarray(valid * np.min(each, axis=0))
 
     def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
         """Weights (k, H, W) of frame `index` compared with the first reference frame."""
         state = self._state(index)
         if self.limit_deg is not None:
-            return np.asarray(images.valid * self._binary(state, images))
+            return np.asarray(images.valid * self._binary(state, images, self.limit_deg))
         before, after = self._zones(self._state(self.reference_frames[0]), state), self._zones(state, state)
         weights = self.instrument.weights(before, after, known=bool(self.states))
         return np.asarray(images.valid * self._at_pixels(weights, images))
 
-    def _binary(self, state: State, images: IlluminationImages) -> FloatImage:
-        assert self.limit_deg is not None
+    def _binary(self, state: State, images: IlluminationImages, limit_deg: float) -> FloatImage:
         deviation = self._zones(state, state).geometry.deviation_deg
         seen = self._at_pixels(np.isfinite(deviation).astype(np.float32), images) > 0.5
         smooth = self._at_pixels(np.nan_to_num(deviation, nan=180.0).astype(np.float32), images)
-        return angle_weights(np.where(seen, smooth, np.nan), self.limit_deg)
+        return angle_weights(np.where(seen, smooth, np.nan), limit_deg)
 
     def _state(self, index: int) -> State:
         return self.states[index] if self.states else State()
@@ -138,19 +139,20 @@ class GeometryWeights:
         """Zones in a state at the material points that the grid's pixels see in another one."""
         if self.surface is not None:
             return zones_on_surface(self.scene, *self.surface)
-        return predict_zones(self.scene, state, material=material_points(self.scene, seen, _grid(self.scene)))
+        pixels = _grid(self.scene.camera.shape, self.step)
+        return predict_zones(self.scene, state, material=material_points(self.scene, seen, pixels))
 
     def _at_pixels(self, coarse: FloatImage, images: IlluminationImages) -> FloatImage:
         """Values (k, h, w) on the grid at the pixels of images (k, H, W), in the order of the test's lights."""
         (left, top), (height, width) = images.origin, images.shape
         x, y = np.meshgrid(*(np.arange(a, a + n, dtype=np.float32) for a, n in ((left, width), (top, height))))
-        place = x / _STEP, y / _STEP
+        place = x / self.step, y / self.step
         return np.stack([cv2.remap(coarse[light], *place, cv2.INTER_LINEAR) for light in self.order])
 
 
-def _grid(scene: Scene) -> tuple[FloatArray, FloatArray]:
+def _grid(shape: tuple[int, int], step: int) -> tuple[FloatArray, FloatArray]:
     """Image points (x, y) of the prediction, up to beyond the last pixel."""
-    rows, columns = (np.arange(0, size + _STEP, _STEP, dtype=np.float64) for size in scene.camera.shape)
+    rows, columns = (np.arange(0, size + step, step, dtype=np.float64) for size in shape)
     x, y = np.meshgrid(columns, rows)
     return x, y
 
@@ -164,7 +166,7 @@ def _order(scene: Scene, lights: Sequence[str], file: Path) -> tuple[int, ...]:
     raise ConfigurationError(f"{file}: the scene's lights are {', '.join(names)}, the test's are {', '.join(lights)}")
 
 
-def _read_surface(path: Path, scene: Scene) -> tuple[FloatArray, FloatArray]:
+def _read_surface(path: Path, scene: Scene, step: int) -> tuple[FloatArray, FloatArray]:
     """Points and normals on the grid, from a height map on disk."""
     camera = scene.camera
     try:
@@ -185,5 +187,58 @@ def _read_surface(path: Path, scene: Scene) -> tuple[FloatArray, FloatArray]:
     except InputError as error:
         raise ConfigurationError(f"weights.height_map {path}: {error}") from None
     limits = camera.shape[1] - 1, camera.shape[0] - 1
-    columns, rows = (np.minimum(place, limit).astype(int) for place, limit in zip(_grid(scene), limits, strict=True))
+    columns, rows = (
+        np.minimum(place, limit).astype(int) for place, limit in zip(_grid(camera.shape, step), limits, strict=True)
+    )
     return points[:, rows, columns], normals[:, rows, columns]
+
+
+def angle_weights(deviation_deg: FloatArray, limit_deg: float = 15.0) -> FloatImage:
+    """Binary weights: 0 within `limit_deg` of the mirror direction and where the deviation is NaN, 1 elsewhere.
+
+    By default the limit is that within which the reflection corrupts the image (paper, Fig. 9).
+
+    Raises
+    ------
+    InputError
+        The limit is not an angle between 0 and 180 degrees.
+    """
+    if not 0 < limit_deg < 180:
+        raise InputError(f"the limit angle lies between 0 and 180 degrees, not {limit_deg!r}")
+    return (deviation_deg > limit_deg).astype(np.float32)
+
+
+def surface_from_heights(
+    heights: npt.ArrayLike, *, distance: float, focal_px: float, centre: tuple[float, float]
+) -> tuple[FloatArray, FloatArray]:
+    """Points and normals of a surface given as a height map over the pixels of the reference image.
+
+    Parameters
+    ----------
+    heights : array_like, shape (H, W)
+        Height (mm) towards the camera over the plane at `distance`, at every pixel; NaN where not known. Smooth at the
+        scale of the speckle: droplets and wrinkles belong to the reflectance.
+    distance
+        Distance (mm) of that plane from the camera.
+    focal_px, centre
+        Focal length and principal point (x, y) in px.
+
+    Returns
+    -------
+    points, normals : ndarray, shape (3, H, W)
+
+    Raises
+    ------
+    InputError
+        Not one image, or a height that reaches the camera.
+    """
+    height = np.asarray(heights, dtype=np.float64)
+    if height.ndim != 2 or min(height.shape) < 2:
+        raise InputError(f"a height map is one image (H, W), not an array of shape {height.shape}")
+    depth = distance - height
+    if not np.nanmin(depth, initial=np.inf) > 0:
+        raise InputError(f"heights must stay below the distance of {distance:g} mm to the camera")
+    rows, columns = np.mgrid[: height.shape[0], : height.shape[1]]
+    points = np.stack([depth * (columns - centre[0]) / focal_px, depth * (rows - centre[1]) / focal_px, depth])
+    down, right = np.gradient(points, axis=(1, 2))
+    return points, unit(np.cross(down, right, axis=0))
