@@ -110,7 +110,7 @@ def _check_raw(
         calibration = calibration.cropped(window.origin, window.shape)
     repeat = raw[1] if len(raw) > 1 else None
     for found in check_state(raw[0], calibration, region.mask, names, accept=settings.accept, repeat=repeat):
-        if not found.certain:
+        if found.passed:
             logger.warning("%s may not be what %s calibrates: %s", names, settings.calibration_file, found.text)
 
 
