@@ -8,18 +8,20 @@ noise. The fitted columns are then checked against the names of the lights and a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rgbmidic.errors import CalibrationError
+from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products
-from rgbmidic.typing import BoolArray, FloatArray
-from rgbmidic_calibration.plausibility import CHECKS, check_captures
+from rgbmidic.typing import FloatArray
+from rgbmidic_calibration.plausibility import CHECKS, capture_checks, judged
 from rgbmidic_calibration.ratio import (
     BlockMeans,
     ColumnFit,
+    LightSignal,
     Variation,
     block_centres,
     capture_scatter,
@@ -29,34 +31,40 @@ from rgbmidic_calibration.ratio import (
 )
 
 CHANNELS = ("R", "G", "B")
-
-BLACK_LEVEL_STD = 0.3
-"""Standard uncertainty (DN) of a black level that no series of dark frames measured: rounded to whole grey levels."""
-
-MIN_BLOCKS = 9
-"""Unsaturated blocks per capture at least: as many as the smallest frame has, 3 x 3 (`block_means`)."""
-AUTOMATIC_ORDER = 2
-"""Largest degree that the data may ask for: shading by lens and filters is a slope and a curvature."""
-LARGEST_ORDER = 4
-"""Largest degree that may be stated: 15 coefficients per entry. Chosen; higher ones only follow the noise of blocks."""
-FIELD_SIGNIFICANCE = 1e-3
-"""Significance level of the test for variation over the field. With 4999 random signs p is at least 2e-4."""
-FIELD_TOLERANCE = 5e-4
-"""Variation of an entry over the field (rms) that is accepted, however significant: it leaks 0.05 % at most."""
 COLOURS = ("red", "green", "blue")
 
-INTENSITY_WARNING, DELIBERATE = 0.05, 0.30
-"""Range of the strengths, relative to their mean, between which the lamp is reported as drifting. Chosen; captures that
-differ by more are an exposure series, which is meant."""
-COLOUR_DRIFT_WARNING = 5e-4
-"""Scatter of an entry between captures: as `FIELD_TOLERANCE`, it leaks 0.05 %."""
-OFFSET_WARNING, OFFSET_SIGNIFICANCE = 0.002, 5.0
-"""Fraction of the signal, and standard uncertainties, from which an offset is reported: it leaks 0.2 %, of the order of
-what `check` allows (`rgbmidic_calibration.verify.Limits.leakage`)."""
-CONDITION_WARNING = 6.0
-"""Chosen: three LEDs on nine measured cameras give 1.6 to 2.5 (calibration/README.md). It decides on a warning only."""
-REJECTED_WARNING = 0.05
-"""Fraction of the blocks left out as outliers; of normal noise it is below 1e-5. It decides on a warning only."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CrosstalkConstants:
+    """Constants of `estimate_crosstalk`.
+
+    Attributes
+    ----------
+    black_level_std
+        Standard uncertainty (DN) of a black level that no series of dark frames measured: rounded to whole grey levels.
+    least_blocks
+        Unsaturated blocks per capture at least: as many as the smallest frame has, 3 x 3 (`block_means`).
+    automatic_order
+        Largest degree that the data may ask for: shading by lens and filters is a slope and a curvature.
+    largest_order
+        Largest degree that may be stated: 15 coefficients per entry. Chosen; higher ones only follow the noise of
+        blocks.
+    significance
+        Significance level of the test for variation over the field. With 4999 random signs p is at least 2e-4.
+    tolerance
+        Variation of an entry over the field (rms), or between captures, that is accepted, however significant: it leaks
+        0.05 % at most.
+    """
+
+    black_level_std: float = 0.3
+    least_blocks: int = 9
+    automatic_order: int = 2
+    largest_order: int = 4
+    significance: float = 1e-3
+    tolerance: float = 5e-4
+
+
+DEFAULT = CrosstalkConstants()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,25 +116,6 @@ class CrosstalkEstimate:
     warnings: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class _Dark:
-    """Dark level of the channels, with the covariances of its error."""
-
-    level: FloatArray  # (C, R, S) mean dark signal above the stated black level
-    mean_covariance: FloatArray  # (C, C) of the error of that mean, common to all blocks
-    frame_covariance: FloatArray  # (C, C) of one frame's own offset
-
-
-@dataclass(frozen=True, slots=True)
-class _Light:
-    """Captures of one light above dark (N, C, R, S), the unsaturated blocks, and the channel that sees it best."""
-
-    name: str
-    signal: FloatArray
-    valid: BoolArray
-    reference: int
-
-
 def estimate_crosstalk(
     lights: Mapping[str, Sequence[BlockMeans]],
     dark: Sequence[BlockMeans] = (),
@@ -134,6 +123,7 @@ def estimate_crosstalk(
     order: int | None = None,
     allow: Sequence[str] = (),
     labels: Mapping[str, Sequence[str]] | None = None,
+    constants: CrosstalkConstants = DEFAULT,
 ) -> CrosstalkEstimate:
     """Estimate the crosstalk matrix from block averages of single-light captures.
 
@@ -146,11 +136,13 @@ def estimate_crosstalk(
         Block averages of the captures with all lights off. Without any, the stated black level is the dark level.
     order
         Degree of the polynomial by which A varies over the field; None: the lowest up to 2 that the data ask for, 0
-        unless the variation is both significant and larger than `FIELD_TOLERANCE`.
+        unless the variation is both significant and larger than the tolerance.
     allow
         Names of plausibility checks (`CHECKS`) that the user waives.
     labels
         File names of the captures, for messages; by light, and ``"dark"``.
+    constants
+        Limits of the method.
 
     Raises
     ------
@@ -160,166 +152,160 @@ def estimate_crosstalk(
     """
     if unknown := sorted(set(allow) - set(CHECKS)):
         raise CalibrationError(f"unknown check {', '.join(unknown)}; those that can be waived are {', '.join(CHECKS)}")
-    if order is not None and not 0 <= order <= LARGEST_ORDER:
-        raise CalibrationError(f"the degree of the field is 0 to {LARGEST_ORDER}, not {order}")
-    warnings = check_captures(lights, dark, allow=allow, labels=labels or {})
+    if order is not None and not 0 <= order <= constants.largest_order:
+        raise CalibrationError(f"the degree of the field is 0 to {constants.largest_order}, not {order}")
+    warnings = judged(capture_checks(lights, dark, labels or {}), allow)
     like = next(iter(lights.values()))[0]
-    centres = block_centres(like.shape, like.block)
-    offset = _dark_level(dark, like)
-    prepared = [_prepare(name, captures, offset) for name, captures in lights.items()]
-    tests = [_variation(light, legendre_products(centres, like.shape, AUTOMATIC_ORDER)) for light in prepared]
+    shape, centres = like.camera.shape, block_centres(like.camera.shape, like.block)
+    level, of_mean, of_frame = np.zeros_like(like.channels), constants.black_level_std**2 * np.eye(3), np.zeros((3, 3))
+    if dark:
+        frames = np.stack([frame.channels for frame in dark])
+        level = frames.mean(axis=0)
+        of_frame = np.cov(frames.mean(axis=(2, 3)), rowvar=False) if len(frames) > 1 else of_mean
+        of_mean = of_frame / len(frames)
+    signals = [_above_dark(name, captures, level, constants) for name, captures in lights.items()]
+    asked = legendre_products(centres, shape, constants.automatic_order)
+    tests = [_needed_degree(signal, asked, constants) for signal in signals]
     order = max(needed for needed, _ in tests) if order is None else order
-    design = legendre_products(centres, like.shape, order)
-    columns = [fit_column(light.signal, light.valid, light.reference, design) for light in prepared]
+    design = legendre_products(centres, shape, order)
+    columns = [fit_column(signal, design) for signal in signals]
     fits = tuple(
-        _summary(light, column, test, design) for light, column, (_, test) in zip(prepared, columns, tests, strict=True)
+        _summary(signal, column, test, design)
+        for signal, column, (_, test) in zip(signals, columns, tests, strict=True)
     )
-    warnings += check_matrix(fits, allow=allow)
-    matrices, covariance = np.stack([fit.coefficients for fit in columns], axis=-1), _covariance(columns, offset)
+    warnings += judged(matrix_checks(fits, constants.tolerance), allow)
+    matrices = np.stack([fit.coefficients for fit in columns], axis=-1)
+    covariance = _covariance(columns, of_mean, of_frame)
     field, size = None, matrices[0].size
     if order:
         std = np.sqrt(np.einsum("tcktck->tck", covariance))
-        field = CrosstalkField(order=order, coefficients=matrices[1:], shape=like.shape, std=std[1:])
+        field = CrosstalkField(order=order, coefficients=matrices[1:], shape=shape, std=std[1:])
     crosstalk = Crosstalk(
         matrix=matrices[0], lights=tuple(lights), covariance=covariance[0, :, :, 0].reshape(size, size), field=field
     )
     return CrosstalkEstimate(crosstalk=crosstalk, lights=fits, warnings=tuple(warnings))
 
 
-def _dark_level(dark: Sequence[BlockMeans], like: BlockMeans) -> _Dark:
-    unknown = BLACK_LEVEL_STD**2 * np.eye(3)
-    if not dark:
-        return _Dark(np.zeros_like(like.channels), unknown, np.zeros((3, 3)))
-    frames = np.stack([frame.channels for frame in dark])
-    drift = np.cov(frames.mean(axis=(2, 3)), rowvar=False) if len(frames) > 1 else unknown
-    return _Dark(frames.mean(axis=0), drift / len(frames), drift)
-
-
-def _prepare(name: str, captures: Sequence[BlockMeans], dark: _Dark) -> _Light:
-    signal = np.stack([frame.channels for frame in captures]) - dark.level
+def _above_dark(
+    name: str, captures: Sequence[BlockMeans], dark: FloatArray, constants: CrosstalkConstants
+) -> LightSignal:
+    values = np.stack([frame.channels for frame in captures]) - dark
     valid = ~np.stack([frame.saturated for frame in captures])
-    if valid.sum() < MIN_BLOCKS * len(captures):
+    if valid.sum() < constants.least_blocks * len(captures):
         raise CalibrationError(
             f"light {name}: {100 * (1 - valid.mean()):.0f} % of the blocks hold saturated samples; "
             "shorten the exposure until none does"
         )
-    reference = int(np.median(signal.transpose(0, 2, 3, 1)[valid], axis=0).argmax())
-    return _Light(name, signal, valid, reference)
+    return LightSignal(name, values, valid, int(np.median(values.transpose(0, 2, 3, 1)[valid], axis=0).argmax()))
 
 
-def _variation(light: _Light, design: FloatArray) -> tuple[int, Variation]:
+def _needed_degree(signal: LightSignal, design: FloatArray, constants: CrosstalkConstants) -> tuple[int, Variation]:
     """Degree that the light's captures ask for, and the test of all terms that are not constant."""
-    needed, overall = 0, Variation(p_value=1.0, rms=0.0)
-    for order in range(AUTOMATIC_ORDER):
-        found = variation(light.signal, light.valid, light.reference, design, (order + 1) * (order + 2) // 2)
-        overall = found if order == 0 else overall
-        if found.p_value >= FIELD_SIGNIFICANCE or found.rms <= FIELD_TOLERANCE:
-            break
-        needed = order + 1
-    return needed, overall
+    tests: list[Variation] = []
+    for order in range(constants.automatic_order):
+        tests.append(variation(signal, design, (order + 1) * (order + 2) // 2))
+        if tests[-1].p_value >= constants.significance or tests[-1].rms <= constants.tolerance:
+            return order, tests[0]
+    return constants.automatic_order, tests[0]
 
 
-def _summary(light: _Light, fit: ColumnFit, found: Variation, design: FloatArray) -> LightFit:
+def _summary(signal: LightSignal, fit: ColumnFit, found: Variation, design: FloatArray) -> LightFit:
     count = fit.weights.sum(axis=(1, 2))
     strength = fit.mass / np.maximum(count, 1)
-    offset, offset_std = offsets_left(light.signal, fit.weights, light.reference, design)
+    offset, offset_std = offsets_left(signal, fit.weights, design)
     return LightFit(
-        name=light.name,
-        reference=light.reference,
+        name=signal.name,
+        reference=signal.reference,
         column=fit.coefficients[0],
         signal=float(fit.mass.sum() / count.sum()),
         used=float((fit.weights > 0).mean()),
-        rejected=float((light.valid & (fit.weights == 0)).mean()),
+        rejected=float((signal.valid & (fit.weights == 0)).mean()),
         intensity_drift=float(np.ptp(strength) / strength.mean()),
         colour_drift=float(np.sqrt(capture_scatter(fit).max())),
         offset=offset,
         offset_std=offset_std,
         variation=found,
-        captures=len(light.signal),
+        captures=len(signal.values),
     )
 
 
-def _covariance(columns: Sequence[ColumnFit], dark: _Dark) -> FloatArray:
-    """Covariance (T, C, k, T, C, k) of all coefficients: the error of the dark mean is common to all lights."""
+def _covariance(columns: Sequence[ColumnFit], of_mean: FloatArray, of_frame: FloatArray) -> FloatArray:
+    """Covariance (T, C, k, T, C, k) of all coefficients.
+
+    The error of the dark frames' mean (covariance `of_mean`) is common to all blocks and lights, that of one frame's
+    own offset (`of_frame`) to the blocks of a frame.
+    """
     terms, channels = columns[0].coefficients.shape
     full = np.zeros((terms, channels, len(columns), terms, channels, len(columns)))
     for i, first in enumerate(columns):
         for j, second in enumerate(columns):
-            shared = dark.mean_covariance + (dark.frame_covariance / len(first.mass) if i == j else 0)
+            shared = of_mean + (of_frame / len(first.mass) if i == j else 0)
             full[:, :, i, :, :, j] = np.einsum("tcx,xy,udy->tcud", first.leverage, shared, second.leverage)
         full[:, :, i, :, :, i] += first.covariance
-        drift = capture_scatter(first) / len(first.mass)
-        full[0, :, i, 0, :, i] += np.diag(drift)
+        full[0, :, i, 0, :, i] += np.diag(capture_scatter(first) / len(first.mass))
     return full
 
 
-def check_matrix(fits: Sequence[LightFit], *, allow: Sequence[str]) -> list[str]:
+def matrix_checks(fits: Sequence[LightFit], tolerance: float) -> Iterator[Check]:
     """Check the fitted columns: the right channel for each light's name, one light per channel, quiet lamps.
 
-    Returns
-    -------
-    list of str
-        Warnings.
-
-    Raises
-    ------
-    CalibrationError
-        A light is seen best by another channel than its name states, or two by the same, and that is not waived.
+    The condition number of three LEDs on nine measured cameras is 1.6 to 2.5 (calibration/README.md).
     """
     lower = [fit.name.lower() for fit in fits]
     if all(name in (*COLOURS, "r", "g", "b") for name in lower):  # single letters count where all names are colours
         lower = [COLOURS["rgb".index(name[0])] for name in lower]
     for fit, name in zip(fits, lower, strict=True):
-        if "name" not in allow and name in COLOURS and name != COLOURS[fit.reference]:
-            raise CalibrationError(
+        if name in COLOURS and name != COLOURS[fit.reference]:
+            text = (
                 f"light {fit.name} is seen best by the {COLOURS[fit.reference]} channel: are the captures of two "
-                "lights swapped, or is the colour filter array (--cfa) another one? (--allow name goes on all the same)"
+                "lights swapped, or is the colour filter array (--cfa) another one?"
             )
+            yield Check("name", text)
     for index, fit in enumerate(fits):
-        twin = next((other for other in fits[:index] if other.reference == fit.reference), None)
-        if twin is not None and "same-channel" not in allow:
-            raise CalibrationError(
+        for twin in [other for other in fits[:index] if other.reference == fit.reference][:1]:
+            text = (
                 f"lights {twin.name} and {fit.name} are both seen best by the {COLOURS[fit.reference]} channel: did "
-                "the same lamp shine in both captures? (--allow same-channel goes on all the same)"
+                "the same lamp shine in both captures?"
             )
-    warnings = [message for fit in fits for message in _fit_warnings(fit)]
+            yield Check("same-channel", text)
+    for fit in fits:
+        yield from _fit_checks(fit, tolerance)
     condition = float(np.linalg.cond(np.column_stack([fit.column for fit in fits])))
-    if condition > CONDITION_WARNING:
-        warnings.append(
-            f"the matrix has condition number {condition:.1f}: unmixing amplifies noise strongly. Are two lamps close "
-            "in colour, or did a second lamp or daylight shine in the captures of one?"
-        )
-    unseen = [COLOURS[c] for c in range(3) if c not in {fit.reference for fit in fits}]
-    if len(fits) < 3 and unseen:
-        warnings.append(
-            f"no light is seen best by the {' and '.join(unseen)} channel: if such a lamp shines during the test it "
-            "must be calibrated too"
-        )
-    return warnings
+    text = (
+        f"the matrix has condition number {condition:.1f}: unmixing amplifies noise strongly. Are two lamps close in "
+        "colour, or did a second lamp or daylight shine in the captures of one?"
+    )
+    yield warning(text, condition, above=6.0)
+    unseen = [colour for c, colour in enumerate(COLOURS) if c not in {fit.reference for fit in fits}]
+    text = (
+        f"no light is seen best by the {' and '.join(unseen)} channel: if such a lamp shines during the test it must "
+        "be calibrated too"
+    )
+    yield warning(text, len(unseen) if len(fits) < 3 else 0)
 
 
-def _fit_warnings(fit: LightFit) -> list[str]:
-    warnings = []
-    if INTENSITY_WARNING < fit.intensity_drift < DELIBERATE:
-        warnings.append(
-            f"light {fit.name}: its strength differs by {100 * fit.intensity_drift:.1f} % between captures: let the "
-            "lamp warm up (the matrix does not suffer)"
-        )
-    if fit.colour_drift > COLOUR_DRIFT_WARNING:
-        warnings.append(
-            f"light {fit.name}: its colour drifts between captures (entries scatter by {fit.colour_drift:.2g} beyond "
-            "noise); the stated uncertainty covers it"
-        )
+def _fit_checks(fit: LightFit, tolerance: float) -> Iterator[Check]:
+    light = f"light {fit.name}: "
+    text = (
+        f"its strength differs by {100 * fit.intensity_drift:.1f} % between captures: let the lamp warm up (the matrix "
+        "does not suffer)"
+    )
+    # captures that differ by 30 % are an exposure series, which is meant
+    yield warning(light + text, fit.intensity_drift if fit.intensity_drift < 0.30 else 0.0, above=0.05)
+    text = (
+        f"its colour drifts between captures (entries scatter by {fit.colour_drift:.2g} beyond noise); the stated "
+        "uncertainty covers it"
+    )
+    yield warning(light + text, fit.colour_drift, above=tolerance)
+    # .2 % of the signal leaks as much, of the order of what `check` allows (`verify.Limits.leakage`)
     left = np.abs(fit.offset)
-    if (clear := (left > OFFSET_SIGNIFICANCE * fit.offset_std) & (left > OFFSET_WARNING * fit.signal)).any():
-        channel = int(np.where(clear, left, 0).argmax())
-        warnings.append(
-            f"light {fit.name}: the {COLOURS[channel]} channel keeps {fit.offset[channel]:+.1f} DN where the light is "
-            "absent: dark frames of other settings or another ambient light, or a camera that is not linear"
-        )
-    if fit.rejected > REJECTED_WARNING:
-        warnings.append(
-            f"light {fit.name}: {100 * fit.rejected:.0f} % of the blocks are outliers: coloured or fluorescent "
-            "spots on the target?"
-        )
-    return warnings
+    left = np.where((left > 5 * fit.offset_std) & (left > 0.002 * fit.signal), left, 0)
+    channel = int(left.argmax())
+    text = (
+        f"the {COLOURS[channel]} channel keeps {fit.offset[channel]:+.1f} DN where the light is absent: dark frames of "
+        "other settings or another ambient light, or a camera that is not linear"
+    )
+    yield warning(light + text, left[channel])
+    # of normal noise less than 1e-5 of the blocks are outliers
+    text = f"{100 * fit.rejected:.0f} % of the blocks are outliers: coloured or fluorescent spots on the target?"
+    yield warning(light + text, fit.rejected, above=0.05)

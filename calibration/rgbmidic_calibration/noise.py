@@ -7,41 +7,42 @@ so neither shading nor texture of the target matters, as long as it stands still
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rgbmidic.errors import CalibrationError
+from rgbmidic.illumination.checks import Check, reported, warning
 from rgbmidic.illumination.linear import CameraNoise, Quantity
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile_means
-from rgbmidic_calibration.plausibility import fixed_pattern
+from rgbmidic_calibration.fixed_pattern import fixed_pattern
 
-HIGHEST = 0.9
-"""Blocks brighter than this fraction of the range are not used: the variance falls as samples reach white.
-From .7 to .95 the gain of the virtual camera changes by .7 of its standard uncertainty at most."""
 
-KNEE = 0.8
-"""Variance over its prediction below which the sensor itself saturates before the white level does: from .6 to .9 no
-figure of the virtual camera changes, since tiles must fall below it by three standard deviations as well."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseConstants:
+    """Constants of `photon_transfer`.
 
-DRIFT_LIMIT, DRIFT_WARNING = 0.2, 0.02
-"""Drift of the lamp's strength within an exposure (`TemporalStack.drift`). Chosen: frames are scaled to one strength,
-so that drift does no harm; a fifth is another exposure rather than a lamp that warms up."""
-RANGE_WARNING = 0.2
-"""Fraction of the range: the relative error of the gain grows as its inverse. Chosen; it decides on a warning only."""
-SCATTER_WARNING = 1.5
-"""Scatter of the tiles' variances over that of noise alone: chosen; it decides on a warning only."""
-CURVE_WARNING, BEND_SIGNIFICANCE = 0.03, 4.0
-"""Departure of an exposure from the line, beyond so many standard deviations. Chosen; it decides on a warning only."""
-ZEROS_WARNING = 0.005
-"""Fraction of dark samples cut off at 0: chosen; of normal noise this lies 2.6 standard deviations above the cut."""
-PLANES_WARNING = 0.05
-"""Relative difference of the planes' gains: chosen; it decides on a warning only."""
-LINEARITY_WARNING = 0.5
-"""Linearity error LE (%) from which lights that shine together are not the sum of the single ones to within what
-`check` allows (`rgbmidic_calibration.verify.Limits.additivity`); EMVA 1288 defines the figure and sets no limit."""
+    Attributes
+    ----------
+    highest
+        Blocks brighter than this fraction of the range are not used: the variance falls as samples reach white. From .7
+        to .95 the gain of the virtual camera changes by .7 of its standard uncertainty at most.
+    knee
+        Variance over its prediction below which the sensor itself saturates before the white level does: from .6 to .9
+        no figure of the virtual camera changes, since tiles must fall below it by three standard deviations as well.
+    drift
+        Largest drift of the lamp's strength within an exposure (`TemporalStack.drift`). Chosen: frames are scaled to
+        one strength, so that drift does no harm; a fifth is another exposure rather than a lamp that warms up.
+    """
+
+    highest: float = 0.9
+    knee: float = 0.8
+    drift: float = 0.2
+
+
+DEFAULT = NoiseConstants()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +69,9 @@ class _Line:
     bend: float
 
 
-def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> NoiseEstimate:
+def photon_transfer(
+    dark: TemporalStack, flats: Sequence[TemporalStack], *, constants: NoiseConstants = DEFAULT
+) -> NoiseEstimate:
     """Noise figures of every colour plane from dark frames and flat frames at several exposures.
 
     Parameters
@@ -78,6 +81,8 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
     flats
         One stack per exposure, each of at least two frames. Any target that stands still; a plain one where the
         response's fixed pattern (PRNU) and dead pixels are wanted.
+    constants
+        Limits of the method.
 
     Raises
     ------
@@ -86,17 +91,21 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
         as the flats.
     """
     same_camera([dark, *flats])
-    _check(dark, flats)
-    lines = [_fit_line(dark, flats, plane) for plane in range(len(dark.camera.names))]
+    _refuse(dark, flats, constants.drift)
+    planes = range(len(dark.camera.names))
+    lines = [_fit_line(dark, flats, plane, constants.highest) for plane in planes]
     drift = dark.strength.var(axis=0, ddof=1)
     rest = np.array([variance.mean(dtype=np.float64) / variance.size for variance in dark.variance])
     black = Quantity(
         np.array(dark.camera.black) + dark.strength.mean(axis=0), np.sqrt(np.maximum(drift, rest) / dark.count)
     )
-    saturation, warnings = _saturation(dark, flats, lines, black)
-    pattern = fixed_pattern(dark, flats, saturation)
+    knees = [_knee(dark, flats, plane, lines[plane], constants.knee) for plane in planes]
+    level, std = dark.camera.white - black.value, np.hypot(black.std, 0.5)
+    early = np.nan_to_num(knees, nan=np.inf) < 0.95 * level  # the sensor saturates before the white level does
+    saturation = Quantity(np.where(early, knees, level), np.where(early, 0.05 * np.array(knees), std))
     read, gain = np.sqrt([line.read_variance for line in lines]), np.array([1 / line.slope for line in lines])
     read_std, slope_std = np.sqrt([np.diag(line.covariance) for line in lines]).T
+    dsnu, prnu, defects, uneven = fixed_pattern(dark, flats, saturation)
     noise = CameraNoise(
         planes=dark.camera.names,
         gain=Quantity(gain, gain**2 * slope_std),
@@ -104,49 +113,49 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
         black_level=black,
         saturation=saturation,
         linearity_error=_linearity(dark, flats, saturation.value),
-        dsnu=pattern.dsnu,
-        prnu=pattern.prnu,
-        defects=pattern.defects,
+        dsnu=dsnu,
+        prnu=prnu,
+        defects=defects,
     )
-    warnings += [*_warnings(dark, flats, noise, lines), *pattern.warnings]
-    return NoiseEstimate(camera_noise=noise, warnings=tuple(warnings))
+    found = [check.text for check in reported(_checks(dark, flats, noise, lines, early))]
+    return NoiseEstimate(camera_noise=noise, warnings=(*found, *uneven))
 
 
-def _check(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
-    for name, stack in [("the dark frames", dark), *((f"flat exposure {i + 1}", s) for i, s in enumerate(flats))]:
-        if stack.count < 2:
-            raise CalibrationError(f"{name}: temporal noise needs at least two frames of the same scene, given is one")
+def _refuse(dark: TemporalStack, flats: Sequence[TemporalStack], drift: float) -> None:
     if not flats:
         raise CalibrationError("no flat exposure is given: the gain needs lit frames at one exposure at least")
-    for index, flat in enumerate(flats):
-        if flat.drift > DRIFT_LIMIT:
+    for index, stack in enumerate([dark, *flats]):
+        name = f"flat exposure {index}" if index else "the dark frames"
+        if stack.count < 2:
+            raise CalibrationError(f"{name}: temporal noise needs at least two frames of the same scene, given is one")
+        if index and stack.drift > drift:
             raise CalibrationError(
-                f"flat exposure {index + 1}: the frames' strengths differ by {100 * flat.drift:.0f} %: each group "
-                "must be frames of one exposure with a steady lamp"
+                f"{name}: the frames' strengths differ by {100 * stack.drift:.0f} %: each group must be frames of one "
+                "exposure with a steady lamp"
             )
-        if flat.piled_at is not None:
+        if index and stack.piled_at is not None:
             raise CalibrationError(
-                f"flat exposure {index + 1}: samples pile up at {flat.piled_at:.0f} DN, below the stated white level "
-                f"{flat.camera.white:g}: the camera saturates there; state --white-level {flat.piled_at:.0f}"
+                f"{name}: samples pile up at {stack.piled_at:.0f} DN, below the stated white level "
+                f"{stack.camera.white:g}: the camera saturates there; state --white-level {stack.piled_at:.0f}"
             )
     brightest = max(float(flat.strength.mean(axis=0).max()) for flat in flats)
     if float(dark.strength.mean(axis=0).max()) > 0.5 * brightest:
         raise CalibrationError("the dark frames are not darker than half of the brightest flat frames: was a lamp on?")
 
 
-def _fit_line(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int) -> _Line:
+def _fit_line(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, highest: float) -> _Line:
     """Line of variance over mean through the blocks of all exposures, weighted by the variance of a variance."""
     level = tile_means(dark.mean[plane])
     range_ = dark.camera.white - dark.camera.black[plane]
-    points = [(np.zeros_like(level), tile_means(dark.variance[plane]), dark.count)]
+    means = [np.zeros_like(level)]
     for flat in flats:
         mean = tile_means(flat.mean[plane]) - level
-        good = (tile_means(flat.clipped[plane]) == 0) & (mean + level < HIGHEST * range_)
-        variance = tile_means(flat.variance[plane])
-        points.append((np.where(good, mean, np.nan), variance, flat.count))
-    mean, variance = (np.concatenate(values) for values in list(zip(*points, strict=True))[:2])
-    exposure = np.repeat(np.arange(float(len(points))), len(level))
-    freedom = np.repeat([TILE**2 * (count - 1) for *_, count in points], len(level))
+        good = (tile_means(flat.clipped[plane]) == 0) & (mean + level < highest * range_)
+        means.append(np.where(good, mean, np.nan))
+    stacks, mean = [dark, *flats], np.concatenate(means)
+    variance = np.concatenate([tile_means(stack.variance[plane]) for stack in stacks])
+    exposure = np.repeat(np.arange(float(len(stacks))), len(level))
+    freedom = np.repeat([TILE**2 * (stack.count - 1) for stack in stacks], len(level))
     used = np.isfinite(mean)
     if not (used & (exposure > 0)).any():
         raise CalibrationError(
@@ -185,54 +194,34 @@ def _weighted_line(mean: FloatArray, variance: FloatArray, freedom: FloatArray, 
         covariance=inverse @ (score.T @ score) @ inverse,
         reach=float(means[0].max()),
         scatter=scatter,
-        bend=float(np.maximum(np.abs(means[1] / means[2] - 1) - BEND_SIGNIFICANCE * noise, 0).max()),
+        bend=float(np.maximum(np.abs(means[1] / means[2] - 1) - 4 * noise, 0).max()),
     )
 
 
-def _saturation(
-    dark: TemporalStack, flats: Sequence[TemporalStack], lines: Sequence[_Line], black: Quantity
-) -> tuple[Quantity, list[str]]:
-    """Where samples saturate: the white level, or the lower level at which the variance breaks down."""
-    level = dark.camera.white - black.value
-    std = np.hypot(black.std, 0.5)
-    warnings = []
-    for plane, line in enumerate(lines):
-        if (knee := _knee(dark, flats, plane, line)) is not None and knee < 0.95 * level[plane]:
-            warnings.append(
-                f"plane {dark.camera.names[plane]}: the variance breaks down at {knee:.0f} DN above black, below "
-                f"the white level: the sensor saturates there (white_level {knee + black.value[plane]:.0f} in the test)"
-            )
-            level[plane], std[plane] = knee, 0.05 * knee
-    if not any(clipped.any() for flat in flats for clipped in flat.clipped) and not warnings:
-        warnings.append("no exposure reached saturation: the full well is that of the stated white level")
-    return Quantity(level, std), warnings
-
-
-def _knee(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, line: _Line) -> float | None:
-    lowest: float | None = None
+def _knee(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, line: _Line, limit: float) -> float:
+    """Lowest level (DN above black) at which the variance breaks down; NaN where it does not."""
+    knees = [np.nan]
     for flat in flats:
         mean = tile_means(flat.mean[plane]) - tile_means(dark.mean[plane])
         free = tile_means(flat.clipped[plane]) == 0
         ratio = tile_means(flat.variance[plane]) / (line.read_variance + line.slope * np.maximum(mean, 0))
         noise = np.sqrt(2 / (TILE**2 * (flat.count - 1)))
-        broken = free & (ratio < KNEE - 3 * noise) & (mean > 0.3 * (dark.camera.white - dark.camera.black[plane]))
+        broken = free & (ratio < limit - 3 * noise) & (mean > 0.3 * (dark.camera.white - dark.camera.black[plane]))
         if broken.sum() > 0.02 * len(mean):
-            knee = float(np.median(mean[broken]))
-            lowest = knee if lowest is None else min(lowest, knee)
-    return lowest
+            knees.append(float(np.median(mean[broken])))
+    return float(np.fmin.reduce(knees))
 
 
 def _linearity(dark: TemporalStack, flats: Sequence[TemporalStack], saturation: FloatArray) -> Quantity:
     """EMVA 1288 LE: mean relative deviation in % from the line through mean against exposure time, 5 to 95 %."""
-    planes = len(dark.camera.names)
     known = [flat for flat in flats if flat.exposure is not None]
     time = np.array([flat.exposure for flat in known], dtype=np.float64)
-    error, std = np.full(planes, np.nan), np.full(planes, np.nan)
-    for plane in range(planes):
+    error, std = np.full((2, len(dark.camera.names)), np.nan)
+    for plane, full in enumerate(saturation):
         mean = np.array([flat.strength[:, plane].mean() for flat in known]) - dark.strength[:, plane].mean()
         steady = np.array([flat.strength[:, plane].std(ddof=1) / np.sqrt(flat.count) for flat in known])
         free = np.array([not flat.clipped[plane].any() for flat in known], dtype=bool)
-        good = free & (mean > 0.05 * saturation[plane]) & (mean < 0.95 * saturation[plane])
+        good = free & (mean > 0.05 * full) & (mean < 0.95 * full)
         if len(np.unique(time[good])) < 3:
             continue
         line = np.polyfit(time[good], mean[good], 1, w=1 / mean[good])
@@ -241,42 +230,50 @@ def _linearity(dark: TemporalStack, flats: Sequence[TemporalStack], saturation: 
     return Quantity(error, std)
 
 
-def _warnings(
-    dark: TemporalStack, flats: Sequence[TemporalStack], noise: CameraNoise, lines: Sequence[_Line]
-) -> list[str]:
-    warnings = []
-    if dark.zeros > ZEROS_WARNING:
-        warnings.append(
-            f"{100 * dark.zeros:.1f} % of the dark samples are 0: the black level is cut off and the read noise "
-            "comes out too small; raise the camera's black level (offset)"
+def _checks(
+    dark: TemporalStack, flats: Sequence[TemporalStack], noise: CameraNoise, lines: Sequence[_Line], early: BoolArray
+) -> Iterator[Check]:
+    """What the user should know; the limits are chosen where no source is given, and decide on nothing else."""
+    planes, black = noise.planes, noise.black_level.value
+    for plane in np.flatnonzero(early).tolist():
+        knee = noise.saturation.value[plane]
+        yield warning(
+            f"plane {planes[plane]}: the variance breaks down at {knee:.0f} DN above black, below the white level: the "
+            f"sensor saturates there (white_level {knee + black[plane]:.0f} in the test)"
         )
+    if not any(clipped.any() for flat in flats for clipped in flat.clipped) and not early.any():
+        yield warning("no exposure reached saturation: the full well is that of the stated white level")
+    text = (
+        f"{100 * dark.zeros:.1f} % of the dark samples are 0: the black level is cut off and the read noise comes out "
+        "too small; raise the camera's black level (offset)"
+    )
+    yield warning(text, dark.zeros, above=0.005)  # of normal noise they lie 2.6 standard deviations above the cut
     drift = max(flat.drift for flat in flats)
-    if drift > DRIFT_WARNING:
-        warnings.append(f"the lamp's strength differs by {100 * drift:.1f} % within an exposure; it was taken out")
-    reach = max(line.reach for line in lines)
-    if reach < RANGE_WARNING * (dark.camera.white - min(dark.camera.black)):
-        warnings.append(
+    text = f"the lamp's strength differs by {100 * drift:.1f} % within an exposure; it was taken out"
+    yield warning(text, drift, above=0.02)
+    reach, range_ = max(line.reach for line in lines), dark.camera.white - min(dark.camera.black)
+    if reach < 0.2 * range_:  # the relative error of the gain grows as its inverse
+        yield warning(
             f"the brightest exposure reaches {reach:.0f} DN only: expose up to 70 % of the range for a good gain"
         )
-    for name, line in zip(dark.camera.names, lines, strict=True):
-        if line.scatter > SCATTER_WARNING or line.bend > CURVE_WARNING:
-            warnings.append(
-                f"plane {name}: the variance does not follow a line (departs by {100 * line.bend:.1f} %, scatters "
-                f"{line.scatter:.1f} times as much as noise): did the target move, or the lamp "
-                "flicker, between frames?"
-            )
-    linearity = noise.linearity_error.value
-    if (linearity > LINEARITY_WARNING).any():
-        worst = int(np.nanargmax(linearity))
-        warnings.append(
-            f"plane {dark.camera.names[worst]}: the linearity error is {linearity[worst]:.2f} %, the limit is "
-            f"{LINEARITY_WARNING:g} %: are the exposure times those of the frames, was the lamp steady? Unmixing "
-            "needs a linear camera"
+    for name, line in zip(planes, lines, strict=True):
+        text = (
+            f"plane {name}: the variance does not follow a line (departs by {100 * line.bend:.1f} %, scatters "
+            f"{line.scatter:.1f} times as much as noise): did the target move, or the lamp flicker, between frames?"
         )
-    if np.isnan(linearity).any() and any(flat.exposure is not None for flat in flats):
-        warnings.append(
+        yield warning(text, max(line.scatter / 1.5, line.bend / 0.03), above=1)
+    # lights that shine together are then the sum of the single ones as `check` allows (`verify.Limits.additivity`);
+    # EMVA 1288 defines the figure and sets no limit
+    error, limit = np.nan_to_num(noise.linearity_error.value), 0.5
+    worst = int(error.argmax())
+    text = (
+        f"plane {planes[worst]}: the linearity error is {error[worst]:.2f} %, the limit is {limit:g} %: are the "
+        "exposure times those of the frames, was the lamp steady? Unmixing needs a linear camera"
+    )
+    yield warning(text, error[worst], above=limit)
+    if np.isnan(noise.linearity_error.value).any() and any(flat.exposure is not None for flat in flats):
+        yield warning(
             "no linearity error for some plane: it takes three exposure times that reach 5 to 95 % of the range there"
         )
-    if np.ptp(noise.gain.value) > PLANES_WARNING * noise.gain.value.mean():
-        warnings.append("the gains of the planes differ: the camera applies digital gain per colour; the mean is used")
-    return warnings
+    text = "the gains of the planes differ: the camera applies digital gain per colour; the mean is used"
+    yield warning(text, np.ptp(noise.gain.value) / noise.gain.value.mean(), above=0.05)

@@ -37,14 +37,10 @@ class BlockMeans:
     ----------
     planes : ndarray, shape (P, R, S), float64
         Mean grey level (DN above black) of each colour plane in each of R x S blocks.
-    names : tuple of str, length P
-        R, G1, G2, B for a mosaic (G1 is the first green met row by row); R, G, B for a 3-CCD frame.
     saturated : ndarray, shape (R, S), bool
         True where any sample of any plane is saturated.
-    full_scale : float
-        Grey level of a just saturated sample (DN above black).
-    shape : tuple of int
-        Rows and columns of the frame in px.
+    camera : Sampling
+        How the frame was sampled.
     block : int
         Side of a block in px.
     detail : float
@@ -54,10 +50,8 @@ class BlockMeans:
     """
 
     planes: FloatArray
-    names: tuple[str, ...]
     saturated: BoolArray
-    full_scale: float
-    shape: tuple[int, int]
+    camera: Sampling
     block: int
     detail: float
     piled_at: float | None = None
@@ -65,19 +59,19 @@ class BlockMeans:
     @property
     def channels(self) -> FloatArray:
         """Block averages of the channels R, G, B, shape (3, R, S): the two greens of a mosaic averaged."""
-        if len(self.names) == 3:
+        if len(self.planes) == 3:
             return self.planes
         return np.stack([self.planes[0], 0.5 * (self.planes[1] + self.planes[2]), self.planes[3]])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Sampling:
     """How a camera samples its frames.
 
     Attributes
     ----------
     names : tuple of str, length P
-        Colour planes: R, G1, G2, B; R, G, B; or M.
+        Colour planes: R, G1, G2, B of a mosaic (G1 is the first green met row by row); R, G, B; or M.
     shape : tuple of int
         Rows and columns of the frames.
     black : tuple of float, length P
@@ -106,13 +100,21 @@ class Sampling:
             order = np.argsort(cfa_channels(frame.cfa).ravel(), kind="stable")
             origins, step = tuple((int(position) // 2, int(position) % 2) for position in order), 2
         shape = frame.values.shape[-2], frame.values.shape[-1]
-        return cls(
-            names=names, shape=shape, black=tuple(black.tolist()), white=frame.white_level, origins=origins, step=step
-        )
+        return cls(names, shape, tuple(black.tolist()), frame.white_level, origins, step)
+
+    @property
+    def full_scale(self) -> float:
+        """Grey level of a just saturated sample (DN above black)."""
+        return self.white - float(np.mean(self.black))
+
+    def matches(self, other: Sampling) -> bool:
+        """The frames have the same size, planes and range; each may state its own black level."""
+        mine, its = ((one.shape, one.names, one.full_scale) for one in (self, other))
+        return mine == its
 
     def __str__(self) -> str:
-        planes = " ".join(self.names)
-        return f"{self.shape[1]} x {self.shape[0]} px with planes {planes} and white level {self.white:g}"
+        planes = f"{self.shape[1]} x {self.shape[0]} px with planes {' '.join(self.names)}"
+        return f"{planes} and a range of {self.full_scale:g} DN from black to white level {self.white:g}"
 
 
 def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
@@ -130,10 +132,10 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
     CalibrationError
         The frame is monochrome, or too small for 3 x 3 blocks.
     """
-    names, planes, black = planes_of(frame)
+    _, planes, black = planes_of(frame)
     camera = Sampling.of(frame)
     shape, step = camera.shape, camera.step
-    if names == ("M",):
+    if camera.names == ("M",):
         raise CalibrationError("a monochrome frame has no colour channels: there is no crosstalk to calibrate")
     if block < 2 or block % 2:
         raise CalibrationError(f"a block has an even number of pixels, at least 2, not {block}")
@@ -142,13 +144,16 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
             f"frames of {shape[1]} x {shape[0]} px are too small for calibration in blocks of {block} px "
             f"(at least {3 * block + 4} px on each side)"
         )
-    means = [
-        _window(shape[0], len(plane), block, step, row) @ plane @ _window(shape[1], plane.shape[1], block, step, col).T
-        - dark
-        for plane, dark, (row, col) in zip(planes, black, camera.origins, strict=True)
-    ]
-    stack = np.stack(means)
-    brightest = int(stack.mean(axis=(1, 2)).argmax())
+    means = np.stack(
+        [
+            _window(shape[0], len(plane), block, step, row)
+            @ plane
+            @ _window(shape[1], len(plane.T), block, step, col).T
+            - dark
+            for plane, dark, (row, col) in zip(planes, black, camera.origins, strict=True)
+        ]
+    )
+    brightest = int(means.mean(axis=(1, 2)).argmax())
     picture = planes[brightest].astype(np.float32)
     level = max(float(picture.mean()) - float(black[brightest]), 1.0)
     clipped = np.atleast_3d(frame.white_level <= frame.values.T).any(axis=2).T.astype(np.float32)
@@ -156,11 +161,9 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
     over_rows, over_columns = (_window(side, side, block, 1, 0) for side in shape)
     saturated = over_rows @ clipped @ over_columns.T > 0
     return BlockMeans(
-        planes=stack,
-        names=names,
+        planes=means,
         saturated=saturated,
-        full_scale=frame.white_level - float(np.mean(black)),
-        shape=shape,
+        camera=camera,
         block=block,
         detail=float(((picture[:, 2:] - 2 * picture[:, 1:-1] + picture[:, :-2]) ** 2).mean()) / level**2,
         piled_at=saturation_pile(planes[brightest], frame.white_level),
@@ -196,13 +199,39 @@ def saturation_pile(plane: npt.NDArray[np.uint16], white: float) -> float | None
     return float(top) if count > 20 and count > 2 * below else None
 
 
-OUTLIER = 5.0
-"""Robust standard deviations beyond which a block is left out: a fluorescent spot, a label, a hot cluster. Of normal
-noise 6e-7 are beyond, less than one block of a calibration."""
+@dataclass(frozen=True, slots=True)
+class LightSignal:
+    """Block averages of the captures of one light.
 
-DRIFT_SIGNIFICANCE = 0.01
-"""Significance level of the F test for scatter between captures: one calibration in a hundred gets a needless addition
-to its covariance."""
+    Attributes
+    ----------
+    name : str
+    values : ndarray, shape (N, C, R, S)
+        Above dark, of N captures.
+    valid : ndarray, shape (N, R, S), bool
+        Blocks without saturated samples.
+    reference : int
+        Channel that sees the light best: the others are compared with it.
+    """
+
+    name: str
+    values: FloatArray
+    valid: BoolArray
+    reference: int
+
+    @property
+    def base(self) -> FloatArray:
+        """Block averages (N, R, S) of the reference channel."""
+        return self.values[:, self.reference]
+
+    @property
+    def others(self) -> list[int]:
+        """The channels but the reference."""
+        return [c for c in range(self.values.shape[1]) if c != self.reference]
+
+    def residual(self, design: FloatArray, coefficients: FloatArray) -> FloatArray:
+        """Residuals y - a x, (N, C, R, S)."""
+        return np.asarray(self.values - np.einsum("rst,tc->crs", design, coefficients) * self.base[:, None])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -233,39 +262,33 @@ class ColumnFit:
     mass: FloatArray
 
 
-def fit_column(signal: FloatArray, valid: BoolArray, reference: int, design: FloatArray) -> ColumnFit:
+def fit_column(signal: LightSignal, design: FloatArray) -> ColumnFit:
     """Fit one light's column of A by ratios of sums (equation of the module), without outliers.
 
     Parameters
     ----------
-    signal : ndarray, shape (N, C, R, S)
-        Block averages above dark of N captures.
-    valid : ndarray, shape (N, R, S), bool
-        Blocks without saturated samples.
-    reference
-        Channel the others are compared with.
+    signal
+        Captures of the light.
     design : ndarray, shape (R, S, T)
         Legendre products at the blocks' centres; T = 1 for a constant column.
     """
-    base = signal[:, reference]
-    weights, coefficients = _without_outliers(signal, valid, reference, design)
-    residual = weights[:, None] * _residual(signal, base, design, coefficients)
-    inverse = np.linalg.inv(_moment(weights * base, design))
-    score = np.einsum("ncrs,rst->tcrs", residual, design)
-    sums = _cluster_sums(score.reshape(-1, *score.shape[2:]))
+    weights, coefficients = _without_outliers(signal, design)
+    residual = weights[:, None] * signal.residual(design, coefficients)
+    inverse = np.linalg.inv(_moment(weights * signal.base, design))
+    sums = _cluster_sums(np.einsum("ncrs,rst->tcrs", residual, design))
     count = max(len(sums), 2)
     terms, channels = coefficients.shape
     spread = (sums.T @ sums * count / (count - 1)).reshape(terms, channels, terms, channels)
     total = np.einsum("nrs,rst->t", weights, design)
     lever = np.einsum("tu,u,cd->tcd", inverse, total, np.eye(channels))
-    lever[:, :, reference] -= inverse @ _moment(weights, design) @ coefficients
+    lever[:, :, signal.reference] -= inverse @ _moment(weights, design) @ coefficients
     return ColumnFit(
         coefficients=coefficients,
         covariance=np.einsum("tu,ucvd,wv->tcwd", inverse, spread, inverse),
         leverage=lever,
         weights=weights,
         residual=residual,
-        mass=(weights * base).sum(axis=(1, 2)),
+        mass=(weights * signal.base).sum(axis=(1, 2)),
     )
 
 
@@ -274,41 +297,36 @@ def _moment(weights: FloatArray, design: FloatArray) -> FloatArray:
     return np.asarray((flat * weights.sum(axis=0).reshape(-1, 1)).T @ flat)
 
 
-def _residual(signal: FloatArray, base: FloatArray, design: FloatArray, coefficients: FloatArray) -> FloatArray:
-    return np.asarray(signal - np.einsum("rst,tc->crs", design, coefficients) * base[:, None])
-
-
-def _without_outliers(
-    signal: FloatArray, valid: BoolArray, reference: int, design: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _without_outliers(signal: LightSignal, design: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Weights and coefficients, iterated from the median of the blocks' ratios.
 
-    Every channel's residual is compared with its median spread times the square root of x (shot noise). Weights
-    between 0 and 1 would need a correction of the sandwich and would cost efficiency.
+    Every channel's residual is compared with its median spread times the square root of x (shot noise). Beyond 5 robust
+    standard deviations a block is left out: a fluorescent spot, a label, a hot cluster. Of normal noise 6e-7 are
+    beyond, less than one block of a calibration. Weights between 0 and 1 would need a correction of the sandwich and
+    would cost efficiency.
     """
-    base = signal[:, reference]
+    base, valid = signal.base, signal.valid
     root = np.sqrt(np.maximum(base, 1e-3 * np.median(base[valid])))
-    ratios = signal / np.where(base > 0, base, np.inf)[:, None]
-    coefficients = np.zeros((design.shape[-1], signal.shape[1]))
+    ratios = signal.values / np.where(base > 0, base, np.inf)[:, None]
+    coefficients = np.zeros((design.shape[-1], signal.values.shape[1]))
     coefficients[0] = np.median(ratios.transpose(0, 2, 3, 1)[valid], axis=0)
     weights = valid.astype(np.float64)
     for _ in range(20):
-        scaled = _residual(signal, base, design, coefficients) / root[:, None]
+        scaled = signal.residual(design, coefficients) / root[:, None]
         spread = np.median(np.abs(scaled.transpose(0, 2, 3, 1)[valid]), axis=0) / 0.6745
-        limit = np.where(spread > 0, OUTLIER * spread, np.inf)[:, None, None]
+        limit = np.where(spread > 0, 5.0 * spread, np.inf)[:, None, None]
         weights = (valid & (np.abs(scaled) <= limit).all(axis=1)).astype(np.float64)
-        right = np.einsum("crs,rst->tc", (weights[:, None] * signal).sum(axis=0), design)
-        update = np.linalg.solve(_moment(weights * base, design), right)
-        done = np.abs(update - coefficients).max() < 1e-10
-        coefficients = update
-        if done:
+        right = np.einsum("crs,rst->tc", (weights[:, None] * signal.values).sum(axis=0), design)
+        before, coefficients = coefficients, np.linalg.solve(_moment(weights * base, design), right)
+        if np.abs(coefficients - before).max() < 1e-10:
             break
-    coefficients[:, reference] = np.eye(len(coefficients))[0]
+    coefficients[:, signal.reference] = np.eye(len(coefficients))[0]
     return weights, coefficients
 
 
 def _cluster_sums(values: FloatArray) -> FloatArray:
-    """Sums (clusters, Q) of (Q, R, S) over 2 x 2 blocks: what spills over a block's border stays within a cluster."""
+    """Sums (clusters, Q) of (..., R, S) over 2 x 2 blocks: what spills over a block's border stays within a cluster."""
+    values = values.reshape(-1, *values.shape[-2:])
     rows, columns = values.shape[1:]
     step = 2 if rows * columns >= 64 else 1
     by_rows = np.add.reduceat(values, np.arange(0, rows, step), axis=1)
@@ -331,7 +349,7 @@ class Variation:
     rms: float
 
 
-def variation(signal: FloatArray, valid: BoolArray, reference: int, design: FloatArray, known: int) -> Variation:
+def variation(signal: LightSignal, design: FloatArray, known: int) -> Variation:
     """Test whether the Legendre products after the first `known` ones are needed in any channel.
 
     A score test with random signs: the model of the first terms is fitted, its residuals are correlated with the other
@@ -341,24 +359,21 @@ def variation(signal: FloatArray, valid: BoolArray, reference: int, design: Floa
 
     Parameters
     ----------
-    signal, valid, reference, design
+    signal, design
         See `fit_column`; `design` has all terms.
     known
         How many of the terms the null hypothesis has.
     """
-    null = fit_column(signal, valid, reference, design[..., :known])
-    moment = _moment(null.weights * signal[:, reference], design)
+    null = fit_column(signal, design[..., :known])
+    moment = _moment(null.weights * signal.base, design)
     # What the fitted terms cannot imitate of the others.
     extra = design[..., known:] - design[..., :known] @ np.linalg.solve(moment[:known, :known], moment[:known, known:])
-    others = [c for c in range(signal.shape[1]) if c != reference]
-    score = np.einsum("crs,rst->ctrs", null.residual[:, others].sum(axis=0), extra)
-    sums = _cluster_sums(score.reshape(-1, *score.shape[2:]))
+    sums = _cluster_sums(np.einsum("crs,rst->ctrs", null.residual[:, signal.others].sum(axis=0), extra))
     inverse = np.linalg.pinv(sums.T @ sums)
-    signs = np.random.default_rng(0).choice((-1.0, 1.0), (4999, len(sums)))
-    flips = signs @ sums
+    flips = np.random.default_rng(0).choice((-1.0, 1.0), (4999, len(sums))) @ sums
     flipped = ((flips @ inverse) * flips).sum(axis=1)
     observed = sums.sum(axis=0) @ inverse @ sums.sum(axis=0)
-    coefficients = fit_column(signal, valid, reference, design).coefficients[known:, others]
+    coefficients = fit_column(signal, design).coefficients[known:, signal.others]
     norms = (design[..., known:] ** 2).mean(axis=(0, 1))
     return Variation(
         p_value=float((1 + (flipped >= observed).sum()) / (1 + len(flipped))),
@@ -366,10 +381,11 @@ def variation(signal: FloatArray, valid: BoolArray, reference: int, design: Floa
     )
 
 
-def capture_scatter(fit: ColumnFit) -> FloatArray:
+def capture_scatter(fit: ColumnFit, significance: float = 0.01) -> FloatArray:
     """Variance (C,) of the entries between captures beyond their noise; zero where an F test finds none.
 
     The noise comes from the residuals' departures from the mean over the captures, where the target's texture cancels.
+    At the default level one calibration in a hundred gets a needless addition to its covariance.
     """
     count, channels = fit.residual.shape[:2]
     if count < 2:
@@ -378,33 +394,29 @@ def capture_scatter(fit: ColumnFit) -> FloatArray:
     departures = (relative - relative.mean(axis=0)).transpose(1, 0, 2, 3).reshape(channels, -1)
     noise = (departures**2).sum(axis=1) / (count - 1)
     scatter = relative.sum(axis=(2, 3)).var(axis=0, ddof=1)
-    limit = fdtri(count - 1, departures.shape[1], 1 - DRIFT_SIGNIFICANCE / channels)
+    limit = fdtri(count - 1, departures.shape[1], 1 - significance / channels)
     return np.where(scatter > limit * noise, scatter - noise, 0.0)
 
 
-def offsets_left(
-    signal: FloatArray, weights: FloatArray, reference: int, design: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def offsets_left(signal: LightSignal, weights: FloatArray, design: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Grey level (C,) that every channel keeps where the light is absent, and its standard uncertainty.
 
     ``y = x a + o`` with the other captures' x as instrument for the slope: their noise is independent. NaN for fewer
     than two captures. The offset of a dark level that is right is zero; on a plain target it is poorly determined.
     """
-    count, channels = signal.shape[:2]
-    offset, std = np.full(channels, np.nan), np.full(channels, np.nan)
+    count, channels = signal.values.shape[:2]
+    offset, std = np.full((2, channels), np.nan)
     if count < 2:
         return offset, std
-    base = signal[:, reference]
+    base = signal.base
     others = (base.sum(axis=0) - base) / (count - 1)
-    columns = [base[..., None] * design, np.ones((*base.shape, 1))]
     instruments = [np.broadcast_to(design, (count, *design.shape)), others[..., None]]
     left = weights[..., None] * np.concatenate(instruments, axis=-1)
-    right = np.concatenate(columns, axis=-1)
-    matrix = np.einsum("nrsi,nrsj->ij", left, right)
-    inverse = np.linalg.inv(matrix)
-    for channel in (c for c in range(channels) if c != reference):
-        solution = inverse @ np.einsum("nrsi,nrs->i", left, signal[:, channel])
-        score = (left * (signal[:, channel] - right @ solution)[..., None]).sum(axis=0)
+    right = np.concatenate([base[..., None] * design, np.ones((*base.shape, 1))], axis=-1)
+    inverse = np.linalg.inv(np.einsum("nrsi,nrsj->ij", left, right))
+    for channel in signal.others:
+        solution = inverse @ np.einsum("nrsi,nrs->i", left, signal.values[:, channel])
+        score = (left * (signal.values[:, channel] - right @ solution)[..., None]).sum(axis=0)
         sums = _cluster_sums(score.transpose(2, 0, 1)) @ inverse.T
         offset[channel], std[channel] = solution[-1], np.sqrt((sums[:, -1] ** 2).sum())
     return offset, std

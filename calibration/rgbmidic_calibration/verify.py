@@ -5,7 +5,7 @@ The sub-command `check`: the verdict on a calibration file, from captures that w
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.checks import Check
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
@@ -20,10 +21,6 @@ from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.captures import TILE, Captures, TemporalStack, same_camera, stack_frames, tile_means
 from rgbmidic_calibration.ratio import BlockMeans, block_centres, block_means
 from rgbmidic_calibration.registration import estimate_registration
-
-SAME_EXPOSURE = 0.05
-"""Drift of the captures (`TemporalStack.drift`) up to which they count as one exposure; more is a lamp that drifts or
-an exposure series (`rgbmidic_calibration.crosstalk.INTENSITY_WARNING`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,20 +49,9 @@ class Limits:
     noise: float = 10.0
 
 
-@dataclass(frozen=True, slots=True)
-class CheckItem:
-    """One line of the verdict: a figure, its uncertainty and its limit, all in `unit`."""
-
-    name: str
-    value: float
-    std: float
-    limit: float
-    unit: str
-
-    @property
-    def passed(self) -> bool:
-        """The figure keeps its limit."""
-        return bool(abs(self.value) <= self.limit)
+def _line(name: str, value: float, std: float, limit: float, unit: str = "%") -> Check:
+    """A line of the verdict."""
+    return Check(name, "", value=value, limit=limit, std=std, unit=unit)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,11 +73,10 @@ class Leakage:
     mean: FloatArray
     std: FloatArray
 
-    def items(self, limit: float) -> list[CheckItem]:
+    def items(self, limit: float) -> list[Check]:
         """One line per pair of lights."""
-        mean, std = 100 * self.mean, 100 * self.std
         return [
-            CheckItem(f"{alone} left in {light}", float(mean[row, column]), float(std[row, column]), limit, "%")
+            _line(f"{alone} left in {light}", 100 * self.mean[row, column], 100 * self.std[row, column], limit)
             for column, alone in enumerate(self.alone)
             for row, light in enumerate(self.lights)
             if light != alone
@@ -122,33 +107,26 @@ def leakage(
             f"the calibration knows the lights {', '.join(crosstalk.lights)}, not {', '.join(unknown)}"
         )
     level = np.mean([frame.channels for frame in dark], axis=0) if dark else np.float64(0)
-    columns = [_unmixed(crosstalk, name, captures, level) for name, captures in lights.items()]
-    mean, std = (np.stack(parts, axis=1) for parts in zip(*columns, strict=True))
+    first = next(iter(lights.values()))[0]
+    unmixing = crosstalk.unmixing_at(block_centres(first.camera.shape, first.block))
+    mean, std = np.empty((2, len(crosstalk.lights), len(lights)))
+    for column, (name, captures) in enumerate(lights.items()):
+        clear = ~np.any([frame.saturated for frame in captures], axis=0)
+        if clear.sum() < 4:
+            raise CalibrationError(f"light {name}: nearly every block holds saturated samples; shorten the exposure")
+        channels = np.mean([frame.channels for frame in captures], axis=0) - level
+        values = np.einsum("rskc,crs->krs", unmixing, channels)[:, clear]
+        lit, brightest = crosstalk.lights.index(name), int(values.sum(axis=1).argmax())
+        total = float(values[lit].sum())
+        if total <= 0 or brightest != lit:
+            raise CalibrationError(
+                f"the captures of light {name} show most light in {crosstalk.lights[brightest]} after unmixing: are "
+                "the captures swapped, was the lamp off, or is the calibration of another camera?"
+            )
+        mean[:, column] = values.sum(axis=1) / total
+        scatter = values - mean[:, column, None] * values[lit]
+        std[:, column] = np.sqrt((scatter**2).sum(axis=1)) / total
     return Leakage(lights=crosstalk.lights, alone=tuple(lights), mean=mean, std=std)
-
-
-def _unmixed(
-    crosstalk: Crosstalk, name: str, captures: Sequence[BlockMeans], level: npt.NDArray[np.floating] | np.float64
-) -> tuple[FloatArray, FloatArray]:
-    """Ratios (k,) of every light's sum to that of light `name`, and their uncertainty."""
-    first = captures[0]
-    clear = ~np.any([frame.saturated for frame in captures], axis=0)
-    if clear.sum() < 4:
-        raise CalibrationError(f"light {name}: nearly every block holds saturated samples; shorten the exposure")
-    channels = np.mean([frame.channels for frame in captures], axis=0) - level
-    unmixing = crosstalk.unmixing_at(block_centres(first.shape, first.block))
-    values = np.einsum("rskc,crs->krs", unmixing, channels)[:, clear]
-    lit = crosstalk.lights.index(name)
-    total = float(values[lit].sum())
-    brightest = int(values.sum(axis=1).argmax())
-    if total <= 0 or brightest != lit:
-        raise CalibrationError(
-            f"the captures of light {name} show most light in {crosstalk.lights[brightest]} after unmixing: are the "
-            "captures swapped, was the lamp off, or is the calibration of another camera?"
-        )
-    ratio = values.sum(axis=1) / total
-    scatter = values - ratio[:, None] * values[lit]
-    return ratio, np.sqrt((scatter**2).sum(axis=1)) / total
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,14 +158,16 @@ class Additivity:
     change_std: FloatArray
     left: float
 
-    def items(self, limits: Limits) -> list[CheckItem]:
+    def items(self, limits: Limits) -> list[Check]:
         """Lines of the verdict."""
         together = "+".join(self.lights)
-        items = [CheckItem(f"{together} not the sum", 100 * self.left, 0.0, limits.additivity, "%")]
-        for name, *figure in zip(self.lights, self.change.tolist(), self.change_std.tolist(), strict=True):
-            change, std = (100 * value for value in figure)
-            items.append(CheckItem(f"strength of {name} in {together}", change, std, limits.strength, "%"))
-        return items
+        return [
+            _line(f"{together} not the sum", 100 * self.left, 0.0, limits.additivity),
+            *(
+                _line(f"strength of {name} in {together}", 100 * change, 100 * std, limits.strength)
+                for name, change, std in zip(self.lights, self.change, self.change_std, strict=True)
+            ),
+        ]
 
 
 def additivity(
@@ -308,8 +288,11 @@ def registration_left(
     return [(name, *figures) for name, figures in list(zip(ordered, worst, strict=True))[1:]]
 
 
-def noise_ratio(stack: TemporalStack, noise: NoiseModel) -> tuple[float, float]:
+def noise_ratio(stack: TemporalStack, noise: NoiseModel, same_exposure: float = 0.05) -> tuple[float, float]:
     """Observed over predicted noise of captures at rest (standard deviations), and its uncertainty.
+
+    Captures count as one exposure up to the drift `same_exposure` (`TemporalStack.drift`); more is a lamp that drifts
+    or an exposure series, as of the warning in `rgbmidic_calibration.crosstalk.matrix_checks`.
 
     Raises
     ------
@@ -318,14 +301,12 @@ def noise_ratio(stack: TemporalStack, noise: NoiseModel) -> tuple[float, float]:
     """
     if stack.count < 2:
         raise CalibrationError("noise needs at least two captures of the same scene")
-    if stack.drift > SAME_EXPOSURE:
+    if stack.drift > same_exposure:
         raise CalibrationError("the captures of a light have different exposures")
-    observed = predicted = 0.0
-    samples = 0
-    for mean, variance, clipped in zip(stack.mean, stack.variance, stack.clipped, strict=True):
-        observed += float(variance[~clipped].sum(dtype=np.float64))
-        predicted += float(noise.variance(mean[~clipped]).sum(dtype=np.float64))
-        samples += int((~clipped).sum())
+    clear = [~clipped for clipped in stack.clipped]
+    observed = sum(float(v[c].sum(dtype=np.float64)) for v, c in zip(stack.variance, clear, strict=True))
+    predicted = sum(float(noise.variance(m[c]).sum(dtype=np.float64)) for m, c in zip(stack.mean, clear, strict=True))
+    samples = sum(int(c.sum()) for c in clear)
     ratio = float(np.sqrt(observed / max(predicted, 1e-12)))
     return ratio, ratio / np.sqrt(2 * max(samples, 1) * (stack.count - 1))
 
@@ -334,7 +315,7 @@ def noise_ratio(stack: TemporalStack, noise: NoiseModel) -> tuple[float, float]:
 class Verdict:
     """Result of `check_calibration`: lines with limits, sums of lights, what was not checked, warnings."""
 
-    items: tuple[CheckItem, ...]
+    items: tuple[Check, ...]
     sums: tuple[Additivity, ...]
     skipped: tuple[str, ...]
     warnings: tuple[str, ...]
@@ -376,37 +357,47 @@ def check_calibration(
     calibration = calibration.cropped(None, next(iter(captures.lights.values())).series.shape)
     if calibration.crosstalk is None:
         raise CalibrationError("the calibration has no crosstalk to check; make it with rgbmidic-calibrate crosstalk")
-    warnings, skipped = _reused(calibration, captures), []
+    known = {
+        entry.get("sha256")
+        for origin in calibration.provenance.values()
+        if isinstance(origin, Mapping)
+        for entry in origin.get("inputs", ())
+    }
+    lit = (*captures.lights.values(), *captures.together.values())
+    reused = [path for group in lit for path, fingerprint in group.fingerprints.items() if fingerprint in known]
+    made = f"{len(reused)} of these captures made the calibration ({[*reused, ''][0]} ...): they always agree"
+    warnings = [f"{made}; a check needs others"] if reused else []
     stacks, dark = captures.stacks()
     means = {name: [block_means(frame) for frame in files.frames()] for name, files in captures.lights.items()}
     dark_means = [block_means(frame) for frame in captures.dark.frames()] if captures.dark else []
-    items = leakage(calibration.crosstalk, means, dark_means).items(limits.leakage)
-    sums = []
-    for names, files in captures.together.items():
-        together = stack_frames(files.frames(), name=files.role)
-        singles = {name: stacks[name] for name in names.split("+")}
-        sums.append(additivity(together, singles, dark, noise=calibration.noise))
+    items, skipped = leakage(calibration.crosstalk, means, dark_means).items(limits.leakage), []
+    sums = [
+        additivity(
+            stack_frames(files.frames(), name=files.role),
+            {name: stacks[name] for name in names.split("+")},
+            dark,
+            noise=calibration.noise,
+        )
+        for names, files in captures.together.items()
+    ]
     items += [item for total in sums for item in total.items(limits)]
 
-    def noise() -> list[CheckItem]:
+    def noise() -> Iterator[Check]:
         if calibration.noise is None:
             raise CalibrationError("the calibration has no noise section")
-        ratios = {name: noise_ratio(stack, calibration.noise) for name, stack in stacks.items()}
-        return [
-            CheckItem(f"noise of {name} against prediction", 100 * (ratio - 1), 100 * std, limits.noise, "%")
-            for name, (ratio, std) in ratios.items()
-        ]
+        for name, stack in stacks.items():
+            ratio, std = noise_ratio(stack, calibration.noise)
+            yield _line(f"noise of {name} against prediction", 100 * (ratio - 1), 100 * std, limits.noise)
 
-    def registration() -> list[CheckItem]:
+    def registration() -> Iterator[Check]:
         if calibration.registration is None:
             raise CalibrationError("the calibration has no registration section")
-        left = registration_left(calibration.registration, stacks, dark, region=region)
-        limit = limits.registration
-        return [CheckItem(f"registration of {name}", value, std, limit, "px") for name, value, std in left]
+        for name, value, std in registration_left(calibration.registration, stacks, dark, region=region):
+            yield _line(f"registration of {name}", value, std, limits.registration, "px")
 
     for check in (noise, registration):
         try:
-            items += check()
+            items += list(check())
         except CalibrationError as error:
             skipped.append(f"{check.__name__} was not checked: {error}")
     if dark is None:
@@ -437,18 +428,3 @@ def read_limits(options: Sequence[str]) -> Limits:
             )
         limits = replace(limits, **{name: number})
     return limits
-
-
-def _reused(calibration: Calibration, captures: Captures) -> list[str]:
-    known = {
-        entry.get("sha256")
-        for origin in calibration.provenance.values()
-        if isinstance(origin, Mapping)
-        for entry in origin.get("inputs", ())
-    }
-    groups = (*captures.lights.values(), *captures.together.values())
-    reused = [path for group in groups for path, fingerprint in group.fingerprints.items() if fingerprint in known]
-    if not reused:
-        return []
-    made = f"{len(reused)} of these captures made the calibration ({reused[0]} ...)"
-    return [f"{made}: they always agree; a check needs others"]

@@ -65,6 +65,7 @@ MODULES = [
     "rgbmidic_calibration.design",
     "rgbmidic_calibration.ratio",
     "rgbmidic_calibration.plausibility",
+    "rgbmidic_calibration.fixed_pattern",
     "rgbmidic_calibration.jobs",
     "rgbmidic_calibration.display",
 ]

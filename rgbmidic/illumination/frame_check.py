@@ -187,7 +187,7 @@ def _levels(samples: _Samples, again: _Samples | None, calibrated: float | None,
             f"their histogram {uneven:.2g}, in the captures of the calibration {calibrated:.2g}): a gain, white "
             "balance, gamma or 8-bit table was applied to stored samples"
         )
-        yield Check("levels", uneven, limit, text)
+        yield Check("levels", text, uneven, limit)
     if uneven <= limit:  # the count of small differences wants samples that take any whole value
         yield from _noise(samples, again, step)
 
@@ -241,7 +241,7 @@ def _noise(samples: _Samples, repeat: _Samples | None, step: int) -> Iterator[Ch
             f"{'' if repeat else ' or less'}, the calibration states {calibrated:.2g} DN (another camera or gain, "
             f"gamma, noise reduction, interpolated samples, black level{motion}?)"
         )
-        yield Check("noise", float(excess[at]), limit, text, doubtful=1.12)
+        yield Check("noise", text, float(excess[at]), limit, doubtful=1.12)
 
 
 _FLATTEST = 0.01, 0.05, 0.2
@@ -326,7 +326,7 @@ def _greens(samples: _Samples) -> Iterator[Check]:
         f"the two greens of the pattern differ by {greens:.1%} (rms of blocks of {2 * BLOCK} px), red and blue by "
         f"{others:.1%}: the pattern or its phase is not that of the calibration"
     )
-    yield Check("greens", greens, max(0.03, 1.5 * others), text)
+    yield Check("greens", text, greens, max(0.03, 1.5 * others))
 
 
 def _lights(samples: _Samples, crosstalk: Crosstalk, full_scale: float, origin: tuple[int, int]) -> Iterator[Check]:
@@ -361,7 +361,7 @@ def _lights(samples: _Samples, crosstalk: Crosstalk, full_scale: float, origin: 
             f"light {name} is {what} of the region after unmixing: crosstalk, pattern or black level of the "
             "calibration are not those of this frame"
         )
-        yield Check("lights", max(negative, mirrored), limit, text)
+        yield Check("lights", text, max(negative, mirrored), limit)
 
 
 def _interpolated(samples: _Samples) -> Iterator[Check]:
@@ -390,7 +390,7 @@ def _interpolated(samples: _Samples) -> Iterator[Check]:
         f"samples of {samples.names[worst]} are interpolated from those of a colour mosaic: their second differences "
         f"depend {relative[worst]:.2g} times on the axis or the place in a 2 x 2 cell"
     )
-    yield Check("demosaiced", float(relative[worst]), 1.5, text)
+    yield Check("demosaiced", text, float(relative[worst]), 1.5)
 
 
 def _curvature(x: npt.NDArray[np.float32], usable: BoolArray) -> tuple[FloatArray, float] | None:
