@@ -64,7 +64,7 @@ class CrosstalkConstants:
     tolerance: float = 5e-4
 
 
-DEFAULT = CrosstalkConstants()
+LIMITS = CrosstalkConstants()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,7 +123,6 @@ def estimate_crosstalk(
     order: int | None = None,
     allow: Sequence[str] = (),
     labels: Mapping[str, Sequence[str]] | None = None,
-    constants: CrosstalkConstants = DEFAULT,
 ) -> CrosstalkEstimate:
     """Estimate the crosstalk matrix from block averages of single-light captures.
 
@@ -141,8 +140,6 @@ def estimate_crosstalk(
         Names of plausibility checks (`CHECKS`) that the user waives.
     labels
         File names of the captures, for messages; by light, and ``"dark"``.
-    constants
-        Limits of the method.
 
     Raises
     ------
@@ -152,20 +149,20 @@ def estimate_crosstalk(
     """
     if unknown := sorted(set(allow) - set(CHECKS)):
         raise CalibrationError(f"unknown check {', '.join(unknown)}; those that can be waived are {', '.join(CHECKS)}")
-    if order is not None and not 0 <= order <= constants.largest_order:
-        raise CalibrationError(f"the degree of the field is 0 to {constants.largest_order}, not {order}")
+    if order is not None and not 0 <= order <= LIMITS.largest_order:
+        raise CalibrationError(f"the degree of the field is 0 to {LIMITS.largest_order}, not {order}")
     warnings = judged(capture_checks(lights, dark, labels or {}), allow)
     like = next(iter(lights.values()))[0]
     shape, centres = like.camera.shape, block_centres(like.camera.shape, like.block)
-    level, of_mean, of_frame = np.zeros_like(like.channels), constants.black_level_std**2 * np.eye(3), np.zeros((3, 3))
+    level, of_mean, of_frame = np.zeros_like(like.channels), LIMITS.black_level_std**2 * np.eye(3), np.zeros((3, 3))
     if dark:
         frames = np.stack([frame.channels for frame in dark])
         level = frames.mean(axis=0)
         of_frame = np.cov(frames.mean(axis=(2, 3)), rowvar=False) if len(frames) > 1 else of_mean
         of_mean = of_frame / len(frames)
-    signals = [_above_dark(name, captures, level, constants) for name, captures in lights.items()]
-    asked = legendre_products(centres, shape, constants.automatic_order)
-    tests = [_needed_degree(signal, asked, constants) for signal in signals]
+    signals = [_above_dark(name, captures, level) for name, captures in lights.items()]
+    asked = legendre_products(centres, shape, LIMITS.automatic_order)
+    tests = [_needed_degree(signal, asked) for signal in signals]
     order = max(needed for needed, _ in tests) if order is None else order
     design = legendre_products(centres, shape, order)
     columns = [fit_column(signal, design) for signal in signals]
@@ -173,7 +170,7 @@ def estimate_crosstalk(
         _summary(signal, column, test, design)
         for signal, column, (_, test) in zip(signals, columns, tests, strict=True)
     )
-    warnings += judged(matrix_checks(fits, constants.tolerance), allow)
+    warnings += judged(matrix_checks(fits), allow)
     matrices = np.stack([fit.coefficients for fit in columns], axis=-1)
     covariance = _covariance(columns, of_mean, of_frame)
     field, size = None, matrices[0].size
@@ -186,12 +183,10 @@ def estimate_crosstalk(
     return CrosstalkEstimate(crosstalk=crosstalk, lights=fits, warnings=tuple(warnings))
 
 
-def _above_dark(
-    name: str, captures: Sequence[BlockMeans], dark: FloatArray, constants: CrosstalkConstants
-) -> LightSignal:
+def _above_dark(name: str, captures: Sequence[BlockMeans], dark: FloatArray) -> LightSignal:
     values = np.stack([frame.channels for frame in captures]) - dark
     valid = ~np.stack([frame.saturated for frame in captures])
-    if valid.sum() < constants.least_blocks * len(captures):
+    if valid.sum() < LIMITS.least_blocks * len(captures):
         raise CalibrationError(
             f"light {name}: {100 * (1 - valid.mean()):.0f} % of the blocks hold saturated samples; "
             "shorten the exposure until none does"
@@ -199,14 +194,14 @@ def _above_dark(
     return LightSignal(name, values, valid, int(np.median(values.transpose(0, 2, 3, 1)[valid], axis=0).argmax()))
 
 
-def _needed_degree(signal: LightSignal, design: FloatArray, constants: CrosstalkConstants) -> tuple[int, Variation]:
+def _needed_degree(signal: LightSignal, design: FloatArray) -> tuple[int, Variation]:
     """Degree that the light's captures ask for, and the test of all terms that are not constant."""
     tests: list[Variation] = []
-    for order in range(constants.automatic_order):
+    for order in range(LIMITS.automatic_order):
         tests.append(variation(signal, design, (order + 1) * (order + 2) // 2))
-        if tests[-1].p_value >= constants.significance or tests[-1].rms <= constants.tolerance:
+        if tests[-1].p_value >= LIMITS.significance or tests[-1].rms <= LIMITS.tolerance:
             return order, tests[0]
-    return constants.automatic_order, tests[0]
+    return LIMITS.automatic_order, tests[0]
 
 
 def _summary(signal: LightSignal, fit: ColumnFit, found: Variation, design: FloatArray) -> LightFit:
@@ -246,7 +241,7 @@ def _covariance(columns: Sequence[ColumnFit], of_mean: FloatArray, of_frame: Flo
     return full
 
 
-def matrix_checks(fits: Sequence[LightFit], tolerance: float) -> Iterator[Check]:
+def matrix_checks(fits: Sequence[LightFit]) -> Iterator[Check]:
     """Check the fitted columns: the right channel for each light's name, one light per channel, quiet lamps.
 
     The condition number of three LEDs on nine measured cameras is 1.6 to 2.5 (calibration/README.md).
@@ -269,7 +264,7 @@ def matrix_checks(fits: Sequence[LightFit], tolerance: float) -> Iterator[Check]
             )
             yield Check("same-channel", text)
     for fit in fits:
-        yield from _fit_checks(fit, tolerance)
+        yield from _fit_checks(fit)
     condition = float(np.linalg.cond(np.column_stack([fit.column for fit in fits])))
     text = (
         f"the matrix has condition number {condition:.1f}: unmixing amplifies noise strongly. Are two lamps close in "
@@ -284,7 +279,7 @@ def matrix_checks(fits: Sequence[LightFit], tolerance: float) -> Iterator[Check]
     yield warning(text, len(unseen) if len(fits) < 3 else 0)
 
 
-def _fit_checks(fit: LightFit, tolerance: float) -> Iterator[Check]:
+def _fit_checks(fit: LightFit) -> Iterator[Check]:
     light = f"light {fit.name}: "
     text = (
         f"its strength differs by {100 * fit.intensity_drift:.1f} % between captures: let the lamp warm up (the matrix "
@@ -296,7 +291,7 @@ def _fit_checks(fit: LightFit, tolerance: float) -> Iterator[Check]:
         f"its colour drifts between captures (entries scatter by {fit.colour_drift:.2g} beyond noise); the stated "
         "uncertainty covers it"
     )
-    yield warning(light + text, fit.colour_drift, above=tolerance)
+    yield warning(light + text, fit.colour_drift, above=LIMITS.tolerance)
     # .2 % of the signal leaks as much, of the order of what `check` allows (`verify.Limits.leakage`)
     left = np.abs(fit.offset)
     left = np.where((left > 5 * fit.offset_std) & (left > 0.002 * fit.signal), left, 0)

@@ -48,15 +48,11 @@ class FixedPatternConstants:
     textured: float = 0.05
 
 
-DEFAULT = FixedPatternConstants()
+LIMITS = FixedPatternConstants()
 
 
 def fixed_pattern(
-    dark: TemporalStack,
-    flats: Sequence[TemporalStack],
-    saturation: Quantity,
-    *,
-    constants: FixedPatternConstants = DEFAULT,
+    dark: TemporalStack, flats: Sequence[TemporalStack], saturation: Quantity
 ) -> tuple[Quantity, Quantity, Defects, list[str]]:
     """Fixed pattern from the mean dark frame and the mean flat frame nearest to half of saturation.
 
@@ -73,12 +69,12 @@ def fixed_pattern(
     dsnu, prnu, defects, textured = [], [], [], []
     for plane, name in enumerate(dark.camera.names):
         excess = dark.mean[plane] - ndimage.median_filter(dark.mean[plane], 5)
-        floor = constants.hot_fraction * (dark.camera.white - dark.camera.black[plane])
-        hot = excess > max(constants.hot * float(np.median(np.abs(excess))) / 0.6745, floor)
-        dsnu.append(_spread(dark.mean[plane], dark.variance[plane] / dark.count, ~hot, constants.window))
+        floor = LIMITS.hot_fraction * (dark.camera.white - dark.camera.black[plane])
+        hot = excess > max(LIMITS.hot * float(np.median(np.abs(excess))) / 0.6745, floor)
+        dsnu.append(_spread(dark.mean[plane], dark.variance[plane] / dark.count, ~hot))
         flat = min(flats, key=lambda f: abs(float(f.strength[:, plane].mean()) - saturation.value[plane] / 2))
-        response, dead = _response(dark, flat, plane, hot, constants)
-        if response[0] > constants.textured:
+        response, dead = _response(dark, flat, plane, hot)
+        if response[0] > LIMITS.textured:
             textured.append(f"{name} {100 * response[0]:.0f} %")
             response, dead = (np.nan, np.nan), np.zeros_like(hot)
         prnu.append((100 * response[0], 100 * response[1]))
@@ -97,26 +93,27 @@ def fixed_pattern(
 
 
 def _response(
-    dark: TemporalStack, flat: TemporalStack, plane: int, hot: BoolArray, constants: FixedPatternConstants
+    dark: TemporalStack, flat: TemporalStack, plane: int, hot: BoolArray
 ) -> tuple[tuple[float, float], BoolArray]:
     """Relative spread of the response with its uncertainty, NaN where it cannot be determined; dead pixels."""
-    lit = constants.lit_fraction * (flat.camera.white - flat.camera.black[plane])
+    lit = LIMITS.lit_fraction * (flat.camera.white - flat.camera.black[plane])
     signal = flat.mean[plane] - dark.mean[plane]
     around = ndimage.median_filter(signal, 5)
     usable = ~hot & ~flat.clipped[plane]
-    dead = usable & (signal < constants.dead_fraction * around) & (around > lit)
+    dead = usable & (signal < LIMITS.dead_fraction * around) & (around > lit)
     level = float(signal[usable].mean()) if usable.any() else 0.0
     if level < lit:
         return (np.nan, np.nan), np.zeros_like(dead)
     temporal = flat.variance[plane] / flat.count + dark.variance[plane] / dark.count
-    local = np.maximum(ndimage.uniform_filter(signal, 4 * constants.window), 1e-3 * level)
-    return _spread(signal / local, temporal / local**2, usable & ~dead, constants.window), dead
+    local = np.maximum(ndimage.uniform_filter(signal, 4 * LIMITS.window), 1e-3 * level)
+    return _spread(signal / local, temporal / local**2, usable & ~dead), dead
 
 
 def _spread(
-    mean: npt.NDArray[np.floating], temporal: npt.NDArray[np.floating], usable: BoolArray, window: int
+    mean: npt.NDArray[np.floating], temporal: npt.NDArray[np.floating], usable: BoolArray
 ) -> tuple[float, float]:
     """Spatial standard deviation about the neighbourhood's mean, temporal noise taken out, and its uncertainty."""
+    window = LIMITS.window
     filled = np.where(usable, mean, np.median(mean[usable]))
     smooth = ndimage.uniform_filter(filled, window, mode="nearest")
     inner = (slice(window, -window), slice(window, -window))

@@ -42,7 +42,7 @@ class NoiseConstants:
     drift: float = 0.2
 
 
-DEFAULT = NoiseConstants()
+LIMITS = NoiseConstants()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,9 +69,7 @@ class _Line:
     bend: float
 
 
-def photon_transfer(
-    dark: TemporalStack, flats: Sequence[TemporalStack], *, constants: NoiseConstants = DEFAULT
-) -> NoiseEstimate:
+def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> NoiseEstimate:
     """Noise figures of every colour plane from dark frames and flat frames at several exposures.
 
     Parameters
@@ -81,8 +79,6 @@ def photon_transfer(
     flats
         One stack per exposure, each of at least two frames. Any target that stands still; a plain one where the
         response's fixed pattern (PRNU) and dead pixels are wanted.
-    constants
-        Limits of the method.
 
     Raises
     ------
@@ -91,15 +87,15 @@ def photon_transfer(
         as the flats.
     """
     same_camera([dark, *flats])
-    _refuse(dark, flats, constants.drift)
+    _refuse(dark, flats)
     planes = range(len(dark.camera.names))
-    lines = [_fit_line(dark, flats, plane, constants.highest) for plane in planes]
+    lines = [_fit_line(dark, flats, plane) for plane in planes]
     drift = dark.strength.var(axis=0, ddof=1)
     rest = np.array([variance.mean(dtype=np.float64) / variance.size for variance in dark.variance])
     black = Quantity(
         np.array(dark.camera.black) + dark.strength.mean(axis=0), np.sqrt(np.maximum(drift, rest) / dark.count)
     )
-    knees = [_knee(dark, flats, plane, lines[plane], constants.knee) for plane in planes]
+    knees = [_knee(dark, flats, plane, lines[plane]) for plane in planes]
     level, std = dark.camera.white - black.value, np.hypot(black.std, 0.5)
     early = np.nan_to_num(knees, nan=np.inf) < 0.95 * level  # the sensor saturates before the white level does
     saturation = Quantity(np.where(early, knees, level), np.where(early, 0.05 * np.array(knees), std))
@@ -121,14 +117,14 @@ def photon_transfer(
     return NoiseEstimate(camera_noise=noise, warnings=(*found, *uneven))
 
 
-def _refuse(dark: TemporalStack, flats: Sequence[TemporalStack], drift: float) -> None:
+def _refuse(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
     if not flats:
         raise CalibrationError("no flat exposure is given: the gain needs lit frames at one exposure at least")
     for index, stack in enumerate([dark, *flats]):
         name = f"flat exposure {index}" if index else "the dark frames"
         if stack.count < 2:
             raise CalibrationError(f"{name}: temporal noise needs at least two frames of the same scene, given is one")
-        if index and stack.drift > drift:
+        if index and stack.drift > LIMITS.drift:
             raise CalibrationError(
                 f"{name}: the frames' strengths differ by {100 * stack.drift:.0f} %: each group must be frames of one "
                 "exposure with a steady lamp"
@@ -143,14 +139,14 @@ def _refuse(dark: TemporalStack, flats: Sequence[TemporalStack], drift: float) -
         raise CalibrationError("the dark frames are not darker than half of the brightest flat frames: was a lamp on?")
 
 
-def _fit_line(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, highest: float) -> _Line:
+def _fit_line(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int) -> _Line:
     """Line of variance over mean through the blocks of all exposures, weighted by the variance of a variance."""
     level = tile_means(dark.mean[plane])
     range_ = dark.camera.white - dark.camera.black[plane]
     means = [np.zeros_like(level)]
     for flat in flats:
         mean = tile_means(flat.mean[plane]) - level
-        good = (tile_means(flat.clipped[plane]) == 0) & (mean + level < highest * range_)
+        good = (tile_means(flat.clipped[plane]) == 0) & (mean + level < LIMITS.highest * range_)
         means.append(np.where(good, mean, np.nan))
     stacks, mean = [dark, *flats], np.concatenate(means)
     variance = np.concatenate([tile_means(stack.variance[plane]) for stack in stacks])
@@ -198,7 +194,7 @@ def _weighted_line(mean: FloatArray, variance: FloatArray, freedom: FloatArray, 
     )
 
 
-def _knee(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, line: _Line, limit: float) -> float:
+def _knee(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, line: _Line) -> float:
     """Lowest level (DN above black) at which the variance breaks down; NaN where it does not."""
     knees = [np.nan]
     for flat in flats:
@@ -206,7 +202,9 @@ def _knee(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, line:
         free = tile_means(flat.clipped[plane]) == 0
         ratio = tile_means(flat.variance[plane]) / (line.read_variance + line.slope * np.maximum(mean, 0))
         noise = np.sqrt(2 / (TILE**2 * (flat.count - 1)))
-        broken = free & (ratio < limit - 3 * noise) & (mean > 0.3 * (dark.camera.white - dark.camera.black[plane]))
+        broken = (
+            free & (ratio < LIMITS.knee - 3 * noise) & (mean > 0.3 * (dark.camera.white - dark.camera.black[plane]))
+        )
         if broken.sum() > 0.02 * len(mean):
             knees.append(float(np.median(mean[broken])))
     return float(np.fmin.reduce(knees))

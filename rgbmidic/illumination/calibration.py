@@ -174,13 +174,31 @@ class Calibration:
         """
         document = read_document(path, "calibration file", SCHEMA_NAME, SCHEMA_VERSION)
         try:
-            return cls._from_document(document, str(path))
+            return cls.from_document(document, str(path))
         except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
             reason = f"missing key {error}" if isinstance(error, KeyError) else error
             raise CalibrationError(f"{path} is damaged: {reason}") from None
 
     @classmethod
-    def _from_document(cls, document: dict[str, Any], name: str) -> Calibration:
+    def from_document(cls, document: dict[str, Any], name: str = "the calibration") -> Calibration:
+        """Return the calibration of a JSON document.
+
+        Parameters
+        ----------
+        document
+            What `to_document` gives.
+        name
+            Name in messages.
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        ValueError
+            A section is damaged.
+        """
         known = {"schema", "schema_version", "crosstalk", "noise", "registration", "camera", "provenance"}
         camera, noise = read_table(document, "camera"), read_table(document, "noise")
         if (cfa := camera.get("cfa")) not in (None, *BAYER_PATTERNS):
