@@ -217,10 +217,10 @@ class TemporalStack:
     ----------
     camera
         How they were sampled; P colour planes.
-    mean, variance : tuple of ndarray, length P, each (h, w), float32
+    mean, variance : ndarray, shape (P, h, w), float32
         Mean above the stated black level (DN) and sample variance (DN squared) over the frames. Every frame is first
         scaled to the mean strength of all, so that a drifting lamp does not count as noise.
-    clipped : tuple of ndarray, length P, each (h, w), bool
+    clipped : ndarray, shape (P, h, w), bool
         True where any frame is saturated.
     strength : ndarray, shape (M, P)
         Mean of every frame and plane above the stated black level (DN).
@@ -233,9 +233,9 @@ class TemporalStack:
     """
 
     camera: Sampling
-    mean: tuple[FloatImage, ...]
-    variance: tuple[FloatImage, ...]
-    clipped: tuple[BoolArray, ...]
+    mean: FloatImage
+    variance: FloatImage
+    clipped: BoolArray
     strength: FloatArray
     zeros: float
     piled_at: float | None
@@ -277,44 +277,43 @@ def stack_frames(
     strength: list[FloatArray] = []
     zeros, piled_at = 0.0, None
     for frame in frames:
-        (_, planes, black), sampling = planes_of(frame), Sampling.of(frame)
+        planes, black, sampling = np.stack(planes_of(frame)[1]), planes_of(frame)[2], Sampling.of(frame)
         if camera is None:
-            camera = sampling
-            means, squares = (
-                [np.zeros(plane.shape, dtype=np.float32) for plane in planes] for _ in ("means", "squares")
-            )
-            clipped = [np.zeros(plane.shape, dtype=bool) for plane in planes]
+            camera, clipped = sampling, np.zeros(planes.shape, dtype=bool)
+            mean, squares = np.zeros((2, *planes.shape), dtype=np.float32)
         if replace(sampling, black=camera.black, origins=camera.origins) != camera:
             raise CalibrationError(
                 f"{name}: a frame is {sampling}, the first {camera}: all must come from the same camera and settings"
             )
-        levels = np.array([plane.mean(dtype=np.float64) for plane in planes]) - black
-        strength.append(levels)
+        strength.append(np.array([plane.mean(dtype=np.float64) for plane in planes]) - black)
         zeros = max(zeros, *(float((plane == 0).mean()) for plane in planes))
         piled_at = piled_at or next(filter(None, (saturation_pile(plane, camera.white) for plane in planes)), None)
-        scale = _ratio(strength[0], levels) if drifts else np.ones(len(levels))
-        for index, plane in enumerate(planes):
-            values = (plane.astype(np.float32) - np.float32(black[index])) * np.float32(scale[index])
-            step = values - means[index]
-            means[index] += step / len(strength)
-            squares[index] += step * (values - means[index])
-            clipped[index] |= plane >= camera.white
+        scale = _ratio(strength[0], strength[-1]) if drifts else np.ones(len(planes))
+        values = (planes.astype(np.float32) - _column(black)) * _column(scale)
+        step = values - mean
+        mean += step / len(strength)
+        squares += step * (values - mean)
+        clipped |= planes >= camera.white
     if camera is None:
         raise CalibrationError(f"{name}: no frames")
     levels = np.array(strength)
     # The frames were scaled to the first one's strength: bring them to the mean strength.
     factor = _ratio(levels.mean(axis=0), levels[0]) if drifts else np.ones(len(camera.names))
-    freedom = max(len(levels) - 1, 1)
     return TemporalStack(
         camera=camera,
-        mean=tuple(mean * np.float32(f) for mean, f in zip(means, factor, strict=True)),
-        variance=tuple(square * np.float32(f**2 / freedom) for square, f in zip(squares, factor, strict=True)),
-        clipped=tuple(clipped),
+        mean=mean * _column(factor),
+        variance=squares * _column(factor**2 / max(len(levels) - 1, 1)),
+        clipped=clipped,
         strength=levels,
         zeros=zeros,
         piled_at=piled_at,
         exposure=exposure,
     )
+
+
+def _column(figures: FloatArray) -> FloatImage:
+    """Figures of the planes (P,), for images (P, h, w)."""
+    return figures.astype(np.float32)[:, None, None]
 
 
 TILE = 16

@@ -194,20 +194,28 @@ def additivity(
         Camera noise; None: from the captures where each group has two or more, else rounding to grey levels alone.
     """
     same_camera([together, *singles.values(), *([dark] if dark else [])])
-    images = [_difference(together, singles, dark, plane, noise) for plane in range(len(together.camera.names))]
-    samples = np.concatenate([image[:, np.isfinite(image[0])] for image in images], axis=1)
+    level = dark.mean if dark else np.float32(0)
+    lights = [stack.mean - level for stack in singles.values()]
+    stacks = [together, *singles.values()]
+    variance = np.sum([_variance(stack, noise) for stack in stacks], axis=0)
+    if dark:
+        variance = variance + (len(lights) - 1) ** 2 * _variance(dark, noise)
+    # difference, its noise variance, and every light's image, NaN where saturated
+    rows = np.stack([together.mean - level - np.sum(lights, axis=0), variance, *lights]).astype(np.float64)
+    rows[:, np.any([stack.clipped for stack in stacks], axis=0)] = np.nan
+    samples = rows[:, np.isfinite(rows[0])]
     if samples.shape[1] < TILE**2:
         raise CalibrationError("nearly every sample is saturated in one of the captures; shorten the exposure")
-    tiles = np.concatenate([tile_means(image) for image in images], axis=1)
+    tiles = tile_means(rows).reshape(len(rows), -1)
     tiles = tiles[:, np.isfinite(tiles[0])]  # without saturated samples
-    difference, variance, lights = tiles[0], tiles[1] / min(TILE, *images[0].shape[1:]) ** 2, tiles[2:]
-    design = np.concatenate([np.ones((1, len(difference))), lights]).T
+    difference, variance, of_lights = tiles[0], tiles[1] / min(TILE, *rows.shape[2:]) ** 2, tiles[2:]
+    design = np.concatenate([np.ones((1, len(difference))), of_lights]).T
     inverse = np.linalg.pinv(design.T @ design)
     solution = inverse @ (design.T @ difference)
     residual = difference - design @ solution
     score = design * residual[:, None]
     std = np.sqrt(np.diag(inverse @ (score.T @ score) @ inverse))
-    signal = float(lights.sum(axis=0).mean())
+    signal = float(of_lights.sum(axis=0).mean())
     left = max(float((residual**2).mean() - variance.mean()), 0.0)
     return Additivity(
         lights=tuple(singles),
@@ -221,32 +229,11 @@ def additivity(
     )
 
 
-def _difference(
-    together: TemporalStack,
-    singles: Mapping[str, TemporalStack],
-    dark: TemporalStack | None,
-    plane: int,
-    noise: NoiseModel | None,
-) -> FloatArray:
-    """Difference, its noise variance, and every light's image, (2 + k, h, w) with NaN where saturated, of one plane."""
-    level = dark.mean[plane] if dark else 0.0
-    lights = [stack.mean[plane] - level for stack in singles.values()]
-    stacks = [together, *singles.values()]
-    variance = np.sum([_variance(stack, plane, noise) for stack in stacks], axis=0)
-    if dark:
-        variance = variance + (len(lights) - 1) ** 2 * _variance(dark, plane, noise)
-    rows = np.stack([together.mean[plane] - level - np.sum(lights, axis=0), variance, *lights]).astype(np.float64)
-    rows[:, np.any([stack.clipped[plane] for stack in stacks], axis=0)] = np.nan
-    return rows
-
-
-def _variance(stack: TemporalStack, plane: int, noise: NoiseModel | None) -> npt.NDArray[np.floating]:
+def _variance(stack: TemporalStack, noise: NoiseModel | None) -> npt.NDArray[np.floating]:
     """Noise variance of the mean over the frames: from the noise model, from the frames themselves, or of rounding."""
     if noise is not None:
-        return np.asarray(noise.variance(stack.mean[plane]) / stack.count)
-    if stack.count > 1:
-        return np.asarray(stack.variance[plane] / stack.count)
-    return np.full(stack.mean[plane].shape, QUANTISATION)
+        return np.asarray(noise.variance(stack.mean) / stack.count)
+    return stack.variance / stack.count if stack.count > 1 else np.full(stack.mean.shape, QUANTISATION)
 
 
 def registration_left(
@@ -303,10 +290,12 @@ def noise_ratio(stack: TemporalStack, noise: NoiseModel, same_exposure: float = 
         raise CalibrationError("noise needs at least two captures of the same scene")
     if stack.drift > same_exposure:
         raise CalibrationError("the captures of a light have different exposures")
-    clear = [~clipped for clipped in stack.clipped]
-    observed = sum(float(v[c].sum(dtype=np.float64)) for v, c in zip(stack.variance, clear, strict=True))
-    predicted = sum(float(noise.variance(m[c]).sum(dtype=np.float64)) for m, c in zip(stack.mean, clear, strict=True))
-    samples = sum(int(c.sum()) for c in clear)
+    clear = ~stack.clipped
+    observed, predicted = (
+        sum(float(plane[use].sum(dtype=np.float64)) for plane, use in zip(values, clear, strict=True))
+        for values in (stack.variance, noise.variance(stack.mean))
+    )
+    samples = int(clear.sum())
     ratio = float(np.sqrt(observed / max(predicted, 1e-12)))
     return ratio, ratio / np.sqrt(2 * max(samples, 1) * (stack.count - 1))
 

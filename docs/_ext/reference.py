@@ -68,6 +68,7 @@ MODULES = [
     "rgbmidic_calibration.fixed_pattern",
     "rgbmidic_calibration.jobs",
     "rgbmidic_calibration.display",
+    "rgbmidic_calibration.pictures",
 ]
 """Modules whose names are public, in the order of the pages; a name that several have is described with the first."""
 
