@@ -30,7 +30,7 @@ from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh
 from rgbmidic.pipeline.reference_state import ReferenceState
 from rgbmidic.pipeline.region import finite_elements_of, read_region, region_and_window, window_around
 from rgbmidic.pipeline.source import FrameSequence, Series, open_sequence
-from rgbmidic.pipeline.suitability import HARDLY_ENOUGH, saturated_fraction, speckle_size, tell_small, too_small
+from rgbmidic.pipeline.suitability import SUITABILITY, saturated_fraction, speckle_size, tell_small, too_small
 from rgbmidic.settings import SolverSettings, TestSettings, grey_levels
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights
@@ -230,7 +230,7 @@ class Plan:
         speckle = speckle_size(rest.images, region)
         if finite_elements is not None:
             tell_small(mesh, speckle, finite_elements)
-        elif small := too_small(size, speckle, HARDLY_ENOUGH):
+        elif small := too_small(size, speckle, SUITABILITY.hardly_enough):
             logger.warning("%s", small)
         rest.check_seen(reference, region)
         return cls(

@@ -17,7 +17,7 @@ from rgbmidic.illumination.separation import LightSeparation, RawState, referenc
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline.source import Series
 from rgbmidic.pipeline.suitability import (
-    SATURATED,
+    SUITABILITY,
     check_texture,
     exposure_fault,
     light_levels,
@@ -102,7 +102,7 @@ def _check_raw(
     share = saturated_fraction(raw[0], region.mask) if raw else 0.0
     if share > _BLIND:
         raise FrameError(f"no light sees the region in the reference ({names}): {exposure_fault(raw[0], region.mask)}")
-    if share > SATURATED:
+    if share > SUITABILITY.saturated:
         logger.warning("%.0f %% of the samples in the region of the reference (%s) are saturated", 100 * share, names)
     if calibration is None or not raw:
         return
