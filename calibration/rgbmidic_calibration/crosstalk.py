@@ -1,9 +1,18 @@
 """The crosstalk matrix A from captures with one light on at a time: camera channels = A . lights.
 
 For each light the channel that sees it best is the reference; the entries of the other channels are ratios to it,
-estimated from block averages (`rgbmidic_calibration.ratio`). The covariance of A adds to the scatter of the blocks the
-error of the dark level, which is common to all blocks and all lights, and the scatter of the captures beyond their
-noise. The fitted columns are then checked against the names of the lights and against each other.
+estimated from block averages (`rgbmidic_calibration.captures.block_means`). The covariance of A adds to the scatter of
+the blocks the error of the dark level, which is common to all blocks and all lights, and the scatter of the captures
+beyond their noise. The fitted columns are then checked against the names of the lights and against each other.
+
+*Ratios of sums.* With x the reference channel's block average, y another channel's and phi the Legendre products over
+the field, the entry a(position) = sum_t a_t phi_t solves
+
+    sum over blocks of  w phi (y - x sum_t a_t phi_t) = 0,
+
+an instrumental-variable estimate: the instrument is the position, which carries no noise, so noise in x does not
+attenuate a as it does in least squares (Fuller, Measurement Error Models, 1987, section 1.4). The covariance is the
+cluster sandwich: the scatter of the score over neighbouring blocks, whatever causes it (noise, the texture's aliasing).
 """
 
 from __future__ import annotations
@@ -12,23 +21,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import fdtri
 
 from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic_calibration.captures import BlockMeans, block_centres
 from rgbmidic_calibration.plausibility import CHECKS, capture_checks, judged
-from rgbmidic_calibration.ratio import (
-    BlockMeans,
-    ColumnFit,
-    LightSignal,
-    Variation,
-    block_centres,
-    capture_scatter,
-    fit_column,
-    offsets_left,
-    variation,
-)
 
 CHANNELS = ("R", "G", "B")
 COLOURS = ("red", "green", "blue")
@@ -67,6 +67,229 @@ class CrosstalkConstants:
 LIMITS = CrosstalkConstants()
 
 
+@dataclass(frozen=True, slots=True)
+class LightSignal:
+    """Block averages of the captures of one light.
+
+    Attributes
+    ----------
+    name : str
+    values : ndarray, shape (N, C, R, S)
+        Above dark, of N captures.
+    valid : ndarray, shape (N, R, S), bool
+        Blocks without saturated samples.
+    reference : int
+        Channel that sees the light best: the others are compared with it.
+    """
+
+    name: str
+    values: FloatArray
+    valid: BoolArray
+    reference: int
+
+    @property
+    def base(self) -> FloatArray:
+        """Block averages (N, R, S) of the reference channel."""
+        return self.values[:, self.reference]
+
+    @property
+    def others(self) -> list[int]:
+        """The channels but the reference."""
+        return [c for c in range(self.values.shape[1]) if c != self.reference]
+
+    def residual(self, design: FloatArray, coefficients: FloatArray) -> FloatArray:
+        """Residuals y - a x, (N, C, R, S)."""
+        return np.asarray(self.values - np.einsum("rst,tc->crs", design, coefficients) * self.base[:, None])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColumnFit:
+    """A column of A as a polynomial over the field.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (T, C)
+        Per Legendre product and channel; (1, 0, 0 ...) in the reference channel.
+    covariance : ndarray, shape (T, C, T, C)
+        From the scatter of the blocks.
+    leverage : ndarray, shape (T, C, C)
+        Change of the coefficients per grey level that all blocks of a channel (last axis) have too much.
+    weights : ndarray, shape (N, R, S)
+        1 for the blocks used, 0 for the others.
+    residual : ndarray, shape (N, C, R, S)
+        y - a x of the blocks used, 0 elsewhere.
+    mass : ndarray, shape (N,)
+        Sum of the reference channel over the blocks used, per capture.
+    """
+
+    coefficients: FloatArray
+    covariance: FloatArray
+    leverage: FloatArray
+    weights: FloatArray
+    residual: FloatArray
+    mass: FloatArray
+
+
+def fit_column(signal: LightSignal, design: FloatArray) -> ColumnFit:
+    """Fit one light's column of A by ratios of sums (equation of the module), without outliers.
+
+    Parameters
+    ----------
+    signal
+        Captures of the light.
+    design : ndarray, shape (R, S, T)
+        Legendre products at the blocks' centres; T = 1 for a constant column.
+    """
+    weights, coefficients = _without_outliers(signal, design)
+    residual = weights[:, None] * signal.residual(design, coefficients)
+    inverse = np.linalg.inv(_moment(weights * signal.base, design))
+    sums = _cluster_sums(np.einsum("ncrs,rst->tcrs", residual, design))
+    count = max(len(sums), 2)
+    terms, channels = coefficients.shape
+    spread = (sums.T @ sums * count / (count - 1)).reshape(terms, channels, terms, channels)
+    total = np.einsum("nrs,rst->t", weights, design)
+    lever = np.einsum("tu,u,cd->tcd", inverse, total, np.eye(channels))
+    lever[:, :, signal.reference] -= inverse @ _moment(weights, design) @ coefficients
+    return ColumnFit(
+        coefficients=coefficients,
+        covariance=np.einsum("tu,ucvd,wv->tcwd", inverse, spread, inverse),
+        leverage=lever,
+        weights=weights,
+        residual=residual,
+        mass=(weights * signal.base).sum(axis=(1, 2)),
+    )
+
+
+def _moment(weights: FloatArray, design: FloatArray) -> FloatArray:
+    flat = design.reshape(-1, design.shape[-1])
+    return np.asarray((flat * weights.sum(axis=0).reshape(-1, 1)).T @ flat)
+
+
+def _without_outliers(signal: LightSignal, design: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Weights and coefficients, iterated from the median of the blocks' ratios.
+
+    Every channel's residual is compared with its median spread times the square root of x (shot noise). Beyond 5 robust
+    standard deviations a block is left out: a fluorescent spot, a label, a hot cluster. Of normal noise 6e-7 are
+    beyond, less than one block of a calibration. Weights between 0 and 1 would need a correction of the sandwich and
+    would cost efficiency.
+    """
+    base, valid = signal.base, signal.valid
+    root = np.sqrt(np.maximum(base, 1e-3 * np.median(base[valid])))
+    ratios = signal.values / np.where(base > 0, base, np.inf)[:, None]
+    coefficients = np.zeros((design.shape[-1], signal.values.shape[1]))
+    coefficients[0] = np.median(ratios.transpose(0, 2, 3, 1)[valid], axis=0)
+    weights = valid.astype(np.float64)
+    for _ in range(20):
+        scaled = signal.residual(design, coefficients) / root[:, None]
+        spread = np.median(np.abs(scaled.transpose(0, 2, 3, 1)[valid]), axis=0) / 0.6745
+        limit = np.where(spread > 0, 5.0 * spread, np.inf)[:, None, None]
+        weights = (valid & (np.abs(scaled) <= limit).all(axis=1)).astype(np.float64)
+        right = np.einsum("crs,rst->tc", (weights[:, None] * signal.values).sum(axis=0), design)
+        before, coefficients = coefficients, np.linalg.solve(_moment(weights * base, design), right)
+        if np.abs(coefficients - before).max() < 1e-10:
+            break
+    coefficients[:, signal.reference] = np.eye(len(coefficients))[0]
+    return weights, coefficients
+
+
+def _cluster_sums(values: FloatArray) -> FloatArray:
+    """Sums (clusters, Q) of (..., R, S) over 2 x 2 blocks: what spills over a block's border stays within a cluster."""
+    values = values.reshape(-1, *values.shape[-2:])
+    rows, columns = values.shape[1:]
+    step = 2 if rows * columns >= 64 else 1
+    by_rows = np.add.reduceat(values, np.arange(0, rows, step), axis=1)
+    return np.asarray(np.add.reduceat(by_rows, np.arange(0, columns, step), axis=2).reshape(len(values), -1).T)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Variation:
+    """Result of `variation`: whether a column varies over the field by certain terms.
+
+    Attributes
+    ----------
+    p_value : float
+        Probability of scores this large without that variation.
+    rms : float
+        Root mean square over the field of these terms as fitted, of the channel where it is largest.
+    """
+
+    p_value: float
+    rms: float
+
+
+def variation(signal: LightSignal, design: FloatArray, known: int) -> Variation:
+    """Test whether the Legendre products after the first `known` ones are needed in any channel.
+
+    A score test with random signs: the model of the first terms is fitted, its residuals are correlated with the other
+    terms in clusters of blocks, and the sum is compared with those of 4999 random choices of the clusters' signs. It
+    keeps its level with few clusters and with heavy tails, which a Wald test with a sandwich covariance does not
+    (Cameron, Gelbach & Miller, Review of Economics and Statistics 90, 414, 2008).
+
+    Parameters
+    ----------
+    signal, design
+        See `fit_column`; `design` has all terms.
+    known
+        How many of the terms the null hypothesis has.
+    """
+    null = fit_column(signal, design[..., :known])
+    moment = _moment(null.weights * signal.base, design)
+    # What the fitted terms cannot imitate of the others.
+    extra = design[..., known:] - design[..., :known] @ np.linalg.solve(moment[:known, :known], moment[:known, known:])
+    sums = _cluster_sums(np.einsum("crs,rst->ctrs", null.residual[:, signal.others].sum(axis=0), extra))
+    inverse = np.linalg.pinv(sums.T @ sums)
+    flips = np.random.default_rng(0).choice((-1.0, 1.0), (4999, len(sums))) @ sums
+    flipped = ((flips @ inverse) * flips).sum(axis=1)
+    observed = sums.sum(axis=0) @ inverse @ sums.sum(axis=0)
+    coefficients = fit_column(signal, design).coefficients[known:, signal.others]
+    norms = (design[..., known:] ** 2).mean(axis=(0, 1))
+    return Variation(
+        p_value=float((1 + (flipped >= observed).sum()) / (1 + len(flipped))),
+        rms=float(np.sqrt((coefficients**2 * norms[:, None]).sum(axis=0)).max()),
+    )
+
+
+def capture_scatter(fit: ColumnFit, significance: float = 0.01) -> FloatArray:
+    """Variance (C,) of the entries between captures beyond their noise; zero where an F test finds none.
+
+    The noise comes from the residuals' departures from the mean over the captures, where the target's texture cancels.
+    At the default level one calibration in a hundred gets a needless addition to its covariance.
+    """
+    count, channels = fit.residual.shape[:2]
+    if count < 2:
+        return np.zeros(channels)
+    relative = fit.residual / fit.mass[:, None, None, None]
+    departures = (relative - relative.mean(axis=0)).transpose(1, 0, 2, 3).reshape(channels, -1)
+    noise = (departures**2).sum(axis=1) / (count - 1)
+    scatter = relative.sum(axis=(2, 3)).var(axis=0, ddof=1)
+    limit = fdtri(count - 1, departures.shape[1], 1 - significance / channels)
+    return np.where(scatter > limit * noise, scatter - noise, 0.0)
+
+
+def offsets_left(signal: LightSignal, weights: FloatArray, design: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Grey level (C,) that every channel keeps where the light is absent, and its standard uncertainty.
+
+    ``y = x a + o`` with the other captures' x as instrument for the slope: their noise is independent. NaN for fewer
+    than two captures. The offset of a dark level that is right is zero; on a plain target it is poorly determined.
+    """
+    count, channels = signal.values.shape[:2]
+    offset, std = np.full((2, channels), np.nan)
+    if count < 2:
+        return offset, std
+    base = signal.base
+    others = (base.sum(axis=0) - base) / (count - 1)
+    instruments = [np.broadcast_to(design, (count, *design.shape)), others[..., None]]
+    left = weights[..., None] * np.concatenate(instruments, axis=-1)
+    right = np.concatenate([base[..., None] * design, np.ones((*base.shape, 1))], axis=-1)
+    inverse = np.linalg.inv(np.einsum("nrsi,nrsj->ij", left, right))
+    for channel in signal.others:
+        solution = inverse @ np.einsum("nrsi,nrs->i", left, signal.values[:, channel])
+        score = (left * (signal.values[:, channel] - right @ solution)[..., None]).sum(axis=0)
+        sums = _cluster_sums(score.transpose(2, 0, 1)) @ inverse.T
+        offset[channel], std[channel] = solution[-1], np.sqrt((sums[:, -1] ** 2).sum())
+    return offset, std
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightFit:
     """Fit of one light's column of A, with its diagnostics.
@@ -87,7 +310,7 @@ class LightFit:
     colour_drift : float
         Largest scatter (standard deviation) of an entry between captures beyond their noise.
     offset, offset_std : ndarray, shape (C,)
-        Grey level that remains where the light is absent, and its uncertainty (`ratio.offsets_left`).
+        Grey level that remains where the light is absent, and its uncertainty (`offsets_left`).
     variation : Variation
         The test whether the column varies over the field.
     captures : int

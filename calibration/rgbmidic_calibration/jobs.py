@@ -21,10 +21,9 @@ from rgbmidic.illumination.unevenness import unevenness
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.camera import LIMITS, covered, estimate_lens, estimate_plane
-from rgbmidic_calibration.captures import CaptureFiles, Captures, provenance, stack_frames
+from rgbmidic_calibration.captures import BlockMeans, CaptureFiles, Captures, block_means, provenance
 from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk
 from rgbmidic_calibration.noise import NoiseEstimate, photon_transfer
-from rgbmidic_calibration.ratio import BlockMeans, block_means
 from rgbmidic_calibration.registration import RegistrationEstimate, estimate_registration
 from rgbmidic_calibration.target import Target, View, find_views
 
@@ -48,12 +47,11 @@ def calibrate_crosstalk(
     details = {
         "block": block,
         "waived_checks": list(allow),
-        "warnings": list(estimate.warnings),
         "variation_over_field": {
             fit.name: {"p_value": fit.variation.p_value, "rms": fit.variation.rms} for fit in estimate.lights
         },
     }
-    return _calibration("crosstalk", captures.groups, uneven, details, crosstalk=estimate.crosstalk), estimate
+    return _calibration("crosstalk", captures.groups, uneven, details, estimate), estimate
 
 
 def calibrate_noise(dark: str, flats: Sequence[str], stated: FrameSettings) -> tuple[Calibration, NoiseEstimate]:
@@ -81,14 +79,10 @@ def calibrate_noise(dark: str, flats: Sequence[str], stated: FrameSettings) -> t
         except ValueError:
             raise ConfigurationError(f"--flat takes FILES or TIME=FILES with a number as time, not {text!r}") from None
         exposures.append((CaptureFiles.find(f"flat exposure {time}", pattern, stated), seconds))
-    dark_stack = stack_frames(dark_files.frames(), drifts=False, name="the dark frames")
-    stacks = [stack_frames(files.frames(), exposure=time, name=files.role) for files, time in exposures]
-    estimate = photon_transfer(dark_stack, stacks)
+    estimate = photon_transfer(dark_files.stack(), [files.stack(time) for files, time in exposures])
     groups = [dark_files, *(files for files, _ in exposures)]
-    details = {"warnings": list(estimate.warnings), "exposures": [time for _, time in exposures]}
-    return _calibration(
-        "noise", groups, _unevenness_of(groups[1:]), details, camera_noise=estimate.camera_noise
-    ), estimate
+    details = {"exposures": [time for _, time in exposures]}
+    return _calibration("noise", groups, _unevenness_of(groups[1:]), details, estimate), estimate
 
 
 def calibrate_registration(
@@ -98,12 +92,11 @@ def calibrate_registration(
     estimate = estimate_registration(*captures.stacks(), region=region, element_size=element_size)
     uneven = _unevenness_of(captures.lights.values())
     details = {
-        "warnings": list(estimate.warnings),
         "region": None if region is None else list(region),
         "element_size": element_size,
         "residual_rms_px": {match.name: match.rms for match in estimate.matches},
     }
-    return _calibration("registration", captures.groups, uneven, details, registration=estimate.registration), estimate
+    return _calibration("registration", captures.groups, uneven, details, estimate), estimate
 
 
 def _unevenness_of(groups: Iterable[CaptureFiles]) -> list[float]:
@@ -127,19 +120,23 @@ def _unevenness(capture: Mosaic | ChannelFrame, lit: float = 0.1) -> list[float]
 
 
 def _calibration(
-    section: str, groups: Sequence[CaptureFiles], uneven: Sequence[float], details: Mapping[str, Any], **found: Any
+    section: str,
+    groups: Sequence[CaptureFiles],
+    uneven: Sequence[float],
+    details: Mapping[str, Any],
+    estimate: CrosstalkEstimate | NoiseEstimate | RegistrationEstimate,
 ) -> Calibration:
     """A calibration of one section, with the camera's settings and where it comes from: date, version, input files.
 
     The settings are those of the first frame; levels that neither the file nor the user states stay open.
     """
-    files = groups[0]
+    files, field = groups[0], "camera_noise" if section == "noise" else section
     header, frame = files.series.lights[0][0].stored(0), next(files.frames())
     levels: dict[str, Any] = {"black_level": float(frame.black_level.mean()), "white_level": frame.white_level}
     known = {name for name in levels for source in (header, files.stated) if getattr(source, name) is not None}
     return Calibration(
-        **found,
-        provenance={section: provenance(section, groups, details)},
+        **{field: getattr(estimate, field)},
+        provenance={section: provenance(section, groups, {**details, "warnings": list(estimate.warnings)})},
         kind="bayer" if isinstance(frame, Mosaic) else "rgb" if len(frame.values) == 3 else "monochrome",
         cfa=frame.cfa if isinstance(frame, Mosaic) else None,
         shape=(frame.values.shape[-2], frame.values.shape[-1]),
@@ -273,7 +270,10 @@ def calibrate_camera(
         fitted = estimate_plane(view, camera or CameraCalibration(shape=view.shape), corners[2] if corners else None)
         camera = fitted.camera
         residuals.append((view.pixels, fitted.residual))
-        details["plane"] = {"photograph": view.name, "rms_px": fitted.rms, **_plane_details(camera)}
+        names = ("mm_per_pixel", "mm_per_pixel_std", "tilt_deg", "tilt_std_deg")
+        figures = zip(names, (*camera.scale(camera.centre), *camera.tilt_deg), strict=True)
+        known = {name: value for name, value in figures if np.isfinite(value)}
+        details["plane"] = {"photograph": view.name, "rms_px": fitted.rms, **known}
         if (hull := covered([view.pixels], view.shape)) < LIMITS.covered / 2:
             warnings.append(
                 f"the target covers {hull:.0%} of the frame on the plane: beyond it the plane is extrapolated"
@@ -297,13 +297,6 @@ def _mean_view(files: CaptureFiles, target: Target) -> View:
                 f"{LIMITS.largest_residual:g} may be: state photographs of one plane"
             )
     return replace(shots[0], pixels=np.mean([shot.pixels for shot in shots], axis=0))
-
-
-def _plane_details(camera: CameraCalibration) -> dict[str, float]:
-    """Return scale and tilt of the plane with their standard uncertainties, as far as they are known."""
-    names = ("mm_per_pixel", "mm_per_pixel_std", "tilt_deg", "tilt_std_deg")
-    values = (*camera.scale(camera.centre), *camera.tilt_deg)
-    return {name: value for name, value in zip(names, values, strict=True) if np.isfinite(value)}
 
 
 def merge_files(paths: Sequence[Path]) -> Calibration:

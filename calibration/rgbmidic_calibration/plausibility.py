@@ -12,7 +12,7 @@ import numpy as np
 from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.checks import Check, refused, reported, warning
 from rgbmidic.typing import FloatArray
-from rgbmidic_calibration.ratio import BlockMeans
+from rgbmidic_calibration.captures import BlockMeans
 
 CHECKS = ("name", "same-channel", "ambient", "greens", "weak", "captures", "dark-frames", "white-level")
 """Checks that can be waived: a light named red, green or blue is seen best by the channel of that colour; no two lights

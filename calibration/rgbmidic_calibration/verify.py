@@ -18,8 +18,16 @@ from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
 from rgbmidic.typing import FloatArray
-from rgbmidic_calibration.captures import TILE, Captures, TemporalStack, same_camera, stack_frames, tile_means
-from rgbmidic_calibration.ratio import BlockMeans, block_centres, block_means
+from rgbmidic_calibration.captures import (
+    TILE,
+    BlockMeans,
+    Captures,
+    TemporalStack,
+    block_centres,
+    block_means,
+    same_camera,
+    tile_means,
+)
 from rgbmidic_calibration.registration import estimate_registration
 
 
@@ -360,15 +368,10 @@ def check_calibration(
     means = {name: [block_means(frame) for frame in files.frames()] for name, files in captures.lights.items()}
     dark_means = [block_means(frame) for frame in captures.dark.frames()] if captures.dark else []
     items, skipped = leakage(calibration.crosstalk, means, dark_means).items(limits.leakage), []
-    sums = [
-        additivity(
-            stack_frames(files.frames(), name=files.role),
-            {name: stacks[name] for name in names.split("+")},
-            dark,
-            noise=calibration.noise,
-        )
-        for names, files in captures.together.items()
-    ]
+    sums = []
+    for names, files in captures.together.items():
+        singles = {name: stacks[name] for name in names.split("+")}
+        sums.append(additivity(files.stack(), singles, dark, noise=calibration.noise))
     items += [item for total in sums for item in total.items(limits)]
 
     def noise() -> Iterator[Check]:
