@@ -21,7 +21,7 @@ from colour_scenes import NOISE, A, sparkle, speckle
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.frame_check import mismatches
+from rgbmidic.illumination.frame_check import contradictions
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.lab.virtual import plate_scene, render, sphere_scene
 from rgbmidic.scene.camera import PIXEL
@@ -165,9 +165,9 @@ def verdict(
 ) -> tuple[int, set[str]]:
     """2 for an error, 1 for a warning, 0; and the checks that found it."""
     inside = np.ones(frame.values.shape[-2:], dtype=bool)
-    found = mismatches(frame, calibration, inside, repeat)
-    level = max((2 if mismatch.certain else 1 for mismatch in found), default=0)
-    return level, {mismatch.check for mismatch in found if (2 if mismatch.certain else 1) == level}
+    found = contradictions(frame, calibration, inside, repeat)
+    level = max((1 if check.passed else 2 for check in found), default=0)
+    return level, {check.name for check in found if (1 if check.passed else 2) == level}
 
 
 def calibrations(matrix: FloatArray) -> tuple[Calibration, Calibration]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import cv2
 import numpy as np
@@ -21,24 +20,47 @@ from rgbmidic.fields.plane import CameraCalibration, distorted, undistorted
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.target import View
 
-LEAST_VIEWS = 5
-"""Views of the target from which a lens is calibrated: each gives two equations for the focal length and principal
-point (Zhang), which leaves seven for the distortion and the check."""
-LEAST_ANGLE = 10.0
-"""Largest angle (degrees) between two views below which all count as parallel: the focal length follows from 1 - cos of
-it, 1.5 %, with corners good to .1 % of the target (derived)."""
-LARGEST_RESIDUAL = 0.5
-"""Residual of the points (px rms) above which no target is flat and rigid: ten times that of the detection (chosen)."""
-PAYS = 0.001
-"""Level of the F test from which the next distortion term is taken up. At .01 three of 100 lenses took up a term by
-chance, which left a strain of 6e-4 in a corner that no view reached; at .001 none (benchmarks/camera.py)."""
-_RIM = 32
-"""Corners of the polygon that stands for a circle: its area is 0.6 % too small, and so is the offset (derived)."""
-_OUTLYING = 3.0
-"""Residual of a view, over the median, that gives a warning: in OpenCV's pictures the largest is 1.3 by `find_view`,
-and 6 by the corners of OpenCV's own sample, some of which are wrong (benchmarks/camera.py)."""
-COVERED = 0.5
-"""Fraction of the frame that the views' points must cover, or a warning says that the lens is extrapolated (chosen)."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraConstants:
+    """Constants of `estimate_lens` and `estimate_plane`.
+
+    Attributes
+    ----------
+    least_views
+        Views of the target from which a lens is calibrated: each gives two equations for the focal length and principal
+        point (Zhang), which leaves seven for the distortion and the check.
+    least_angle
+        Largest angle (degrees) between two views below which all count as parallel: the focal length follows from
+        1 - cos of it, 1.5 %, with corners good to .1 % of the target (derived).
+    largest_residual
+        Residual of the points (px rms) above which no target is flat and rigid: ten times that of the detection
+        (chosen).
+    significance
+        Level of the F test from which the next distortion term is taken up. At .01 three of 100 lenses took up a term
+        by chance, which left a strain of 6e-4 in a corner that no view reached; at .001 none (benchmarks/camera.py).
+    outlying
+        Residual of a view, over the median, that gives a warning: in OpenCV's pictures the largest is 1.3 by
+        `find_view`, and 6 by the corners of OpenCV's own sample, some of which are wrong (benchmarks/camera.py).
+    covered
+        Fraction of the frame that the views' points must cover, or a warning says that the lens is extrapolated
+        (chosen).
+    """
+
+    least_views: int = 5
+    least_angle: float = 10.0
+    largest_residual: float = 0.5
+    significance: float = 0.001
+    outlying: float = 3.0
+    covered: float = 0.5
+
+
+LIMITS = CameraConstants()
+
+
+def covered(points: Sequence[FloatArray], shape: tuple[int, int]) -> float:
+    """Fraction of a frame within the hull of points (m, 2), px."""
+    return float(cv2.contourArea(cv2.convexHull(np.concatenate(points).astype(np.float32))) / np.prod(shape))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,12 +101,12 @@ def estimate_lens(views: Sequence[View], rejected: Sequence[str] = ()) -> LensEs
 
     The pixels are square. Circles are corrected by `_centre_offset`, as a first fit places them. Distortion terms are
     taken up one after the other (k1, k2, k3; p1 and p2 together), the one that lowers the squares most first, as long
-    as it pays at the level `PAYS` of the F test.
+    as it pays at the level of the F test.
 
     Parameters
     ----------
     views
-        `LEAST_VIEWS` at least, under different angles.
+        Five at least, under different angles.
     rejected
         Reasons why other photographs were not used, for the messages.
 
@@ -94,10 +116,10 @@ def estimate_lens(views: Sequence[View], rejected: Sequence[str] = ()) -> LensEs
         Too few views, frames of different sizes, all views parallel, or residuals as no flat target has them.
     """
     why = "".join(f"; {reason}" for reason in rejected)
-    if len(views) < LEAST_VIEWS:
+    if len(views) < LIMITS.least_views:
         raise CalibrationError(
-            f"a lens needs {LEAST_VIEWS} photographs of the target at least, under different angles; it was found in "
-            f"{len(views)}{why}"
+            f"a lens needs {LIMITS.least_views} photographs of the target at least, under different angles; it was "
+            f"found in {len(views)}{why}"
         )
     shapes = {view.shape for view in views}
     if len(shapes) > 1:
@@ -105,61 +127,63 @@ def estimate_lens(views: Sequence[View], rejected: Sequence[str] = ()) -> LensEs
     if any(view.radius for view in views):
         views = _centred(views, _fit(views, 1, 0))
     count = 2 * sum(len(view.points) for view in views)
-    fits = {(0, 0): _fit(views, 0, 0)}
-    chosen, tests = (0, 0), dict[str, float]()
+    terms, fit, tests = (0, 0), _fit(views, 0, 0), dict[str, float]()
     while True:
-        radial, tangential = chosen
+        radial, tangential = terms
         tried = {(radial + 1, tangential): f"k{radial + 1}"} if radial < 3 else {}
         tried |= {} if tangential else {(radial, 1): "p1, p2"}
-        best: tuple[float, tuple[int, int]] | None = None
-        for terms, name in tried.items():
-            fits[terms] = fits.get(terms) or _fit(views, *terms)
-            added, free = fits[terms].terms - fits[chosen].terms, count - fits[terms].unknowns
-            gain = (fits[chosen].squares / fits[terms].squares - 1) * free / added
+        gains = []
+        for more, name in tried.items():
+            other = _fit(views, *more)
+            added, free = other.unknowns - fit.unknowns, count - other.unknowns
+            gain = (fit.squares / other.squares - 1) * free / added
             tests[name] = float(stats.f.sf(max(gain, 0), added, free))
-            if tests[name] < PAYS and (best is None or gain > best[0]):
-                best = gain, terms
-        if best is None:
-            break
-        chosen = best[1]
-    return _concluded(views, fits[chosen], tests, tuple(rejected))
+            if tests[name] < LIMITS.significance:
+                gains.append((gain, more, other))
+        if not gains:
+            return _concluded(views, fit, tests, list(rejected))
+        _, terms, fit = max(gains, key=lambda entry: entry[0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Fit:
-    """One bundle adjustment: parameters, poses of the views, sum of squared residuals, numbers of unknowns."""
+    """One bundle adjustment: parameters, poses of the views, sum of squared residuals, number of unknowns."""
 
     lens: FloatArray
     poses: list[tuple[FloatArray, FloatArray]]
     squares: float
-    terms: int
     unknowns: int
+
+    def image(self, places: FloatArray, turn: FloatArray, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where places (m, 2) of the target, mm, are in the frame, px, in one pose; its derivatives by OpenCV."""
+        matrix = np.array([[self.lens[0], 0, self.lens[1]], [0, self.lens[0], self.lens[2]], [0, 0, 1.0]])
+        points, slopes = cv2.projectPoints(_flat(places), turn, shift, matrix, self.lens[3:])[:2]
+        return np.asarray(points[:, 0]), np.asarray(slopes)
+
+
+def _flat(places: FloatArray) -> FloatArray:
+    """Places (m, 2) of the target as points of space, (m, 3)."""
+    return np.c_[places, np.zeros(len(places))]
 
 
 def _fit(views: Sequence[View], radial: int, tangential: int) -> _Fit:
     flags = cv2.CALIB_FIX_ASPECT_RATIO | (0 if tangential else cv2.CALIB_ZERO_TANGENT_DIST)
-    for number, flag in enumerate((cv2.CALIB_FIX_K1, cv2.CALIB_FIX_K2, cv2.CALIB_FIX_K3), 1):
-        flags |= 0 if number <= radial else flag
-    steps = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+    for flag in (cv2.CALIB_FIX_K1, cv2.CALIB_FIX_K2, cv2.CALIB_FIX_K3)[radial:]:
+        flags |= flag
     rms, matrix, distortion, turns, shifts = cv2.calibrateCamera(
-        [np.c_[view.points, np.zeros(len(view.points))].astype(np.float32) for view in views],
+        [_flat(view.points).astype(np.float32) for view in views],
         [view.pixels.astype(np.float32)[:, None] for view in views],
         views[0].shape[::-1],
         np.eye(3),
         np.zeros(5),
         flags=flags,
-        criteria=steps,
+        criteria=(cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12),
     )
-    terms = radial + 2 * tangential
     return _Fit(
         lens=np.r_[matrix[0, 0], matrix[:2, 2], np.ravel(distortion)[:5]],
-        poses=[
-            (np.asarray(turn, dtype=float), np.asarray(shift, dtype=float))
-            for turn, shift in zip(turns, shifts, strict=True)
-        ],
+        poses=list(zip(turns, shifts, strict=True)),
         squares=float(rms) ** 2 * sum(len(view.points) for view in views),
-        terms=terms,
-        unknowns=3 + terms + 6 * len(views),
+        unknowns=3 + radial + 2 * tangential + 6 * len(views),
     )
 
 
@@ -171,10 +195,10 @@ def _centre_offset(points: FloatArray, radius: float, image: Callable[[FloatArra
     """
     if not radius:
         return np.zeros((1, 2))
-    angle = np.linspace(0, 2 * np.pi, _RIM, endpoint=False)
+    corners = 32  # the polygon's area is 0.6 % too small, and so is the offset (derived)
+    angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)
     rim = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    centres = image(points)
-    corner = image((points[:, None] + rim).reshape(-1, 2)).reshape(-1, _RIM, 2) - centres[:, None]
+    corner = image((points[:, None] + rim).reshape(-1, 2)).reshape(-1, corners, 2) - image(points)[:, None]
     following = np.roll(corner, -1, axis=1)
     area = corner[..., 0] * following[..., 1] - corner[..., 1] * following[..., 0]
     return np.asarray(((corner + following) * area[..., None]).sum(axis=1) / (3 * area.sum(axis=1, keepdims=True)))
@@ -182,65 +206,51 @@ def _centre_offset(points: FloatArray, radius: float, image: Callable[[FloatArra
 
 def _centred(views: Sequence[View], fit: _Fit) -> list[View]:
     """Views with the images of the circles' centres as points."""
-    matrix = np.array([[fit.lens[0], 0, fit.lens[1]], [0, fit.lens[0], fit.lens[2]], [0, 0, 1.0]])
 
-    def image(places: FloatArray, turn: FloatArray, shift: FloatArray) -> FloatArray:
-        flat = np.c_[places, np.zeros(len(places))]
-        return np.asarray(cv2.projectPoints(flat, turn, shift, matrix, fit.lens[3:])[0][:, 0])
+    def centres(view: View, pose: tuple[FloatArray, FloatArray]) -> FloatArray:
+        return view.pixels - _centre_offset(view.points, view.radius, lambda places: fit.image(places, *pose)[0])
 
-    return [
-        replace(
-            view, pixels=view.pixels - _centre_offset(view.points, view.radius, partial(image, turn=turn, shift=shift))
-        )
-        for view, (turn, shift) in zip(views, fit.poses, strict=True)
-    ]
+    return [replace(view, pixels=centres(view, pose)) for view, pose in zip(views, fit.poses, strict=True)]
 
 
-def _concluded(views: Sequence[View], fit: _Fit, tests: dict[str, float], rejected: tuple[str, ...]) -> LensEstimate:
+def _concluded(views: Sequence[View], fit: _Fit, tests: dict[str, float], warnings: list[str]) -> LensEstimate:
     """Covariance, residuals and checks of the chosen fit; the poses are eliminated view by view."""
-    active = np.r_[True, True, True, fit.lens[3:] != 0]
+    active = np.ix_(*[np.flatnonzero(np.r_[True, True, True, fit.lens[3:] != 0])] * 2)
     normal, residuals = np.zeros((8, 8)), []
-    matrix = np.array([[fit.lens[0], 0, fit.lens[1]], [0, fit.lens[0], fit.lens[2]], [0, 0, 1.0]])
-    for view, (turn, shift) in zip(views, fit.poses, strict=True):
-        flat = np.c_[view.points, np.zeros(len(view.points))]
-        there, slopes = cv2.projectPoints(flat, turn, shift, matrix, fit.lens[3:])
-        residuals.append(view.pixels - there[:, 0])
-        pose, lens = slopes[:, :6], np.c_[slopes[:, 6] + slopes[:, 7], slopes[:, 8:15]]
-        own = lens - pose @ np.linalg.lstsq(pose, lens, rcond=None)[0]
-        normal += own.T @ own
+    for view, pose in zip(views, fit.poses, strict=True):
+        there, slopes = fit.image(view.points, *pose)
+        residuals.append(view.pixels - there)
+        by_pose, by_lens = slopes[:, :6], np.c_[slopes[:, 6] + slopes[:, 7], slopes[:, 8:15]]
+        free = by_lens - by_pose @ np.linalg.lstsq(by_pose, by_lens, rcond=None)[0]
+        normal += free.T @ free
     squares = sum(float((residual**2).sum()) for residual in residuals)
     count = 2 * sum(len(view.points) for view in views)
     covariance = np.zeros((8, 8))
-    covariance[np.ix_(active, active)] = (
-        np.linalg.inv(normal[np.ix_(active, active)]) * squares / (count - fit.unknowns)
-    )
+    covariance[active] = np.linalg.inv(normal[active]) * squares / (count - fit.unknowns)
     normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn, _ in fit.poses])
     angle = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1, 1))))
-    if angle < LEAST_ANGLE:
+    if angle < LIMITS.least_angle:
         raise CalibrationError(
             f"all views are parallel within {angle:.1f} degrees: the focal length needs views that differ by "
-            f"{LEAST_ANGLE:g} degrees at least; tilt the target by 20 to 40 degrees about both axes"
+            f"{LIMITS.least_angle:g} degrees at least; tilt the target by 20 to 40 degrees about both axes"
         )
-    rms = float(np.sqrt(squares / count))
-    if rms > LARGEST_RESIDUAL:
-        worst = max(zip(residuals, views, strict=True), key=lambda entry: float((entry[0] ** 2).mean()))[1].name
+    rms, sizes = float(np.sqrt(squares / count)), np.array([np.sqrt((residual**2).mean()) for residual in residuals])
+    if rms > LIMITS.largest_residual:
         raise CalibrationError(
-            f"the points are off by {rms:.2f} px rms, at most {LARGEST_RESIDUAL:g} is what a flat, rigid target "
-            f"leaves; most in {worst}: is the target flat, and its size stated right?"
+            f"the points are off by {rms:.2f} px rms, at most {LIMITS.largest_residual:g} is what a flat, rigid "
+            f"target leaves; most in {views[int(sizes.argmax())].name}: is the target flat, and its size stated right?"
         )
-    hull = cv2.contourArea(cv2.convexHull(np.concatenate([view.pixels for view in views]).astype(np.float32)))
-    covered = float(hull / np.prod(views[0].shape))
-    warnings = list(rejected)
-    if covered < COVERED:
+    seen = covered([view.pixels for view in views], views[0].shape)
+    if seen < LIMITS.covered:
         warnings.append(
-            f"the views cover {covered:.0%} of the frame: beyond them the distortion is extrapolated; show the target "
+            f"the views cover {seen:.0%} of the frame: beyond them the distortion is extrapolated; show the target "
             "in every corner"
         )
-    sizes = np.array([np.sqrt((residual**2).mean()) for residual in residuals])
     warnings += [
-        f"{views[index].name}: the points are off by {sizes[index]:.3f} px rms, those of half the views by less than "
+        f"{view.name}: the points are off by {size:.3f} px rms, those of half the views by less than "
         f"{np.median(sizes):.3f}: was the target moved or bent? Leave it out"
-        for index in np.flatnonzero(sizes > _OUTLYING * np.median(sizes)).tolist()
+        for view, size in zip(views, sizes, strict=True)
+        if size > LIMITS.outlying * np.median(sizes)
     ]
     return LensEstimate(
         lens=fit.lens,
@@ -248,7 +258,7 @@ def _concluded(views: Sequence[View], fit: _Fit, tests: dict[str, float], reject
         residuals=tuple(residuals),
         rms=rms,
         angle=angle,
-        covered=covered,
+        covered=seen,
         tests=tests,
         warnings=tuple(warnings),
     )
@@ -297,30 +307,29 @@ def estimate_plane(view: View, camera: CameraCalibration, std: float | None = No
     points, start = view.points @ motion[:2, :2].T + motion[:2, 2], at_first.homography
     assert start is not None
 
-    def seen(places: FloatArray, entries: FloatArray, values: FloatArray | None) -> FloatArray:
+    def seen(places: FloatArray, entries: FloatArray, values: FloatArray | None = lens) -> FloatArray:
         back = np.c_[places, np.ones(len(places))] @ np.linalg.inv(np.r_[entries, 1.0].reshape(3, 3)).T
         ideal = back[:, :2] / back[:, 2:] + centre
         return ideal if values is None else distorted(values, ideal)
 
+    entries = start.ravel()[:8]
+    pixels = view.pixels - _centre_offset(points, view.radius, lambda places: seen(places, entries))
+
     def off(entries: FloatArray, values: FloatArray | None = lens) -> FloatArray:
         return (seen(points, entries, values) - pixels).ravel()
 
-    entries = start.ravel()[:8]
-    pixels = view.pixels - _centre_offset(points, view.radius, lambda places: seen(places, entries, lens))
     # columns scaled alike: by what a px at the edge of the target does
     scale = np.maximum(np.abs(entries), np.r_[[1e-3 * abs(entries[0])] * 6, [1e-6] * 2])
-
-    def scaled(part: FloatArray) -> FloatArray:
-        return off(part * scale)
-
-    found = optimize.least_squares(scaled, entries / scale, jac="3-point", method="lm", xtol=1e-14)
+    found = optimize.least_squares(
+        lambda part: off(part * scale), entries / scale, jac="3-point", method="lm", xtol=1e-14
+    )
     entries, slopes = found.x * scale, np.asarray(found.jac, dtype=np.float64) / scale
     residual = off(entries)
     rms = float(np.sqrt((residual**2).mean()))
-    if rms > LARGEST_RESIDUAL and std is None:
+    if rms > LIMITS.largest_residual and std is None:
         raise CalibrationError(
-            f"{view.name}: the points are off the plane by {rms:.2f} px rms, at most {LARGEST_RESIDUAL:g} is what a "
-            "flat target leaves" + (": calibrate the lens too, with --views" if lens is None else "")
+            f"{view.name}: the points are off the plane by {rms:.2f} px rms, at most {LIMITS.largest_residual:g} "
+            "is what a flat target leaves" + (": calibrate the lens too, with --views" if lens is None else "")
         )
     variance = std**2 if std is not None else float((residual**2).sum()) / (residual.size - 8)
     covariance = np.zeros((16, 16))

@@ -1,6 +1,12 @@
-"""Captures of a calibration: the files of each group with their hashes, and their mean and temporal variance.
+"""Captures of a calibration: their files with hashes, their mean and temporal variance, their averages in blocks.
 
 Mean and variance are those of every sample over the frames of one exposure, plane by plane.
+
+*Block averages.* The samples of different channels of a Bayer mosaic lie at different points of the target, so on a
+speckled target their ratio pixel by pixel is meaningless. Averages over a block are comparable, provided that every
+plane's average is taken about the same point: the window is a box convolved with [1 2 1] in rows and columns. Its
+transfer function has a triple zero at the carriers of the 2x2 cell, hence the four planes see the mean, the slope and
+the curvature of the picture alike.
 """
 
 from __future__ import annotations
@@ -17,11 +23,10 @@ import numpy.typing as npt
 import rgbmidic
 from rgbmidic.errors import CalibrationError, ConfigurationError, FrameError
 from rgbmidic.frames import ChannelFrame, FrameSeries, FrameSource, Mosaic, open_series
-from rgbmidic.frames.data import planes_of
+from rgbmidic.frames.data import cfa_channels, planes_of
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
-from rgbmidic_calibration.ratio import Sampling, saturation_pile
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,8 +81,13 @@ class CaptureFiles:
 
     def frames(self) -> Iterator[Mosaic | ChannelFrame]:
         """The frames one after the other."""
-        for index in range(len(self)):
-            yield self.series.read(index)[0]
+        return (self.series.read(index)[0] for index in range(len(self)))
+
+    def stack(self, exposure: float | None = None) -> TemporalStack:
+        """Mean and variance of the frames of one exposure; dark frames do not drift."""
+        dark = self.role == "dark"
+        name = "the dark frames" if dark else self.role
+        return stack_frames(self.frames(), exposure=exposure, drifts=not dark, name=name)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -169,8 +179,7 @@ class Captures:
 
     def stacks(self) -> tuple[dict[str, TemporalStack], TemporalStack | None]:
         """Mean and variance of the captures of every light by its name, and of the dark frames."""
-        dark = stack_frames(self.dark.frames(), drifts=False, name="the dark frames") if self.dark else None
-        return {name: stack_frames(files.frames(), name=files.role) for name, files in self.lights.items()}, dark
+        return {name: files.stack() for name, files in self.lights.items()}, self.dark.stack() if self.dark else None
 
 
 def named_patterns(options: Sequence[str], option: str) -> dict[str, str]:
@@ -209,6 +218,59 @@ def check_output(path: Path, *, overwrite: bool, option: str = "--out") -> None:
         raise ConfigurationError(f"the folder of {option} {path} does not exist")
 
 
+@dataclass(frozen=True, slots=True)
+class Sampling:
+    """How a camera samples its frames.
+
+    Attributes
+    ----------
+    names : tuple of str, length P
+        Colour planes: R, G1, G2, B of a mosaic (G1 is the first green met row by row); R, G, B; or M.
+    shape : tuple of int
+        Rows and columns of the frames.
+    black : tuple of float, length P
+        Stated black levels (DN).
+    white : float
+        White level (DN).
+    origins : tuple of (int, int), length P
+        Row and column of each plane's first sample.
+    step : int
+        Distance of a plane's samples in the frame, px: 2 for a mosaic.
+    """
+
+    names: tuple[str, ...]
+    shape: tuple[int, int]
+    black: tuple[float, ...]
+    white: float
+    origins: tuple[tuple[int, int], ...]
+    step: int
+
+    @classmethod
+    def of(cls, frame: Mosaic | ChannelFrame) -> Sampling:
+        """How the camera of a frame samples."""
+        names, _, black = planes_of(frame)
+        origins, step = ((0, 0),) * len(names), 1
+        if isinstance(frame, Mosaic):
+            order = np.argsort(cfa_channels(frame.cfa).ravel(), kind="stable")
+            origins, step = tuple((int(position) // 2, int(position) % 2) for position in order), 2
+        shape = frame.values.shape[-2], frame.values.shape[-1]
+        return cls(names, shape, tuple(black.tolist()), frame.white_level, origins, step)
+
+    @property
+    def full_scale(self) -> float:
+        """Grey level of a just saturated sample (DN above black)."""
+        return self.white - float(np.mean(self.black))
+
+    def matches(self, other: Sampling) -> bool:
+        """The frames have the same size, planes and range; each may state its own black level."""
+        mine, its = ((one.shape, one.names, one.full_scale) for one in (self, other))
+        return mine == its
+
+    def __str__(self) -> str:
+        planes = f"{self.shape[1]} x {self.shape[0]} px with planes {' '.join(self.names)}"
+        return f"{planes} and a range of {self.full_scale:g} DN from black to white level {self.white:g}"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TemporalStack:
     """Frames of a scene at rest, all at one exposure.
@@ -217,10 +279,10 @@ class TemporalStack:
     ----------
     camera
         How they were sampled; P colour planes.
-    mean, variance : tuple of ndarray, length P, each (h, w), float32
+    mean, variance : ndarray, shape (P, h, w), float32
         Mean above the stated black level (DN) and sample variance (DN squared) over the frames. Every frame is first
         scaled to the mean strength of all, so that a drifting lamp does not count as noise.
-    clipped : tuple of ndarray, length P, each (h, w), bool
+    clipped : ndarray, shape (P, h, w), bool
         True where any frame is saturated.
     strength : ndarray, shape (M, P)
         Mean of every frame and plane above the stated black level (DN).
@@ -233,9 +295,9 @@ class TemporalStack:
     """
 
     camera: Sampling
-    mean: tuple[FloatImage, ...]
-    variance: tuple[FloatImage, ...]
-    clipped: tuple[BoolArray, ...]
+    mean: FloatImage
+    variance: FloatImage
+    clipped: BoolArray
     strength: FloatArray
     zeros: float
     piled_at: float | None
@@ -277,44 +339,43 @@ def stack_frames(
     strength: list[FloatArray] = []
     zeros, piled_at = 0.0, None
     for frame in frames:
-        (_, planes, black), sampling = planes_of(frame), Sampling.of(frame)
+        planes, black, sampling = np.stack(planes_of(frame)[1]), planes_of(frame)[2], Sampling.of(frame)
         if camera is None:
-            camera = sampling
-            means, squares = (
-                [np.zeros(plane.shape, dtype=np.float32) for plane in planes] for _ in ("means", "squares")
-            )
-            clipped = [np.zeros(plane.shape, dtype=bool) for plane in planes]
+            camera, clipped = sampling, np.zeros(planes.shape, dtype=bool)
+            mean, squares = np.zeros((2, *planes.shape), dtype=np.float32)
         if replace(sampling, black=camera.black, origins=camera.origins) != camera:
             raise CalibrationError(
                 f"{name}: a frame is {sampling}, the first {camera}: all must come from the same camera and settings"
             )
-        levels = np.array([plane.mean(dtype=np.float64) for plane in planes]) - black
-        strength.append(levels)
+        strength.append(np.array([plane.mean(dtype=np.float64) for plane in planes]) - black)
         zeros = max(zeros, *(float((plane == 0).mean()) for plane in planes))
         piled_at = piled_at or next(filter(None, (saturation_pile(plane, camera.white) for plane in planes)), None)
-        scale = _ratio(strength[0], levels) if drifts else np.ones(len(levels))
-        for index, plane in enumerate(planes):
-            values = (plane.astype(np.float32) - np.float32(black[index])) * np.float32(scale[index])
-            step = values - means[index]
-            means[index] += step / len(strength)
-            squares[index] += step * (values - means[index])
-            clipped[index] |= plane >= camera.white
+        scale = _ratio(strength[0], strength[-1]) if drifts else np.ones(len(planes))
+        values = (planes.astype(np.float32) - _column(black)) * _column(scale)
+        step = values - mean
+        mean += step / len(strength)
+        squares += step * (values - mean)
+        clipped |= planes >= camera.white
     if camera is None:
         raise CalibrationError(f"{name}: no frames")
     levels = np.array(strength)
     # The frames were scaled to the first one's strength: bring them to the mean strength.
     factor = _ratio(levels.mean(axis=0), levels[0]) if drifts else np.ones(len(camera.names))
-    freedom = max(len(levels) - 1, 1)
     return TemporalStack(
         camera=camera,
-        mean=tuple(mean * np.float32(f) for mean, f in zip(means, factor, strict=True)),
-        variance=tuple(square * np.float32(f**2 / freedom) for square, f in zip(squares, factor, strict=True)),
-        clipped=tuple(clipped),
+        mean=mean * _column(factor),
+        variance=squares * _column(factor**2 / max(len(levels) - 1, 1)),
+        clipped=clipped,
         strength=levels,
         zeros=zeros,
         piled_at=piled_at,
         exposure=exposure,
     )
+
+
+def _column(figures: FloatArray) -> FloatImage:
+    """Figures of the planes (P,), for images (P, h, w)."""
+    return figures.astype(np.float32)[:, None, None]
 
 
 TILE = 16
@@ -357,3 +418,120 @@ def same_camera(stacks: Sequence[TemporalStack]) -> None:
     for stack in stacks[1:]:
         if stack.camera != first:
             raise CalibrationError(f"the exposures are of different cameras or settings: {stack.camera} and {first}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BlockMeans:
+    """Block averages of one frame above the stated black level.
+
+    Attributes
+    ----------
+    planes : ndarray, shape (P, R, S), float64
+        Mean grey level (DN above black) of each colour plane in each of R x S blocks.
+    saturated : ndarray, shape (R, S), bool
+        True where any sample of any plane is saturated.
+    camera : Sampling
+        How the frame was sampled.
+    block : int
+        Side of a block in px.
+    detail : float
+        Mean square second difference over the square of the mean, in the brightest plane: how sharp the picture is.
+    piled_at : float or None
+        Grey level (DN) below the white level at which samples pile up as they do at saturation; None: nowhere.
+    """
+
+    planes: FloatArray
+    saturated: BoolArray
+    camera: Sampling
+    block: int
+    detail: float
+    piled_at: float | None = None
+
+    @property
+    def channels(self) -> FloatArray:
+        """Block averages of the channels R, G, B, shape (3, R, S): the two greens of a mosaic averaged."""
+        if len(self.planes) == 3:
+            return self.planes
+        return np.stack([self.planes[0], 0.5 * (self.planes[1] + self.planes[2]), self.planes[3]])
+
+
+def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
+    """Average every colour plane of a frame in blocks.
+
+    Parameters
+    ----------
+    frame
+        Raw frame, Bayer or 3-CCD.
+    block
+        Side of a block in px; even.
+
+    Raises
+    ------
+    CalibrationError
+        The frame is monochrome, or too small for 3 x 3 blocks.
+    """
+    _, planes, black = planes_of(frame)
+    camera = Sampling.of(frame)
+    shape, step = camera.shape, camera.step
+    if camera.names == ("M",):
+        raise CalibrationError("a monochrome frame has no colour channels: there is no crosstalk to calibrate")
+    if block < 2 or block % 2:
+        raise CalibrationError(f"a block has an even number of pixels, at least 2, not {block}")
+    if min(shape) < 3 * block + 4:
+        raise CalibrationError(
+            f"frames of {shape[1]} x {shape[0]} px are too small for calibration in blocks of {block} px "
+            f"(at least {3 * block + 4} px on each side)"
+        )
+    means = np.stack(
+        [
+            _window(shape[0], len(plane), block, step, row)
+            @ plane
+            @ _window(shape[1], len(plane.T), block, step, col).T
+            - dark
+            for plane, dark, (row, col) in zip(planes, black, camera.origins, strict=True)
+        ]
+    )
+    brightest = int(means.mean(axis=(1, 2)).argmax())
+    picture = planes[brightest].astype(np.float32)
+    level = max(float(picture.mean()) - float(black[brightest]), 1.0)
+    clipped = np.atleast_3d(frame.white_level <= frame.values.T).any(axis=2).T.astype(np.float32)
+    # the window is positive on the block and its rim of one pixel, 0 elsewhere
+    over_rows, over_columns = (_window(side, side, block, 1, 0) for side in shape)
+    saturated = over_rows @ clipped @ over_columns.T > 0
+    return BlockMeans(
+        planes=means,
+        saturated=saturated,
+        camera=camera,
+        block=block,
+        detail=float(((picture[:, 2:] - 2 * picture[:, 1:-1] + picture[:, :-2]) ** 2).mean()) / level**2,
+        piled_at=saturation_pile(planes[brightest], frame.white_level),
+    )
+
+
+def block_centres(shape: tuple[int, int], block: int) -> FloatArray:
+    """Centres (x, y) in px of the blocks of a frame, shape (R, S, 2)."""
+    rows, columns = (_starts(side, block) + (block - 1) / 2 for side in shape)
+    return np.stack(np.meshgrid(columns, rows), axis=-1)
+
+
+def _starts(side: int, block: int) -> npt.NDArray[np.intp]:
+    # Two pixels at each border stay unused: the window reaches one pixel beyond its block.
+    return np.arange(2, side - side % 2 - block - 1, block)
+
+
+def _window(side: int, length: int, block: int, step: int, offset: int) -> FloatArray:
+    """Weights (blocks, samples) that average the samples at offset + step * n with the window of the module."""
+    position = offset + step * np.arange(length)
+    distance = position[None, :] - _starts(side, block)[:, None]
+    edges = np.array([-2, -1, 0, 1, block - 2, block - 1, block, block + 1])
+    weights = np.interp(distance, edges, [0, 1, 3, 4, 4, 3, 1, 0], left=0.0, right=0.0)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float64)
+
+
+def saturation_pile(plane: npt.NDArray[np.uint16], white: float) -> float | None:
+    """Largest value of a plane where it occurs far more often than the values just below it."""
+    top = int(plane.max())
+    if top >= white or top < 8:
+        return None
+    count, below = int((plane == top).sum()), int(((plane < top) & (plane >= top - 4)).sum())
+    return float(top) if count > 20 and count > 2 * below else None

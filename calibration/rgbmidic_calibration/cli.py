@@ -193,6 +193,7 @@ def camera(
     from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic_calibration import display, jobs
     from rgbmidic_calibration.captures import check_output
+    from rgbmidic_calibration.pictures import draw_camera
     from rgbmidic_calibration.target import Target
 
     check_output(out, overwrite=overwrite)
@@ -211,7 +212,7 @@ def camera(
     estimate.camera.write(out)
     display.camera(estimate.camera, out)
     if picture is not None:
-        display.draw_camera(estimate, picture)
+        draw_camera(estimate, picture)
 
 
 @app.command()
@@ -264,13 +265,14 @@ def design(
     from rgbmidic_calibration import design as designs
     from rgbmidic_calibration import display
     from rgbmidic_calibration.captures import named_patterns
+    from rgbmidic_calibration.pictures import draw_design
 
     lamps = {name: designs.read_lamp(text) for name, text in named_patterns(light, "--light").items()}
     sensitivities = designs.read_camera(camera)
     found = designs.best_sets(sensitivities, lamps, min(choose, len(lamps)))
     display.designs(found[:show_sets])
     if picture is not None:
-        designs.draw_design(found[0], sensitivities, lamps, picture)
+        draw_design(found[0], sensitivities, lamps, picture)
 
 
 @app.command()
@@ -298,14 +300,14 @@ def show(
     from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic_calibration import display
-    from rgbmidic_calibration.design import draw_calibration
     from rgbmidic_calibration.jobs import CameraEstimate
+    from rgbmidic_calibration.pictures import draw_calibration, draw_camera
 
     if CameraCalibration.is_in(file):
         camera = CameraCalibration.read(file)
         display.camera(camera, file, written=False)
         if picture is not None:
-            display.draw_camera(CameraEstimate(camera=camera), picture)
+            draw_camera(CameraEstimate(camera=camera), picture)
         return
     calibration = Calibration.read(file)
     display.calibration(calibration, file)

@@ -11,14 +11,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from rgbmidic.fields.plane import LENS_PARAMETERS, CameraCalibration, distorted
+from rgbmidic.fields.plane import LENS_PARAMETERS, CameraCalibration
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
 from rgbmidic_calibration.design import Design
-from rgbmidic_calibration.jobs import CameraEstimate
 from rgbmidic_calibration.noise import NoiseEstimate
 from rgbmidic_calibration.registration import RegistrationEstimate
 from rgbmidic_calibration.verify import Verdict
@@ -215,35 +214,3 @@ def _noise(result: CameraNoise) -> tuple[Table, str]:
     table.add_row("dynamic range, dB", *(f"{value:.1f}" for value in result.dynamic_range))
     counts = [f"{sum(kind == name for *_, kind in result.defects)} {name}" for name in ("hot", "dead")]
     return table, f"pixels to distrust: {', '.join(counts)}"
-
-
-def draw_camera(estimate: CameraEstimate, path: Path) -> None:
-    """Draw the residuals of all points, the distortion over the frame, and the local scale on the plane."""
-    from matplotlib.figure import Figure
-
-    camera = estimate.camera
-    rows, columns = camera.shape
-    y, x = np.mgrid[0 : rows - 1 : 24j, 0 : columns - 1 : 24j]
-    grid = np.stack([x.ravel(), y.ravel()], axis=1)
-    shown = list(zip(estimate.views, estimate.lens.residuals, strict=True)) if estimate.lens else []
-    if estimate.plane_view and estimate.plane:
-        shown.append((estimate.plane_view, estimate.plane.residual))
-    count = 3 if shown else 2  # a file has no residuals
-    figure = Figure(figsize=(4.3 * count, 4.2), layout="constrained")
-    axes = figure.subplots(1, count)
-    if shown:
-        unit = float(f"{max(1e-6, *(np.abs(residual).max() for _, residual in shown)):.0e}")
-        for view, residual in shown:
-            axes[0].quiver(*view.pixels.T, *residual.T, angles="xy", scale_units="width", scale=10 * unit, width=0.003)
-        axes[0].set_title(f"residuals of the points (a tenth of the width: {unit:g} px)")
-    if camera.lens is not None:
-        shift = np.linalg.norm(distorted(camera.lens, grid) - grid, axis=1).reshape(x.shape)
-        axes[-2].clabel(axes[-2].contour(x, y, shift, cmap="viridis"), fmt="%.2f")
-    axes[-2].set_title("distortion, px" if camera.lens is not None else "no lens calibrated")
-    if camera.homography is not None:
-        scale = np.sqrt(np.linalg.det(camera.jacobian(grid))).reshape(x.shape)
-        axes[-1].clabel(axes[-1].contour(x, y, 100 * (scale / scale.mean() - 1), cmap="viridis"), fmt="%.3f")
-    axes[-1].set_title("scale on the plane, % of its mean" if camera.homography is not None else "no plane calibrated")
-    for axis in axes:
-        axis.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), aspect="equal", xlabel="x, px", ylabel="y, px")
-    figure.savefig(path, dpi=120)

@@ -6,12 +6,11 @@ Noise, crosstalk and registration are often measured on different days, hence th
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
@@ -19,25 +18,14 @@ from rgbmidic.fields.plane import CameraCalibration
 from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.unevenness import unevenness
-from rgbmidic.settings import FrameSettings
-from rgbmidic_calibration.camera import (
-    COVERED,
-    LARGEST_RESIDUAL,
-    LensEstimate,
-    PlaneEstimate,
-    estimate_lens,
-    estimate_plane,
-)
-from rgbmidic_calibration.captures import CaptureFiles, Captures, provenance, stack_frames
+from rgbmidic.settings import ELEMENT_SIZE, FrameSettings
+from rgbmidic.typing import FloatArray
+from rgbmidic_calibration.camera import LIMITS, covered, estimate_lens, estimate_plane
+from rgbmidic_calibration.captures import BlockMeans, CaptureFiles, Captures, block_means, provenance
 from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk
 from rgbmidic_calibration.noise import NoiseEstimate, photon_transfer
-from rgbmidic_calibration.ratio import BlockMeans, block_means
-from rgbmidic_calibration.registration import ELEMENT, RegistrationEstimate, estimate_registration
+from rgbmidic_calibration.registration import RegistrationEstimate, estimate_registration
 from rgbmidic_calibration.target import Target, View, find_views
-
-LIT = 0.1
-"""Mean above black, relative to the full scale, of a plane whose histogram is looked at: in the dark, noise is too
-little to smooth it. Some cameras apply gains of their own to red and blue, so all planes are."""
 
 
 def calibrate_crosstalk(
@@ -59,12 +47,11 @@ def calibrate_crosstalk(
     details = {
         "block": block,
         "waived_checks": list(allow),
-        "warnings": list(estimate.warnings),
         "variation_over_field": {
             fit.name: {"p_value": fit.variation.p_value, "rms": fit.variation.rms} for fit in estimate.lights
         },
     }
-    return _calibration("crosstalk", captures.groups, uneven, details, crosstalk=estimate.crosstalk), estimate
+    return _calibration("crosstalk", captures.groups, uneven, details, estimate), estimate
 
 
 def calibrate_noise(dark: str, flats: Sequence[str], stated: FrameSettings) -> tuple[Calibration, NoiseEstimate]:
@@ -92,53 +79,64 @@ def calibrate_noise(dark: str, flats: Sequence[str], stated: FrameSettings) -> t
         except ValueError:
             raise ConfigurationError(f"--flat takes FILES or TIME=FILES with a number as time, not {text!r}") from None
         exposures.append((CaptureFiles.find(f"flat exposure {time}", pattern, stated), seconds))
-    dark_stack = stack_frames(dark_files.frames(), drifts=False, name="the dark frames")
-    stacks = [stack_frames(files.frames(), exposure=time, name=files.role) for files, time in exposures]
-    estimate = photon_transfer(dark_stack, stacks)
+    estimate = photon_transfer(dark_files.stack(), [files.stack(time) for files, time in exposures])
     groups = [dark_files, *(files for files, _ in exposures)]
-    uneven = [value for files in groups[1:] for value in _unevenness(next(files.frames()))]
-    details = {"warnings": list(estimate.warnings), "exposures": [time for _, time in exposures]}
-    return _calibration("noise", groups, uneven, details, camera_noise=estimate.camera_noise), estimate
+    details = {"exposures": [time for _, time in exposures]}
+    return _calibration("noise", groups, _unevenness_of(groups[1:]), details, estimate), estimate
 
 
 def calibrate_registration(
-    captures: Captures, *, region: Sequence[float] | None = None, element_size: float = ELEMENT
+    captures: Captures, *, region: Sequence[float] | None = None, element_size: float = ELEMENT_SIZE
 ) -> tuple[Calibration, RegistrationEstimate]:
     """Registration section from captures of a speckled target; the first light is the reference."""
     estimate = estimate_registration(*captures.stacks(), region=region, element_size=element_size)
-    uneven = [value for files in captures.lights.values() for value in _unevenness(next(files.frames()))]
+    uneven = _unevenness_of(captures.lights.values())
     details = {
-        "warnings": list(estimate.warnings),
         "region": None if region is None else list(region),
         "element_size": element_size,
         "residual_rms_px": {match.name: match.rms for match in estimate.matches},
     }
-    return _calibration("registration", captures.groups, uneven, details, registration=estimate.registration), estimate
+    return _calibration("registration", captures.groups, uneven, details, estimate), estimate
 
 
-def _unevenness(capture: Mosaic | ChannelFrame) -> list[float]:
-    """Unevenness of the histogram of every lit plane, where it can be determined."""
-    found = []
-    for plane, black in zip(*planes_of(capture)[1:], strict=True):
-        if plane.mean() > black + LIT * (capture.white_level - black):
-            found.append(unevenness(plane[plane < capture.white_level]))
+def _unevenness_of(groups: Iterable[CaptureFiles]) -> list[float]:
+    """Of the first frame of every group."""
+    return [value for files in groups for value in _unevenness(next(files.frames()))]
+
+
+def _unevenness(capture: Mosaic | ChannelFrame, lit: float = 0.1) -> list[float]:
+    """Unevenness of the histogram of every lit plane, where it can be determined.
+
+    Lit are planes whose mean above black exceeds the fraction `lit` of the full scale: in the dark, noise is too little
+    to smooth it. Some cameras apply gains of their own to red and blue, so all planes are looked at.
+    """
+    white = capture.white_level
+    found = [
+        unevenness(plane[plane < white])
+        for plane, black in zip(*planes_of(capture)[1:], strict=True)
+        if plane.mean() > black + lit * (white - black)
+    ]
     return [value for value in found if np.isfinite(value)]
 
 
 def _calibration(
-    section: str, groups: Sequence[CaptureFiles], uneven: Sequence[float], details: Mapping[str, Any], **found: Any
+    section: str,
+    groups: Sequence[CaptureFiles],
+    uneven: Sequence[float],
+    details: Mapping[str, Any],
+    estimate: CrosstalkEstimate | NoiseEstimate | RegistrationEstimate,
 ) -> Calibration:
     """A calibration of one section, with the camera's settings and where it comes from: date, version, input files.
 
     The settings are those of the first frame; levels that neither the file nor the user states stay open.
     """
-    files = groups[0]
+    files, field = groups[0], "camera_noise" if section == "noise" else section
     header, frame = files.series.lights[0][0].stored(0), next(files.frames())
     levels: dict[str, Any] = {"black_level": float(frame.black_level.mean()), "white_level": frame.white_level}
     known = {name for name in levels for source in (header, files.stated) if getattr(source, name) is not None}
     return Calibration(
-        **found,
-        provenance={section: provenance(section, groups, details)},
+        **{field: getattr(estimate, field)},
+        provenance={section: provenance(section, groups, {**details, "warnings": list(estimate.warnings)})},
         kind="bayer" if isinstance(frame, Mosaic) else "rgb" if len(frame.values) == 3 else "monochrome",
         cfa=frame.cfa if isinstance(frame, Mosaic) else None,
         shape=(frame.values.shape[-2], frame.values.shape[-1]),
@@ -147,20 +145,12 @@ def _calibration(
     )
 
 
-SECTIONS = ("crosstalk", "camera_noise", "noise", "registration")
-CAMERA = ("kind", "cfa", "black_level", "white_level", "shape")
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraEstimate:
-    """Result of `calibrate_camera`: what is written, how it was found, and warnings."""
+    """Result of `calibrate_camera`: what is written, and of every photograph the points and their residuals, px."""
 
     camera: CameraCalibration
-    views: tuple[View, ...] = ()
-    lens: LensEstimate | None = None
-    plane_view: View | None = None
-    plane: PlaneEstimate | None = None
-    warnings: tuple[str, ...] = ()
+    residuals: tuple[tuple[FloatArray, FloatArray], ...] = ()
 
 
 def read_corners(corners: str, size: str, std: float, shape: tuple[int, int]) -> View:
@@ -248,16 +238,15 @@ def calibrate_camera(
     if plane and corners:
         raise ConfigurationError("--plane and --corners both state the plane: state one of them")
     details: dict[str, Any] = {} if lens is None else {"lens": dict(lens.details).get("lens")}
-    groups, found, estimate = list[CaptureFiles](), list[View](), None
-    warnings: tuple[str, ...] = ()
-    camera = None
-    if lens is not None:  # that of an earlier plane left out
-        camera = replace(lens, homography=None, covariance=np.pad(lens.covariance[:8, :8], (0, 8)))
+    groups, residuals, warnings = list[CaptureFiles](), list[tuple[FloatArray, FloatArray]](), list[str]()
+    # of an earlier calibration the lens, its plane left out
+    camera = lens and replace(lens, homography=None, covariance=np.pad(lens.covariance[:8, :8], (0, 8)))
     if views and target:
         groups.append(CaptureFiles.find("views", views, stated))
         found, reasons = find_views(groups[-1], target)
         estimate = estimate_lens(found, reasons)
-        warnings = estimate.warnings
+        warnings += estimate.warnings
+        residuals += [(view.pixels, off) for view, off in zip(found, estimate.residuals, strict=True)]
         camera = CameraCalibration(
             shape=found[0].shape, lens=estimate.lens, covariance=np.pad(estimate.covariance, (0, 8))
         )
@@ -268,35 +257,30 @@ def calibrate_camera(
             "covered": estimate.covered,
             "p_values": estimate.tests,
         }
-    view, fitted = None, None
+    view = None
     if plane and target:
         groups.append(CaptureFiles.find("plane", plane, stated))
         view = _mean_view(groups[-1], target)
     elif corners:
-        if camera is None and stated.shape is None:
-            raise ConfigurationError("--corners need the frames' size: --shape ROWSxCOLUMNS, or --lens")
         shape = camera.shape if camera is not None else stated.shape
-        assert shape is not None
+        if shape is None:
+            raise ConfigurationError("--corners need the frames' size: --shape ROWSxCOLUMNS, or --lens")
         view = read_corners(*corners, shape)
     if view is not None:
-        camera = camera or CameraCalibration(shape=view.shape)
-        fitted = estimate_plane(view, camera, corners[2] if corners else None)
+        fitted = estimate_plane(view, camera or CameraCalibration(shape=view.shape), corners[2] if corners else None)
         camera = fitted.camera
-        details["plane"] = {"photograph": view.name, "rms_px": fitted.rms, **_plane_details(camera)}
-        hull = cv2.contourArea(cv2.convexHull(view.pixels.astype(np.float32))) / np.prod(view.shape)
-        if hull < COVERED / 2:
-            beyond = f"the target covers {hull:.0%} of the frame on the plane: beyond it the plane is extrapolated"
-            warnings = (*warnings, beyond)
+        residuals.append((view.pixels, fitted.residual))
+        names = ("mm_per_pixel", "mm_per_pixel_std", "tilt_deg", "tilt_std_deg")
+        figures = zip(names, (*camera.scale(camera.centre), *camera.tilt_deg), strict=True)
+        known = {name: value for name, value in figures if np.isfinite(value)}
+        details["plane"] = {"photograph": view.name, "rms_px": fitted.rms, **known}
+        if (hull := covered([view.pixels], view.shape)) < LIMITS.covered / 2:
+            warnings.append(
+                f"the target covers {hull:.0%} of the frame on the plane: beyond it the plane is extrapolated"
+            )
     assert camera is not None
-    details |= {"warnings": list(warnings), "provenance": provenance("camera", groups, {})}
-    return CameraEstimate(
-        camera=replace(camera, details=details),
-        views=tuple(found),
-        lens=estimate,
-        plane_view=view,
-        plane=fitted,
-        warnings=warnings,
-    )
+    details |= {"warnings": warnings, "provenance": provenance("camera", groups, {})}
+    return CameraEstimate(camera=replace(camera, details=details), residuals=tuple(residuals))
 
 
 def _mean_view(files: CaptureFiles, target: Target) -> View:
@@ -307,21 +291,12 @@ def _mean_view(files: CaptureFiles, target: Target) -> View:
     for shot in shots[1:]:
         if not np.array_equal(shot.points, shots[0].points):
             raise CalibrationError("--plane: the photographs show different points of the target: state one of them")
-        if (moved := float(np.abs(shot.pixels - shots[0].pixels).max())) > LARGEST_RESIDUAL:
+        if (moved := float(np.abs(shot.pixels - shots[0].pixels).max())) > LIMITS.largest_residual:
             raise CalibrationError(
                 f"--plane: from {shots[0].name} to {shot.name} the target moved by up to {moved:.2f} px, at most "
-                f"{LARGEST_RESIDUAL:g} may be: state photographs of one plane"
+                f"{LIMITS.largest_residual:g} may be: state photographs of one plane"
             )
     return replace(shots[0], pixels=np.mean([shot.pixels for shot in shots], axis=0))
-
-
-def _plane_details(camera: CameraCalibration) -> dict[str, float]:
-    """Return scale and tilt of the plane with their standard uncertainties, as far as they are known."""
-    (scale, scale_std), (tilt, tilt_std) = camera.scale(camera.centre), camera.tilt_deg
-    names = ("mm_per_pixel", "mm_per_pixel_std", "tilt_deg", "tilt_std_deg")
-    return {
-        name: value for name, value in zip(names, (scale, scale_std, tilt, tilt_std), strict=True) if np.isfinite(value)
-    }
 
 
 def merge_files(paths: Sequence[Path]) -> Calibration:
@@ -337,38 +312,20 @@ def merge_files(paths: Sequence[Path]) -> Calibration:
     """
     if len(paths) < 2:
         raise ConfigurationError(f"merge needs at least two calibration files, given is {len(paths)}")
-    read = {str(path): Calibration.read(path) for path in paths}
-    chosen: dict[str, Any] = {name: _agreed(name, read) for name in (*SECTIONS, *CAMERA)}
-    origins: dict[str, Any] = {}
-    extra: dict[str, Any] = {}
-    for path, calibration in read.items():
-        _add(origins, calibration.provenance, f"provenance of {path}")
-        _add(extra, calibration.extra, path)
-    uneven = [calibration.unevenness for calibration in read.values() if calibration.unevenness is not None]
-    return Calibration(**chosen, unevenness=max(uneven, default=None), provenance=origins, extra=extra)
-
-
-def _agreed(name: str, read: Mapping[str, Calibration]) -> Any:
-    """The value of a section or camera setting; files that have it must agree."""
-    found: tuple[str, Calibration] | None = None
-    for path, calibration in read.items():
-        if getattr(calibration, name) is None:
-            continue
-        if found and _document(calibration, name) != _document(found[1], name):
-            raise CalibrationError(
-                f"{found[0]} and {path} differ in {name.replace('_', ' ')}: merge takes it from one file only, and the "
-                "camera settings must be the same in all"
-            )
-        found = found or (path, calibration)
-    return getattr(found[1], name) if found else None
-
-
-def _document(calibration: Calibration, name: str) -> Any:
-    document = calibration.to_document()
-    return document["camera"][name] if name in CAMERA else document["noise" if "noise" in name else name]
-
-
-def _add(into: dict[str, Any], new: Mapping[str, Any], where: str) -> None:
-    for key, value in new.items():
-        if into.setdefault(key, value) != value:
-            raise CalibrationError(f"{where}: section {key} differs from that of an earlier file")
+    found: dict[tuple[str, str], tuple[Any, Path]] = {}
+    for path in paths:
+        for name, section in Calibration.read(path).to_document().items():
+            for key, value in section.items() if name in ("camera", "provenance") else [("", section)]:
+                before, where = found.setdefault((name, key), (value, path))
+                if key == "unevenness":
+                    found[name, key] = max(before, value), path
+                elif before != value:
+                    part = f"the provenance of {key}" if name == "provenance" else (key or name).replace("_", " ")
+                    raise CalibrationError(
+                        f"{where} and {path} differ in {part}: merge takes it from one file only, and the camera "
+                        "settings must be the same in all"
+                    )
+    document: dict[str, Any] = {}
+    for (name, key), (value, _) in found.items():
+        document[name] = document.get(name, {}) | {key: value} if key else value
+    return Calibration.from_document(document)

@@ -2,46 +2,71 @@
 
 With shot noise of the electrons and read noise, the temporal variance of a sample is ``v = r^2 + K mu`` with K = 1/gain
 and mu the mean above dark (EMVA standard 1288, release 4.0, section 2.2 and 6). Mean and variance are taken in blocks,
-so neither shading nor texture of the target matters, as long as it stands still.
+so neither shading nor texture of the target matters, as long as it stands still. The fixed pattern (DSNU, PRNU) and hot
+and dead pixels follow its sections 4 and 8.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
 
 from rgbmidic.errors import CalibrationError
+from rgbmidic.illumination.checks import Check, reported, warning
 from rgbmidic.illumination.linear import CameraNoise, Quantity
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile_means
-from rgbmidic_calibration.plausibility import fixed_pattern
 
-HIGHEST = 0.9
-"""Blocks brighter than this fraction of the range are not used: the variance falls as samples reach white.
-From .7 to .95 the gain of the virtual camera changes by .7 of its standard uncertainty at most."""
 
-KNEE = 0.8
-"""Variance over its prediction below which the sensor itself saturates before the white level does: from .6 to .9 no
-figure of the virtual camera changes, since tiles must fall below it by three standard deviations as well."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseConstants:
+    """Constants of `photon_transfer`.
 
-DRIFT_LIMIT, DRIFT_WARNING = 0.2, 0.02
-"""Drift of the lamp's strength within an exposure (`TemporalStack.drift`). Chosen: frames are scaled to one strength,
-so that drift does no harm; a fifth is another exposure rather than a lamp that warms up."""
-RANGE_WARNING = 0.2
-"""Fraction of the range: the relative error of the gain grows as its inverse. Chosen; it decides on a warning only."""
-SCATTER_WARNING = 1.5
-"""Scatter of the tiles' variances over that of noise alone: chosen; it decides on a warning only."""
-CURVE_WARNING, BEND_SIGNIFICANCE = 0.03, 4.0
-"""Departure of an exposure from the line, beyond so many standard deviations. Chosen; it decides on a warning only."""
-ZEROS_WARNING = 0.005
-"""Fraction of dark samples cut off at 0: chosen; of normal noise this lies 2.6 standard deviations above the cut."""
-PLANES_WARNING = 0.05
-"""Relative difference of the planes' gains: chosen; it decides on a warning only."""
-LINEARITY_WARNING = 0.5
-"""Linearity error LE (%) from which lights that shine together are not the sum of the single ones to within what
-`check` allows (`rgbmidic_calibration.verify.Limits.additivity`); EMVA 1288 defines the figure and sets no limit."""
+    Attributes
+    ----------
+    highest
+        Blocks brighter than this fraction of the range are not used: the variance falls as samples reach white. From .7
+        to .95 the gain of the virtual camera changes by .7 of its standard uncertainty at most.
+    knee
+        Variance over its prediction below which the sensor itself saturates before the white level does: from .6 to .9
+        no figure of the virtual camera changes, since tiles must fall below it by three standard deviations as well.
+    drift
+        Largest drift of the lamp's strength within an exposure (`TemporalStack.drift`). Chosen: frames are scaled to
+        one strength, so that drift does no harm; a fifth is another exposure rather than a lamp that warms up.
+    window
+        Side (samples of a plane) of the neighbourhood whose mean is taken out: shading and dirt are wider than this.
+    hot
+        Robust standard deviations above the neighbourhood's median that make a pixel hot in the dark: of normal noise
+        one sample in 1e15 lies there; from 6 to 10 the virtual camera has no false one.
+    hot_fraction
+        Fraction of the full scale by which a hot pixel exceeds its neighbourhood at least: 20 DN of 12 bit, seven times
+        the dark noise of the virtual camera, which has no false one from .002 to .01.
+    dead_fraction
+        Response relative to the neighbourhood's median below which a pixel is dead: half, as far from a live pixel as
+        from a black one; from .3 to .7 the virtual camera has no false one.
+    lit_fraction
+        Signal over the full scale below which neither is determined (chosen).
+    textured
+        Local variation of the response above which the target, not the sensor, is uneven: from .03 to .08 the virtual
+        camera's white card is judged alike.
+    """
+
+    highest: float = 0.9
+    knee: float = 0.8
+    drift: float = 0.2
+    window: int = 7
+    hot: float = 8.0
+    hot_fraction: float = 0.005
+    dead_fraction: float = 0.5
+    lit_fraction: float = 0.02
+    textured: float = 0.05
+
+
+LIMITS = NoiseConstants()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,17 +111,21 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
         as the flats.
     """
     same_camera([dark, *flats])
-    _check(dark, flats)
-    lines = [_fit_line(dark, flats, plane) for plane in range(len(dark.camera.names))]
+    _refuse(dark, flats)
+    planes = range(len(dark.camera.names))
+    lines = [_fit_line(dark, flats, plane) for plane in planes]
     drift = dark.strength.var(axis=0, ddof=1)
     rest = np.array([variance.mean(dtype=np.float64) / variance.size for variance in dark.variance])
     black = Quantity(
         np.array(dark.camera.black) + dark.strength.mean(axis=0), np.sqrt(np.maximum(drift, rest) / dark.count)
     )
-    saturation, warnings = _saturation(dark, flats, lines, black)
-    pattern = fixed_pattern(dark, flats, saturation)
+    knees = [_knee(dark, flats, plane, lines[plane]) for plane in planes]
+    level, std = dark.camera.white - black.value, np.hypot(black.std, 0.5)
+    early = np.nan_to_num(knees, nan=np.inf) < 0.95 * level  # the sensor saturates before the white level does
+    saturation = Quantity(np.where(early, knees, level), np.where(early, 0.05 * np.array(knees), std))
     read, gain = np.sqrt([line.read_variance for line in lines]), np.array([1 / line.slope for line in lines])
     read_std, slope_std = np.sqrt([np.diag(line.covariance) for line in lines]).T
+    dsnu, prnu, defects, uneven = fixed_pattern(dark, flats, saturation)
     noise = CameraNoise(
         planes=dark.camera.names,
         gain=Quantity(gain, gain**2 * slope_std),
@@ -104,30 +133,30 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
         black_level=black,
         saturation=saturation,
         linearity_error=_linearity(dark, flats, saturation.value),
-        dsnu=pattern.dsnu,
-        prnu=pattern.prnu,
-        defects=pattern.defects,
+        dsnu=dsnu,
+        prnu=prnu,
+        defects=defects,
     )
-    warnings += [*_warnings(dark, flats, noise, lines), *pattern.warnings]
-    return NoiseEstimate(camera_noise=noise, warnings=tuple(warnings))
+    found = [check.text for check in reported(_checks(dark, flats, noise, lines, early))]
+    return NoiseEstimate(camera_noise=noise, warnings=(*found, *uneven))
 
 
-def _check(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
-    for name, stack in [("the dark frames", dark), *((f"flat exposure {i + 1}", s) for i, s in enumerate(flats))]:
-        if stack.count < 2:
-            raise CalibrationError(f"{name}: temporal noise needs at least two frames of the same scene, given is one")
+def _refuse(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
     if not flats:
         raise CalibrationError("no flat exposure is given: the gain needs lit frames at one exposure at least")
-    for index, flat in enumerate(flats):
-        if flat.drift > DRIFT_LIMIT:
+    for index, stack in enumerate([dark, *flats]):
+        name = f"flat exposure {index}" if index else "the dark frames"
+        if stack.count < 2:
+            raise CalibrationError(f"{name}: temporal noise needs at least two frames of the same scene, given is one")
+        if index and stack.drift > LIMITS.drift:
             raise CalibrationError(
-                f"flat exposure {index + 1}: the frames' strengths differ by {100 * flat.drift:.0f} %: each group "
-                "must be frames of one exposure with a steady lamp"
+                f"{name}: the frames' strengths differ by {100 * stack.drift:.0f} %: each group must be frames of one "
+                "exposure with a steady lamp"
             )
-        if flat.piled_at is not None:
+        if index and stack.piled_at is not None:
             raise CalibrationError(
-                f"flat exposure {index + 1}: samples pile up at {flat.piled_at:.0f} DN, below the stated white level "
-                f"{flat.camera.white:g}: the camera saturates there; state --white-level {flat.piled_at:.0f}"
+                f"{name}: samples pile up at {stack.piled_at:.0f} DN, below the stated white level "
+                f"{stack.camera.white:g}: the camera saturates there; state --white-level {stack.piled_at:.0f}"
             )
     brightest = max(float(flat.strength.mean(axis=0).max()) for flat in flats)
     if float(dark.strength.mean(axis=0).max()) > 0.5 * brightest:
@@ -138,15 +167,15 @@ def _fit_line(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int) -
     """Line of variance over mean through the blocks of all exposures, weighted by the variance of a variance."""
     level = tile_means(dark.mean[plane])
     range_ = dark.camera.white - dark.camera.black[plane]
-    points = [(np.zeros_like(level), tile_means(dark.variance[plane]), dark.count)]
+    means = [np.zeros_like(level)]
     for flat in flats:
         mean = tile_means(flat.mean[plane]) - level
-        good = (tile_means(flat.clipped[plane]) == 0) & (mean + level < HIGHEST * range_)
-        variance = tile_means(flat.variance[plane])
-        points.append((np.where(good, mean, np.nan), variance, flat.count))
-    mean, variance = (np.concatenate(values) for values in list(zip(*points, strict=True))[:2])
-    exposure = np.repeat(np.arange(float(len(points))), len(level))
-    freedom = np.repeat([TILE**2 * (count - 1) for *_, count in points], len(level))
+        good = (tile_means(flat.clipped[plane]) == 0) & (mean + level < LIMITS.highest * range_)
+        means.append(np.where(good, mean, np.nan))
+    stacks, mean = [dark, *flats], np.concatenate(means)
+    variance = np.concatenate([tile_means(stack.variance[plane]) for stack in stacks])
+    exposure = np.repeat(np.arange(float(len(stacks))), len(level))
+    freedom = np.repeat([TILE**2 * (stack.count - 1) for stack in stacks], len(level))
     used = np.isfinite(mean)
     if not (used & (exposure > 0)).any():
         raise CalibrationError(
@@ -185,54 +214,36 @@ def _weighted_line(mean: FloatArray, variance: FloatArray, freedom: FloatArray, 
         covariance=inverse @ (score.T @ score) @ inverse,
         reach=float(means[0].max()),
         scatter=scatter,
-        bend=float(np.maximum(np.abs(means[1] / means[2] - 1) - BEND_SIGNIFICANCE * noise, 0).max()),
+        bend=float(np.maximum(np.abs(means[1] / means[2] - 1) - 4 * noise, 0).max()),
     )
 
 
-def _saturation(
-    dark: TemporalStack, flats: Sequence[TemporalStack], lines: Sequence[_Line], black: Quantity
-) -> tuple[Quantity, list[str]]:
-    """Where samples saturate: the white level, or the lower level at which the variance breaks down."""
-    level = dark.camera.white - black.value
-    std = np.hypot(black.std, 0.5)
-    warnings = []
-    for plane, line in enumerate(lines):
-        if (knee := _knee(dark, flats, plane, line)) is not None and knee < 0.95 * level[plane]:
-            warnings.append(
-                f"plane {dark.camera.names[plane]}: the variance breaks down at {knee:.0f} DN above black, below "
-                f"the white level: the sensor saturates there (white_level {knee + black.value[plane]:.0f} in the test)"
-            )
-            level[plane], std[plane] = knee, 0.05 * knee
-    if not any(clipped.any() for flat in flats for clipped in flat.clipped) and not warnings:
-        warnings.append("no exposure reached saturation: the full well is that of the stated white level")
-    return Quantity(level, std), warnings
-
-
-def _knee(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, line: _Line) -> float | None:
-    lowest: float | None = None
+def _knee(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, line: _Line) -> float:
+    """Lowest level (DN above black) at which the variance breaks down; NaN where it does not."""
+    knees = [np.nan]
     for flat in flats:
         mean = tile_means(flat.mean[plane]) - tile_means(dark.mean[plane])
         free = tile_means(flat.clipped[plane]) == 0
         ratio = tile_means(flat.variance[plane]) / (line.read_variance + line.slope * np.maximum(mean, 0))
         noise = np.sqrt(2 / (TILE**2 * (flat.count - 1)))
-        broken = free & (ratio < KNEE - 3 * noise) & (mean > 0.3 * (dark.camera.white - dark.camera.black[plane]))
+        broken = (
+            free & (ratio < LIMITS.knee - 3 * noise) & (mean > 0.3 * (dark.camera.white - dark.camera.black[plane]))
+        )
         if broken.sum() > 0.02 * len(mean):
-            knee = float(np.median(mean[broken]))
-            lowest = knee if lowest is None else min(lowest, knee)
-    return lowest
+            knees.append(float(np.median(mean[broken])))
+    return float(np.fmin.reduce(knees))
 
 
 def _linearity(dark: TemporalStack, flats: Sequence[TemporalStack], saturation: FloatArray) -> Quantity:
     """EMVA 1288 LE: mean relative deviation in % from the line through mean against exposure time, 5 to 95 %."""
-    planes = len(dark.camera.names)
     known = [flat for flat in flats if flat.exposure is not None]
     time = np.array([flat.exposure for flat in known], dtype=np.float64)
-    error, std = np.full(planes, np.nan), np.full(planes, np.nan)
-    for plane in range(planes):
+    error, std = np.full((2, len(dark.camera.names)), np.nan)
+    for plane, full in enumerate(saturation):
         mean = np.array([flat.strength[:, plane].mean() for flat in known]) - dark.strength[:, plane].mean()
         steady = np.array([flat.strength[:, plane].std(ddof=1) / np.sqrt(flat.count) for flat in known])
         free = np.array([not flat.clipped[plane].any() for flat in known], dtype=bool)
-        good = free & (mean > 0.05 * saturation[plane]) & (mean < 0.95 * saturation[plane])
+        good = free & (mean > 0.05 * full) & (mean < 0.95 * full)
         if len(np.unique(time[good])) < 3:
             continue
         line = np.polyfit(time[good], mean[good], 1, w=1 / mean[good])
@@ -241,42 +252,124 @@ def _linearity(dark: TemporalStack, flats: Sequence[TemporalStack], saturation: 
     return Quantity(error, std)
 
 
-def _warnings(
-    dark: TemporalStack, flats: Sequence[TemporalStack], noise: CameraNoise, lines: Sequence[_Line]
-) -> list[str]:
-    warnings = []
-    if dark.zeros > ZEROS_WARNING:
-        warnings.append(
-            f"{100 * dark.zeros:.1f} % of the dark samples are 0: the black level is cut off and the read noise "
-            "comes out too small; raise the camera's black level (offset)"
+def fixed_pattern(
+    dark: TemporalStack, flats: Sequence[TemporalStack], saturation: Quantity
+) -> tuple[Quantity, Quantity, tuple[tuple[int, int, str], ...], list[str]]:
+    """Fixed pattern from the mean dark frame and the mean flat frame nearest to half of saturation.
+
+    The variance of the temporal noise that remains in a mean over n frames, its n-th part, is taken out.
+
+    Returns
+    -------
+    dsnu, prnu : Quantity
+        In DN and in %.
+    defects : tuple of (int, int, str)
+        Row, column and kind of hot and dead pixels.
+    warnings : list of str
+    """
+    dsnu, prnu, defects, textured = [], [], [], []
+    for plane, name in enumerate(dark.camera.names):
+        excess = dark.mean[plane] - ndimage.median_filter(dark.mean[plane], 5)
+        floor = LIMITS.hot_fraction * (dark.camera.white - dark.camera.black[plane])
+        hot = excess > max(LIMITS.hot * float(np.median(np.abs(excess))) / 0.6745, floor)
+        dsnu.append(_spread(dark.mean[plane], dark.variance[plane] / dark.count, ~hot))
+        flat = min(flats, key=lambda f: abs(float(f.strength[:, plane].mean()) - saturation.value[plane] / 2))
+        response, dead = _response(dark, flat, plane, hot)
+        if response[0] > LIMITS.textured:
+            textured.append(f"{name} {100 * response[0]:.0f} %")
+            response, dead = (np.nan, np.nan), np.zeros_like(hot)
+        prnu.append((100 * response[0], 100 * response[1]))
+        row, column = dark.camera.origins[plane]
+        defects += [
+            (int(r) * dark.camera.step + row, int(c) * dark.camera.step + column, kind)
+            for kind, marked in (("hot", hot), ("dead", dead & ~hot))
+            for r, c in np.argwhere(marked)
+        ]
+    warning = (
+        f"the target is textured or the lamp uneven (local variation {', '.join(textured)}): PRNU and dead pixels need "
+        "a plain white target out of focus"
+    )
+    figures = Quantity(*np.array(dsnu).T), Quantity(*np.array(prnu).T)
+    return *figures, tuple(sorted(defects)), [warning] if textured else []
+
+
+def _response(
+    dark: TemporalStack, flat: TemporalStack, plane: int, hot: BoolArray
+) -> tuple[tuple[float, float], BoolArray]:
+    """Relative spread of the response with its uncertainty, NaN where it cannot be determined; dead pixels."""
+    lit = LIMITS.lit_fraction * (flat.camera.white - flat.camera.black[plane])
+    signal = flat.mean[plane] - dark.mean[plane]
+    around = ndimage.median_filter(signal, 5)
+    usable = ~hot & ~flat.clipped[plane]
+    dead = usable & (signal < LIMITS.dead_fraction * around) & (around > lit)
+    level = float(signal[usable].mean()) if usable.any() else 0.0
+    if level < lit:
+        return (np.nan, np.nan), np.zeros_like(dead)
+    temporal = flat.variance[plane] / flat.count + dark.variance[plane] / dark.count
+    local = np.maximum(ndimage.uniform_filter(signal, 4 * LIMITS.window), 1e-3 * level)
+    return _spread(signal / local, temporal / local**2, usable & ~dead), dead
+
+
+def _spread(
+    mean: npt.NDArray[np.floating], temporal: npt.NDArray[np.floating], usable: BoolArray
+) -> tuple[float, float]:
+    """Spatial standard deviation about the neighbourhood's mean, temporal noise taken out, and its uncertainty."""
+    window = LIMITS.window
+    filled = np.where(usable, mean, np.median(mean[usable]))
+    smooth = ndimage.uniform_filter(filled, window, mode="nearest")
+    inner = (slice(window, -window), slice(window, -window))
+    square = ((filled - smooth) ** 2 / (1 - 1 / window**2) - temporal)[inner][usable[inner]]
+    variance = float(square.mean(dtype=np.float64))
+    # Neighbouring residuals share their mean; the plain standard error is good within a few per cent.
+    error = float(square.std(dtype=np.float64)) / np.sqrt(max(square.size, 1))
+    value = np.sqrt(max(variance, 0.0))
+    return float(value), float(error / (2 * value)) if variance > error else float(np.sqrt(error))
+
+
+def _checks(
+    dark: TemporalStack, flats: Sequence[TemporalStack], noise: CameraNoise, lines: Sequence[_Line], early: BoolArray
+) -> Iterator[Check]:
+    """What the user should know; the limits are chosen where no source is given, and decide on nothing else."""
+    planes, black = noise.planes, noise.black_level.value
+    for plane in np.flatnonzero(early).tolist():
+        knee = noise.saturation.value[plane]
+        yield warning(
+            f"plane {planes[plane]}: the variance breaks down at {knee:.0f} DN above black, below the white level: the "
+            f"sensor saturates there (white_level {knee + black[plane]:.0f} in the test)"
         )
+    if not any(clipped.any() for flat in flats for clipped in flat.clipped) and not early.any():
+        yield warning("no exposure reached saturation: the full well is that of the stated white level")
+    text = (
+        f"{100 * dark.zeros:.1f} % of the dark samples are 0: the black level is cut off and the read noise comes out "
+        "too small; raise the camera's black level (offset)"
+    )
+    yield warning(text, dark.zeros, above=0.005)  # of normal noise they lie 2.6 standard deviations above the cut
     drift = max(flat.drift for flat in flats)
-    if drift > DRIFT_WARNING:
-        warnings.append(f"the lamp's strength differs by {100 * drift:.1f} % within an exposure; it was taken out")
-    reach = max(line.reach for line in lines)
-    if reach < RANGE_WARNING * (dark.camera.white - min(dark.camera.black)):
-        warnings.append(
+    text = f"the lamp's strength differs by {100 * drift:.1f} % within an exposure; it was taken out"
+    yield warning(text, drift, above=0.02)
+    reach, range_ = max(line.reach for line in lines), dark.camera.white - min(dark.camera.black)
+    if reach < 0.2 * range_:  # the relative error of the gain grows as its inverse
+        yield warning(
             f"the brightest exposure reaches {reach:.0f} DN only: expose up to 70 % of the range for a good gain"
         )
-    for name, line in zip(dark.camera.names, lines, strict=True):
-        if line.scatter > SCATTER_WARNING or line.bend > CURVE_WARNING:
-            warnings.append(
-                f"plane {name}: the variance does not follow a line (departs by {100 * line.bend:.1f} %, scatters "
-                f"{line.scatter:.1f} times as much as noise): did the target move, or the lamp "
-                "flicker, between frames?"
-            )
-    linearity = noise.linearity_error.value
-    if (linearity > LINEARITY_WARNING).any():
-        worst = int(np.nanargmax(linearity))
-        warnings.append(
-            f"plane {dark.camera.names[worst]}: the linearity error is {linearity[worst]:.2f} %, the limit is "
-            f"{LINEARITY_WARNING:g} %: are the exposure times those of the frames, was the lamp steady? Unmixing "
-            "needs a linear camera"
+    for name, line in zip(planes, lines, strict=True):
+        text = (
+            f"plane {name}: the variance does not follow a line (departs by {100 * line.bend:.1f} %, scatters "
+            f"{line.scatter:.1f} times as much as noise): did the target move, or the lamp flicker, between frames?"
         )
-    if np.isnan(linearity).any() and any(flat.exposure is not None for flat in flats):
-        warnings.append(
+        yield warning(text, max(line.scatter / 1.5, line.bend / 0.03), above=1)
+    # lights that shine together are then the sum of the single ones as `check` allows (`verify.Limits.additivity`);
+    # EMVA 1288 defines the figure and sets no limit
+    error, limit = np.nan_to_num(noise.linearity_error.value), 0.5
+    worst = int(error.argmax())
+    text = (
+        f"plane {planes[worst]}: the linearity error is {error[worst]:.2f} %, the limit is {limit:g} %: are the "
+        "exposure times those of the frames, was the lamp steady? Unmixing needs a linear camera"
+    )
+    yield warning(text, error[worst], above=limit)
+    if np.isnan(noise.linearity_error.value).any() and any(flat.exposure is not None for flat in flats):
+        yield warning(
             "no linearity error for some plane: it takes three exposure times that reach 5 to 95 % of the range there"
         )
-    if np.ptp(noise.gain.value) > PLANES_WARNING * noise.gain.value.mean():
-        warnings.append("the gains of the planes differ: the camera applies digital gain per colour; the mean is used")
-    return warnings
+    text = "the gains of the planes differ: the camera applies digital gain per colour; the mean is used"
+    yield warning(text, np.ptp(noise.gain.value) / noise.gain.value.mean(), above=0.05)

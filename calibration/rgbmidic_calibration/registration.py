@@ -8,7 +8,7 @@ scale and a radial term (`rgbmidic.illumination.images`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,38 +17,50 @@ from scipy import ndimage
 
 from rgbmidic.correlation.solution import NodeStatus, Solution
 from rgbmidic.errors import CalibrationError, RgbmidicError
+from rgbmidic.illumination.checks import Check, reported, warning
 from rgbmidic.illumination.images import PARAMETERS, Registration, frame_geometry, registration_basis
 from rgbmidic.pipeline import correlate
+from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic_calibration.captures import TemporalStack, same_camera
 
-LOCAL = 8.0
-"""Standard deviation (px) of the neighbourhood whose mean a plane is divided by: several speckles."""
 
-CLEAR = 15.0
-"""Signal over noise of the mean frame below which a plane is not used for the light. Measured on the virtual sphere's
-target (256 px, three lights, no lateral colour): errors of .004 and .005 px from 10 to 20, of .010 and .016 px at 30,
-where the weaker planes drop out, .002 px at 5, where the stated uncertainty is the same."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegistrationConstants:
+    """Constants of `estimate_registration`.
 
-BORDER = 8
-"""Pixels at the frame's edge that are left out: the neighbourhood of `LOCAL` is cut off there."""
+    Attributes
+    ----------
+    local
+        Standard deviation (px) of the neighbourhood whose mean a plane is divided by: several speckles.
+    clear
+        Signal over noise of the mean frame below which a plane is not used for the light. Measured on the virtual
+        sphere's target (256 px, three lights, no lateral colour): errors of .004 and .005 px from 10 to 20, of .010 and
+        .016 px at 30, where the weaker planes drop out, .002 px at 5, where the stated uncertainty is the same.
+    border
+        Pixels at the frame's edge that are left out: the neighbourhood of `local` is cut off there.
+    outlier
+        Standard deviations beyond which a node is left out of the fit, as a block of the crosstalk.
+    measured
+        Fraction of the nodes that must be measured: .99 to 1 on the virtual sphere's target, nearly none without a
+        match.
+    residual
+        Residual of the fit (px rms) above which the target moved: ten times the motion that gives a warning; at rest
+        .02 to .03 px.
+    least_samples
+        Samples at least for the fit of the motion, with four unknowns: a plane of 32 x 32 has as many.
+    """
 
-ELEMENT = 25.0
-"""Side of the elements of the DIC between lights, px: the paper's (section 2.2)."""
-OUTLIER = 5.0
-"""Standard deviations beyond which a node is left out of the fit (`rgbmidic_calibration.ratio.OUTLIER`)."""
-MEASURED_LIMIT = 0.5
-"""Fraction of the nodes that must be measured: .99 to 1 on the virtual sphere's target, nearly none without a match."""
-RESIDUAL_LIMIT = 0.3
-"""Residual of the fit (px rms) above which the target moved: ten times `MOTION_WARNING`; at rest .02 to .03 px."""
-MISFIT_WARNING = 0.05
-"""Smooth misfit (px rms), of the order of what `check` allows (`rgbmidic_calibration.verify.Limits.registration`)."""
-MOTION_WARNING = 0.03
-"""Motion from capture to capture (px): what `check` allows (`rgbmidic_calibration.verify.Limits.registration`)."""
-MIN_SAMPLES = 1000
-"""Samples at least for the fit of the motion, with four unknowns: a plane of 32 x 32 has as many."""
-SATURATED_LIMIT = 0.5
-"""Fraction of a picture that may be saturated: what is left for `MEASURED_LIMIT`."""
+    local: float = 8.0
+    clear: float = 15.0
+    border: int = 8
+    outlier: float = 5.0
+    measured: float = 0.5
+    residual: float = 0.3
+    least_samples: int = 1000
+
+
+LIMITS = RegistrationConstants()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,27 +125,35 @@ def light_picture(stack: TemporalStack, dark: TemporalStack | None = None) -> Fl
         raise CalibrationError(f"the light gives {max(levels):.1f} DN above dark only: was the lamp on?")
     if stack.camera.step == 1:
         brightest = int(np.argmax(levels))
-        return _relative(signals[brightest], stack.clipped[brightest], LOCAL)
+        return _relative(signals[brightest], stack.clipped[brightest], LIMITS.local)
+
+    def clear(plane: int) -> bool:
+        """Whether a plane exceeds its noise; of a single frame, a tenth of the brightest plane."""
+        known = [one for one in (stack, dark) if one is not None and (one is stack or one.count > 1)]
+        noise = sum(float(one.variance[plane].mean(dtype=np.float64)) / one.count for one in known)
+        faint = stack.count < 2 and levels[plane] < 0.1 * max(levels)
+        return not faint and levels[plane] > LIMITS.clear * float(np.sqrt(noise))
+
     picture = np.full(stack.camera.shape, np.nan, dtype=np.float32)
     used = np.zeros_like(picture)
     for plane, (signal, (row, column)) in enumerate(zip(signals, stack.camera.origins, strict=True)):
-        if _clear(stack, dark, plane, levels):
+        if clear(plane):
             place = (slice(row, 2 * signal.shape[0], 2), slice(column, 2 * signal.shape[1], 2))
-            picture[place] = _relative(signal, stack.clipped[plane], LOCAL / 2)
+            picture[place] = _relative(signal, stack.clipped[plane], LIMITS.local / 2)
             used[place] = 1
     if not used.any():
         raise CalibrationError("no colour plane stands out of its noise: do all captures show the same scene at rest?")
-    return _filled(picture, used)
-
-
-def _clear(stack: TemporalStack, dark: TemporalStack | None, plane: int, levels: Sequence[float]) -> bool:
-    """Whether a plane exceeds its noise by `CLEAR`; of a single frame, a tenth of the brightest plane."""
-    if levels[plane] < 0.1 * max(levels) and stack.count < 2:
-        return False
-    noise = float(stack.variance[plane].mean(dtype=np.float64)) / stack.count
-    if dark is not None and dark.count > 1:
-        noise += float(dark.variance[plane].mean(dtype=np.float64)) / dark.count
-    return levels[plane] > CLEAR * float(np.sqrt(noise))
+    if used.all():
+        return picture
+    # Pixels of planes not used: the mean of their neighbours, symmetric so that nothing shifts. A neighbourhood that
+    # lost a saturated sample is not symmetric any more.
+    known = used * np.isfinite(picture)
+    kernel = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], dtype=np.float32)
+    total, count, expected = (
+        ndimage.convolve(values, kernel) for values in (np.nan_to_num(picture) * known, known, used)
+    )
+    mean = np.where(count == expected, total / np.maximum(count, 1), np.nan)
+    return np.where(used > 0, picture, mean).astype(np.float32)
 
 
 def _relative(signal: npt.NDArray[np.floating], clipped: BoolArray, sigma: float) -> FloatImage:
@@ -145,26 +165,12 @@ def _relative(signal: npt.NDArray[np.floating], clipped: BoolArray, sigma: float
     return np.where(clipped, np.nan, signal / np.maximum(mean, floor)).astype(np.float32)
 
 
-def _filled(picture: FloatImage, used: FloatImage) -> FloatImage:
-    """Pixels of planes not used: the mean of their neighbours, symmetric so that nothing shifts."""
-    if used.all():
-        return picture
-    known = used * np.isfinite(picture)
-    kernel = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], dtype=np.float32)
-    total = ndimage.convolve(np.nan_to_num(picture) * known, kernel)
-    count = ndimage.convolve(known, kernel)
-    expected = ndimage.convolve(used, kernel)
-    # A neighbourhood that lost a saturated sample is not symmetric any more.
-    mean = np.where(count == expected, total / np.maximum(count, 1), np.nan)
-    return np.where(used > 0, picture, mean).astype(np.float32)
-
-
 def estimate_registration(
     lights: Mapping[str, TemporalStack],
     dark: TemporalStack | None = None,
     *,
     region: Sequence[float] | None = None,
-    element_size: float = ELEMENT,
+    element_size: float = ELEMENT_SIZE,
 ) -> RegistrationEstimate:
     """Registration of every light against the first.
 
@@ -177,7 +183,7 @@ def estimate_registration(
     region
         Rectangle (x0, y0, x1, y1) in px where the target is; None: the whole frame.
     element_size
-        Side of the elements of the DIC, px.
+        Side of the elements of the DIC, px: by default the paper's (section 2.2).
 
     Raises
     ------
@@ -195,7 +201,7 @@ def estimate_registration(
             pictures[name] = light_picture(stack, dark)
         except CalibrationError as error:
             raise CalibrationError(f"light {name}: {error}") from None
-        if (saturated := float(np.isnan(pictures[name]).mean())) > SATURATED_LIMIT:
+        if (saturated := float(np.isnan(pictures[name]).mean())) > 1 - LIMITS.measured:
             raise CalibrationError(
                 f"light {name}: {100 * saturated:.0f} % of the picture is saturated; shorten the exposure"
             )
@@ -207,29 +213,28 @@ def estimate_registration(
     for index, name in enumerate(names[1:], start=1):
         pair = {light: pictures[light] for light in (names[0], name)}
         solution = _match(pair, region, element_size)
-        parameters[index], covariance[index], match = _fit(name, solution, centre, radius, element_size)
+        parameters[index], covariance[index], match = _fit(name, solution, (centre, radius), element_size)
         covariance[index, :2, :2] += np.diag(motion[names[0]] + motion[name])
         matches.append(match)
     registration = Registration(
         lights=names, parameters=parameters, centre=centre, radius=radius, covariance=covariance
     )
-    return RegistrationEstimate(
-        registration=registration, matches=tuple(matches), warnings=tuple(_warnings(lights, dark, motion, matches))
-    )
+    warnings = tuple(check.text for check in reported(_checks(lights, dark, motion, matches)))
+    return RegistrationEstimate(registration=registration, matches=tuple(matches), warnings=warnings)
 
 
 def _match(pictures: Mapping[str, FloatImage], region: Sequence[float] | None, element_size: float) -> Solution:
     """DIC between the pictures of two lights."""
     reference, other = pictures.values()
-    height, width = reference.shape
-    inside = region if region is not None else (BORDER, BORDER, width - 1 - BORDER, height - 1 - BORDER)
+    (height, width), edge = reference.shape, LIMITS.border
+    inside = region if region is not None else (edge, edge, width - 1 - edge, height - 1 - edge)
     pair = f"the pictures of lights {' and '.join(pictures)}"
     try:
         solution = correlate(reference, other, region=inside, element_size=element_size)
     except RgbmidicError as error:
         raise CalibrationError(f"{pair} cannot be compared: {error}") from None
     measured = float((solution.node_status == NodeStatus.MEASURED).mean())
-    if measured < MEASURED_LIMIT:
+    if measured < LIMITS.measured:
         raise CalibrationError(
             f"{pair} match in {100 * measured:.0f} % of the field only: is the target speckled and at rest, sharp "
             "under both lights, and not saturated?"
@@ -238,11 +243,11 @@ def _match(pictures: Mapping[str, FloatImage], region: Sequence[float] | None, e
 
 
 def _fit(
-    name: str, solution: Solution, centre: tuple[float, float], radius: float, element_size: float
+    name: str, solution: Solution, frame: tuple[tuple[float, float], float], element_size: float
 ) -> tuple[FloatArray, FloatArray, LightMatch]:
     """Parameters (5,), covariance (5, 5) and residuals: weighted least squares without outliers, cluster sandwich."""
     value = solution.displacement
-    basis = registration_basis(solution.nodes, centre, radius)
+    basis = registration_basis(solution.nodes, *frame)
     weight = np.nan_to_num(1 / solution.displacement_std**2, posinf=0.0)
     used = good = np.asarray((np.isfinite(value) & (weight > 0)).all(axis=1))
     for _ in range(10):
@@ -251,7 +256,7 @@ def _fit(
         parameters = inverse @ np.einsum("ndp,nd->p", scaled, np.nan_to_num(value))
         residual = value - basis @ parameters
         size = np.linalg.norm(residual, axis=1)
-        limit = OUTLIER * np.median(size[good]) / 1.1774
+        limit = LIMITS.outlier * np.median(size[good]) / 1.1774
         update = good & (np.nan_to_num(size, nan=np.inf) <= limit)
         if (update == used).all():
             break
@@ -260,7 +265,7 @@ def _fit(
     sums = _cell_sums(score, solution.nodes, 2 * element_size)
     covariance = inverse @ (sums.T @ sums) @ inverse * len(sums) / max(len(sums) - 1, 1)
     match = LightMatch(name=name, nodes=solution.nodes, residual=residual, used=used)
-    if match.rms > RESIDUAL_LIMIT:
+    if match.rms > LIMITS.residual:
         raise CalibrationError(
             f"the picture of light {name} departs from a shift, rotation and magnification of the first light's by "
             f"{match.rms:.2f} px rms: did the target deform or move, or is it another target?"
@@ -274,30 +279,33 @@ def _cell_sums(values: FloatArray, nodes: FloatArray, side: float) -> FloatArray
     return np.stack([np.bincount(cell.ravel(), weights=column) for column in values.T], axis=1)
 
 
-def _warnings(
+def _checks(
     lights: Mapping[str, TemporalStack],
     dark: TemporalStack | None,
     motion: Mapping[str, FloatArray],
     matches: Sequence[LightMatch],
-) -> list[str]:
-    warnings = [] if dark else ["no dark frames: the sensor's own pattern stays in the pictures"]
+) -> Iterator[Check]:
+    """What the user should know, from about what `check` allows (`rgbmidic_calibration.verify.Limits`)."""
+    if dark is None:
+        yield warning("no dark frames: the sensor's own pattern stays in the pictures")
     for name, stack in lights.items():
-        if (moved := float(np.sqrt(motion[name].max() * stack.count))) > MOTION_WARNING:
-            warnings.append(
-                f"light {name}: the picture moves by {moved:.2f} px (standard deviation) from capture to capture: "
-                "something vibrates or drifts; the stated uncertainty of the shift covers it"
-            )
+        moved = float(np.sqrt(motion[name].max() * stack.count))
+        text = (
+            f"light {name}: the picture moves by {moved:.2f} px (standard deviation) from capture to capture: "
+            "something vibrates or drifts; the stated uncertainty of the shift covers it"
+        )
+        yield warning(text, moved, above=0.03)
     for match in matches:  # what the model leaves, over cells of 4 x 4 nodes: noise is small there, a misfit is not
         side = 4 * max(float(np.median(np.diff(np.unique(match.nodes[:, 0].round(2))))), 1.0)
         residual = match.residual[match.used]
         sums = _cell_sums(np.column_stack([residual, np.ones(len(residual))]), match.nodes[match.used], side)
         means = (sums[:, :2] / sums[:, 2:])[sums[:, 2] >= 8]
-        if means.size and (smooth := float(np.sqrt((means**2).mean()))) > MISFIT_WARNING:
-            warnings.append(
-                f"light {match.name}: a smooth misfit of {smooth:.2f} px rms is left: the target was not at rest, or "
-                "the lens needs more than shift, rotation, scale and radial term"
-            )
-    return warnings
+        smooth = float(np.sqrt((means**2).mean())) if means.size else 0.0
+        text = (
+            f"light {match.name}: a smooth misfit of {smooth:.2f} px rms is left: the target was not at rest, or the "
+            "lens needs more than shift, rotation, scale and radial term"
+        )
+        yield warning(text, smooth, above=0.05)
 
 
 def jitter(stack: TemporalStack, picture: FloatImage) -> FloatArray:
@@ -318,13 +326,13 @@ def jitter(stack: TemporalStack, picture: FloatImage) -> FloatArray:
     plane = int(stack.strength.mean(axis=0).argmax())
     mean = stack.mean[plane].astype(np.float64)
     (row, column), step = stack.camera.origins[plane], stack.camera.step
-    local = ndimage.gaussian_filter(mean, LOCAL / step)
+    local = ndimage.gaussian_filter(mean, LIMITS.local / step)
     place = (slice(row, row + step * mean.shape[0], step), slice(column, None, step))
     stencil = np.array([1, -8, 0, 8, -1]) / 12
     slopes = [ndimage.correlate1d(picture, stencil, axis=axis)[place][:, : mean.shape[1]] * local for axis in (1, 0)]
     columns = np.stack([np.ones_like(mean), mean, slopes[0] ** 2, slopes[1] ** 2], axis=-1)
     use = np.isfinite(columns).all(axis=-1) & ~stack.clipped[plane]
-    if use.sum() < MIN_SAMPLES:
+    if use.sum() < LIMITS.least_samples:
         return np.full(2, np.nan)
     weight = 1 / np.maximum(mean[use], 0.02 * float(mean[use].mean()))
     moments = (columns[use] * weight[:, None]).T

@@ -18,20 +18,6 @@ from rgbmidic_calibration.captures import CaptureFiles
 
 _KINDS = ("chessboard", "charuco", "circles", "acircles")
 _FORM = re.compile(rf"({'|'.join(_KINDS)}):(\d+)x(\d+):([\d.]+)mm(?::([\d.]+)mm)?(?::(DICT_\w+))?")
-CLIPPED = 0.05
-"""Fraction of saturated samples within the target above which a photograph is refused. In OpenCV's own pictures up to
-2.9 % lie in white squares and leave the residual of the corners as it is (benchmarks/camera.py); of a board that is
-overexposed it is half."""
-BLURRED = 0.25
-"""Blur of the target's edges (10 to 90 %), over the square's side, above which a photograph is refused: beyond it the
-blur of one edge reaches the next corner's window (chosen)."""
-_WINDOW, _LEAST_WINDOW = 15.0, 4
-"""Largest and smallest half width (px) of the window around a corner: beyond 15 px nothing is gained, below 4 px there
-are hardly more samples than unknowns."""
-_TURNS, _STILL = 12, 1e-4
-"""Most Gauss-Newton iterations of a corner, and the step (px) below which none is needed: after 8 (measured)."""
-_LARGEST_CHANGE = np.array([1.0, 1.0, 0.2, 0.2, 0.5, np.inf, np.inf])
-"""Largest step of position (px), angles, and logarithm of the width; the grey levels are linear."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -159,8 +145,9 @@ def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, r
         return np.asarray(values[:, :2] / values[:, 2:])
 
     edges = [seen(points + step) - seen(points - step) for step in reach * np.eye(2)]
-    half = int(min(_WINDOW, np.min([np.linalg.norm(edge, axis=1).min() for edge in edges]) / (2 * np.sqrt(2))))
-    if half < _LEAST_WINDOW:
+    # half width (px) of the window: beyond 15 nothing is gained, below 4 there are hardly more samples than unknowns
+    half = int(min(15, np.min([np.linalg.norm(edge, axis=1).min() for edge in edges]) / (2 * np.sqrt(2))))
+    if half < 4:
         return pixels
     y, x = (part.ravel() for part in np.mgrid[-half : half + 1, -half : half + 1])
     corner = np.round(pixels).astype(int)
@@ -194,15 +181,16 @@ def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, r
     state = np.column_stack([pixels - corner, *angles, np.zeros(len(pixels)), (low + high) / 2, (high - low) / 2])
     signs = np.einsum("mp,mp->m", model(state)[0] - state[:, 5:6], values - values.mean(axis=1, keepdims=True))
     state[:, 6] *= np.where(signs < 0, -1, 1)
-    for _ in range(_TURNS):
+    largest_change = np.array([1.0, 1.0, 0.2, 0.2, 0.5, np.inf, np.inf])  # px, angles, log of the width; grey levels
+    for _ in range(12):  # 8 are needed (measured)
         levels, slopes = model(state)
         normal = slopes.transpose(0, 2, 1) @ slopes
         scale = 1 / np.sqrt(np.maximum(np.einsum("maa->ma", normal), 1e-12))
         normal = normal * scale[:, :, None] * scale[:, None] + 1e-9 * np.eye(7)
         right_side = np.einsum("mpa,mp->ma", slopes, values - levels) * scale
         change = np.linalg.solve(normal, right_side[..., None])[..., 0] * scale
-        state += np.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE)
-        if not (np.abs(change[:, :2]) > _STILL).any():
+        state += np.clip(change, -largest_change, largest_change)
+        if not (np.abs(change[:, :2]) > 1e-4).any():
             break
     found = corner + state[:, :2]
     sure = inside & (np.abs(found - pixels) < half / 2).all(axis=1) & np.isfinite(state).all(axis=1)
@@ -273,25 +261,28 @@ def find_view(frame: Mosaic | ChannelFrame, target: Target, name: str) -> View:
     points, pixels = found
     inside = np.zeros(image.shape, dtype=np.uint8)
     cv2.fillConvexPoly(inside, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
-    if (fraction := float(clipped[inside > 0].mean())) > CLIPPED:
+    # in OpenCV's own pictures up to 2.9 % lie in white squares and leave the residual of the corners as it is
+    # (benchmarks/camera.py); of a board that is overexposed it is half
+    if (fraction := float(clipped[inside > 0].mean())) > (limit := 0.05):
         raise CalibrationError(
-            f"{name}: {fraction:.1%} of the samples within the target are saturated, at most {CLIPPED:.1%} may be: "
+            f"{name}: {fraction:.1%} of the samples within the target are saturated, at most {limit:.1%} may be: "
             "take away light or glare"
         )
     if target.kind == "chessboard":
         sharpness = cv2.estimateChessboardSharpness(grey, (target.columns, target.rows), pixels.astype(np.float32))[0]
         edge = float(np.ravel(np.asarray(sharpness))[0])
         side = float(np.linalg.norm(np.diff(pixels[: target.columns], axis=0), axis=1).mean())
-        if not edge <= BLURRED * side:
+        if not edge <= (limit := 0.25) * side:  # else the blur of one edge reaches the next corner's window (chosen)
             raise CalibrationError(
-                f"{name}: the edges of the squares are {edge:.1f} px wide, at most {BLURRED:g} of their side of "
+                f"{name}: the edges of the squares are {edge:.1f} px wide, at most {limit:g} of their side of "
                 f"{side:.0f} px may be: focus, or hold the target still"
             )
+    radius = 0.0
     if target.kind in ("chessboard", "charuco"):
         reach = target.spacing if target.kind == "chessboard" else (target.spacing - target.marker) / 2
         pixels = refined_corners(image, points, pixels, 0.8 * reach)
-        return View(name=name, points=points, pixels=pixels, shape=(image.shape[0], image.shape[1]))
-    radius = _radius(grey, points, pixels)
+    else:
+        radius = _radius(grey, points, pixels)
     return View(name=name, points=points, pixels=pixels, shape=(image.shape[0], image.shape[1]), radius=radius)
 
 

@@ -5,7 +5,7 @@ The sub-command `check`: the verdict on a calibration file, from captures that w
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -13,17 +13,22 @@ import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.checks import Check
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
 from rgbmidic.typing import FloatArray
-from rgbmidic_calibration.captures import TILE, Captures, TemporalStack, same_camera, stack_frames, tile_means
-from rgbmidic_calibration.ratio import BlockMeans, block_centres, block_means
+from rgbmidic_calibration.captures import (
+    TILE,
+    BlockMeans,
+    Captures,
+    TemporalStack,
+    block_centres,
+    block_means,
+    same_camera,
+    tile_means,
+)
 from rgbmidic_calibration.registration import estimate_registration
-
-SAME_EXPOSURE = 0.05
-"""Drift of the captures (`TemporalStack.drift`) up to which they count as one exposure; more is a lamp that drifts or
-an exposure series (`rgbmidic_calibration.crosstalk.INTENSITY_WARNING`)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,20 +57,9 @@ class Limits:
     noise: float = 10.0
 
 
-@dataclass(frozen=True, slots=True)
-class CheckItem:
-    """One line of the verdict: a figure, its uncertainty and its limit, all in `unit`."""
-
-    name: str
-    value: float
-    std: float
-    limit: float
-    unit: str
-
-    @property
-    def passed(self) -> bool:
-        """The figure keeps its limit."""
-        return bool(abs(self.value) <= self.limit)
+def _line(name: str, value: float, std: float, limit: float, unit: str = "%") -> Check:
+    """A line of the verdict."""
+    return Check(name, "", value=value, limit=limit, std=std, unit=unit)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,11 +81,10 @@ class Leakage:
     mean: FloatArray
     std: FloatArray
 
-    def items(self, limit: float) -> list[CheckItem]:
+    def items(self, limit: float) -> list[Check]:
         """One line per pair of lights."""
-        mean, std = 100 * self.mean, 100 * self.std
         return [
-            CheckItem(f"{alone} left in {light}", float(mean[row, column]), float(std[row, column]), limit, "%")
+            _line(f"{alone} left in {light}", 100 * self.mean[row, column], 100 * self.std[row, column], limit)
             for column, alone in enumerate(self.alone)
             for row, light in enumerate(self.lights)
             if light != alone
@@ -122,33 +115,26 @@ def leakage(
             f"the calibration knows the lights {', '.join(crosstalk.lights)}, not {', '.join(unknown)}"
         )
     level = np.mean([frame.channels for frame in dark], axis=0) if dark else np.float64(0)
-    columns = [_unmixed(crosstalk, name, captures, level) for name, captures in lights.items()]
-    mean, std = (np.stack(parts, axis=1) for parts in zip(*columns, strict=True))
+    first = next(iter(lights.values()))[0]
+    unmixing = crosstalk.unmixing_at(block_centres(first.camera.shape, first.block))
+    mean, std = np.empty((2, len(crosstalk.lights), len(lights)))
+    for column, (name, captures) in enumerate(lights.items()):
+        clear = ~np.any([frame.saturated for frame in captures], axis=0)
+        if clear.sum() < 4:
+            raise CalibrationError(f"light {name}: nearly every block holds saturated samples; shorten the exposure")
+        channels = np.mean([frame.channels for frame in captures], axis=0) - level
+        values = np.einsum("rskc,crs->krs", unmixing, channels)[:, clear]
+        lit, brightest = crosstalk.lights.index(name), int(values.sum(axis=1).argmax())
+        total = float(values[lit].sum())
+        if total <= 0 or brightest != lit:
+            raise CalibrationError(
+                f"the captures of light {name} show most light in {crosstalk.lights[brightest]} after unmixing: are "
+                "the captures swapped, was the lamp off, or is the calibration of another camera?"
+            )
+        mean[:, column] = values.sum(axis=1) / total
+        scatter = values - mean[:, column, None] * values[lit]
+        std[:, column] = np.sqrt((scatter**2).sum(axis=1)) / total
     return Leakage(lights=crosstalk.lights, alone=tuple(lights), mean=mean, std=std)
-
-
-def _unmixed(
-    crosstalk: Crosstalk, name: str, captures: Sequence[BlockMeans], level: npt.NDArray[np.floating] | np.float64
-) -> tuple[FloatArray, FloatArray]:
-    """Ratios (k,) of every light's sum to that of light `name`, and their uncertainty."""
-    first = captures[0]
-    clear = ~np.any([frame.saturated for frame in captures], axis=0)
-    if clear.sum() < 4:
-        raise CalibrationError(f"light {name}: nearly every block holds saturated samples; shorten the exposure")
-    channels = np.mean([frame.channels for frame in captures], axis=0) - level
-    unmixing = crosstalk.unmixing_at(block_centres(first.shape, first.block))
-    values = np.einsum("rskc,crs->krs", unmixing, channels)[:, clear]
-    lit = crosstalk.lights.index(name)
-    total = float(values[lit].sum())
-    brightest = int(values.sum(axis=1).argmax())
-    if total <= 0 or brightest != lit:
-        raise CalibrationError(
-            f"the captures of light {name} show most light in {crosstalk.lights[brightest]} after unmixing: are the "
-            "captures swapped, was the lamp off, or is the calibration of another camera?"
-        )
-    ratio = values.sum(axis=1) / total
-    scatter = values - ratio[:, None] * values[lit]
-    return ratio, np.sqrt((scatter**2).sum(axis=1)) / total
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,14 +166,16 @@ class Additivity:
     change_std: FloatArray
     left: float
 
-    def items(self, limits: Limits) -> list[CheckItem]:
+    def items(self, limits: Limits) -> list[Check]:
         """Lines of the verdict."""
         together = "+".join(self.lights)
-        items = [CheckItem(f"{together} not the sum", 100 * self.left, 0.0, limits.additivity, "%")]
-        for name, *figure in zip(self.lights, self.change.tolist(), self.change_std.tolist(), strict=True):
-            change, std = (100 * value for value in figure)
-            items.append(CheckItem(f"strength of {name} in {together}", change, std, limits.strength, "%"))
-        return items
+        return [
+            _line(f"{together} not the sum", 100 * self.left, 0.0, limits.additivity),
+            *(
+                _line(f"strength of {name} in {together}", 100 * change, 100 * std, limits.strength)
+                for name, change, std in zip(self.lights, self.change, self.change_std, strict=True)
+            ),
+        ]
 
 
 def additivity(
@@ -214,20 +202,28 @@ def additivity(
         Camera noise; None: from the captures where each group has two or more, else rounding to grey levels alone.
     """
     same_camera([together, *singles.values(), *([dark] if dark else [])])
-    images = [_difference(together, singles, dark, plane, noise) for plane in range(len(together.camera.names))]
-    samples = np.concatenate([image[:, np.isfinite(image[0])] for image in images], axis=1)
+    level = dark.mean if dark else np.float32(0)
+    lights = [stack.mean - level for stack in singles.values()]
+    stacks = [together, *singles.values()]
+    variance = np.sum([_variance(stack, noise) for stack in stacks], axis=0)
+    if dark:
+        variance = variance + (len(lights) - 1) ** 2 * _variance(dark, noise)
+    # difference, its noise variance, and every light's image, NaN where saturated
+    rows = np.stack([together.mean - level - np.sum(lights, axis=0), variance, *lights]).astype(np.float64)
+    rows[:, np.any([stack.clipped for stack in stacks], axis=0)] = np.nan
+    samples = rows[:, np.isfinite(rows[0])]
     if samples.shape[1] < TILE**2:
         raise CalibrationError("nearly every sample is saturated in one of the captures; shorten the exposure")
-    tiles = np.concatenate([tile_means(image) for image in images], axis=1)
+    tiles = tile_means(rows).reshape(len(rows), -1)
     tiles = tiles[:, np.isfinite(tiles[0])]  # without saturated samples
-    difference, variance, lights = tiles[0], tiles[1] / min(TILE, *images[0].shape[1:]) ** 2, tiles[2:]
-    design = np.concatenate([np.ones((1, len(difference))), lights]).T
+    difference, variance, of_lights = tiles[0], tiles[1] / min(TILE, *rows.shape[2:]) ** 2, tiles[2:]
+    design = np.concatenate([np.ones((1, len(difference))), of_lights]).T
     inverse = np.linalg.pinv(design.T @ design)
     solution = inverse @ (design.T @ difference)
     residual = difference - design @ solution
     score = design * residual[:, None]
     std = np.sqrt(np.diag(inverse @ (score.T @ score) @ inverse))
-    signal = float(lights.sum(axis=0).mean())
+    signal = float(of_lights.sum(axis=0).mean())
     left = max(float((residual**2).mean() - variance.mean()), 0.0)
     return Additivity(
         lights=tuple(singles),
@@ -241,32 +237,11 @@ def additivity(
     )
 
 
-def _difference(
-    together: TemporalStack,
-    singles: Mapping[str, TemporalStack],
-    dark: TemporalStack | None,
-    plane: int,
-    noise: NoiseModel | None,
-) -> FloatArray:
-    """Difference, its noise variance, and every light's image, (2 + k, h, w) with NaN where saturated, of one plane."""
-    level = dark.mean[plane] if dark else 0.0
-    lights = [stack.mean[plane] - level for stack in singles.values()]
-    stacks = [together, *singles.values()]
-    variance = np.sum([_variance(stack, plane, noise) for stack in stacks], axis=0)
-    if dark:
-        variance = variance + (len(lights) - 1) ** 2 * _variance(dark, plane, noise)
-    rows = np.stack([together.mean[plane] - level - np.sum(lights, axis=0), variance, *lights]).astype(np.float64)
-    rows[:, np.any([stack.clipped[plane] for stack in stacks], axis=0)] = np.nan
-    return rows
-
-
-def _variance(stack: TemporalStack, plane: int, noise: NoiseModel | None) -> npt.NDArray[np.floating]:
+def _variance(stack: TemporalStack, noise: NoiseModel | None) -> npt.NDArray[np.floating]:
     """Noise variance of the mean over the frames: from the noise model, from the frames themselves, or of rounding."""
     if noise is not None:
-        return np.asarray(noise.variance(stack.mean[plane]) / stack.count)
-    if stack.count > 1:
-        return np.asarray(stack.variance[plane] / stack.count)
-    return np.full(stack.mean[plane].shape, QUANTISATION)
+        return np.asarray(noise.variance(stack.mean) / stack.count)
+    return stack.variance / stack.count if stack.count > 1 else np.full(stack.mean.shape, QUANTISATION)
 
 
 def registration_left(
@@ -308,8 +283,11 @@ def registration_left(
     return [(name, *figures) for name, figures in list(zip(ordered, worst, strict=True))[1:]]
 
 
-def noise_ratio(stack: TemporalStack, noise: NoiseModel) -> tuple[float, float]:
+def noise_ratio(stack: TemporalStack, noise: NoiseModel, same_exposure: float = 0.05) -> tuple[float, float]:
     """Observed over predicted noise of captures at rest (standard deviations), and its uncertainty.
+
+    Captures count as one exposure up to the drift `same_exposure` (`TemporalStack.drift`); more is a lamp that drifts
+    or an exposure series, as of the warning in `rgbmidic_calibration.crosstalk.matrix_checks`.
 
     Raises
     ------
@@ -318,14 +296,14 @@ def noise_ratio(stack: TemporalStack, noise: NoiseModel) -> tuple[float, float]:
     """
     if stack.count < 2:
         raise CalibrationError("noise needs at least two captures of the same scene")
-    if stack.drift > SAME_EXPOSURE:
+    if stack.drift > same_exposure:
         raise CalibrationError("the captures of a light have different exposures")
-    observed = predicted = 0.0
-    samples = 0
-    for mean, variance, clipped in zip(stack.mean, stack.variance, stack.clipped, strict=True):
-        observed += float(variance[~clipped].sum(dtype=np.float64))
-        predicted += float(noise.variance(mean[~clipped]).sum(dtype=np.float64))
-        samples += int((~clipped).sum())
+    clear = ~stack.clipped
+    observed, predicted = (
+        sum(float(plane[use].sum(dtype=np.float64)) for plane, use in zip(values, clear, strict=True))
+        for values in (stack.variance, noise.variance(stack.mean))
+    )
+    samples = int(clear.sum())
     ratio = float(np.sqrt(observed / max(predicted, 1e-12)))
     return ratio, ratio / np.sqrt(2 * max(samples, 1) * (stack.count - 1))
 
@@ -334,7 +312,7 @@ def noise_ratio(stack: TemporalStack, noise: NoiseModel) -> tuple[float, float]:
 class Verdict:
     """Result of `check_calibration`: lines with limits, sums of lights, what was not checked, warnings."""
 
-    items: tuple[CheckItem, ...]
+    items: tuple[Check, ...]
     sums: tuple[Additivity, ...]
     skipped: tuple[str, ...]
     warnings: tuple[str, ...]
@@ -376,37 +354,42 @@ def check_calibration(
     calibration = calibration.cropped(None, next(iter(captures.lights.values())).series.shape)
     if calibration.crosstalk is None:
         raise CalibrationError("the calibration has no crosstalk to check; make it with rgbmidic-calibrate crosstalk")
-    warnings, skipped = _reused(calibration, captures), []
+    known = {
+        entry.get("sha256")
+        for origin in calibration.provenance.values()
+        if isinstance(origin, Mapping)
+        for entry in origin.get("inputs", ())
+    }
+    lit = (*captures.lights.values(), *captures.together.values())
+    reused = [path for group in lit for path, fingerprint in group.fingerprints.items() if fingerprint in known]
+    made = f"{len(reused)} of these captures made the calibration ({[*reused, ''][0]} ...): they always agree"
+    warnings = [f"{made}; a check needs others"] if reused else []
     stacks, dark = captures.stacks()
     means = {name: [block_means(frame) for frame in files.frames()] for name, files in captures.lights.items()}
     dark_means = [block_means(frame) for frame in captures.dark.frames()] if captures.dark else []
-    items = leakage(calibration.crosstalk, means, dark_means).items(limits.leakage)
+    items, skipped = leakage(calibration.crosstalk, means, dark_means).items(limits.leakage), []
     sums = []
     for names, files in captures.together.items():
-        together = stack_frames(files.frames(), name=files.role)
         singles = {name: stacks[name] for name in names.split("+")}
-        sums.append(additivity(together, singles, dark, noise=calibration.noise))
+        sums.append(additivity(files.stack(), singles, dark, noise=calibration.noise))
     items += [item for total in sums for item in total.items(limits)]
 
-    def noise() -> list[CheckItem]:
+    def noise() -> Iterator[Check]:
         if calibration.noise is None:
             raise CalibrationError("the calibration has no noise section")
-        ratios = {name: noise_ratio(stack, calibration.noise) for name, stack in stacks.items()}
-        return [
-            CheckItem(f"noise of {name} against prediction", 100 * (ratio - 1), 100 * std, limits.noise, "%")
-            for name, (ratio, std) in ratios.items()
-        ]
+        for name, stack in stacks.items():
+            ratio, std = noise_ratio(stack, calibration.noise)
+            yield _line(f"noise of {name} against prediction", 100 * (ratio - 1), 100 * std, limits.noise)
 
-    def registration() -> list[CheckItem]:
+    def registration() -> Iterator[Check]:
         if calibration.registration is None:
             raise CalibrationError("the calibration has no registration section")
-        left = registration_left(calibration.registration, stacks, dark, region=region)
-        limit = limits.registration
-        return [CheckItem(f"registration of {name}", value, std, limit, "px") for name, value, std in left]
+        for name, value, std in registration_left(calibration.registration, stacks, dark, region=region):
+            yield _line(f"registration of {name}", value, std, limits.registration, "px")
 
     for check in (noise, registration):
         try:
-            items += check()
+            items += list(check())
         except CalibrationError as error:
             skipped.append(f"{check.__name__} was not checked: {error}")
     if dark is None:
@@ -437,18 +420,3 @@ def read_limits(options: Sequence[str]) -> Limits:
             )
         limits = replace(limits, **{name: number})
     return limits
-
-
-def _reused(calibration: Calibration, captures: Captures) -> list[str]:
-    known = {
-        entry.get("sha256")
-        for origin in calibration.provenance.values()
-        if isinstance(origin, Mapping)
-        for entry in origin.get("inputs", ())
-    }
-    groups = (*captures.lights.values(), *captures.together.values())
-    reused = [path for group in groups for path, fingerprint in group.fingerprints.items() if fingerprint in known]
-    if not reused:
-        return []
-    made = f"{len(reused)} of these captures made the calibration ({reused[0]} ...)"
-    return [f"{made}: they always agree; a check needs others"]

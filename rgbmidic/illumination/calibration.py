@@ -25,8 +25,8 @@ _Section = TypeVar("_Section")
 SCHEMA_NAME = "rgbmidic-calibration"
 SCHEMA_VERSION = 1
 
-_PLANES = {"bayer": 4, "rgb": 3, "monochrome": 1}
-_CHANNELS = {"bayer": 3, "rgb": 3, "monochrome": 1}
+_KINDS: dict[FrameKind, tuple[int, int]] = {"bayer": (4, 3), "rgb": (3, 3), "monochrome": (1, 1)}
+"""Numbers of colour planes and channels by the kind of frames."""
 _CAMERA = ("kind", "cfa", "black_level", "white_level", "unevenness", "shape")
 """Fields of a `Calibration` that are keys of the section ``camera``."""
 _PARAMETERS = ["shift_x_px", "shift_y_px", "rotation_rad", "scale", "radial_at_radius"]
@@ -54,7 +54,7 @@ class Calibration:
     name
         Name in messages: the file name.
     unevenness
-        Unevenness of the histogram of the captures' grey levels (`rgbmidic.illumination.frame_check.unevenness`).
+        Unevenness of the histogram of the captures' grey levels (`rgbmidic.illumination.unevenness`).
     provenance
         Inputs with their hashes, date, software version, by section; not changed by reading.
     extra
@@ -94,16 +94,13 @@ class Calibration:
     @property
     def kinds(self) -> tuple[FrameKind, ...]:
         """The kinds of frames that it may be of, by all that it holds: one, or more where that leaves it open."""
-        planes = len(self.camera_noise.planes) if self.camera_noise else 0
-        channels = len(self.crosstalk.matrix) if self.crosstalk else 0
-        possible: tuple[FrameKind, ...] = ("bayer", "rgb", "monochrome")
+        known = len(self.camera_noise.planes) if self.camera_noise else 0
+        seen = len(self.crosstalk.matrix) if self.crosstalk else 0
+        stated = {self.kind, "bayer" if self.cfa else None} - {None}
         return tuple(
             kind
-            for kind in possible
-            if self.kind in (None, kind)
-            and (self.cfa is None or kind == "bayer")
-            and planes in (0, _PLANES[kind])
-            and channels in (0, _CHANNELS[kind])
+            for kind, (planes, channels) in _KINDS.items()
+            if stated <= {kind} and known in (0, planes) and seen in (0, channels)
         )
 
     def cropped(self, origin: tuple[int, int] | None, shape: tuple[int, int]) -> Calibration:
@@ -174,13 +171,31 @@ class Calibration:
         """
         document = read_document(path, "calibration file", SCHEMA_NAME, SCHEMA_VERSION)
         try:
-            return cls._from_document(document, str(path))
+            return cls.from_document(document, str(path))
         except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
             reason = f"missing key {error}" if isinstance(error, KeyError) else error
             raise CalibrationError(f"{path} is damaged: {reason}") from None
 
     @classmethod
-    def _from_document(cls, document: dict[str, Any], name: str) -> Calibration:
+    def from_document(cls, document: dict[str, Any], name: str = "the calibration") -> Calibration:
+        """Return the calibration of a JSON document.
+
+        Parameters
+        ----------
+        document
+            What `to_document` gives.
+        name
+            Name in messages.
+
+        Returns
+        -------
+        Calibration
+
+        Raises
+        ------
+        ValueError
+            A section is damaged.
+        """
         known = {"schema", "schema_version", "crosstalk", "noise", "registration", "camera", "provenance"}
         camera, noise = read_table(document, "camera"), read_table(document, "noise")
         if (cfa := camera.get("cfa")) not in (None, *BAYER_PATTERNS):
@@ -234,15 +249,11 @@ class Calibration:
             for section in ("crosstalk", "noise", "registration")
             if section in document
         }
-        made = {name: one for name, one in self.provenance.items() if isinstance(one, Mapping)}
-        origins = {
-            name: {
-                "date": one.get("date", "at an unknown time"),
-                "files": len(one.get("inputs", ())),
-                "warnings": list(one.get("warnings", ())),
-            }
-            for name, one in made.items()
-        }
+        origins = {}
+        for name, made in self.provenance.items():
+            if isinstance(made, Mapping):
+                date, files = made.get("date", "at an unknown time"), len(made.get("inputs", ()))
+                origins[name] = {"date": date, "files": files, "warnings": list(made.get("warnings", ()))}
         return {**figures, "provenance": origins}
 
     def write(self, path: Path | str) -> None:
@@ -263,10 +274,6 @@ class Calibration:
 
 def _size(shape: tuple[int, int]) -> str:
     return f"{shape[1]} x {shape[0]}"
-
-
-_LARGEST = 1e30
-"""Beyond it squares and products of figures would be infinite."""
 
 
 def read_document(path: Path | str, what: str, schema: str, version: int) -> dict[str, Any]:
@@ -326,8 +333,8 @@ def _read(kind: type[_Section], document: dict[str, Any], name: str) -> _Section
 
 
 def _number(text: str) -> float:
-    """Return a number of the file: JSON has no NaN nor infinity, and no figure of a camera is beyond `_LARGEST`."""
+    """Return a number of the file: JSON has no NaN nor infinity, and no figure whose products would be infinite."""
     value = float(text)
-    if not abs(value) <= _LARGEST:
+    if not abs(value) <= 1e30:
         raise ValueError(f"{text[:40]} is not a number of a calibration")
     return value

@@ -26,7 +26,7 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState, light_images
 from rgbmidic.pipeline.order import STRIDE, is_key
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.suitability import SATURATED, exposure_fault, saturated_fraction, too_small
+from rgbmidic.pipeline.suitability import SUITABILITY, exposure_fault, saturated_fraction, too_small
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
@@ -164,7 +164,7 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     there = state
     if not isinstance(state, IlluminationImages):
         there = tuple(replace(frame, values=frame.values[..., *here]) for frame in state)
-    if (share := saturated_fraction(there, plan.region.mask)) > plan.saturated + SATURATED:
+    if (share := saturated_fraction(there, plan.region.mask)) > plan.saturated + SUITABILITY.saturated:
         words = "%s: %.0f %% of the samples in the region are saturated, %.0f %% in the reference: look at the exposure"
         logger.warning(words, name, 100 * share, 100 * plan.saturated)
     with stage("separation"):

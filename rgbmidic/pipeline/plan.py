@@ -236,7 +236,7 @@ class Plan:
         speckle = suitability.speckle_size(images, region)
         if finite_elements is not None:
             suitability.tell_small(mesh, speckle, finite_elements)
-        elif small := suitability.too_small(size, speckle, suitability.HARDLY_ENOUGH):
+        elif small := suitability.too_small(size, speckle, suitability.SUITABILITY.hardly_enough):
             logger.warning("%s", small)
         _check_seen(states[0], name, images, reference, region)
         return cls(
@@ -405,13 +405,13 @@ def _check_raw(
         raise FrameError(
             f"no light sees the region in the reference ({name}): {suitability.exposure_fault(raw[0], region.mask)}"
         )
-    if saturated > suitability.SATURATED:
+    if saturated > suitability.SUITABILITY.saturated:
         logger.warning(f"{100 * saturated:.0f} % of the samples in the region of the reference ({name}) are saturated")
     if calibration is None:
         return
     repeat = raw[1] if len(raw) > 1 else None
     for found in check_state(raw[0], calibration, region.mask, name, accept=settings.calibration.accept, repeat=repeat):
-        if not found.certain:
+        if found.passed:
             logger.warning("%s may not be what %s calibrates: %s", name, settings.calibration.file, found.text)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -18,10 +19,40 @@ from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
 
-_LOOKED_AT = 256
-"""Largest side (px) of the part of the region in which the speckle is measured: a thousand speckles of 8 px."""
 SPECKLES = 3.0
 """Least number of speckles on the side of an element (iDICs Good Practices Guide, for subsets)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SuitabilityConstants:
+    """From where on a state cannot be measured, or hardly.
+
+    Attributes
+    ----------
+    no_texture
+        Correlation of neighbouring samples under which nothing can be measured: with speckle of 2 to 5 px no element
+        matched at a contrast of .3 times the noise, where it is .02 to .05 (tests/truth/test_texture_check.py).
+    faint_texture
+        Correlation under which the result is poor: in the same simulation displacements were wrong by .2 to .7 px (rms)
+        at a contrast of .5 to .7 times the noise, where it is .08 to .23. Speckle in focus has .5 to .95.
+    hardly_enough, enough
+        Speckles on the side of an element. Of 150 pairs of simulated images (speckle of 2.6 to 8.4 px and +-600 DN,
+        noise of 8, 40 and 80 DN, .4 % strain) 13 of the 46 with fewer than 1.3 did not converge, some with most of
+        their nodes lost, 1 of the 36 with 1.3 to 1.85, and none of the 68 with more, which lost 2 % of the nodes at
+        most.
+    saturated
+        Fraction of the samples in the region that are saturated, beyond that of the reference, from which a frame is
+        over-exposed. Chosen: reflections saturate a few per cent; three times the exposure saturates a fifth and more.
+    """
+
+    no_texture: float = 0.05
+    faint_texture: float = 0.2
+    hardly_enough: float = 1.3
+    enough: float = 2.0
+    saturated: float = 0.1
+
+
+SUITABILITY = SuitabilityConstants()
 
 
 def light_levels(images: IlluminationImages, region: Region) -> dict[str, float]:
@@ -37,55 +68,35 @@ def tell_small(mesh: Tri3Mesh, speckle: float | None, finite_elements: FiniteEle
     It goes with the inverse of the element's side (`rgbmidic.scene.forecast.node_constant`).
     """
     sides = np.sqrt(2 * mesh.areas)
-    small = np.zeros(sides.size, dtype=bool) if speckle is None else sides < SPECKLES * speckle
+    small = sides < SPECKLES * (speckle or 0.0)
     if speckle is None or not small.any():
         return
     least = int(np.argmin(sides))
     typical = float(np.median(sides[small]))
-    logger.warning(
-        "%s: %d of %d triangles have sides under %g speckles of %.1f px, %.1f px in the median (element %d: %.1f px): "
-        "expect %.1f times (%.1f times) the uncertainty of elements of %g speckles; with fewer than %g nodes are lost",
-        finite_elements.name,
-        int(small.sum()),
-        sides.size,
-        SPECKLES,
-        speckle,
-        typical,
-        finite_elements.element_numbers[least],
-        sides[least],
-        SPECKLES * speckle / typical,
-        SPECKLES * speckle / sides[least],
-        SPECKLES,
-        _ENOUGH,
+    few = SPECKLES * speckle
+    text = (
+        f"{int(small.sum())} of {sides.size} triangles have sides under {SPECKLES:g} speckles of {speckle:.1f} px, "
+        f"{typical:.1f} px in the median (element {finite_elements.element_numbers[least]}: {sides[least]:.1f} px): "
+        f"expect {few / typical:.1f} times ({few / sides[least]:.1f} times) the uncertainty of elements of "
+        f"{SPECKLES:g} speckles; with fewer than {SUITABILITY.enough:g} nodes are lost"
     )
+    logger.warning("%s: %s", finite_elements.name, text)
 
 
 def speckle_size(images: IlluminationImages, region: Region) -> float | None:
     """Size of the speckle (px), the median over the lights that are on, in the middle of the region; None: unknown."""
-    part = [
-        slice(max(int(np.median(inside)) - _LOOKED_AT // 2, int(inside[0])), int(inside[-1]) + 1)
-        for inside in (np.flatnonzero(region.mask.any(axis=axis)) for axis in (1, 0))
-    ]
+    side = 256  # px: a thousand speckles of 8 px
+    ends = []
+    for axis in (1, 0):
+        inside = np.flatnonzero(region.mask.any(axis=axis))
+        first = max(int(np.median(inside)) - side // 2, int(inside[0]))
+        ends.append(slice(first, min(first + side, int(inside[-1]) + 1)))
     levels = light_levels(images, region).values()
     lit = [level >= DARK for level in levels] if max(levels) >= DARK else [True] * len(images.names)
-    pictures = [values[part[0], part[1]][:_LOOKED_AT, :_LOOKED_AT] for values in images.values[lit]]
+    pictures = images.values[lit][:, *ends]
     known = [np.where(np.isfinite(one), one, np.nanmean(one)) for one in pictures if np.isfinite(one).any()]
     sizes = [size for one in known if (size := speckle_diameter(one.astype(np.float64))) is not None]
     return float(np.median(sizes)) if sizes else None
-
-
-NO_TEXTURE = 0.05
-"""Correlation of neighbouring samples under which nothing can be measured: with speckle of 2 to 5 px no element matched
-at a contrast of .3 times the noise, where it is .02 to .05 (tests/truth/test_texture_check.py)."""
-FAINT_TEXTURE = 0.2
-"""Correlation under which the result is poor: in the same simulation displacements were wrong by .2 to .7 px (rms) at a
-contrast of .5 to .7 times the noise, where it is .08 to .23. Speckle in focus has .5 to .95."""
-HARDLY_ENOUGH, _ENOUGH = 1.3, 2.0
-"""Speckles on the side of an element. Of 150 pairs of simulated images (speckle of 2.6 to 8.4 px and +-600 DN, noise of
-8, 40 and 80 DN, .4 % strain) 13 of the 46 with fewer than 1.3 did not converge, some with most of their nodes lost, 1
-of the 36 with 1.3 to 1.85, and none of the 68 with more, which lost 2 % of the nodes at most."""
-_MEAN_WIDTH = 5.0
-"""Standard deviation, in samples, of the local mean that is taken off: shading is no texture."""
 
 
 def check_texture(state: RawState, inside: BoolArray, name: str) -> None:
@@ -105,15 +116,14 @@ def check_texture(state: RawState, inside: BoolArray, name: str) -> None:
     FrameError
         No frame shows anything in the region that noise would not.
     """
-    shown = [
-        neighbour_correlation(frame, inside) for frame in ([state] if isinstance(state, IlluminationImages) else state)
-    ]
+    frames = [state] if isinstance(state, IlluminationImages) else state
+    shown = [neighbour_correlation(frame, inside) for frame in frames]
     told = f"neighbouring samples of the reference ({name}) correlate by {min(shown):.2f} in the region"
-    if max(shown) < NO_TEXTURE:
+    if max(shown) < SUITABILITY.no_texture:
         raise FrameError(
             f"{told}, where noise gives 0 and speckle .4 or more: there is no texture above the noise to measure with"
         )
-    if min(shown) < FAINT_TEXTURE:
+    if min(shown) < SUITABILITY.faint_texture:
         logger.warning("%s, where speckle gives .4 or more: its contrast is hardly above the noise", told)
 
 
@@ -135,7 +145,7 @@ def neighbour_correlation(frame: Mosaic | ChannelFrame | IlluminationImages, ins
 
 
 def _planes(frame: Mosaic | ChannelFrame | IlluminationImages, inside: BoolArray) -> list[FloatArray]:
-    """Samples of each channel on their own lattice, less their local mean; 0 outside and where saturated."""
+    """Samples of each channel on their own lattice, less their local mean (shading); 0 outside and where saturated."""
     step = 2 if isinstance(frame, Mosaic) else 1
     seen = frame.valid if isinstance(frame, IlluminationImages) else frame.values < frame.white_level
     usable = inside & seen
@@ -145,7 +155,7 @@ def _planes(frame: Mosaic | ChannelFrame | IlluminationImages, inside: BoolArray
     height, width = (int(index[-1] + 1 - index[0]) // step * step for index in (rows, columns))
     window = known[:, rows[0] : rows[0] + height, columns[0] : columns[0] + width]
     planes = [channel[p::step, q::step] for channel in window for p in range(step) for q in range(step)]
-    return [np.nan_to_num(plane - local_mean(plane, _MEAN_WIDTH)).astype(np.float64) for plane in planes]
+    return [np.nan_to_num(plane - local_mean(plane, 5.0)).astype(np.float64) for plane in planes]
 
 
 def exposure_fault(state: RawState, inside: BoolArray) -> str | None:
@@ -155,11 +165,6 @@ def exposure_fault(state: RawState, inside: BoolArray) -> str | None:
     faults = [_fault(frame, inside) for frame in state]
     told = [f"light {i + 1}: {fault}" if len(state) > 1 else fault for i, fault in enumerate(faults) if fault]
     return "; ".join(told) or None
-
-
-SATURATED = 0.1
-"""Fraction of the samples in the region that are saturated, beyond that of the reference, from which a frame is
-over-exposed. Chosen: reflections saturate a few per cent; three times the exposure saturates a fifth and more."""
 
 
 def saturated_fraction(state: RawState, inside: BoolArray) -> float:
@@ -198,12 +203,12 @@ def _fault(frame: Mosaic | ChannelFrame, inside: BoolArray) -> str | None:
     return None
 
 
-def too_small(element_size: float, speckle: float | None, least: float = _ENOUGH) -> str:
+def too_small(element_size: float, speckle: float | None, least: float = SUITABILITY.enough) -> str:
     """What is wrong with elements (px) that have fewer than `least` speckles (px) on a side, in words; else nothing."""
     if speckle is None or element_size >= least * speckle:
         return ""
     return (
         f"elements of {element_size:g} px are too small for speckles of {speckle:.1f} px: with fewer than {least:g} "
         "speckles on a side nodes are lost and frames may not converge; set mesh.element_size to "
-        f"{np.ceil(_ENOUGH * speckle):.0f} or more"
+        f"{np.ceil(SUITABILITY.enough * speckle):.0f} or more"
     )

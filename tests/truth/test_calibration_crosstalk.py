@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from calibration_scene import MATRICES, captures, speckle_target, white_target
 
+from rgbmidic_calibration.captures import block_means
 from rgbmidic_calibration.crosstalk import estimate_crosstalk
-from rgbmidic_calibration.ratio import block_means
 
 SEEDS = 50
 RELATIVE_ERROR = 0.00039

@@ -11,10 +11,9 @@ from rgbmidic.lab.virtual import record, render, sphere_scene, truth, turned
 from rgbmidic.lab.virtual.dataset import dark_frames, target_scene
 from rgbmidic.pipeline import measure
 from rgbmidic.settings import CalibrationSettings, FrameSettings, RegionSettings, TestSettings
-from rgbmidic_calibration.captures import stack_frames
+from rgbmidic_calibration.captures import block_means, stack_frames
 from rgbmidic_calibration.crosstalk import estimate_crosstalk
 from rgbmidic_calibration.noise import photon_transfer
-from rgbmidic_calibration.ratio import block_means
 from rgbmidic_calibration.registration import estimate_registration
 
 SIZE = 224

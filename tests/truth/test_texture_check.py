@@ -8,7 +8,7 @@ import pytest
 
 from rgbmidic import correlate
 from rgbmidic.frames.data import ChannelFrame
-from rgbmidic.pipeline.suitability import FAINT_TEXTURE, NO_TEXTURE, neighbour_correlation
+from rgbmidic.pipeline.suitability import SUITABILITY, neighbour_correlation
 
 SIDE = 256
 SHIFT = (0.4, -0.3)
@@ -40,9 +40,9 @@ def test_what_is_refused_cannot_be_measured_and_what_is_warned_of_is_poor(diamet
         solution = correlate(first, second, normalise=10.0, prefilter="binomial", initial=(0.3, -0.2))
         error = np.sqrt(np.nanmean((solution.displacement - SHIFT) ** 2)) if solution.measured.any() else np.nan
         found[contrast] = correlation(first), error
-    assert found[0.3][0] < NO_TEXTURE
+    assert found[0.3][0] < SUITABILITY.no_texture
     assert np.isnan(found[0.3][1])
-    assert NO_TEXTURE < found[0.5][0] < FAINT_TEXTURE
+    assert SUITABILITY.no_texture < found[0.5][0] < SUITABILITY.faint_texture
     assert found[0.5][1] > 0.2
-    assert found[1.5][0] > FAINT_TEXTURE
+    assert found[1.5][0] > SUITABILITY.faint_texture
     assert found[1.5][1] < 0.2

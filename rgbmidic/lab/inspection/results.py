@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rgbmidic.illumination.frame_check import Mismatch
+from rgbmidic.illumination.checks import Check
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import COLOURED, TextureModel
@@ -150,7 +150,7 @@ class Inspection:
         Camera noise, calibrated or estimated from the frame.
     noise_known, crosstalk_known : bool
         Whether the calibration states them; for a monochrome camera crosstalk counts as known.
-    contradictions : tuple of Mismatch
+    contradictions : tuple of Check
         Contradictions of the frame to the calibration: doubtful, or accepted.
     element_size : float
         px.
@@ -178,7 +178,7 @@ class Inspection:
     noise: NoiseModel
     noise_known: bool
     crosstalk_known: bool
-    contradictions: tuple[Mismatch, ...]
+    contradictions: tuple[Check, ...]
     element_size: float
     mesh: Tri3Mesh
     prediction: Prediction
@@ -203,7 +203,7 @@ class Inspection:
 
 def _of_set_up(inspection: Inspection) -> Iterator[Finding]:
     for found in inspection.contradictions:
-        yield Finding(f"not calibrated: {found.check}", found.text)
+        yield Finding(f"not calibrated: {found.name}", found.text)
     if inspection.greens > CONSTANTS.greens:
         difference = f"{inspection.greens:.0%}"
         yield Finding(

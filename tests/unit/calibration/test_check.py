@@ -12,8 +12,7 @@ from rgbmidic.frames.data import Mosaic
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic_calibration.captures import stack_frames
-from rgbmidic_calibration.ratio import block_means
+from rgbmidic_calibration.captures import block_means, stack_frames
 from rgbmidic_calibration.verify import Limits, additivity, leakage, noise_ratio, read_limits, registration_left
 
 MATRIX = MATRICES[1.5]

@@ -10,8 +10,8 @@ from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.settings import BAYER_PATTERNS
+from rgbmidic_calibration.captures import block_centres, block_means
 from rgbmidic_calibration.crosstalk import estimate_crosstalk
-from rgbmidic_calibration.ratio import block_centres, block_means
 
 MATRIX = MATRICES[1.5]
 

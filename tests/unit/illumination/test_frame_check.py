@@ -16,7 +16,7 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.frames.images import write_dng
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.frame_check import check_state, mismatches
+from rgbmidic.illumination.frame_check import check_state, contradictions
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
 from rgbmidic.illumination.unevenness import unevenness
 from rgbmidic.pipeline import measure
@@ -47,7 +47,7 @@ def recorded(images, *, matrix=A, noise=NOISE, cfa="RGGB", black=BLACK, change=N
 
 def found(frame, calibration=CALIBRATION, repeat=None):
     """The checks that find something, with whether they are certain."""
-    return {one.check: one.certain for one in mismatches(frame, calibration, INSIDE, repeat)}
+    return {one.name: not one.passed for one in contradictions(frame, calibration, INSIDE, repeat)}
 
 
 def camera(**factors):
@@ -148,11 +148,11 @@ def test_lights_that_another_crosstalk_makes_negative_or_mirrored():
     images = lights(4.2, powers=(0.15, 1.0, 1.0))
     much = Crosstalk(matrix=np.array([[1, 0.5, 0.3], [0.14, 1, 0.16], [0.03, 0.12, 1]]), lights=CROSSTALK.lights)
     assert found(recorded(images)) == {}
-    (one,) = mismatches(recorded(images), replace(CALIBRATION, crosstalk=much), INSIDE)
-    assert (one.check, one.certain) == ("lights", True)
+    (one,) = contradictions(recorded(images), replace(CALIBRATION, crosstalk=much), INSIDE)
+    assert (one.name, one.passed) == ("lights", False)
     assert "light red is negative on 100% of the region" in one.text
     images[0] += 700  # of a plain light: red is positive, with the texture upside down
-    (one,) = mismatches(recorded(images), replace(CALIBRATION, crosstalk=much), INSIDE)
+    (one,) = contradictions(recorded(images), replace(CALIBRATION, crosstalk=much), INSIDE)
     assert "light red is mirrored (dark for bright) on 100% of the region" in one.text
 
 
@@ -176,7 +176,7 @@ def test_what_is_accepted_is_told_and_what_is_unknown_refused():
     with pytest.raises(FrameError, match=r"shot\.dng is not what was calibrated.*calibration\.accept = \[\"levels\"\]"):
         check_state([frame], CALIBRATION, INSIDE, "shot.dng")
     (told,) = check_state([frame], CALIBRATION, INSIDE, "shot.dng", accept=["levels"])
-    assert (told.check, told.certain) == ("levels", True)
+    assert (told.name, told.passed) == ("levels", False)
     with pytest.raises(ConfigurationError, match="accept takes noise, levels"):
         check_state([frame], CALIBRATION, INSIDE, "shot.dng", accept=["level"])
 
