@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from rgbmidic import command
 from rgbmidic._version import __version__
-from rgbmidic.cli_parts import Out, Overwrite, explain_first_run, note, print_table, progress_of, read_settings
+from rgbmidic.cli_parts import Out, Overwrite, Test, explain_first_run, note, print_table, progress_of, read_settings
 from rgbmidic.errors import InputError
-
-if TYPE_CHECKING:
-    pass
 
 app = typer.Typer()
 
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option("--out", help="Output folder; must be empty or new.")] = Path("rgbmidic-demo"),
+    out: Annotated[Path, typer.Option(help="Output folder; must be empty or new.")] = Path("rgbmidic-demo"),
 ) -> None:
     """Make a small virtual test, calibrate and measure it, and compare the result with the exact truth."""
     note(f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}")
@@ -123,9 +120,7 @@ def virtual(
 def plan(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Lamps, camera, paint, specimen and its states.")],
     out: Out,
-    distance: Annotated[
-        float | None, typer.Option("--distance", metavar="MM", help="Camera to specimen; else the scene's.")
-    ] = None,
+    distance: Annotated[float | None, typer.Option(metavar="MM", help="Camera to specimen; else the scene's.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Predict where each lamp is reflected, the expected uncertainty, and better positions of the lamps."""
@@ -198,14 +193,14 @@ def inspect(
         ),
     ],
     statement: dict[str, Any],
-    test: Annotated[Path | None, typer.Option("--test", help="TEST.toml of the test.")] = None,
-    calibration: Annotated[Path | None, typer.Option("--calibration", help="Calibration file.")] = None,
-    region: Annotated[str, typer.Option("--region", help="x0,y0,x1,y1 in px; else the test's or all.")] = "",
-    element_size: Annotated[float | None, typer.Option("--element-size", help="px; else the test's, or 25.")] = None,
+    test: Annotated[Path | None, typer.Option(help="TEST.toml of the test.")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file.")] = None,
+    region: Annotated[str, typer.Option(help="x0,y0,x1,y1 in px; else the test's or all.")] = "",
+    element_size: Annotated[float | None, typer.Option(help="px; else the test's, or 25.")] = None,
     accept: Annotated[
-        list[str] | None, typer.Option("--accept", help="Failing calibration check to accept; else the test's.")
+        list[str] | None, typer.Option(help="Failing calibration check to accept; else the test's.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for inspection.png and inspection.json.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for inspection.png and inspection.json.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Inspect one frame before a test: lights, reflections, speckle, noise, expected uncertainty."""
@@ -248,18 +243,18 @@ def inspect(
 
 @app.command()
 def resolution(
-    test: Annotated[Path, typer.Argument(metavar="TEST.toml", help="Settings of the test.")],
+    test: Test,
     sizes: Annotated[
-        str, typer.Option("--sizes", help="Element sizes in px, such as 10,16,25,40; else those that suit the speckle.")
+        str, typer.Option(help="Element sizes in px, such as 10,16,25,40; else those that suit the speckle.")
     ] = "",
     gauges: Annotated[
-        str, typer.Option("--gauges", help="Lengths of virtual strain gauges in px; else three elements of each size.")
+        str, typer.Option(help="Lengths of virtual strain gauges in px; else three elements of each size.")
     ] = "",
     frames: Annotated[
         str,
-        typer.Option("--frames", help="Frames, such as 5,10:20, among which the key frame is; else five."),
+        typer.Option(help="Frames, such as 5,10:20, among which the key frame is; else five."),
     ] = "",
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for resolution.csv, .json and .png.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for resolution.csv, .json and .png.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Find the element size of a test: noise, discretisation error and strain resolution of several, on its frames."""

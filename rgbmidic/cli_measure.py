@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rgbmidic import command
-from rgbmidic.cli_parts import Out, Overwrite, explain_first_run, note, progress_of
+from rgbmidic.cli_parts import Draw, Out, Overwrite, Test, Workers, explain_first_run, note, progress_of
 from rgbmidic.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,20 +31,18 @@ that breaks or leaves the picture halfway through is an ordinary test, a run tha
 
 @app.command()
 def run(
-    test: Annotated[Path, typer.Argument(metavar="TEST.toml", help="Settings of the test.")],
+    test: Test,
     out: Out,
     overwrite: Overwrite = False,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the interrupted run in DIR.")] = False,
     retry_failed: Annotated[
         bool, typer.Option("--retry-failed", help="With --resume: measure all failed frames again.")
     ] = False,
-    frames: Annotated[
-        str, typer.Option("--frames", help="Only these, such as 1000:2000; end with `rgbmidic finish`.")
-    ] = "",
-    workers: Annotated[int, typer.Option("--workers", min=0, help="Frames at a time; 0: as many as cores.")] = 0,
-    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
+    frames: Annotated[str, typer.Option(help="Only these, such as 1000:2000; end with `rgbmidic finish`.")] = "",
+    workers: Workers = 0,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None,
     timings: Annotated[bool, typer.Option("--timings", help="Store and print the time of each stage.")] = False,
-    draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
+    draw: Draw = True,
 ) -> None:
     """Measure a test: from raw frames to one displacement field per frame."""
     from rgbmidic.pipeline import measure
@@ -82,12 +80,12 @@ def batch(
     ],
     out: Out,
     table: Annotated[
-        Path | None, typer.Option("--table", help="CSV: a column test, and keys of TEST.toml that its values replace.")
+        Path | None, typer.Option(help="CSV: a column test, and keys of TEST.toml that its values replace.")
     ] = None,
     elastic: Annotated[
-        str, typer.Option("--elastic", metavar="LOW:HIGH", help="Strains between which a modulus is fitted.")
+        str, typer.Option(metavar="LOW:HIGH", help="Strains between which a modulus is fitted.")
     ] = "0.0005:0.0025",
-    workers: Annotated[int, typer.Option("--workers", min=0, help="Frames at a time; 0: as many as cores.")] = 0,
+    workers: Workers = 0,
     reports: Annotated[bool, typer.Option("--reports/--no-reports", help="Write a report of each test.")] = True,
     overwrite: Overwrite = False,
 ) -> None:
@@ -140,7 +138,7 @@ def batch(
 @app.command()
 def finish(
     result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder of runs with --frames.")],
-    draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
+    draw: Draw = True,
 ) -> None:
     """Finish a result that was measured in parts: check that no frame is missing, and draw it."""
     from rgbmidic.results import Result, finish_result

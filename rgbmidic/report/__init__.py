@@ -13,7 +13,7 @@ from rgbmidic.report.figures import (
     residual_figure,
 )
 from rgbmidic.report.gallery import REPORT, remove_figures, remove_report, write_figures, write_maps
-from rgbmidic.report.movie import MOVIES, write_movie
+from rgbmidic.report.movie import MOVIES, Movie, write_movie
 from rgbmidic.report.movie_curve import Curve
 from rgbmidic.report.page import render
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
@@ -24,6 +24,7 @@ __all__ = [
     "REPORT",
     "STYLE",
     "Curve",
+    "Movie",
     "brightness_figure",
     "convergence_figure",
     "finish_plot",

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic.report.setup import NoiseFloor, TimeHistory
 from rgbmidic.report.style import (
     GAP,
     LEGEND,
@@ -27,6 +26,7 @@ from rgbmidic.report.style import (
     time_axis,
     time_unit,
 )
+from rgbmidic.report.summary import NoiseFloor, TimeHistory
 from rgbmidic.results import QUANTITIES, Histories, HistoryColumn, Profile, Wave, uncertain
 from rgbmidic.typing import FloatArray
 
