@@ -7,19 +7,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 
+from rgbmidic import cli_parts as parts
 from rgbmidic import command
-from rgbmidic.cli_parts import (
-    Measure,
-    Opened,
-    Overwrite,
-    Workers,
-    derived_options,
-    note,
-    opened_result,
-    print_table,
-    progress_of,
-)
 from rgbmidic.errors import InputError
 
 app = typer.Typer()
@@ -37,37 +28,35 @@ _PLACES = {
 }
 """Keys of ``[probes]`` with the option, the form of a place and the help."""
 _TIP: dict[str, Any] = {
-    "youngs_modulus": Annotated[float | None, typer.Option(metavar="MPA", help="For --tip.")],
-    "poissons_ratio": Annotated[float | None, typer.Option(help="For --tip.")],
-    "plane": Annotated[str | None, typer.Option(help="For --tip: stress or strain.")],
-    "terms": Annotated[int | None, typer.Option(help="Highest term of Williams' series; 0: automatic.")],
+    "youngs_modulus": Annotated[float | None, Option(metavar="MPA", help="For --tip.")],
+    "poissons_ratio": Annotated[float | None, Option(help="For --tip.")],
+    "plane": Annotated[str | None, Option(help="For --tip: stress or strain.")],
+    "terms": Annotated[int | None, Option(help="Highest term of Williams' series; 0: automatic.")],
     "fit_tip": Annotated[
-        bool | None, typer.Option("--fit-tip/--mesh-tip", help="Fit the position of the tip along the crack.")
+        bool | None, Option("--fit-tip/--mesh-tip", help="Fit the position of the tip along the crack.")
     ],
 }
 """Keys of ``[probes]`` that are of a crack's tip."""
 _PROBE_OPTIONS: dict[str, Any] = {
     **{
-        key: Annotated[list[str] | None, typer.Option(option, metavar=form, help=text)]
+        key: Annotated[list[str] | None, Option(option, metavar=form, help=text)]
         for key, (option, form, text) in _PLACES.items()
     },
     **_TIP,
-    "measure": Measure,
-    "window": Annotated[int | None, typer.Option(help="Frames that a rate is taken over, 4 or more; 0: no rates.")],
-    "rigid_motion": Annotated[str | None, typer.Option("--rigid", help="Rigid motion: none, tell (report) or remove.")],
+    "measure": parts.Measure,
+    "window": Annotated[int | None, Option(help="Frames that a rate is taken over, 4 or more; 0: no rates.")],
+    "rigid_motion": Annotated[str | None, Option("--rigid", help="Rigid motion: none, tell (report) or remove.")],
 }
 _CHANNEL_OPTIONS: dict[str, Any] = {
-    "file": Annotated[Path | None, typer.Option("--channels", help="CSV file: time_s, then one column per channel.")],
-    "offset": Annotated[float | None, typer.Option(metavar="S", help="Time added to the channels, s.")],
-    "trigger": Annotated[str | None, typer.Option(help="Channel whose first step is at time 0.")],
-    "align": Annotated[
-        str | None, typer.Option(metavar="CHANNEL=COLUMN", help="Offset by correlation with a history.")
-    ],
-    "area": Annotated[float | None, typer.Option(metavar="MM2", help="Cross-section, to compute a stress.")],
-    "force": Annotated[str | None, typer.Option(help="Channel with the force (_N or _kN).")],
+    "file": Annotated[Path | None, Option("--channels", help="CSV file: time_s, then one column per channel.")],
+    "offset": Annotated[float | None, Option(metavar="S", help="Time added to the channels, s.")],
+    "trigger": Annotated[str | None, Option(help="Channel whose first step is at time 0.")],
+    "align": Annotated[str | None, Option(metavar="CHANNEL=COLUMN", help="Offset by correlation with a history.")],
+    "area": Annotated[float | None, Option(metavar="MM2", help="Cross-section, to compute a stress.")],
+    "force": Annotated[str | None, Option(help="Channel with the force (_N or _kN).")],
 }
 """Keys of ``[channels]``."""
-_Frames = Annotated[str, typer.Option(help="Only these, such as 0,5,10:200; by default all.")]
+_Frames = Annotated[str, Option(help="Only these, such as 0,5,10:200; by default all.")]
 
 
 def _read_channels(options: dict[str, Any]) -> dict[str, Any]:
@@ -91,17 +80,17 @@ def _read_probes(options: dict[str, Any]) -> dict[str, Any]:
 
 
 @app.command()
-@opened_result
+@parts.opened_result
 @command.gather("probes", _PROBE_OPTIONS, _read_probes)
 @command.gather("channels", _CHANNEL_OPTIONS, _read_channels)
 def history(
-    opened: Opened,
+    opened: parts.Opened,
     probes: dict[str, Any],
     channels: dict[str, Any],
     out: Annotated[
-        Path | None, typer.Option(help="CSV file to write; a picture gets the same name. Else printed only.")
+        Path | None, Option(help="CSV file to write; a picture gets the same name. Else printed only.")
     ] = None,
-    overwrite: Overwrite = False,
+    overwrite: parts.Overwrite = False,
 ) -> None:
     """Displacement, strain and rates over time at points, over areas and along gauges: table, picture and CSV file.
 
@@ -129,26 +118,26 @@ def history(
         write_histories(histories, out, overwrite=overwrite)
         save_figure(history_figure(histories), command.picture_beside(out))
     for remark in histories.remarks:
-        note(f"note: {remark}")
-    print_table(f"{len(histories.frames)} frames", *history_rows(histories))
+        parts.note(f"note: {remark}")
+    parts.print_table(f"{len(histories.frames)} frames", *history_rows(histories))
     if out is not None:
         print(f"table: {out}   picture: {command.picture_beside(out)}")
 
 
 @app.command()
-@opened_result
-@derived_options
+@parts.opened_result
+@parts.derived_options
 def profile(
-    opened: Opened,
-    line: Annotated[str, typer.Option(metavar="X0,Y0:X1,Y1", help="Ends of the line on the reference, px.")],
-    out: Annotated[Path, typer.Option(help="CSV file to write; a picture gets the same name.")],
+    opened: parts.Opened,
+    line: Annotated[str, Option(metavar="X0,Y0:X1,Y1", help="Ends of the line on the reference, px.")],
+    out: Annotated[Path, Option(help="CSV file to write; a picture gets the same name.")],
     derived: dict[str, Any],
-    field: Annotated[str, typer.Option(help="One field, such as exx, u or u_velocity.")] = "u",
+    field: Annotated[str, Option(help="One field, such as exx, u or u_velocity.")] = "u",
     frames: _Frames = "",
-    curves: Annotated[str, typer.Option(help="Frames drawn as curves, such as 10,20,30.")] = "",
-    speed: Annotated[str, typer.Option(metavar="WHAT", help="Fit the speed of a wave: front or peak.")] = "",
-    level: Annotated[float | None, typer.Option(help="Fraction of the peak that defines the front; else 0.5.")] = None,
-    overwrite: Overwrite = False,
+    curves: Annotated[str, Option(help="Frames drawn as curves, such as 10,20,30.")] = "",
+    speed: Annotated[str, Option(metavar="WHAT", help="Fit the speed of a wave: front or peak.")] = "",
+    level: Annotated[float | None, Option(help="Fraction of the peak that defines the front; else 0.5.")] = None,
+    overwrite: parts.Overwrite = False,
 ) -> None:
     """A field along a line in every frame: table, position-time picture, curves, and the speed of a front or peak."""
     from rgbmidic.report import profile_figure, save_figure, wave_text
@@ -172,7 +161,7 @@ def profile(
     if wave is not None:
         print(f"{wave_text(read, wave)}; arrival times: {arrivals_file(out)}")
         if not wave.front.straight:
-            note(
+            parts.note(
                 "note: the arrival times do not lie on a line within their uncertainty: the wave changes its speed or "
                 "form, or the mesh does not follow it; the uncertainty of the speed includes that scatter"
             )
@@ -180,29 +169,29 @@ def profile(
 
 
 @app.command()
-@opened_result
-@derived_options
+@parts.opened_result
+@parts.derived_options
 def movie(
-    opened: Opened,
-    out: Annotated[Path, typer.Option(help="File to write: .mp4, .webm or .gif.")],
+    opened: parts.Opened,
+    out: Annotated[Path, Option(help="File to write: .mp4, .webm or .gif.")],
     derived: dict[str, Any],
-    field: Annotated[str, typer.Option(help="Fields side by side, such as u,exx,velocity.")] = "u",
+    field: Annotated[str, Option(help="Fields side by side, such as u,exx,velocity.")] = "u",
     range_: Annotated[
-        str, typer.Option("--range", metavar="LOW:HIGH", help="Range of the colour bars; else that of all frames.")
+        str, Option("--range", metavar="LOW:HIGH", help="Range of the colour bars; else that of all frames.")
     ] = "",
     frames: _Frames = "",
-    fps: Annotated[float, typer.Option(help="Frames per second of the movie.")] = 15.0,
-    over: Annotated[str, typer.Option(help="reference, or frame (the raw frames, deformed).")] = "reference",
+    fps: Annotated[float, Option(help="Frames per second of the movie.")] = 15.0,
+    over: Annotated[str, Option(help="reference, or frame (the raw frames, deformed).")] = "reference",
     curve: Annotated[
-        Path | None, typer.Option(help="CSV of `rgbmidic history` or of channels: a curve with a cursor.")
+        Path | None, Option(help="CSV of `rgbmidic history` or of channels: a curve with a cursor.")
     ] = None,
-    column: Annotated[str | None, typer.Option(help="Column of --curve; by default the first.")] = None,
-    offset: Annotated[float, typer.Option(metavar="S", help="Time added to the channels, s.")] = 0.0,
-    colours: Annotated[str | None, typer.Option(help="Name of a matplotlib colour map.")] = None,
-    opacity: Annotated[float, typer.Option(help="Opacity of the fields over the image, 0 to 1.")] = 1.0,
-    width: Annotated[int, typer.Option(help="Width of the movie, px.")] = 1280,
-    workers: Workers = 0,
-    overwrite: Overwrite = False,
+    column: Annotated[str | None, Option(help="Column of --curve; by default the first.")] = None,
+    offset: Annotated[float, Option(metavar="S", help="Time added to the channels, s.")] = 0.0,
+    colours: Annotated[str | None, Option(help="Name of a matplotlib colour map.")] = None,
+    opacity: Annotated[float, Option(help="Opacity of the fields over the image, 0 to 1.")] = 1.0,
+    width: Annotated[int, Option(help="Width of the movie, px.")] = 1280,
+    workers: parts.Workers = 0,
+    overwrite: parts.Overwrite = False,
 ) -> None:
     """Write a movie of one field or several side by side, over the reference image or the raw frames."""
     from rgbmidic._kernels.threads import threads
@@ -224,6 +213,6 @@ def movie(
         opacity=opacity,
         width=width,
     )
-    with progress_of("movie") as progress:
+    with parts.progress_of("movie") as progress:
         write_movie(shown, out, fps=fps, processes=workers or threads(), overwrite=overwrite, progress=progress)
     print(out)

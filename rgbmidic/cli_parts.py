@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from rich.console import Console
+from typer import Argument, Option
 
 from rgbmidic import command
 from rgbmidic.errors import InputError
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 messages = Console(stderr=True)
 
-Draw = Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")]
-Measure = Annotated[str | None, typer.Option(help="green-lagrange, hencky, biot or engineering.")]
-Out = Annotated[Path, typer.Option(help="Output folder; created if it does not exist.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
-Test = Annotated[Path, typer.Argument(metavar="TEST.toml", help="Settings of the test.")]
-Workers = Annotated[int, typer.Option(min=0, help="Processes that work at a time; 0: as many as cores.")]
+Draw = Annotated[bool, Option("--figures/--no-figures", help="Write pictures into DIR/figures.")]
+Measure = Annotated[str | None, Option(help="green-lagrange, hencky, biot or engineering.")]
+Out = Annotated[Path, Option(help="Output folder; created if it does not exist.")]
+Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
+Test = Annotated[Path, Argument(metavar="TEST.toml", help="Settings of the test.")]
+Workers = Annotated[int, Option(min=0, help="Processes that work at a time; 0: as many as cores.")]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,22 +73,22 @@ def _open(options: Mapping[str, Any]) -> Opened:
 
 
 _RESULT_OPTIONS: dict[str, Any] = {
-    "result": Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
+    "result": Annotated[Path, Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
     "test": Annotated[
         Path | None,
-        typer.Option(help="TEST.toml whose [scale], [setup], [probes] and [channels] replace those of the result."),
+        Option(help="TEST.toml whose [scale], [setup], [probes] and [channels] replace those of the result."),
     ],
-    "partial": Annotated[bool, typer.Option("--partial", help="Use the finished frames of an interrupted run.")],
+    "partial": Annotated[bool, Option("--partial", help="Use the finished frames of an interrupted run.")],
 }
 opened_result = command.gather("opened", _RESULT_OPTIONS, _open, result=command.REQUIRED, partial=False)
 """Decorator of a command whose parameter `opened` is the result that it reads."""
 
 _DERIVED: dict[str, Any] = {
-    "gauge": Annotated[float | None, typer.Option("--gauge-length", "--gauge", help="Virtual strain gauge, px.")],
+    "gauge": Annotated[float | None, Option("--gauge-length", "--gauge", help="Virtual strain gauge, px.")],
     "measure": Measure,
-    "since": Annotated[int | None, typer.Option(metavar="N", help="Show the fields relative to frame N.")],
-    "rigid_removed": Annotated[bool, typer.Option("--remove-rigid", help="Remove the rigid motion.")],
-    "window": Annotated[int | None, typer.Option(help="Frames that a rate is taken over, 4 or more.")],
+    "since": Annotated[int | None, Option(metavar="N", help="Show the fields relative to frame N.")],
+    "rigid_removed": Annotated[bool, Option("--remove-rigid", help="Remove the rigid motion.")],
+    "window": Annotated[int | None, Option(help="Frames that a rate is taken over, 4 or more.")],
 }
 derived_options = command.gather("derived", _DERIVED, dict, rigid_removed=False)
 """Decorator of a command whose parameter `derived` states how fields are derived, as `rgbmidic.results.Maps.of`."""

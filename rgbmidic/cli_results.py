@@ -6,18 +6,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
+from rgbmidic import cli_parts as parts
 from rgbmidic import command
-from rgbmidic.cli_parts import (
-    Opened,
-    Out,
-    Overwrite,
-    derived_options,
-    note,
-    opened_result,
-    print_table,
-    progress_of,
-)
 from rgbmidic.errors import InputError
 from rgbmidic.extras import optional
 
@@ -25,17 +17,17 @@ app = typer.Typer()
 
 
 @app.command()
-@opened_result
-@derived_options
+@parts.opened_result
+@parts.derived_options
 def figures(
-    opened: Opened,
+    opened: parts.Opened,
     derived: dict[str, Any],
-    out: Annotated[Path | None, typer.Option(help="Folder for the pictures; by default RESULT/figures.")] = None,
-    frames: Annotated[str, typer.Option(help="Such as 0,5,10:20; by default three frames.")] = "",
+    out: Annotated[Path | None, Option(help="Folder for the pictures; by default RESULT/figures.")] = None,
+    frames: Annotated[str, Option(help="Such as 0,5,10:20; by default three frames.")] = "",
     fields: Annotated[
-        str, typer.Option("--field", help="Fields to map, with their uncertainty, such as exx,velocity,magnitude.")
+        str, Option("--field", help="Fields to map, with their uncertainty, such as exx,velocity,magnitude.")
     ] = "",
-    hatch: Annotated[bool, typer.Option("--hatch", help="Hatch values within 2 standard uncertainties of 0.")] = False,
+    hatch: Annotated[bool, Option("--hatch", help="Hatch values within 2 standard uncertainties of 0.")] = False,
 ) -> None:
     """Draw a result: maps, masks and reflections of some frames, curves over all frames, or any fields."""
     from rgbmidic._kernels.threads import threads
@@ -56,12 +48,12 @@ def figures(
 
 
 @app.command()
-@opened_result
+@parts.opened_result
 def export(
-    opened: Opened,
-    out: Annotated[Path, typer.Option(help="File to write; for crackpy a folder.")],
-    to: Annotated[str, typer.Option(help="Format: npz, csv, hdf5 or crackpy.")] = "npz",
-    overwrite: Overwrite = False,
+    opened: parts.Opened,
+    out: Annotated[Path, Option(help="File to write; for crackpy a folder.")],
+    to: Annotated[str, Option(help="Format: npz, csv, hdf5 or crackpy.")] = "npz",
+    overwrite: parts.Overwrite = False,
 ) -> None:
     """Write a result for another program: ParaView, MATLAB, xarray, a spreadsheet, CrackPy."""
     from rgbmidic.results import export_result
@@ -70,12 +62,12 @@ def export(
 
 
 @app.command()
-@opened_result
+@parts.opened_result
 def report(
-    opened: Opened,
-    out: Annotated[Path | None, typer.Option(help="HTML file; by default RESULT/report.html.")] = None,
-    frames: Annotated[str, typer.Option(help="Frames to show as maps, such as 0,5,10:20.")] = "",
-    overwrite: Overwrite = False,
+    opened: parts.Opened,
+    out: Annotated[Path | None, Option(help="HTML file; by default RESULT/report.html.")] = None,
+    frames: Annotated[str, Option(help="Frames to show as maps, such as 0,5,10:20.")] = "",
+    overwrite: parts.Overwrite = False,
 ) -> None:
     """Write the report of a test: one HTML page that can be printed."""
     from rgbmidic.report import REPORT, write_report
@@ -92,11 +84,11 @@ def report(
 def view(
     path: Annotated[
         Path,
-        typer.Argument(metavar="PATH", help="Result, also of a running test; TEST.toml; raw frames; folder of tests."),
+        Argument(metavar="PATH", help="Result, also of a running test; TEST.toml; raw frames; folder of tests."),
     ],
     statement: dict[str, Any],
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0: any free port.")] = 0,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the browser.")] = True,
+    port: Annotated[int, Option(min=0, max=65535, help="Port; 0: any free port.")] = 0,
+    browser: Annotated[bool, Option("--browser/--no-browser", help="Open the browser.")] = True,
 ) -> None:
     """Look at a result, or set up a test, in the browser. The address is printed; it is valid on this machine only.
 
@@ -107,27 +99,25 @@ def view(
 
 
 @app.command()
-@opened_result
+@parts.opened_result
 def compare(
-    opened: Opened,
+    opened: parts.Opened,
     fe: Annotated[
-        Path, typer.Option("--fe", help="Simulation: .vtu, .pvd or a folder of such files, or .csv by node numbers.")
+        Path, Option("--fe", help="Simulation: .vtu, .pvd or a folder of such files, or .csv by node numbers.")
     ],
-    out: Out,
-    mesh: Annotated[Path | None, typer.Option(help="Mesh file with the nodes of a .csv.")] = None,
+    out: parts.Out,
+    mesh: Annotated[Path | None, Option(help="Mesh file with the nodes of a .csv.")] = None,
     points: Annotated[
         list[str] | None,
-        typer.Option(metavar="X_MM,Y_MM:X_PX,Y_PX", help="Mesh point and its pixel; twice or more."),
+        Option(metavar="X_MM,Y_MM:X_PX,Y_PX", help="Mesh point and its pixel; twice or more."),
     ] = None,
-    unit: Annotated[str, typer.Option(help="Unit of length of the files: mm, m, um or inch.")] = "mm",
-    field: Annotated[str | None, typer.Option(help="Name of the displacement in the files.")] = None,
-    interval: Annotated[
-        float | None, typer.Option(metavar="S", help="Time between files with successive numbers.")
-    ] = None,
-    offset: Annotated[float, typer.Option(metavar="S", help="Time added to the simulation, s.")] = 0.0,
-    frames: Annotated[str, typer.Option(help="Such as 0,5,10:20; by default all.")] = "",
-    rigid: Annotated[str, typer.Option(help="Rigid motion: tell (report it) or remove.")] = "tell",
-    overwrite: Overwrite = False,
+    unit: Annotated[str, Option(help="Unit of length of the files: mm, m, um or inch.")] = "mm",
+    field: Annotated[str | None, Option(help="Name of the displacement in the files.")] = None,
+    interval: Annotated[float | None, Option(metavar="S", help="Time between files with successive numbers.")] = None,
+    offset: Annotated[float, Option(metavar="S", help="Time added to the simulation, s.")] = 0.0,
+    frames: Annotated[str, Option(help="Such as 0,5,10:20; by default all.")] = "",
+    rigid: Annotated[str, Option(help="Rigid motion: tell (report it) or remove.")] = "tell",
+    overwrite: parts.Overwrite = False,
 ) -> None:
     """Measured minus simulated displacement and strain, in mm and in units of the stated uncertainty.
 
@@ -150,26 +140,26 @@ def compare(
     simulation = Simulation.read(fe, mesh=numbered, unit=unit, field=field, interval=interval, offset=offset)
     comparison = Comparison(result, simulation, placement, scale=scale, frames=chosen, remove_rigid=rigid == "remove")
     check_folder(out, comparison_files(comparison), overwrite=overwrite)
-    with progress_of("comparing") as progress:
+    with parts.progress_of("comparing") as progress:
         done = write_comparison(comparison, out, progress)
-    note(f"placed: {placement.summary()}")
+    parts.note(f"placed: {placement.summary()}")
     headings = ["frame", "scale", "uncertainty", "chi-square at nodes", "levelled", "after the scale"]
     rows = []
     for made in done:
         squares = [made.agreement[way, "displacement"].chi_square for way in ("nodes", "levelled")]
         numbers = (made.fit.scale, made.fit.scale_std, *squares, made.fit.chi_square)
         rows.append([f"{made.frame}", *(f"{number:.4g}" for number in numbers)])
-    print_table(f"{len(done)} frames against {fe}", headings, rows)
+    parts.print_table(f"{len(done)} frames against {fe}", headings, rows)
     print(scale_text(comparison, done))
     print(f"page: {out / PAGE}")
 
 
 @app.command()
 def scale(
-    points: Annotated[str, typer.Argument(metavar="X0,Y0:X1,Y1", help="Two points with a known distance, px.")],
-    length: Annotated[float, typer.Option(metavar="MM", help="Their distance in mm.")],
-    length_std: Annotated[float, typer.Option(metavar="MM", help="Its standard uncertainty.")] = 0.0,
-    point_std: Annotated[float, typer.Option(metavar="PX", help="Uncertainty of each point, px.")] = 0.5,
+    points: Annotated[str, Argument(metavar="X0,Y0:X1,Y1", help="Two points with a known distance, px.")],
+    length: Annotated[float, Option(metavar="MM", help="Their distance in mm.")],
+    length_std: Annotated[float, Option(metavar="MM", help="Its standard uncertainty.")] = 0.0,
+    point_std: Annotated[float, Option(metavar="PX", help="Uncertainty of each point, px.")] = 0.5,
 ) -> None:
     """Millimetres per pixel, with its uncertainty, from two points on an image and their distance."""
     from rgbmidic.fields import Units

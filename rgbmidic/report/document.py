@@ -42,6 +42,8 @@ class ReportConstants:
         Key frames in a strip: as many as a page is wide with panels of 4 cm.
     listed
         Failed frames that are listed with their reason: half a page.
+    panels
+        Panels of the histories of the probes in a picture: as many fill a page of A4.
     fewest
         Frames from which position against time is a picture: fewer are single stripes.
     finest_nodes, finest_gauge
@@ -58,6 +60,7 @@ class ReportConstants:
     shown: int = 3
     keys: int = 5
     listed: int = 20
+    panels: int = 4
     fewest: int = 10
     finest_nodes: float = 2.2
     finest_gauge: float = 2.6
@@ -164,14 +167,12 @@ class _Report:
         keys, physical = self.history.key_frames(self.constants.keys), self.physical
         if len(keys) < 3:
             return
-        frames = {self.when(frame, short=True): physical.frame(frame) for frame in keys}
-        moved = [(title, np.hypot(values["u"], values["v"])) for title, values in frames.items()]
-        strain = [(title, values["e1"]) for title, values in frames.items()]
-        for label, strip in (
-            (f"displacement ({physical.units.length})", moved),
-            (f"larger principal strain ({physical.measure_name})", strain),
+        frames = {self.when(frame, short=True): frame for frame in keys}
+        for name, label in (
+            ("magnitude", f"displacement ({physical.units.length})"),
+            ("e1", f"larger principal strain ({physical.measure_name})"),
         ):
-            yield self.maps.strip(strip, label), label
+            yield self.maps.strip(name, frames, label), label
 
     def histories(self) -> Histories:
         """Read the time histories of the probes."""

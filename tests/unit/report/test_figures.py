@@ -196,12 +196,11 @@ def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gallery, "save_figure", lambda _, path: path.touch())
 
 
-def test_all_figures_can_be_written_by_two_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gallery, "_FEW", 5)
+def test_all_figures_can_be_written_by_two_processes(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=12, reference=np.stack([IMAGE] * 3))
     told_once = {"convergence", "residual", "brightness"}
     with_pictures = {*EVERY_FRAME, "masks", "reflections"}
-    files = write_figures(result, tmp_path / "figures", [4], processes=2)
+    files = write_figures(result, tmp_path / "figures", [4], processes=2, few=5)
     assert {file.stem for file in files} == told_once | {f"{name}_000004" for name in with_pictures}
     assert all(file.stat().st_size > 5000 for file in files)
 
