@@ -11,7 +11,7 @@ from typer import Argument, Option
 
 from rgbmidic import command
 from rgbmidic._version import __version__
-from rgbmidic.cli_parts import Out, Overwrite, Test, explain_first_run, note, print_table, progress_of, read_settings
+from rgbmidic.cli_parts import Out, Overwrite, Test, explain_first_run, note, print_table, progress_of
 from rgbmidic.errors import InputError
 
 app = typer.Typer()
@@ -203,6 +203,7 @@ def inspect(
     """Inspect one frame before a test: lights, reflections, speckle, noise, expected uncertainty."""
     from rgbmidic.lab import check_folder
     from rgbmidic.lab.inspection import inspect_files, report, state_frames
+    from rgbmidic.settings import read_test
 
     if out is not None:
         check_folder(out, report.FILES, overwrite=overwrite)
@@ -210,7 +211,7 @@ def inspect(
         if test is not None or len(frames) > 1:
             raise InputError("a TEST.toml stands for the frames of its reference: give it alone, or frames and --test")
         test, frames = frames[0], []
-    settings = read_settings(test)
+    settings = None if test is None else read_test(test)
     explain_first_run()
     with progress_of("inspecting") as progress:
         inspection = inspect_files(

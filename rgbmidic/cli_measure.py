@@ -147,10 +147,9 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
     a run that measures few of its frames is not.
     """
     from rgbmidic._kernels.threads import threads
-    from rgbmidic.report import remove_figures, remove_report, write_figures
+    from rgbmidic.report import remove_pictures, write_figures
 
-    remove_figures(result.path / "figures")
-    remove_report(result.path)
+    remove_pictures(result.path)
     if draw:
         write_figures(result, result.path / "figures", processes=processes or threads())
     _print_summary(result, time.perf_counter() - started)

@@ -58,18 +58,12 @@ class Opened:
         return chosen
 
 
-def read_settings(test: Path | None) -> TestSettings | None:
-    """Settings of a TEST.toml, None where none is stated."""
-    from rgbmidic.settings import read_test
-
-    return None if test is None else read_test(test)
-
-
 def _open(options: Mapping[str, Any]) -> Opened:
     from rgbmidic.results import Result
+    from rgbmidic.settings import read_test
 
-    result = Result.open(options["result"], partial=options["partial"])
-    return Opened(result=result, settings=read_settings(options["test"]))
+    result, test = Result.open(options["result"], partial=options["partial"]), options["test"]
+    return Opened(result=result, settings=None if test is None else read_test(test))
 
 
 _RESULT_OPTIONS: dict[str, Any] = {

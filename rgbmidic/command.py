@@ -28,14 +28,13 @@ HELP = {"help_option_names": ["-h", "--help"]}
 
 FRAME_OPTIONS: dict[str, Any] = {
     "kind": Annotated[
-        str | None,
-        Option("--kind", help="bayer, rgb (3-CCD) or monochrome; else as the files state, else bayer."),
+        str | None, Option(help="bayer, rgb (3-CCD) or monochrome; else as the files state, else bayer.")
     ],
-    "cfa": Annotated[str | None, Option("--cfa", help="Bayer pattern RGGB, BGGR, GRBG or GBRG.")],
-    "black_level": Annotated[float | None, Option("--black-level", help="Grey level of a dark sample, DN.")],
-    "white_level": Annotated[float | None, Option("--white-level", help="Smallest saturated grey level, DN.")],
-    "shape": Annotated[str | None, Option("--shape", help="ROWSxCOLUMNS of a headerless file, such as 512x768.")],
-    "dtype": Annotated[str | None, Option("--dtype", help="uint8, uint16 or >u2, of a headerless file.")],
+    "cfa": Annotated[str | None, Option(help="Bayer pattern RGGB, BGGR, GRBG or GBRG.")],
+    "black_level": Annotated[float | None, Option(help="Grey level of a dark sample, DN.")],
+    "white_level": Annotated[float | None, Option(help="Smallest saturated grey level, DN.")],
+    "shape": Annotated[str | None, Option(help="ROWSxCOLUMNS of a headerless file, such as 512x768.")],
+    "dtype": Annotated[str | None, Option(help="uint8, uint16 or >u2, of a headerless file.")],
 }
 """Options that state what the files of frames do not, by the keys of ``[frames]``."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from rgbmidic.results.physical import Physical
-
 logger = logging.getLogger(__name__)
 
 Panel = tuple[str, Sequence[HistoryColumn]]
@@ -31,33 +29,13 @@ _KIND = re.compile(
 _KIND_OF_UNIT = {"deg": "rotation", "": "strain", "MPa √m": "K", "MPa": "T-stress"}
 
 
-def field_history_figure(physical: Physical, history: TimeHistory) -> Figure:
-    """Draw displacement and strain over the frames: median of the nodes as a line, 5 to 95 % of them as a band."""
-
-    def band(axis: Axes, name: str, style: dict[str, Any]) -> None:
-        low, _, high = history.quantiles[name].T
-        axis.fill_between(history.axis[0], low, high, color=style["color"], alpha=0.18, linewidth=0)
-
-    panels = {f"displacement ({physical.units.length})": ("u", "v")}
-    return _medians({**panels, f"strain ({physical.measure_name})": ("exx", "eyy", "exy")}, history, band)
-
-
-def uncertainty_figure(physical: Physical, history: TimeHistory, floor: NoiseFloor | None) -> Figure:
-    """Draw the stated uncertainty over the frames, median of the nodes; the noise floor as thin lines."""
-
-    def level(axis: Axes, name: str, style: dict[str, Any]) -> None:
-        if floor is not None:
-            axis.axhline(floor.measured[name.removesuffix("_std")], linewidth=0.6, **style)
-        axis.set_ylim(bottom=0)
-
-    panels = {f"standard uncertainty ({physical.units.length})": ("u_std", "v_std")}
-    return _medians({**panels, "standard uncertainty of strain": ("exx_std", "eyy_std", "exy_std")}, history, level)
-
-
-def _medians(
-    panels: Mapping[str, Sequence[str]], history: TimeHistory, add: Callable[[Axes, str, dict[str, Any]], None]
+def medians_figure(
+    history: TimeHistory, panels: Mapping[str, Sequence[str]], *, band: bool = False, floor: NoiseFloor | None = None
 ) -> Figure:
-    """Draw the median over the nodes of quantities over the frames, a panel for each label; `add` adds to each line."""
+    """Draw the median over the nodes of quantities over the frames, a panel for each label.
+
+    Either with a band of 5 to 95 % of the nodes, or, of standard uncertainties, with the noise floor as thin lines.
+    """
     times, label_of_times = history.axis
     marker = "o" if len(times) <= style.FIGURES.marked else None
 
@@ -65,9 +43,14 @@ def _medians(
         for axis, (label, names) in zip(axes, panels.items(), strict=True):
             for name, colour, line in zip(names, ("blue", "vermillion", "green"), style.LINES, strict=False):
                 look: dict[str, Any] = {"color": style.OKABE_ITO[colour], "linestyle": line}
-                median = history.quantiles[name][:, 1]
+                low, median, high = history.quantiles[name].T
                 axis.plot(times, median, linewidth=1.2, label=name, marker=marker, markersize=2.5, **look)
-                add(axis, name, look)
+                if band:
+                    axis.fill_between(times, low, high, color=look["color"], alpha=0.18, linewidth=0)
+                if floor is not None:
+                    axis.axhline(floor.measured[name.removesuffix("_std")], linewidth=0.6, **look)
+            if not band:
+                axis.set_ylim(bottom=0)
             axis.legend(loc="best")
             style.finish_plot(axis, label_of_times, label, whole=not history.timed)
 

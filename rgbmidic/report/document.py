@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -19,13 +20,9 @@ from rgbmidic.report.style import PAGE_DPI, time_text
 from rgbmidic.report.summary import TimeHistory, noise_floor, speckle_size
 from rgbmidic.results import QUANTITIES, Maps, Result, channels_of, probes_of, rounded, uncertain
 from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results.histories import read_histories
 from rgbmidic.results.physical import Physical
-from rgbmidic.settings import ChannelSettings, ProbeSettings, SetupSettings, TestSettings, read_section
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from rgbmidic.results.histories import Histories
+from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,112 +110,76 @@ def write_report(
     probes = probes_of(result) if settings is None else settings.probes
     channels = channels_of(result) if settings is None else settings.channels
     physical = Physical.of(result, None if settings is None else settings.scale)
-    report = _Report(physical, probes, channels, frames)
-    exposure, speckle = result.provenance.get("exposure_ns"), speckle_size(result)
+    for frame in frames or ():
+        result.frame(frame)  # an error of one is raised before the long work
+    constants, kept = ReportConstants(), result.provenance
+    history = TimeHistory(physical, figures.spread(figures.shown_frames(result), constants.histories))
+    if frames is None:
+        measured = figures.spread(figures.measured_frames(result), constants.shown)
+        frames = sorted({*measured, history.farthest})
+    maps = figures.MapDrawer(Maps(result=result, physical=physical), PAGE_DPI)
+    exposure, speckle = kept.get("exposure_ns"), speckle_size(result)
     ends, odd = result.status[list(result.deformed)], [index for index in result.deformed if result.status[index] != 0]
     odd = [index for index in odd if result.finished[index]]
     text = render(
         "report.html",
-        **vars(report),
-        report=report,
-        constants=report.constants,
-        result=result,
-        stated=asdict(setup),
-        rate=result.provenance.get("frame_rate") or result.setting("scale", "frame_rate"),
-        exposure=None if exposure is None else f"{exposure / 1000:g} µs",
-        speckle=None if speckle is None else physical.in_units(speckle),
-        missing=int((~result.finished).sum()),
-        endings={word: int((ends == code).sum()) for code, word in enumerate(QUANTITIES["status"].codes)},
-        troubled=list(zip((result.names[index] for index in odd), result.each("reason", odd), strict=True)),
+        constants=constants,
         curves=curves,
         figures=figures,
         isfinite=np.isfinite,
         uncertain=uncertain,
-        measured=report.history.fractions[:, 0],
+        rounded=rounded,
+        result=result,
+        physical=physical,
+        stated=asdict(setup),
+        probes=probes,
+        shown=frames,
+        maps=maps,
+        history=history,
+        measured=history.fractions[:, 0],
+        floor=noise_floor(physical),
+        histories=read_histories(result, probes, scale=physical.scale, channels=channels) if probes.places else None,
+        lines=_lines(maps.maps, probes, constants),
+        when=partial(_when, physical),
+        rate=kept.get("frame_rate") or result.setting("scale", "frame_rate"),
+        exposure=None if exposure is None else f"{exposure / 1000:g} µs",
+        blur=1e-9 * (exposure or 0) * history.fastest if physical.units.timed else 0,
+        speckle=None if speckle is None else physical.in_units(speckle),
+        missing=int((~result.finished).sum()),
+        endings={word: int((ends == code).sum()) for code, word in enumerate(QUANTITIES["status"].codes)},
+        troubled=list(zip((result.names[index] for index in odd), result.each("reason", odd), strict=True)),
     )
     write_complete(out, lambda file: file.write(text.encode()))
 
 
-class _Report:
-    """Data that the sections of a report are made from, which its template names."""
+def _lines(maps: Maps, probes: ProbeSettings, constants: ReportConstants) -> Iterator[dict[str, Any]]:
+    """Yield position against time along the lines of the probes, else through the middle of the region."""
+    from rgbmidic.results.profiles import read_profile
 
-    constants = ReportConstants()
+    measured, nodes = figures.measured_frames(maps.result), maps.result.nodes
+    if not maps.physical.units.timed or len(measured) < constants.fewest:
+        return
+    middle, (wide, tall) = (nodes.min(axis=0) + nodes.max(axis=0)) / 2, np.ptp(nodes, axis=0) / 2
+    reach = np.array([wide, 0.0] if wide >= tall else [0.0, tall])
+    lines = {"the longer side of the region, through its middle": (*(middle - reach), *(middle + reach))}
+    if stated := [place for kind, place in probes.places if kind == "line"]:
+        lines = {f"line_{number}": place for number, place in enumerate(stated, 1)}
+    frames = figures.spread(measured, constants.histories)
+    for name, place in lines.items():
+        x0, y0, x1, y1 = place
+        field = "exx" if abs(x1 - x0) >= abs(y1 - y0) else "eyy"
+        where = f"{name}, from ({x0:.0f}, {y0:.0f}) to ({x1:.0f}, {y1:.0f}) px"
+        line = {"field": field, "where": where, "drawn": len(frames), "measured": len(measured), "error": None}
+        try:
+            yield line | {"figure": curves.profile_figure(read_profile(maps, field, place, frames))}
+        except InputError as error:
+            yield line | {"error": error}
 
-    def __init__(
-        self, physical: Physical, probes: ProbeSettings, channels: ChannelSettings, frames: Sequence[int] | None
-    ) -> None:
-        result = physical.result
-        for frame in frames or ():
-            result.frame(frame)  # an error of one is raised before the long work
-        self.physical, self.probes, self.channels = physical, probes, channels
-        self.history = TimeHistory(physical, figures.spread(figures.shown_frames(result), self.constants.histories))
-        measured = figures.spread(figures.measured_frames(result), self.constants.shown)
-        self.shown = tuple(sorted({*measured, self.history.farthest})) if frames is None else tuple(frames)
-        self.maps = figures.MapDrawer(Maps(result=result, physical=physical), PAGE_DPI)
-        self.floor, self.excess = noise_floor(physical), 0.0
-        if self.floor is not None:  # over what is stated
-            stated = np.hypot(self.history.median("u_std"), self.history.median("v_std"))
-            self.excess = np.hypot(self.floor.measured["u"], self.floor.measured["v"]) / stated
-        exposed = 1e-9 * (result.provenance.get("exposure_ns") or 0)
-        self.blur = exposed * self.history.fastest if physical.units.timed else 0.0
 
-    def strips(self) -> Iterator[tuple[Figure, str]]:
-        """Yield pictures of displacement and strain in key frames, with what they show."""
-        keys, physical = self.history.key_frames(self.constants.keys), self.physical
-        if len(keys) < 3:
-            return
-        frames = {self.when(frame, short=True): frame for frame in keys}
-        for name, label in (
-            ("magnitude", f"displacement ({physical.units.length})"),
-            ("e1", f"larger principal strain ({physical.measure_name})"),
-        ):
-            yield self.maps.strip(name, frames, label), label
-
-    def histories(self) -> Histories:
-        """Read the time histories of the probes."""
-        from rgbmidic.results.histories import read_histories
-
-        return read_histories(self.physical.result, self.probes, scale=self.physical.scale, channels=self.channels)
-
-    def lines(self) -> Iterator[dict[str, Any]]:
-        """Yield position against time along the lines of the probes, else through the middle of the region."""
-        physical, measured = self.physical, figures.measured_frames(self.physical.result)
-        if not physical.units.timed or len(measured) < self.constants.fewest:
-            return
-        from rgbmidic.results.profiles import read_profile
-
-        nodes = physical.result.nodes
-        middle, (wide, tall) = (nodes.min(axis=0) + nodes.max(axis=0)) / 2, np.ptp(nodes, axis=0) / 2
-        reach = np.array([wide, 0.0] if wide >= tall else [0.0, tall])
-        lines = {"the longer side of the region, through its middle": (*(middle - reach), *(middle + reach))}
-        if stated := [place for kind, place in self.probes.places if kind == "line"]:
-            lines = {f"line_{number}": place for number, place in enumerate(stated, 1)}
-        maps, frames = self.maps.maps, figures.spread(measured, self.constants.histories)
-        for name, place in lines.items():
-            x0, y0, x1, y1 = place
-            field = "exx" if abs(x1 - x0) >= abs(y1 - y0) else "eyy"
-            where = f"{name}, from ({x0:.0f}, {y0:.0f}) to ({x1:.0f}, {y1:.0f}) px"
-            line = {"field": field, "where": where, "drawn": len(frames), "measured": len(measured), "error": None}
-            try:
-                yield line | {"figure": curves.profile_figure(read_profile(maps, field, place, frames))}
-            except InputError as error:
-                yield line | {"error": error}
-
-    def uncertainty_rows(self) -> Iterator[tuple[str, ...]]:
-        """Yield quantity, unit, and quantiles over the nodes of its standard uncertainty, medians of the frames."""
-        for name in ("u_std", "v_std", "exx_std", "eyy_std", "exy_std"):
-            known = self.history.quantiles[name]
-            known = known[np.isfinite(known).all(axis=1)]
-            numbers = [rounded(value, value) for value in np.median(known, axis=0)] if len(known) else "---"
-            yield name, self.physical.units.length if name[0] in "uv" else "1", *numbers
-
-    def when(self, frame: int, *, short: bool = False) -> str:
-        """Name a frame, with its time where it is known."""
-        times = self.physical.times
-        when = f" at {time_text(times[frame], times)}" if self.physical.units.timed else ""
-        if short:
-            return f"frame {frame}{when.replace(' at', ',')}"
-        return f"frame {frame} ({self.physical.result.names[frame]}){when}"
+def _when(physical: Physical, frame: int) -> str:
+    """Name a frame, with its time where it is known."""
+    at = f" at {time_text(physical.times[frame], physical.times)}" if physical.units.timed else ""
+    return f"frame {frame} ({physical.result.names[frame]}){at}"
 
 
 def write_batch_page(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> None:

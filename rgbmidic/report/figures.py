@@ -315,7 +315,7 @@ class MapDrawer:
         """Draw the fraction of each light in what determines the nodes of a frame, as `fraction_figure` does."""
         return self.fields(frame, [f"fraction of {light}" for light in self.result.lights])
 
-    def strip(self, name: str, frames: Mapping[str, int], label: str) -> Figure:
+    def strip(self, name: str, frames: Sequence[int], label: str) -> Figure:
         """Draw small maps of one field in several frames, side by side, in the same colours.
 
         Parameters
@@ -323,7 +323,7 @@ class MapDrawer:
         name
             Name of the field.
         frames
-            Indices of the frames by their titles.
+            Indices of the frames.
         label
             Title of the figure: the field and its unit.
 
@@ -332,15 +332,16 @@ class MapDrawer:
         Figure
         """
         field, (x, y) = self.maps.field(name), picture_limits(self.result, self.result.nodes)
-        maps = {title: self.maps.read(name, frame).values for title, frame in frames.items()}
+        maps, physical = {frame: self.maps.read(name, frame).values for frame in frames}, self.maps.physical
         every = np.concatenate([*maps.values()])
         known = every[np.isfinite(every)]
         norm = style.colour_scale(known) if known.size else None
 
         def draw(axes: list[Axes]) -> None:
-            for axis, (title, values) in zip(axes, maps.items(), strict=False):
+            for axis, (frame, values) in zip(axes, maps.items(), strict=False):
                 self._show(axis, values, norm, field, bar=axis is axes[-2])
-                axis.set_title(title)
+                at = f", {style.time_text(physical.times[frame], physical.times)}" if physical.units.timed else ""
+                axis.set_title(f"frame {frame}{at}")
                 style.finish_picture(axis, x, y, first=axis is axes[0], unit=self._unit, factor=self._factor)
             axes[-1].set_axis_off()  # room for the colour bar
 

@@ -157,27 +157,8 @@ def _file(folder: Path, kind: str, frame: int | None) -> Path:
     return folder / (f"{kind}.png" if frame is None else f"{kind}_{frame:06d}.png")
 
 
-def remove_figures(folder: Path | str) -> None:
-    """Remove the pictures that an earlier run left, since they would show another result; nothing else is touched.
-
-    Parameters
-    ----------
-    folder
-        Folder of the figures.
-
-    Raises
-    ------
-    ResultError
-        A picture cannot be removed.
-    """
-    for file in Path(folder).glob("*.png"):
-        if _NAMES.fullmatch(file.name):
-            with writing(file):
-                file.unlink()
-
-
-def remove_report(folder: Path | str) -> None:
-    """Remove the report in a folder whose result is measured anew, since it would show the earlier one.
+def remove_pictures(folder: Path | str) -> None:
+    """Remove the figures and the report of an earlier run, since they would show another result; nothing else.
 
     Parameters
     ----------
@@ -187,7 +168,9 @@ def remove_report(folder: Path | str) -> None:
     Raises
     ------
     ResultError
-        The report cannot be removed.
+        One of them cannot be removed.
     """
-    with writing(Path(folder) / REPORT):
-        (Path(folder) / REPORT).unlink(missing_ok=True)
+    drawn = [file for file in (Path(folder) / "figures").glob("*.png") if _NAMES.fullmatch(file.name)]
+    for file in (*drawn, Path(folder) / REPORT):
+        with writing(file):
+            file.unlink(missing_ok=True)

@@ -19,7 +19,7 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.report import curves, document, remove_report, style, summary, write_batch_page, write_report
+from rgbmidic.report import curves, document, remove_pictures, style, summary, write_batch_page, write_report
 from rgbmidic.results import FrameRecord, Maps, Result, ResultStore, read_profile
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import (
@@ -188,7 +188,7 @@ def test_calibration_exposure_and_stress_are_in_the_report(tmp_path: Path, monke
     notes = {"calibration_figures": figures, "reference_exposure": exposure}
     result = make(tmp_path / "r", [still(index, 0.01) for index in range(3)], notes=notes, settings=stated)
     seen: list[Any] = []
-    monkeypatch.setattr(curves, "history_figure", seen.append)
+    monkeypatch.setattr(curves, "history_figure", lambda histories, _: seen.append(histories))
     write_report(result, tmp_path / "a.html")
     page = Reader(tmp_path / "a.html")
     assert page.rows["channel 2"] == "0.20000 ± 0.0002 | 1.00000 | 0.30000 ± 0.0002"
@@ -285,8 +285,8 @@ def test_the_page_of_a_batch_links_its_reports_and_escapes_what_it_is_given(tmp_
 def test_the_report_of_an_earlier_run_is_removed_and_nothing_else(tmp_path: Path) -> None:
     for name in ("report.html", "mine.html"):
         (tmp_path / name).touch()
-    remove_report(tmp_path)
-    remove_report(tmp_path)
+    remove_pictures(tmp_path)
+    remove_pictures(tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["mine.html"]
 
 
