@@ -55,37 +55,25 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Calibration": "rgbmidic.illumination.calibration",
-    "CameraCalibration": "rgbmidic.fields",
-    "FiniteElementMesh": "rgbmidic.mesh",
-    "Inspection": "rgbmidic.lab.inspection",
-    "NodeStatus": "rgbmidic.correlation",
-    "Placement": "rgbmidic.mesh",
-    "Region": "rgbmidic.mesh",
-    "Result": "rgbmidic.results",
-    "RgbmidicError": "rgbmidic.errors",
-    "Solution": "rgbmidic.correlation",
-    "SolverSettings": "rgbmidic.settings",
-    "Status": "rgbmidic.correlation",
-    "TestSettings": "rgbmidic.settings",
-    "Tri3Mesh": "rgbmidic.mesh",
-    "correlate": "rgbmidic.pipeline",
-    "discretisation_error": "rgbmidic.correlation",
-    "export_result": "rgbmidic.results",
-    "inspect_frame": "rgbmidic.lab.inspection",
-    "measure": "rgbmidic.pipeline",
-    "measure_sequence": "rgbmidic.pipeline",
-    "read_frame": "rgbmidic.frames",
-    "read_histories": "rgbmidic.results.histories",
-    "read_mesh": "rgbmidic.mesh",
-    "read_test": "rgbmidic.settings",
-    "separate": "rgbmidic.illumination",
+    "correlation": ("NodeStatus", "Solution", "Status", "discretisation_error"),
+    "errors": ("RgbmidicError",),
+    "fields": ("CameraCalibration",),
+    "frames": ("read_frame",),
+    "illumination": ("separate",),
+    "illumination.calibration": ("Calibration",),
+    "lab.inspection": ("Inspection", "inspect_frame"),
+    "mesh": ("FiniteElementMesh", "Placement", "Region", "Tri3Mesh", "read_mesh"),
+    "pipeline": ("correlate", "measure", "measure_sequence"),
+    "results": ("Result", "export_result"),
+    "results.histories": ("read_histories",),
+    "settings": ("SolverSettings", "TestSettings", "read_test"),
 }
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{home}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 from typer.core import TyperGroup
 
 from rgbmidic import cli_before, cli_fields, cli_measure, cli_results, command
@@ -49,8 +50,8 @@ def main() -> None:
 @app.callback(invoke_without_command=True)
 def _rgbmidic(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show where an error occurs.")] = False,
+    version: Annotated[bool, Option("--version", help="Print the version and exit.")] = False,
+    debug: Annotated[bool, Option("--debug", help="Show where an error occurs.")] = False,
 ) -> None:
     """Digital Image Correlation that survives light reflections."""
     if version:

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from rgbmidic import command
 from rgbmidic._version import __version__
-from rgbmidic.cli_parts import Out, Overwrite, explain_first_run, note, print_table, progress_of, read_settings
+from rgbmidic.cli_parts import Out, Overwrite, Test, explain_first_run, note, print_table, progress_of
 from rgbmidic.errors import InputError
-
-if TYPE_CHECKING:
-    pass
 
 app = typer.Typer()
 
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option("--out", help="Output folder; must be empty or new.")] = Path("rgbmidic-demo"),
+    out: Annotated[Path, Option(help="Output folder; must be empty or new.")] = Path("rgbmidic-demo"),
 ) -> None:
     """Make a small virtual test, calibrate and measure it, and compare the result with the exact truth."""
     note(f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}")
@@ -89,8 +87,8 @@ def _calibrate_demo_camera(test: Path) -> None:
 
 @app.command()
 def sample(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a sample; without it, all are listed.")] = "",
-    folder: Annotated[Path | None, typer.Argument(metavar="FOLDER", help="New or empty folder; else NAME.")] = None,
+    name: Annotated[str, Argument(metavar="NAME", help="Name of a sample; without it, all are listed.")] = "",
+    folder: Annotated[Path | None, Argument(metavar="FOLDER", help="New or empty folder; else NAME.")] = None,
 ) -> None:
     """Download published real files with a TEST.toml for them, or list the available samples."""
     from rgbmidic.lab.samples import SAMPLES, write_sample
@@ -108,7 +106,7 @@ def sample(
 
 @app.command()
 def virtual(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Scene to render.")],
+    scene: Annotated[Path, Argument(metavar="SCENE.toml", help="Scene to render.")],
     out: Out,
 ) -> None:
     """Render a virtual test: raw frames, calibration captures and the exact truth."""
@@ -121,11 +119,9 @@ def virtual(
 
 @app.command()
 def plan(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="Lamps, camera, paint, specimen and its states.")],
+    scene: Annotated[Path, Argument(metavar="SCENE.toml", help="Lamps, camera, paint, specimen and its states.")],
     out: Out,
-    distance: Annotated[
-        float | None, typer.Option("--distance", metavar="MM", help="Camera to specimen; else the scene's.")
-    ] = None,
+    distance: Annotated[float | None, Option(metavar="MM", help="Camera to specimen; else the scene's.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Predict where each lamp is reflected, the expected uncertainty, and better positions of the lamps."""
@@ -160,11 +156,11 @@ def plan(
 @command.frame_options
 def frames(
     statement: dict[str, Any],
-    path: Annotated[str, typer.Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")] = "",
-    formats: Annotated[bool, typer.Option("--formats", help="List the formats that are read.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
+    path: Annotated[str, Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")] = "",
+    formats: Annotated[bool, Option("--formats", help="List the formats that are read.")] = False,
+    json: Annotated[bool, Option("--json", help="Print the list as JSON.")] = False,
     save: Annotated[
-        tuple[int, Path] | None, typer.Option("--save", metavar="N OUT.tif", help="Write frame N as a 16-bit TIFF.")
+        tuple[int, Path] | None, Option("--save", metavar="N OUT.tif", help="Write frame N as a 16-bit TIFF.")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -195,24 +191,21 @@ def frames(
 def inspect(
     frames: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="FRAME...", help="A raw frame; in succession one per light; or TEST.toml: its reference."
-        ),
+        Argument(metavar="FRAME...", help="A raw frame; in succession one per light; or TEST.toml: its reference."),
     ],
     statement: dict[str, Any],
-    test: Annotated[Path | None, typer.Option("--test", help="TEST.toml of the test.")] = None,
-    calibration: Annotated[Path | None, typer.Option("--calibration", help="Calibration file.")] = None,
-    region: Annotated[str, typer.Option("--region", help="x0,y0,x1,y1 in px; else the test's or all.")] = "",
-    element_size: Annotated[float | None, typer.Option("--element-size", help="px; else the test's, or 25.")] = None,
-    accept: Annotated[
-        list[str] | None, typer.Option("--accept", help="Failing calibration check to accept; else the test's.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for inspection.png and inspection.json.")] = None,
+    test: Annotated[Path | None, Option(help="TEST.toml of the test.")] = None,
+    calibration: Annotated[Path | None, Option(help="Calibration file.")] = None,
+    region: Annotated[str, Option(help="x0,y0,x1,y1 in px; else the test's or all.")] = "",
+    element_size: Annotated[float | None, Option(help="px; else the test's, or 25.")] = None,
+    accept: Annotated[list[str] | None, Option(help="Failing calibration check to accept; else the test's.")] = None,
+    out: Annotated[Path | None, Option(help="Folder for inspection.png and inspection.json.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Inspect one frame before a test: lights, reflections, speckle, noise, expected uncertainty."""
     from rgbmidic.lab import check_folder
     from rgbmidic.lab.inspection import inspect_files, report, state_frames
+    from rgbmidic.settings import read_test
 
     if out is not None:
         check_folder(out, report.FILES, overwrite=overwrite)
@@ -220,7 +213,7 @@ def inspect(
         if test is not None or len(frames) > 1:
             raise InputError("a TEST.toml stands for the frames of its reference: give it alone, or frames and --test")
         test, frames = frames[0], []
-    settings = read_settings(test)
+    settings = None if test is None else read_test(test)
     explain_first_run()
     with progress_of("inspecting") as progress:
         inspection = inspect_files(
@@ -250,18 +243,18 @@ def inspect(
 
 @app.command()
 def resolution(
-    test: Annotated[Path, typer.Argument(metavar="TEST.toml", help="Settings of the test.")],
+    test: Test,
     sizes: Annotated[
-        str, typer.Option("--sizes", help="Element sizes in px, such as 10,16,25,40; else those that suit the speckle.")
+        str, Option(help="Element sizes in px, such as 10,16,25,40; else those that suit the speckle.")
     ] = "",
     gauges: Annotated[
-        str, typer.Option("--gauges", help="Lengths of virtual strain gauges in px; else three elements of each size.")
+        str, Option(help="Lengths of virtual strain gauges in px; else three elements of each size.")
     ] = "",
     frames: Annotated[
         str,
-        typer.Option("--frames", help="Frames, such as 5,10:20, among which the key frame is; else five."),
+        Option(help="Frames, such as 5,10:20, among which the key frame is; else five."),
     ] = "",
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for resolution.csv, .json and .png.")] = None,
+    out: Annotated[Path | None, Option(help="Folder for resolution.csv, .json and .png.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Find the element size of a test: noise, discretisation error and strain resolution of several, on its frames."""

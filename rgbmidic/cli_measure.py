@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from rgbmidic import command
-from rgbmidic.cli_parts import Out, Overwrite, explain_first_run, note, progress_of
+from rgbmidic.cli_parts import Draw, Out, Overwrite, Test, Workers, explain_first_run, note, progress_of
 from rgbmidic.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,30 +22,20 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-_CONVERGED, _UNCONVERGED, _FAILED = 0, 1, 2
-
-
-_TOO_MANY = 0.5
-"""Fraction of the deformed frames beyond which those that failed or did not converge make a run a failure: a specimen
-that breaks or leaves the picture halfway through is an ordinary test, a run that measures few of its frames is not."""
-
-
 @app.command()
 def run(
-    test: Annotated[Path, typer.Argument(metavar="TEST.toml", help="Settings of the test.")],
+    test: Test,
     out: Out,
     overwrite: Overwrite = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the interrupted run in DIR.")] = False,
+    resume: Annotated[bool, Option("--resume", help="Continue the interrupted run in DIR.")] = False,
     retry_failed: Annotated[
-        bool, typer.Option("--retry-failed", help="With --resume: measure all failed frames again.")
+        bool, Option("--retry-failed", help="With --resume: measure all failed frames again.")
     ] = False,
-    frames: Annotated[
-        str, typer.Option("--frames", help="Only these, such as 1000:2000; end with `rgbmidic finish`.")
-    ] = "",
-    workers: Annotated[int, typer.Option("--workers", min=0, help="Frames at a time; 0: as many as cores.")] = 0,
-    scheduler: Annotated[str | None, typer.Option("--scheduler", help="Address of a Dask scheduler.")] = None,
-    timings: Annotated[bool, typer.Option("--timings", help="Store and print the time of each stage.")] = False,
-    draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
+    frames: Annotated[str, Option(help="Only these, such as 1000:2000; end with `rgbmidic finish`.")] = "",
+    workers: Workers = 0,
+    scheduler: Annotated[str | None, Option(help="Address of a Dask scheduler.")] = None,
+    timings: Annotated[bool, Option("--timings", help="Store and print the time of each stage.")] = False,
+    draw: Draw = True,
 ) -> None:
     """Measure a test: from raw frames to one displacement field per frame."""
     from rgbmidic.pipeline import measure
@@ -77,18 +68,16 @@ def run(
 
 @app.command()
 def batch(
-    tests: Annotated[
-        list[Path], typer.Argument(metavar="TEST.toml...", help="Settings of the tests; one with --table.")
-    ],
+    tests: Annotated[list[Path], Argument(metavar="TEST.toml...", help="Settings of the tests; one with --table.")],
     out: Out,
     table: Annotated[
-        Path | None, typer.Option("--table", help="CSV: a column test, and keys of TEST.toml that its values replace.")
+        Path | None, Option(help="CSV: a column test, and keys of TEST.toml that its values replace.")
     ] = None,
     elastic: Annotated[
-        str, typer.Option("--elastic", metavar="LOW:HIGH", help="Strains between which a modulus is fitted.")
+        str, Option(metavar="LOW:HIGH", help="Strains between which a modulus is fitted.")
     ] = "0.0005:0.0025",
-    workers: Annotated[int, typer.Option("--workers", min=0, help="Frames at a time; 0: as many as cores.")] = 0,
-    reports: Annotated[bool, typer.Option("--reports/--no-reports", help="Write a report of each test.")] = True,
+    workers: Workers = 0,
+    reports: Annotated[bool, Option("--reports/--no-reports", help="Write a report of each test.")] = True,
     overwrite: Overwrite = False,
 ) -> None:
     """Measure a series of tests, each into DIR/NAME, with one summary table and page.
@@ -103,8 +92,8 @@ def batch(
     if table is not None and len(tests) != 1:
         raise InputError(f"--table goes with one TEST.toml, the template, not with {len(tests)}")
     chosen = series.read_tests(tests) if table is None else series.read_table(tests[0], table)
-    limits = command.read_pair(elastic, "--elastic")
-    if not 0 <= limits[0] < limits[1]:
+    low, high = command.read_pair(elastic, "--elastic")
+    if not 0 <= low < high:
         raise InputError(f"--elastic is a smaller and a larger strain, not {elastic}")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -121,7 +110,7 @@ def batch(
             chosen,
             out,
             workers=workers or None,
-            elastic=limits,
+            elastic=(low, high),
             overwrite=overwrite,
             conclude=conclude,
             progress=lambda name: progress,
@@ -139,8 +128,8 @@ def batch(
 
 @app.command()
 def finish(
-    result: Annotated[Path, typer.Argument(metavar="DIR", help="Result folder of runs with --frames.")],
-    draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Write pictures into DIR/figures.")] = True,
+    result: Annotated[Path, Argument(metavar="DIR", help="Result folder of runs with --frames.")],
+    draw: Draw = True,
 ) -> None:
     """Finish a result that was measured in parts: check that no frame is missing, and draw it."""
     from rgbmidic.results import Result, finish_result
@@ -153,21 +142,21 @@ def finish(
 def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0) -> None:
     """Draw a finished result and print the status of its frames.
 
-    The drawing uses as many processes as cores if no number is stated; the command fails if more than `_TOO_MANY`
-    of the frames failed or did not converge.
+    The drawing uses as many processes as cores if no number is stated. The command fails if more than half of the
+    frames failed or did not converge: a specimen that breaks or leaves the picture halfway through is an ordinary test,
+    a run that measures few of its frames is not.
     """
     from rgbmidic._kernels.threads import threads
-    from rgbmidic.report import remove_figures, remove_report, write_figures
+    from rgbmidic.report import remove_pictures, write_figures
 
-    remove_figures(result.path / "figures")
-    remove_report(result.path)
+    remove_pictures(result.path)
     if draw:
         write_figures(result, result.path / "figures", processes=processes or threads())
     _print_summary(result, time.perf_counter() - started)
-    failed = [index for index in result.deformed if result.status[index] != _CONVERGED]
+    failed = [index for index in result.deformed if result.status[index] != 0]
     if unread := int(result.unread.sum()):
         note(f"note: frames that could not be read: {unread}; --resume tries them again")
-    if len(failed) > _TOO_MANY * len(result.deformed) or not result.deformed:
+    if len(failed) > len(result.deformed) / 2 or not result.deformed:
         first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}" if failed else "there is none"
         count = f"{len(failed)} of {len(result.deformed)} deformed frames failed or did not converge"
         raise typer.Exit(command.fail(f"{count}; {first}", command.FAILURE))
@@ -195,11 +184,12 @@ def _continuation_hint(test: Path, out: Path, frames: str, *, resume: bool) -> I
 
 def _print_summary(result: Result, seconds: float) -> None:
     """Print the status of the deformed frames; the reference, matched with itself, is left out."""
+    from rgbmidic.results import QUANTITIES
     from rgbmidic.timing import STAGES
 
     deformed = list(result.deformed)
-    ends = [int((result.status[deformed] == code).sum()) for code in (_CONVERGED, _UNCONVERGED, _FAILED)]
-    words = [f"{ends[0]} converged", *([f"{ends[1]} not converged"] if ends[1] else []), f"{ends[2]} failed"]
+    ends = {word: int((result.status[deformed] == code).sum()) for code, word in enumerate(QUANTITIES["status"].codes)}
+    words = [f"{count} {word}" for word, count in ends.items() if count or word != "not converged"]
     measured = [float((status == 0).mean()) for status in result.each("node_status", deformed)]
     rows = {"frames": f"{len(deformed)} deformed: {', '.join(words)}", "nodes": f"{len(result.nodes)}"}
     if measured:

@@ -1,84 +1,96 @@
-"""What the commands of `rgbmidic` share: options, notes, tables and progress."""
+"""What the commands of `rgbmidic` share: options, the result that they read, notes, tables and progress."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from rich.console import Console
+from typer import Argument, Option
 
 from rgbmidic import command
 from rgbmidic.errors import InputError
 
 if TYPE_CHECKING:
-    from rgbmidic.results import Result
-    from rgbmidic.settings import TestSettings
-
-_WIDE = 400
-"""Columns that a table may take: where the terminal has fewer it breaks the lines, and nothing is cut off."""
-
+    from rgbmidic.results import Maps, Result
+    from rgbmidic.settings import ScaleSettings, TestSettings
 
 messages = Console(stderr=True)
+
+Draw = Annotated[bool, Option("--figures/--no-figures", help="Write pictures into DIR/figures.")]
+Measure = Annotated[str | None, Option(help="green-lagrange, hencky, biot or engineering.")]
+Out = Annotated[Path, Option(help="Output folder; created if it does not exist.")]
+Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
+Test = Annotated[Path, Argument(metavar="TEST.toml", help="Settings of the test.")]
+Workers = Annotated[int, Option(min=0, help="Processes that work at a time; 0: as many as cores.")]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Opened:
+    """A result that a command reads, and the settings that stand in place of those it keeps, if any are stated."""
+
+    result: Result
+    settings: TestSettings | None
+
+    @property
+    def scale(self) -> ScaleSettings | None:
+        """The scale of these settings; None: that of the result."""
+        return None if self.settings is None else self.settings.scale
+
+    def maps(self, derived: Mapping[str, Any]) -> Maps:
+        """The fields of the result, as the options of `derived_options` derive them."""
+        from rgbmidic.results import Maps
+
+        return Maps.of(self.result, self.scale, **derived)
+
+    def frames(self, text: str) -> list[int] | None:
+        """The measured ones of the frames that ``--frames`` states; None where it states none."""
+        if (asked := command.read_frames(text)) is None:
+            return None
+        result, there = self.result, f"{self.result.path} has frames 0 to {len(self.result) - 1}"
+        if max(asked) >= len(result):
+            raise InputError(f"--frames {text}: {there}")
+        if not (chosen := [frame for frame in asked if result.finished[frame]]):
+            raise InputError(f"--frames {text}: none of them is measured; {there}")
+        return chosen
+
+
+def _open(options: Mapping[str, Any]) -> Opened:
+    from rgbmidic.results import Result
+    from rgbmidic.settings import read_test
+
+    result, test = Result.open(options["result"], partial=options["partial"]), options["test"]
+    return Opened(result=result, settings=None if test is None else read_test(test))
+
+
+_RESULT_OPTIONS: dict[str, Any] = {
+    "result": Annotated[Path, Argument(metavar="RESULT", help="Result folder that `rgbmidic run` wrote.")],
+    "test": Annotated[
+        Path | None,
+        Option(help="TEST.toml whose [scale], [setup], [probes] and [channels] replace those of the result."),
+    ],
+    "partial": Annotated[bool, Option("--partial", help="Use the finished frames of an interrupted run.")],
+}
+opened_result = command.gather("opened", _RESULT_OPTIONS, _open, result=command.REQUIRED, partial=False)
+"""Decorator of a command whose parameter `opened` is the result that it reads."""
+
+_DERIVED: dict[str, Any] = {
+    "gauge": Annotated[float | None, Option("--gauge-length", "--gauge", help="Virtual strain gauge, px.")],
+    "measure": Measure,
+    "since": Annotated[int | None, Option(metavar="N", help="Show the fields relative to frame N.")],
+    "rigid_removed": Annotated[bool, Option("--remove-rigid", help="Remove the rigid motion.")],
+    "window": Annotated[int | None, Option(help="Frames that a rate is taken over, 4 or more.")],
+}
+derived_options = command.gather("derived", _DERIVED, dict, rigid_removed=False)
+"""Decorator of a command whose parameter `derived` states how fields are derived, as `rgbmidic.results.Maps.of`."""
 
 
 def note(text: str) -> None:
     """Print a line on stderr as it is, however long."""
     messages.print(text, soft_wrap=True, markup=False, highlight=False)
-
-
-def read_settings(test: Path | None) -> TestSettings | None:
-    """Settings of a TEST.toml, None where none is stated."""
-    from rgbmidic.settings import read_test
-
-    return None if test is None else read_test(test)
-
-
-Out = Annotated[Path, typer.Option("--out", help="Output folder; created if it does not exist.")]
-
-
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
-
-
-Reading = Annotated[
-    Path | None,
-    typer.Option(
-        "--test", help="TEST.toml whose [scale], [setup], [probes] and [channels] replace those of the result."
-    ),
-]
-
-
-Partial = Annotated[bool, typer.Option("--partial", help="Use the finished frames of an interrupted run.")]
-
-
-Measure = Annotated[str | None, typer.Option("--measure", help="green-lagrange, hencky, biot or engineering.")]
-
-
-_DERIVED: dict[str, Any] = {
-    "gauge": Annotated[float | None, typer.Option("--gauge-length", "--gauge", help="Virtual strain gauge, px.")],
-    "measure": Measure,
-    "since": Annotated[int | None, typer.Option("--since", metavar="N", help="Show the fields relative to frame N.")],
-    "rigid_removed": Annotated[bool, typer.Option("--remove-rigid", help="Remove the rigid motion.")],
-    "window": Annotated[int | None, typer.Option("--window", help="Frames that a rate is taken over, 4 or more.")],
-}
-"""Options that state how fields are derived, by the keys of `rgbmidic.results.Maps.of`."""
-
-
-derived_options = command.gather("derived", _DERIVED, lambda options: options, rigid_removed=False)
-
-
-def chosen_frames(result: Result, text: str) -> list[int] | None:
-    """The measured ones of the frames that ``--frames`` states; None where it states none."""
-    if (asked := command.read_frames(text)) is None:
-        return None
-    if max(asked) >= len(result):
-        raise InputError(f"--frames {text}: {result.path} has frames 0 to {len(result) - 1}")
-    chosen = [frame for frame in asked if result.finished[frame]]
-    if not chosen:
-        raise InputError(f"--frames {text}: none of them is measured; {result.path} has frames 0 to {len(result) - 1}")
-    return chosen
 
 
 def explain_first_run() -> None:
@@ -93,7 +105,10 @@ def explain_first_run() -> None:
 
 
 def print_table(title: str, headings: list[str], rows: list[list[str]], words: Mapping[str, str] | None = None) -> None:
-    """Print a table on stdout, and below it what words of its heading mean."""
+    """Print a table on stdout, and below it what words of its heading mean.
+
+    It is as wide as it needs to be: where the terminal has fewer columns it breaks the lines, and nothing is cut off.
+    """
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
@@ -102,14 +117,27 @@ def print_table(title: str, headings: list[str], rows: list[list[str]], words: M
     for row in rows:
         table.add_row(*row)
     print(title)
-    Console(soft_wrap=True, width=_WIDE).print(table)
+    Console(soft_wrap=True, width=400).print(table)
     for heading, meaning in (words or {}).items():
         print(f"  {heading}: {meaning}")
     print()
 
 
-def progress_of(what: str) -> AbstractContextManager[Callable[[int, int, str], None]]:
-    """A bar on stderr for people who watch, see `rgbmidic.timing`."""
-    from rgbmidic.progress import progress_bar
+@contextmanager
+def progress_of(what: str) -> Iterator[Callable[[int, int, str], None]]:
+    """A bar on stderr, and the function that moves it: frames done, their total, a line about the last one.
 
-    return progress_bar(what, messages)
+    Nothing is shown where nobody watches: an error stays one line, a log file stays short.
+    """
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    rate, last = TextColumn("{task.fields[rate]}"), TextColumn("{task.fields[line]}", markup=False)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), rate, TimeRemainingColumn(), last)
+    with Progress(*columns, console=messages, transient=True, disable=not messages.is_terminal) as bar:
+        task = bar.add_task(what, total=None, line="", rate="")
+
+        def move(done: int, total: int, line: str) -> None:
+            speed = bar.tasks[task].speed
+            bar.update(task, completed=done, total=total, line=line, rate=f"{speed:.3g}/s" if speed else "")
+
+        yield move

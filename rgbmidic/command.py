@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 
 from rgbmidic.errors import InputError, RgbmidicError, disk_reason, shortened
 
@@ -27,14 +28,13 @@ HELP = {"help_option_names": ["-h", "--help"]}
 
 FRAME_OPTIONS: dict[str, Any] = {
     "kind": Annotated[
-        str | None,
-        typer.Option("--kind", help="bayer, rgb (3-CCD) or monochrome; else as the files state, else bayer."),
+        str | None, Option(help="bayer, rgb (3-CCD) or monochrome; else as the files state, else bayer.")
     ],
-    "cfa": Annotated[str | None, typer.Option("--cfa", help="Bayer pattern RGGB, BGGR, GRBG or GBRG.")],
-    "black_level": Annotated[float | None, typer.Option("--black-level", help="Grey level of a dark sample, DN.")],
-    "white_level": Annotated[float | None, typer.Option("--white-level", help="Smallest saturated grey level, DN.")],
-    "shape": Annotated[str | None, typer.Option("--shape", help="ROWSxCOLUMNS of a headerless file, such as 512x768.")],
-    "dtype": Annotated[str | None, typer.Option("--dtype", help="uint8, uint16 or >u2, of a headerless file.")],
+    "cfa": Annotated[str | None, Option(help="Bayer pattern RGGB, BGGR, GRBG or GBRG.")],
+    "black_level": Annotated[float | None, Option(help="Grey level of a dark sample, DN.")],
+    "white_level": Annotated[float | None, Option(help="Smallest saturated grey level, DN.")],
+    "shape": Annotated[str | None, Option(help="ROWSxCOLUMNS of a headerless file, such as 512x768.")],
+    "dtype": Annotated[str | None, Option(help="uint8, uint16 or >u2, of a headerless file.")],
 }
 """Options that state what the files of frames do not, by the keys of ``[frames]``."""
 
@@ -132,24 +132,34 @@ def gather(
 
 
 def read_place(text: str, option: str, form: str) -> tuple[float, ...]:
-    """The numbers of a place that is stated in a `form` such as ``"X0,Y0:X1,Y1"``, or with commas between all of them.
+    """The finite numbers that are stated in a `form` such as ``"X0,Y0:X1,Y1"``, or with commas between all of them.
 
     Raises
     ------
     InputError
-        It is not of that form.
+        They are not of that form.
     """
-    groups = [part.split(",") for part in text.split(":")]
     forms = (form, form.replace(":", ","), form.replace("Y0,X1", "Y0:X1"))
-    shapes = [[len(group.split(",")) for group in one.split(":")] for one in forms]
-    try:
-        numbers = tuple(float(number) for group in groups for number in group)
-    except ValueError:
-        numbers = ()
-    if not numbers or [len(group) for group in groups] not in shapes:
-        unit = "" if "MM" in form else " in px"
+    shapes = [[part.count(",") for part in one.split(":")] for one in (*forms, text)]
+    numbers = _numbers(text.replace(":", ","))
+    if not numbers or shapes[-1] not in shapes[:-1] or not all(map(math.isfinite, numbers)):
+        unit = " in px" if "X" in form and "MM" not in form else ""
         raise InputError(f"{option} is {form}{unit}, such as {_EXAMPLES[form]}, not {text!r}")
     return numbers
+
+
+def read_pair(text: str, option: str) -> tuple[float, float]:
+    """The two finite numbers of ``LOW:HIGH``; an `InputError` where it is something else."""
+    low, high = read_place(text, option, "LOW:HIGH")
+    return low, high
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    """Numbers with commas between them; none where it is something else."""
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return ()
 
 
 def read_frames(text: str, option: str = "--frames") -> list[int] | None:
@@ -165,7 +175,7 @@ def read_frames(text: str, option: str = "--frames") -> list[int] | None:
         low, colon, high = (side.strip() for side in part.partition(":"))
         known = low.isdecimal() and len(low + high) < 16 and (high.isdecimal() if colon else not high)
         frames = range(int(low), int(high) if colon else int(low) + 1) if known else range(0)
-        if not 0 < len(frames) <= _MOST_FRAMES - len(chosen):
+        if not 0 < len(frames) <= 10**7 - len(chosen):  # more are a slip
             chosen.clear()
             break
         chosen += frames
@@ -174,8 +184,6 @@ def read_frames(text: str, option: str = "--frames") -> list[int] | None:
     return chosen or None
 
 
-_MOST_FRAMES = 10**7
-"""Most frames that an option states: more are a slip."""
 _EXAMPLES = {
     "X,Y": "120,85.5",
     "X0,Y0:X1,Y1": "40,60:200,60",
@@ -184,6 +192,7 @@ _EXAMPLES = {
     "X,Y:R0,R1": "120,85:60,110",
     "X0,Y0,X1,Y1": "40,60,200,160",
     "X_MM,Y_MM:X_PX,Y_PX": "0,12.5:40,610",
+    "LOW:HIGH": "-0.01:0.01",
 }
 
 
@@ -196,26 +205,12 @@ def picture_beside(table: Path) -> Path:
 
 def read_lengths(text: str, option: str) -> tuple[float, ...]:
     """Different positive lengths in px with commas between them; an `InputError` where it is something else."""
-    try:
-        values = tuple(float(part) for part in text.split(",")) if text.strip() else ()
-    except ValueError:
-        values = (math.nan,)
-    if len(set(values)) < len(values) or not all(math.isfinite(value) and value > 0 for value in values):
-        raise InputError(
-            f"{option} are different lengths in px with commas between them, such as 10,16,25, not {text!r}"
-        )
+    values = _numbers(text)
+    wrong = len(set(values)) < len(values) or not all(math.isfinite(value) and value > 0 for value in values)
+    if wrong or (text.strip() and not values):
+        form = "different lengths in px with commas between them, such as 10,16,25"
+        raise InputError(f"{option} are {form}, not {text!r}")
     return values
-
-
-def read_pair(text: str, option: str) -> tuple[float, float]:
-    """The two finite numbers of ``LOW:HIGH``; an `InputError` where it is something else."""
-    try:
-        low, high = map(float, text.split(":"))
-        if not math.isfinite(low + high):
-            raise ValueError(text)
-    except ValueError:
-        raise InputError(f"{option} is LOW:HIGH, such as -0.01:0.01, not {text!r}") from None
-    return low, high
 
 
 def read_statement(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,21 +9,6 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = [
-    "CalibrationError",
-    "ConfigurationError",
-    "FrameError",
-    "InputError",
-    "RegionError",
-    "ResultError",
-    "RgbmidicError",
-    "disk_faults",
-    "disk_reason",
-    "first_line",
-    "legible",
-    "shortened",
-]
-
 _LONG_WORD, _LONGEST = re.compile(r"\S{1000,}"), 4000
 """Characters that no name of a file or key has (Linux allows 255 for a name), and a screenful of them."""
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")

@@ -70,10 +70,8 @@ def each(name: str, items: Iterable[T]) -> Iterator[T]:
     left = iter(items)
     while True:
         with stage(name):
-            found = next(left, _END)
-        if found is _END:
-            return
-        yield found  # type: ignore[misc]
-
-
-_END = object()
+            try:
+                found = next(left)
+            except StopIteration:
+                return
+        yield found

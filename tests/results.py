@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +11,10 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.report import render
+from rgbmidic.report.document import ReportConstants
 from rgbmidic.results import QUANTITIES, FrameRecord, Origin, Result, ResultStore
+from rgbmidic.results.physical import Physical
 from rgbmidic.timing import STAGES
 
 LIGHTS = ("red", "green", "blue")
@@ -104,3 +109,10 @@ def make_origin(frames: int, **options: Any) -> Origin:
     """What the frames of a made-up result share."""
     names = [f"frame {index}" for index in range(frames)]
     return Origin(**{"nodes": MESH.nodes, "elements": MESH.elements, "names": names, "lights": LIGHTS, **options})
+
+
+def analysis_rows(result: Result) -> dict[str, str]:
+    """The rows of a report's table of the analysis."""
+    given = {"physical": Physical.of(result), "constants": ReportConstants(), "reference": "", "noise": ""}
+    rows = re.findall("<tr><td>(.*?)</td><td>(.*?)</td></tr>", render("analysis.html", **given))
+    return {name: html.unescape(text) for name, text in rows}

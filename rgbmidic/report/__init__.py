@@ -12,8 +12,8 @@ from rgbmidic.report.figures import (
     reflection_figure,
     residual_figure,
 )
-from rgbmidic.report.gallery import REPORT, remove_figures, remove_report, write_figures, write_maps
-from rgbmidic.report.movie import MOVIES, write_movie
+from rgbmidic.report.gallery import REPORT, remove_pictures, write_figures, write_maps
+from rgbmidic.report.movie import MOVIES, Movie, write_movie
 from rgbmidic.report.movie_curve import Curve
 from rgbmidic.report.page import render
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
@@ -24,6 +24,7 @@ __all__ = [
     "REPORT",
     "STYLE",
     "Curve",
+    "Movie",
     "brightness_figure",
     "convergence_figure",
     "finish_plot",
@@ -33,8 +34,7 @@ __all__ = [
     "mask_figure",
     "profile_figure",
     "reflection_figure",
-    "remove_figures",
-    "remove_report",
+    "remove_pictures",
     "render",
     "residual_figure",
     "save_figure",

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,18 +26,38 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from rgbmidic.results.agreement import Fit
+
 PAGE, TABLE, SCALE, INDEX = "comparison.html", "comparison.csv", "scale.csv", "comparison.pvd"
-_SHOWN = 2
-"""Frames of which maps are shown at most."""
-_REACH = 4.0
-"""Ratios to the standard uncertainty at the ends of the colours: beyond lies one in 16,000 of a right simulation."""
-_UNLIKELY = 0.01
-"""Probability of chi-square under which a warning names the frame (chosen)."""
-_SHAPE = 1.5
-"""Chi-square of what the best scale leaves above which the shape differs: 1.2 times the stated uncertainty, more than
-that is wrong by in any scene of docs/explanation/uncertainty.md."""
-_BINS = np.linspace(-6, 6, 49)
-"""Of a histogram of ratios; those beyond are counted in the outermost ones."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparisonConstants:
+    """What a comparison shows, and where it begins to doubt the simulation.
+
+    Attributes
+    ----------
+    shown
+        Frames of which maps are shown at most.
+    reach
+        Ratios to the standard uncertainty at the ends of the colours: beyond lies one in 16,000 of a right simulation.
+    unlikely
+        Probability of chi-square under which a warning names the frame. Chosen.
+    rigid
+        Standard uncertainties of a rigid motion above which a warning names the frame. Chosen.
+    shape
+        Chi-square of what the best scale leaves above which the shape differs: 1.2 times the stated uncertainty, more
+        than that is wrong by in any scene of docs/explanation/uncertainty.md.
+    """
+
+    shown: int = 2
+    reach: float = 4.0
+    unlikely: float = 0.01
+    rigid: float = 4.0
+    shape: float = 1.5
+
+
+_LIMITS = ComparisonConstants()
 _GROUPS = {"displacement": QUANTITIES[:2], "strain": QUANTITIES[2:]}
 _TITLES = {"nodes": "at the nodes", "levelled": "levelled"}
 
@@ -80,56 +101,44 @@ def write_comparison(
     ResultError
         A file cannot be written, or a frame of the result is damaged.
     """
-    shown = spread(comparison.frames, _SHOWN)
+    shown = spread(comparison.frames, _LIMITS.shown)
     done: list[FrameComparison] = []
+    tables: dict[str, list[dict[str, Any]]] = {TABLE: [], SCALE: []}
     optional("meshio", "fe")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
     for made in comparison.each():
         _write_state(comparison, made, out / _state(made.frame))
         done.append(made if made.frame in shown else replace(made, measured={}, std={}, simulated={}))
+        number, clock = int(comparison.result.number[made.frame]), "time_s" if comparison.timed else "time_frame"
+        head = {"frame": made.frame, "number": number, clock: made.time}
+        for (way, name), one in made.agreement.items():
+            what = {"way": way, "quantity": name, "unit": "1" if name[0] == "e" else "mm"}
+            tables[TABLE].append(head | what | asdict(one))
+        tables[SCALE].append(head | _scale_columns(made.fit))
         if progress is not None:
             progress(len(done), len(comparison.frames), "frames")
     sets = "".join(f'<DataSet timestep="{one.time:.12g}" file={quoteattr(_state(one.frame))}/>' for one in done)
     index = f'<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1"><Collection>{sets}</Collection></VTKFile>'
-    texts = {
-        TABLE: _table([row for made in done for row in _agreement_rows(comparison, made)]),
-        SCALE: _table([_scale_row(comparison, made) for made in done]),
-        INDEX: index,
-        PAGE: _page(comparison, done),
-    }
-    for name, text in texts.items():
+    texts = {name: _csv(rows) for name, rows in tables.items()}
+    for name, text in {**texts, INDEX: index, PAGE: _page(comparison, done)}.items():
         write_complete(out / name, methodcaller("write", text.encode()))
     return done
 
 
-def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
     """Rows of texts, whole numbers and numbers as CSV; NaN is an empty field."""
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     writer.writerow(rows[0])
     for row in rows:
-        cells = (
-            "" if value != value else f"{value:.9g}" if isinstance(value, float) else value for value in row.values()
-        )
-        writer.writerow(cells)
+        cells = (f"{value:.9g}" if isinstance(value, float) else value for value in row.values())
+        writer.writerow("" if cell == "nan" else cell for cell in cells)
     return text.getvalue()
 
 
-def _of_frame(comparison: Comparison, made: FrameComparison) -> dict[str, Any]:
-    clock = "time_s" if comparison.timed else "time_frame"
-    return {"frame": made.frame, "number": int(comparison.result.number[made.frame]), clock: made.time}
-
-
-def _agreement_rows(comparison: Comparison, made: FrameComparison) -> Iterator[dict[str, Any]]:
-    for (way, name), one in made.agreement.items():
-        what = {"way": way, "quantity": name, "unit": "1" if name[0] == "e" else "mm"}
-        yield _of_frame(comparison, made) | what | asdict(one)
-
-
-def _scale_row(comparison: Comparison, made: FrameComparison) -> dict[str, Any]:
-    fit = made.fit
-    row = _of_frame(comparison, made) | {"scale": fit.scale, "scale_std": fit.scale_std}
+def _scale_columns(fit: Fit) -> dict[str, float]:
+    row = {"scale": fit.scale, "scale_std": fit.scale_std}
     names = ("rigid_u_mm", "rigid_v_mm", "rigid_rotation_deg")
     for name, value, std in zip(names, fit.rigid.tolist(), fit.rigid_std.tolist(), strict=True):
         row |= {name: value, f"{name}_std": std}
@@ -141,20 +150,20 @@ def _write_state(comparison: Comparison, made: FrameComparison, path: Path) -> N
     import meshio
 
     mesh = comparison.simulation.mesh
+    flat = np.zeros(len(mesh.points))
+
+    def vectors(group: str, value_of: Callable[[str], FloatArray]) -> FloatArray:
+        parts = [value_of(name) for name in _GROUPS[group]]
+        return np.column_stack([*parts, *[flat] * (3 - len(parts))])
+
     fields: dict[str, Any] = {"node_number": mesh.node_numbers}
-    for group, names in _GROUPS.items():
-
-        def stacked(values: Mapping[str, FloatArray], names: Sequence[str] = names) -> FloatArray:
-            return np.column_stack(
-                [*(values[name] for name in names), *[np.zeros(len(mesh.points))] * (3 - len(names))]
-            )
-
-        fields |= {group: stacked(made.measured), f"{group}_std": stacked(made.std)}
+    for group in _GROUPS:
+        fields[group] = vectors(group, made.measured.__getitem__)
+        fields[f"{group}_std"] = vectors(group, made.std.__getitem__)
         for way in WAYS:
-            fields[f"{group}_simulated_{way}"] = stacked(made.simulated[way])
-            fields[f"{group}_ratio_{way}"] = stacked({name: made.ratio(way, name) for name in names})
-    points = np.column_stack([mesh.points, np.zeros(len(mesh.points))])
-    cells = {"element_number": [mesh.element_numbers]}
+            fields[f"{group}_simulated_{way}"] = vectors(group, made.simulated[way].__getitem__)
+            fields[f"{group}_ratio_{way}"] = vectors(group, partial(made.ratio, way))
+    points, cells = np.column_stack([mesh.points, flat]), {"element_number": [mesh.element_numbers]}
     written = meshio.Mesh(points, [("triangle", mesh.elements)], point_data=fields, cell_data=cells)
     write_complete(path, lambda file: meshio.vtu.write(file.name, written))
 
@@ -185,7 +194,7 @@ def difference_figure(
 
     def draw(axes: list[Axes]) -> None:
         for axis, name in zip(axes, names, strict=True):
-            values, unit, reach = made.ratio(way, name), " in uncertainties", _REACH
+            values, unit, reach = made.ratio(way, name), " in uncertainties", _LIMITS.reach
             if not ratio:
                 values, unit = made.difference(way, name), "" if name[0] == "e" else " (mm)"
                 ordinary = style.ordinary_values(values, made.std[name])
@@ -208,13 +217,14 @@ def histogram_figure(made: FrameComparison) -> Figure:
     """Draw how often each ratio of difference to standard uncertainty occurs, both ways, and what a Gaussian has."""
 
     def draw(axes: list[Axes]) -> None:
-        middles, width = (_BINS[1:] + _BINS[:-1]) / 2, _BINS[1] - _BINS[0]
+        bins = np.linspace(-6, 6, 49)  # what lies beyond is counted in the outermost ones
+        middles, width = (bins[1:] + bins[:-1]) / 2, bins[1] - bins[0]
         for axis, (title, names) in zip(axes, _GROUPS.items(), strict=True):
             for way, colour in zip(WAYS, ("vermillion", "blue"), strict=True):
                 ratios = np.concatenate([made.ratio(way, name) for name in names])
                 ratios = ratios[np.isfinite(ratios)]
-                counts = np.histogram(np.clip(ratios, _BINS[0], _BINS[-1]), _BINS)[0] / max(len(ratios), 1) / width
-                axis.stairs(counts, _BINS, color=style.OKABE_ITO[colour], label=_TITLES[way], linewidth=1.2)
+                counts = np.histogram(np.clip(ratios, bins[0], bins[-1]), bins)[0] / max(len(ratios), 1) / width
+                axis.stairs(counts, bins, color=style.OKABE_ITO[colour], label=_TITLES[way], linewidth=1.2)
             axis.plot(middles, np.exp(-(middles**2) / 2) / np.sqrt(2 * np.pi), "k--", linewidth=1, label="expected")
             axis.set_title(title)
             style.finish_plot(axis, "difference over its standard uncertainty", "density")
@@ -257,50 +267,31 @@ def scale_text(comparison: Comparison, done: Sequence[FrameComparison]) -> str:
         text += "1 is within two standard uncertainties"
     else:
         text += f"{away:.1f} standard uncertainties from 1; where the loads are right, divide the moduli by it"
-    if rest > _SHAPE:
+    if rest > _LIMITS.shape:
         text += f"; the shape differs (chi-square of what is left: {rest:.3g}), which this uncertainty does not hold"
     return text
 
 
 def _page(comparison: Comparison, done: Sequence[FrameComparison]) -> str:
+    unlikely = {
+        name: [made.frame for made in done if made.agreement["levelled", name].probability < _LIMITS.unlikely]
+        for name in ("displacement", *QUANTITIES[2:])
+    }
+    rigid = [(made.frame, (np.abs(made.fit.rigid) > _LIMITS.rigid * made.fit.rigid_std).any()) for made in done]
     return render(
         "comparison.html",
         comparison=comparison,
         done=done,
         simulation=Path(comparison.simulation.name).name,
         scale=scale_text(comparison, done),
-        warnings=list(_warnings(comparison, done)),
+        limits=_LIMITS,
+        unlikely=unlikely,
+        moved=[frame for frame, moves in rigid if moves],
         heads=[entry.name.replace("_", " ") for entry in fields(next(iter(done[0].agreement.values())))],
-        rows=_agreement_cells,
+        values=lambda one: asdict(one).values(),
         groups=_GROUPS.values(),
         titles=_TITLES,
         scale_figure=scale_figure,
         histogram_figure=histogram_figure,
         difference_figure=difference_figure,
     )
-
-
-def _agreement_cells(made: FrameComparison) -> Iterator[tuple[str, ...]]:
-    for key, one in made.agreement.items():
-        yield *key, *(f"{value:.3g}" for value in asdict(one).values())
-
-
-def _warnings(comparison: Comparison, done: Sequence[FrameComparison]) -> Iterator[str]:
-    if beyond := comparison.left_out:
-        yield f"{len(beyond)} frames from {beyond[0]} on lie beyond the times of the simulation and are left out"
-    for name in ("displacement", *QUANTITIES[2:]):
-        odd = [made.frame for made in done if made.agreement["levelled", name].probability < _UNLIKELY]
-        if odd:
-            yield (
-                f"{name}: the levelled simulation differs by more than the stated uncertainty in {len(odd)} of "
-                f"{len(done)} frames (probability of chi-square below {_UNLIKELY:g}), first in frame {odd[0]}"
-            )
-    if not comparison.remove_rigid:
-        moved = [made.frame for made in done if (np.abs(made.fit.rigid) > 4 * made.fit.rigid_std).any()]
-        if moved:
-            yield (
-                f"measured and simulated displacement differ by a rigid motion in {len(moved)} of {len(done)} frames, "
-                f"first in frame {moved[0]}: `--rigid remove` takes it off"
-            )
-    if len(comparison.placement.pairs) == 2 and comparison.placement.camera is None:
-        yield "two pairs of points place the mesh: their error is not known, and neither is that of the scale"

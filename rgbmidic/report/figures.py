@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +12,11 @@ import numpy.typing as npt
 
 from rgbmidic.report import style
 from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Maps, Quantity, Result
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.colors import Colormap, Normalize
+    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
 MAPS = {
@@ -29,14 +29,6 @@ MAPS = {
 _COLOURS = {"positive": "plasma", "fraction": "cividis", "angle": "twilight"}
 """Colours of the kinds of fields; all others have viridis."""
 _FAILED = QUANTITIES["status"].codes.index("failed")
-_EQUAL = 1e-9
-"""Fraction of the colour range by which a value may exceed it by rounding alone."""
-_RASTER = 450
-"""Points along the longer side of a map: the panels of two maps have as many pixels at 150 dpi."""
-_MANY_FRAMES = 8
-"""Frames up to which a legend names each: it fills half the height of a panel."""
-_MOST_LINES = 100
-"""Frames of which lines are drawn at most; more cover each other. Chosen; only the picture depends on it."""
 
 
 def shown_frames(result: Result) -> tuple[int, ...]:
@@ -130,11 +122,8 @@ def mask_figure(result: Result, frame: int) -> Figure | None:
     InputError, ResultError
         As `map_figure`.
     """
-    record = result.frame(frame)
-    excluded = 1 - record.weights_thumbnail / 255
-    if not excluded.any():
-        return None
-    return _shaded(result, frame, record, excluded, lambda part: f"{part.mean():.1%} excluded")
+    excluded = 1 - result.frame(frame).weights_thumbnail / 255
+    return _shaded(result, frame, excluded, excluded, "{:.1%} excluded") if excluded.any() else None
 
 
 def reflection_figure(result: Result, frame: int) -> Figure | None:
@@ -157,11 +146,8 @@ def reflection_figure(result: Result, frame: int) -> Figure | None:
     InputError, ResultError
         As `map_figure`.
     """
-    record = result.frame(frame)
-    index = record.reflection_thumbnail / 255
-    if not index.size:
-        return None
-    return _shaded(result, frame, record, index, lambda part: f"reflects on {(part > REFLECTING).mean():.1%}")
+    index = result.frame(frame).reflection_thumbnail / 255
+    return _shaded(result, frame, index, index > REFLECTING, "reflects on {:.1%}") if index.size else None
 
 
 def brightness_figure(result: Result) -> Figure:
@@ -214,30 +200,27 @@ def convergence_figure(result: Result) -> Figure:
     from matplotlib.colors import Normalize
 
     shown = shown_frames(result)
-    frames = shown[:: math.ceil(len(shown) / _MOST_LINES)]
+    frames = shown[:: math.ceil(len(shown) / style.FIGURES.lines)]
+    named = len(frames) <= style.FIGURES.legend  # else no legend, but a colour bar
 
     def draw(axes: list[Axes]) -> None:
-        (axis,) = axes
-        colours: list[Any] = [style.CURVES[index % len(style.CURVES)] for index in range(len(frames))]
-        if len(frames) > _MANY_FRAMES:  # no legend, but a colour bar
-            norm = Normalize(frames[0], frames[-1])
-            colours = [colormaps["viridis"](norm(frame)) for frame in frames]
-            style.add_colour_bar(axis, norm, "viridis", label="frame")
-        looks = zip(colours, cycle(style.MARKERS), cycle(style.LINES), strict=False)
-        for frame, history, look in zip(frames, result.each("history", frames), looks, strict=False):
-            steps, name = np.arange(1, len(history) + 1), style.literal(result.names[frame])
-            colour, marker, line = look
-            axis.plot(
-                steps, history, marker=marker, markersize=3, linewidth=1, linestyle=line, color=colour, label=name
-            )
+        (axis,), norm = axes, Normalize(frames[0], frames[-1])
+        colours = style.CURVES if named else [colormaps["viridis"](norm(frame)) for frame in frames]
+        looks = zip(cycle(colours), cycle(style.MARKERS), cycle(style.LINES), strict=False)
+        for frame, history, (colour, marker, line) in zip(frames, result.each("history", frames), looks, strict=False):
+            look: dict[str, Any] = {"color": colour, "marker": marker, "markersize": 3, "linestyle": line}
+            name = style.literal(result.names[frame])
+            axis.plot(np.arange(1, len(history) + 1), history, linewidth=1, label=name, **look)
         if (tolerance := result.setting("solver", "tolerance")) is not None:
             axis.axhline(tolerance, color="0.4", linewidth=0.8, linestyle="--", label="tolerance")
         axis.set_yscale("log")
         style.finish_plot(axis, "iteration", "largest motion of a measured node (px)")
-        if len(frames) <= _MANY_FRAMES:
+        if named:
             axis.legend(loc="upper right")
+        else:
+            style.add_colour_bar(axis, norm, "viridis", label="frame")
 
-    return style.draw_figure(draw, count=1, aspect=0.6, beside=style.BAR if len(frames) > _MANY_FRAMES else style.GAP)
+    return style.draw_figure(draw, count=1, aspect=0.6, beside=style.GAP if named else style.BAR)
 
 
 def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
@@ -279,7 +262,7 @@ class MapDrawer:
         self._figures: dict[int, Figure] = {}
         self._mesh = Triangulation(result.nodes[:, 0], result.nodes[:, 1], result.elements)
         low, high = result.nodes.min(axis=0), result.nodes.max(axis=0)
-        step = float((high - low).max()) / _RASTER
+        step = float((high - low).max()) / style.FIGURES.raster
         x, y = (np.arange(start + step / 2, end, step) for start, end in zip(low, high, strict=True))
         self._places = np.meshgrid(x, y)
         self._extent = (low[0], low[0] + step * len(x), low[1] + step * len(y), low[1])
@@ -332,13 +315,15 @@ class MapDrawer:
         """Draw the fraction of each light in what determines the nodes of a frame, as `fraction_figure` does."""
         return self.fields(frame, [f"fraction of {light}" for light in self.result.lights])
 
-    def strip(self, maps: Sequence[tuple[str, FloatArray]], label: str) -> Figure:
-        """Draw small maps of one nodal field in several frames, side by side, in the same colours.
+    def strip(self, name: str, frames: Sequence[int], label: str) -> Figure:
+        """Draw small maps of one field in several frames, side by side, in the same colours.
 
         Parameters
         ----------
-        maps
-            Title and values (N,) of each frame.
+        name
+            Name of the field.
+        frames
+            Indices of the frames.
         label
             Title of the figure: the field and its unit.
 
@@ -346,15 +331,17 @@ class MapDrawer:
         -------
         Figure
         """
-        x, y = picture_limits(self.result, self.result.nodes)
-        every = np.concatenate([values for _, values in maps])
+        field, (x, y) = self.maps.field(name), picture_limits(self.result, self.result.nodes)
+        maps, physical = {frame: self.maps.read(name, frame).values for frame in frames}, self.maps.physical
+        every = np.concatenate([*maps.values()])
         known = every[np.isfinite(every)]
         norm = style.colour_scale(known) if known.size else None
 
         def draw(axes: list[Axes]) -> None:
-            for axis, (title, values) in zip(axes, maps, strict=False):
-                self._show(axis, self._raster(values), values, norm, bar=axis is axes[-2])
-                axis.set_title(title)
+            for axis, (frame, values) in zip(axes, maps.items(), strict=False):
+                self._show(axis, values, norm, field, bar=axis is axes[-2])
+                at = f", {style.time_text(physical.times[frame], physical.times)}" if physical.units.timed else ""
+                axis.set_title(f"frame {frame}{at}")
                 style.finish_picture(axis, x, y, first=axis is axes[0], unit=self._unit, factor=self._factor)
             axes[-1].set_axis_off()  # room for the colour bar
 
@@ -381,7 +368,7 @@ class MapDrawer:
                 ordinary = style.ordinary_values(values, std)
                 norm = style.colour_scale(ordinary, positive=field.logarithmic) if ordinary.size else None
                 norm = Normalize(*field.ends) if field.ends else norm
-                self._show(axis, self._raster(values, stepped=field.stepped), values, norm, field)
+                self._show(axis, values, norm, field)
                 axis.set_title(style.literal(field.label))
                 if hatched and np.isfinite(std).any():
                     doubtful = self._raster(np.abs(values) - 2 * std)
@@ -421,31 +408,24 @@ class MapDrawer:
         return np.asarray(picture)
 
     def _show(
-        self,
-        axis: Axes,
-        picture: FloatArray,
-        values: FloatArray,
-        norm: Normalize | None,
-        field: Quantity | None = None,
-        *,
-        bar: bool = True,
+        self, axis: Axes, values: FloatArray, norm: Normalize | None, field: Quantity, *, bar: bool = True
     ) -> None:
-        """Show a picture of nodal values and their colour bar; a code has one colour in every picture."""
+        """Show nodal values and their colour bar; a code has one colour in every picture."""
         from matplotlib.colors import ListedColormap
 
-        if norm is None or not np.isfinite(values).any():
+        known = values[np.isfinite(values)]
+        if norm is None or not known.size:
             box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
             axis.text(0.5, 0.5, "nothing measured", transform=axis.transAxes, ha="center", va="center", bbox=box)
             return
-        colours: str | Colormap = "viridis" if field is None else field_colours(field)
-        if field is not None and field.codes:
-            colours = ListedColormap(style.STATUS_COLOURS[: len(field.codes)])
+        codes = ListedColormap(style.STATUS_COLOURS[: len(field.codes)])
+        colours = codes if field.codes else field_colours(field)
+        picture = self._raster(values, stepped=field.stepped)
         axis.imshow(picture, extent=self._extent, cmap=colours, norm=norm, interpolation="nearest")
-        if not bar:
-            return
-        scaled = norm(values[np.isfinite(values)])
-        beyond = bool(scaled.min() < -_EQUAL), bool(scaled.max() > 1 + _EQUAL)
-        style.add_colour_bar(axis, norm, colours, beyond=beyond, names=() if field is None else field.codes)
+        if bar:
+            scaled = norm(known)
+            beyond = bool(scaled.min() < -1e-9), bool(scaled.max() > 1 + 1e-9)  # by more than rounding
+            style.add_colour_bar(axis, norm, colours, beyond=beyond, names=field.codes)
 
 
 def field_colours(field: Quantity) -> str:
@@ -453,15 +433,15 @@ def field_colours(field: Quantity) -> str:
     return _COLOURS.get(field.kind, "viridis")
 
 
-def _shaded(
-    result: Result, frame: int, record: FrameRecord, cover: FloatArray, title_of: Callable[[FloatArray], str]
-) -> Figure | None:
+def _shaded(result: Result, frame: int, cover: FloatArray, counted: AnyArray, words: str) -> Figure | None:
     """Show the reference of each light around the mesh, shaded by a reduced picture (k, h, w) of one frame.
 
-    `title_of` describes the part of a light's picture that is shown. None where no reference was kept.
+    The `words` state the mean of what is `counted` (k, h, w) over the part that is shown. None where no reference was
+    kept.
     """
     if (reference := result.reference) is None:
         return None
+    record = result.frame(frame)
     step, origin = -(-reference.shape[1] // cover.shape[1]), result.reference_origin
     moved = result.nodes + np.stack([record.u, record.v], axis=1)
     x, y = picture_limits(result, np.concatenate([result.nodes, moved[np.isfinite(moved).all(axis=1)]]))
@@ -471,10 +451,10 @@ def _shaded(
     )
 
     def draw(axes: list[Axes]) -> None:
-        for axis, image, part, light in zip(axes, reference, cover, result.lights, strict=True):
+        for axis, image, light, part, share in zip(axes, reference, result.lights, cover, counted, strict=True):
             style.show_image(axis, image, origin)
             style.shade(axis, part, step, origin, style.LIGHT_COLOURS.get(light))
-            axis.set_title(style.literal(f"{light}: {title_of(part[rows, columns])}"))
+            axis.set_title(style.literal(f"{light}: {words.format(share[rows, columns].mean())}"))
             style.finish_picture(axis, x, y, first=axis is axes[0])
 
     title = f"{_frame_title(result, frame, record)}, over the reference image"

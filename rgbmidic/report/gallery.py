@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 
 REPORT = "report.html"
 """Name of the report that lies in a result's folder."""
-
-_FRAMES = 3
-"""Frames that get pictures where none are named, as in the report."""
 _OF_TEST: Mapping[str, Callable[[Result], Figure]] = {
     "convergence": figures.convergence_figure,
     "residual": figures.residual_figure,
@@ -39,15 +36,12 @@ _OF_FRAME: Mapping[str, Callable[[figures.MapDrawer, int], Figure | None]] = {
     "reflections": lambda maps, frame: figures.reflection_figure(maps.result, frame),
 }
 _NAMES = re.compile(rf"({'|'.join(_OF_TEST)}|({'|'.join(_OF_FRAME)}|map_.+)_[0-9]{{6,}})\.png")
-_FEW = 20
-"""Pictures below which another process does not pay. Measured: it starts in 1 to 2 s, a picture takes 0.15 s."""
-
 _Picture = tuple[str, int | None]
 """Kind of a picture, and its frame if it is of one."""
 
 
 def write_figures(
-    result: Result, folder: Path | str, frames: Sequence[int] | None = None, *, processes: int = 1
+    result: Result, folder: Path | str, frames: Sequence[int] | None = None, *, processes: int = 1, few: int = 20
 ) -> tuple[Path, ...]:
     """Write figures of convergence, residual and brightness, and of some frames maps, masks and reflections.
 
@@ -63,6 +57,8 @@ def write_figures(
     processes
         Number of processes that draw, this one included. With more than one, a script that calls this function must
         be importable (``if __name__ == "__main__":``).
+    few
+        Pictures below which another process does not pay. Measured: it starts in 1 to 2 s, a picture takes 0.15 s.
 
     Returns
     -------
@@ -79,12 +75,12 @@ def write_figures(
     folder = Path(folder)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    frames = figures.spread(figures.measured_frames(result), _FRAMES) if frames is None else frames
+    frames = _shown(result) if frames is None else frames
     for frame in frames:
         result.frame(frame)  # an error of one is raised before the first picture
     pictures: list[_Picture] = [(kind, None) for kind in _OF_TEST]
     pictures += [(kind, frame) for frame in frames for kind in _OF_FRAME]
-    parts = max(1, min(processes, len(pictures) // _FEW))
+    parts = max(1, min(processes, len(pictures) // few))
     # Ctrl-C reaches all processes: the others end silently, this one reports it
     ended = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     with ProcessPoolExecutor(parts, multiprocessing.get_context("spawn"), initializer=ended) as pool:
@@ -129,18 +125,21 @@ def write_maps(
         The result is damaged, or the folder cannot be written.
     """
     folder, drawer = Path(folder), figures.MapDrawer(maps, DPI)
-    chosen = figures.spread(figures.measured_frames(maps.result), _FRAMES) if frames is None else frames
-    for name in names:
-        for frame in chosen:
-            maps.read(name, frame)  # an error of one is raised before the first picture
+    chosen = _shown(maps.result) if frames is None else frames
+    pictures = [(name, frame) for name in names for frame in chosen]
+    for name, frame in pictures:
+        maps.read(name, frame)  # an error of one is raised before the first picture
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    files = []
-    for name in names:
-        for frame in chosen:
-            files.append(_file(folder, f"map_{name.replace(' ', '_')}", frame))
-            save_figure(drawer.fields(frame, [name], std=True, hatched=hatched), files[-1])
+    files = [_file(folder, f"map_{name.replace(' ', '_')}", frame) for name, frame in pictures]
+    for file, (name, frame) in zip(files, pictures, strict=True):
+        save_figure(drawer.fields(frame, [name], std=True, hatched=hatched), file)
     return tuple(files)
+
+
+def _shown(result: Result) -> tuple[int, ...]:
+    """Select the three frames that get pictures where none are named, as in the report."""
+    return figures.spread(figures.measured_frames(result), 3)
 
 
 def _draw(result: Result, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
@@ -158,27 +157,8 @@ def _file(folder: Path, kind: str, frame: int | None) -> Path:
     return folder / (f"{kind}.png" if frame is None else f"{kind}_{frame:06d}.png")
 
 
-def remove_figures(folder: Path | str) -> None:
-    """Remove the pictures that an earlier run left, since they would show another result; nothing else is touched.
-
-    Parameters
-    ----------
-    folder
-        Folder of the figures.
-
-    Raises
-    ------
-    ResultError
-        A picture cannot be removed.
-    """
-    for file in Path(folder).glob("*.png"):
-        if _NAMES.fullmatch(file.name):
-            with writing(file):
-                file.unlink()
-
-
-def remove_report(folder: Path | str) -> None:
-    """Remove the report in a folder whose result is measured anew, since it would show the earlier one.
+def remove_pictures(folder: Path | str) -> None:
+    """Remove the figures and the report of an earlier run, since they would show another result; nothing else.
 
     Parameters
     ----------
@@ -188,7 +168,9 @@ def remove_report(folder: Path | str) -> None:
     Raises
     ------
     ResultError
-        The report cannot be removed.
+        One of them cannot be removed.
     """
-    with writing(Path(folder) / REPORT):
-        (Path(folder) / REPORT).unlink(missing_ok=True)
+    drawn = [file for file in (Path(folder) / "figures").glob("*.png") if _NAMES.fullmatch(file.name)]
+    for file in (*drawn, Path(folder) / REPORT):
+        with writing(file):
+            file.unlink(missing_ok=True)

@@ -30,14 +30,6 @@ from rgbmidic.typing import AnyArray, FloatArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-
-_SAMPLE = 4_000_000
-"""Nodal values of each field that its colour range is found from: 500 frames of 8,000 nodes; of more, evenly spaced
-frames count."""
-_FEW = 100
-"""Frames below which another process does not pay. Measured: it starts in 2 s, a page of 1 Mpx takes 20 ms."""
-_AROUND = 235
-"""Grey level outside the image, as in the viewer's light page."""
 _ENCODERS = {
     ".mp4": "-c:v libx264 -preset fast -crf 18 -pix_fmt yuv420p -movflags +faststart -f mp4",
     ".webm": "-c:v libvpx-vp9 -crf 28 -b:v 0 -deadline realtime -cpu-used 5 -row-mt 1 -pix_fmt yuv420p -f webm",
@@ -45,36 +37,42 @@ _ENCODERS = {
 """Quality at which text of 9 points keeps its edges; both need an even number of rows and columns."""
 MOVIES = (*_ENCODERS, ".gif")
 """Endings of the files that `write_movie` writes."""
+_Span = tuple[float, float]
 
 
-def write_movie(
-    maps: Maps,
-    out: Path | str,
-    fields: Sequence[str],
-    *,
-    frames: Sequence[int] | None = None,
-    limits: tuple[float, float] | Mapping[str, tuple[float, float]] | None = None,
-    fps: float = 15.0,
-    images: Callable[[int], AnyArray] | None = None,
-    curve: Curve | None = None,
-    colours: str | None = None,
-    opacity: float = 1.0,
-    width: int = 1280,
-    processes: int = 1,
-    overwrite: bool = False,
-    progress: Callable[[int, int, str], None] | None = None,
-) -> Path:
-    """Write a movie of nodal fields, side by side; blank where not measured.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MovieConstants:
+    """How a movie is made, whatever it shows.
 
-    The pages are the same for any number of processes. Nothing is left under the name of the file unless all of it was
-    written.
+    Attributes
+    ----------
+    sample
+        Nodal values of each field that its colour range is found from: 500 frames of 8,000 nodes; of more, evenly
+        spaced frames count.
+    few
+        Frames below which another process does not pay. Measured: it starts in 2 s, a page of 1 Mpx takes 20 ms.
+    around
+        Grey level outside the image, as in the viewer's light page.
+    patience
+        Seconds after which an ffmpeg that neither takes a page nor ends is ended. Measured: noise of 3840 x 2160 px
+        takes .5 s a page, and 12 s at the end for the pages held back; the largest page has 8 times as many, and others
+        may compute.
+    """
 
-    Parameters
+    sample: int = 4_000_000
+    few: int = 100
+    around: int = 235
+    patience: float = 300.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Movie:
+    """What a movie shows: nodal fields, side by side; blank where not measured.
+
+    Attributes
     ----------
     maps
         The result and how its fields are derived.
-    out
-        File to write; the ending states the format, one of `MOVIES`.
     fields
         Names of the fields.
     frames
@@ -82,8 +80,6 @@ def write_movie(
     limits
         Ends of the colour bar of all fields, or by the name of each; of others, or None: those of all its frames but
         the extreme .5 % at each end.
-    fps
-        Frames per second of the movie.
     images
         Picture (H, W) in grey, 0 to 255, of a frame; the fields then lie over the deformed specimen. None: over the
         reference image.
@@ -95,6 +91,87 @@ def write_movie(
         Of the fields over the image, 0 to 1.
     width
         Of the movie in px.
+    constants
+        How it is made.
+
+    Raises
+    ------
+    InputError
+        A field, a frame, the limits or a number is none of those allowed.
+    """
+
+    maps: Maps
+    fields: Sequence[str]
+    frames: Sequence[int] | None = None
+    limits: _Span | Mapping[str, _Span] | None = None
+    images: Callable[[int], AnyArray] | None = None
+    curve: Curve | None = None
+    colours: str | None = None
+    opacity: float = 1.0
+    width: int = 1280
+    constants: MovieConstants = MovieConstants()
+
+    def __post_init__(self) -> None:
+        from matplotlib import colormaps
+
+        if not (320 <= self.width <= 7680 and 0 <= self.opacity <= 1):
+            given = f"{self.width} px and {self.opacity:g}"
+            raise InputError(f"a movie has 320 to 7680 px and an opacity of 0 to 1, not {given}")
+        result = self.maps.result
+        if beyond := [frame for frame in self.chosen if not 0 <= frame < len(result)] or not self.chosen:
+            raise InputError(f"there is no frame {beyond} in {result.path}, which has {len(result)} frames")
+        for low, high in self.stated.values():
+            if not low < high:
+                raise InputError(f"the colours range from a smaller to a larger value, not {low:g} to {high:g}")
+        if not self.fields or any(self.maps.field(name).codes for name in self.fields):
+            raise InputError(f"a movie shows fields of numbers, not {', '.join(self.fields) or 'none'}")
+        if self.colours is not None and self.colours not in colormaps:
+            known = ", ".join(list(colormaps)[:12])
+            raise InputError(f'there are no colours "{self.colours}"; there are {known}, ...')
+        if self.curve is not None and self.curve.timed and self.times is None:
+            raise InputError("a curve over time needs the frames' times: state frame_rate in [scale]")
+
+    @property
+    def chosen(self) -> list[int]:
+        """Indices of the frames that are shown."""
+        finished = self.maps.result.finished
+        return np.flatnonzero(finished).tolist() if self.frames is None else list(self.frames)
+
+    @property
+    def stated(self) -> Mapping[str, _Span]:
+        """Ends of the colour bars that are stated, by field."""
+        if self.limits is None or isinstance(self.limits, Mapping):
+            return self.limits or {}
+        return dict.fromkeys(self.fields, self.limits)
+
+    @property
+    def times(self) -> FloatArray | None:
+        """Times (T,) of all frames of the result in s; None where not known."""
+        return frame_times(self.maps.result, self.maps.physical.scale)
+
+
+def write_movie(
+    movie: Movie,
+    out: Path | str,
+    *,
+    fps: float = 15.0,
+    processes: int = 1,
+    overwrite: bool = False,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> Path:
+    """Write a movie of nodal fields.
+
+    The pages are the same for any number of processes. Nothing is left under the name of the file unless all of it was
+    written.
+
+    Parameters
+    ----------
+    movie
+        What it shows.
+    out
+        File to write; the ending states the format, one of `MOVIES`.
+    fps
+        Frames per second of the movie.
     processes
         Number of processes that draw. With more than one, a script that calls this function must be importable
         (``if __name__ == "__main__":``).
@@ -111,156 +188,102 @@ def write_movie(
     Raises
     ------
     InputError
-        The ending, a field, a frame, the limits or a number is none of those allowed, or nothing is measured.
+        The ending or the number of frames per second is none of those allowed, or nothing is measured.
     ResultError
         The result is damaged, or the file cannot be written.
     """
     out = Path(out)
-    if out.suffix.lower() not in MOVIES:
+    ending = out.suffix.lower()
+    if ending not in MOVIES:
         raise InputError(f"a movie's name ends in {', '.join(MOVIES)}, not {out.name!r}")
-    if not (0.1 <= fps <= 240 and 320 <= width <= 7680 and 0 <= opacity <= 1):
-        raise InputError(
-            f"a movie has .1 to 240 frames per second, 320 to 7680 px and an opacity of 0 to 1, not {fps:g} frames "
-            f"per second, {width} px and {opacity:g}"
-        )
+    if not 0.1 <= fps <= 240:
+        raise InputError(f"a movie has .1 to 240 frames per second, not {fps:g}")
     check_file(out, overwrite=overwrite)
-    chosen = np.flatnonzero(maps.result.finished).tolist() if frames is None else list(frames)
-    if beyond := [frame for frame in chosen if not 0 <= frame < len(maps.result)] or not chosen:
-        raise InputError(f"there is no frame {beyond} in {maps.result.path}, which has {len(maps.result)} frames")
-    drawer = _Drawer.of(maps, tuple(fields), chosen, limits, images=images, curve=curve, colours=colours)
-    drawer = replace(drawer, opacity=opacity, width=width)
-    exe = "" if out.suffix.lower() == ".gif" else str(optional("imageio_ffmpeg", "movie").get_ffmpeg_exe())
-    parts = max(1, min(processes, len(chosen) // _FEW))
+    chosen, constants, shared = movie.chosen, movie.constants, _Shared.of(movie)
+    exe = "" if ending == ".gif" else str(optional("imageio_ffmpeg", "movie").get_ffmpeg_exe())
+    parts = max(1, min(processes, len(chosen) // constants.few))
 
     def pages() -> Iterator[Page]:
-        for done, page in enumerate(_pages(drawer, chosen, parts), 1):
+        for done, page in enumerate(_pages(shared, chosen, parts), 1):
             yield page
             if progress is not None:
                 progress(done, len(chosen), "")
 
     if exe:
-        write_complete(out, lambda file: video(file, pages(), fps, [exe, *_ENCODERS[out.suffix.lower()].split()]))
+        encoder = [exe, *_ENCODERS[ending].split()]
+        write_complete(out, lambda file: video(file, pages(), fps, encoder, constants.patience))
     else:
-        canvas = drawer.opened()
+        canvas = _Canvas(shared)
         samples = [*canvas.mixtures(), *(canvas.page(frame) for frame in spread(chosen, 3))]
         write_complete(out, lambda file: gif(file, pages(), fps, samples))
     return out
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Drawer:
-    """What all pages of a movie share.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Panel:
+    """A field, the values of its first and last colour, their name, and whether there are values below or above."""
 
-    Attributes
-    ----------
-    maps, images, curve, opacity, width
-        As of `write_movie`.
-    fields, ends, colours, beyond
-        For each panel the field, the values of the first and last colour, the name of the colours, and whether there
-        are values below or above.
-    times : ndarray, shape (T,), or None
-        Of the frames, s.
-    limits
-        Of the picture along x and y, px.
-    """
+    field: Quantity
+    ends: _Span
+    colours: str
+    beyond: tuple[bool, bool]
 
-    maps: Maps
-    fields: tuple[Quantity, ...]
-    ends: tuple[tuple[float, float], ...]
-    colours: tuple[str, ...]
-    beyond: tuple[tuple[bool, bool], ...]
-    times: FloatArray | None
-    limits: tuple[tuple[float, float], tuple[float, float]]
-    images: Callable[[int], AnyArray] | None = None
-    curve: Curve | None = None
-    opacity: float = 1.0
-    width: int = 1280
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Shared:
+    """What all pages of a movie share, found from all its frames: the panels, and the limits (px) along x and y."""
+
+    movie: Movie
+    panels: tuple[_Panel, ...]
+    limits: tuple[_Span, _Span]
 
     @classmethod
-    def of(
-        cls,
-        maps: Maps,
-        names: tuple[str, ...],
-        frames: list[int],
-        limits: tuple[float, float] | Mapping[str, tuple[float, float]] | None,
-        **more: Any,
-    ) -> _Drawer:
-        """Find the colours of fields from all frames, or from evenly spaced ones."""
-        from matplotlib import colormaps
-
-        fields = tuple(maps.field(name) for name in names)
-        given_ends = limits if isinstance(limits, Mapping) else dict.fromkeys(names, limits) if limits else {}
-        for low, high in given_ends.values():
-            if not low < high:
-                raise InputError(f"the colours range from a smaller to a larger value, not {low:g} to {high:g}")
-        if not fields or any(field.codes for field in fields):
-            raise InputError(f"a movie shows fields of numbers, not {', '.join(names) or 'none'}")
-        given = more.pop("colours")
-        if given is not None and given not in colormaps:
-            raise InputError(f'there are no colours "{given}"; there are {", ".join(list(colormaps)[:12])}, ...')
-        result = maps.result
-        times = frame_times(result, maps.physical.scale)
-        curve = more["curve"]
-        if curve is not None and curve.timed and times is None:
-            raise InputError("a curve over time needs the frames' times: state frame_rate in [scale]")
-        ends, beyond, corners = [], [], [result.nodes]
-        for part in fields:
-            ordinary: list[FloatArray] = []
-            for frame in spread(frames, max(2, _SAMPLE // len(result.nodes))):
-                read = maps.read(part.name, frame)
+    def of(cls, movie: Movie) -> _Shared:
+        """Find the colours of the fields from all frames, or from evenly spaced ones."""
+        maps, result = movie.maps, movie.maps.result
+        frames = spread(movie.chosen, max(2, movie.constants.sample // len(result.nodes)))
+        panels, corners = [], [result.nodes]
+        for name in movie.fields:
+            ordinary, field = [], maps.field(name)
+            for frame in frames:
+                read = maps.read(name, frame)
                 ordinary.append(style.ordinary_values(read.values, read.std))
-                known = np.isfinite(read.moved).all(axis=1)
-                if more["images"] is not None and known.any():
-                    corners.append(np.stack([read.moved[known].min(axis=0), read.moved[known].max(axis=0)]))
-            known_values = np.concatenate(ordinary)
-            if not known_values.size:
-                raise InputError(f"{part.name} is measured in none of the frames of {result.path}")
-            low, high = given_ends.get(part.name) or part.ends or style.colour_range(known_values)
-            ends.append((low, high))
-            beyond.append((bool(known_values.min() < low), bool(known_values.max() > high)))
-        return cls(
-            maps=maps,
-            fields=fields,
-            ends=tuple(ends),
-            colours=tuple(given or field_colours(part) for part in fields),
-            beyond=tuple(beyond),
-            times=times,
-            limits=picture_limits(result, np.concatenate(corners)),
-            **more,
-        )
-
-    def opened(self) -> _Canvas:
-        """Draw what all pages share."""
-        return _Canvas(self)
+                seen = read.moved[np.isfinite(read.moved).all(axis=1)]
+                if movie.images is not None and len(seen):
+                    corners.append(np.stack([seen.min(axis=0), seen.max(axis=0)]))
+            known = np.concatenate(ordinary)
+            if not known.size:
+                raise InputError(f"{name} is measured in none of the frames of {result.path}")
+            low, high = movie.stated.get(name) or field.ends or style.colour_range(known)
+            beyond, colours = (bool(known.min() < low), bool(known.max() > high)), movie.colours or field_colours(field)
+            panels.append(_Panel(field=field, ends=(low, high), colours=colours, beyond=beyond))
+        return cls(movie=movie, panels=tuple(panels), limits=picture_limits(result, np.concatenate(corners)))
 
 
 class _Canvas:
     """A page that is drawn once, and the parts of it that change from frame to frame."""
 
-    def __init__(self, drawer: _Drawer) -> None:
+    def __init__(self, shared: _Shared) -> None:
         from matplotlib import colormaps
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.colors import Normalize
 
-        self._drawer, self._curve = drawer, drawer.curve
-        ((left, right), (top, bottom)), (unit, factor) = drawer.limits, drawer.maps.physical.axes
+        movie, panels, (x, y) = shared.movie, shared.panels, shared.limits
+        self._movie, self._panels, self._limits, self._times = movie, panels, shared.limits, movie.times
+        unit, factor = movie.maps.physical.axes
 
         def draw(axes: list[Axes]) -> None:
-            panels = zip(axes, drawer.fields, drawer.ends, drawer.colours, drawer.beyond, strict=False)
-            for axis, part, ends, colours, beyond in panels:
-                style.finish_picture(
-                    axis, (left, right), (top, bottom), first=axis is axes[0], unit=unit, factor=factor
-                )
-                axis.set_title(style.literal(part.label))
-                style.add_colour_bar(axis, Normalize(*ends), colours, beyond=beyond)
-            if drawer.curve is not None:
-                self._draw_curve(axes[-1], drawer.curve)
+            for axis, panel in zip(axes, panels, strict=False):
+                style.finish_picture(axis, x, y, first=axis is axes[0], unit=unit, factor=factor)
+                axis.set_title(style.literal(panel.field.label))
+                style.add_colour_bar(axis, Normalize(*panel.ends), panel.colours, beyond=panel.beyond)
+            if movie.curve is not None:
+                self._draw_curve(axes[-1], movie.curve)
 
-        count = len(drawer.fields) + (drawer.curve is not None)
-        aspect = (bottom - top) / (right - left)
+        count, aspect = len(panels) + (movie.curve is not None), np.ptp(y) / np.ptp(x)
         self.figure = style.draw_figure(draw, count=count, aspect=aspect, beside=style.BAR, title=" ")
-        self.figure.set_dpi(drawer.width / self.figure.get_figwidth())
-        texts = {drawer.maps.how(part.name) for part in drawer.fields}
+        self.figure.set_dpi(movie.width / self.figure.get_figwidth())
+        texts = {movie.maps.how(panel.field.name) for panel in panels}
         self._how = "; ".join(sorted(text for text in texts if sum(text in other for other in texts) == 1))
         canvas: Any = FigureCanvasAgg(self.figure)
         self._canvas = canvas
@@ -270,22 +293,22 @@ class _Canvas:
         self._title.set_visible(True)
         self._bare = canvas.copy_from_bbox(self.figure.bbox)
         self._boxes = []
-        for axis in self.figure.axes[: len(drawer.fields)]:
+        for axis in self.figure.axes[: len(panels)]:
             box = axis.get_window_extent()  # from the bottom of the page
             rows = slice(int(np.ceil(self.figure.bbox.height - box.y1)) + 1, int(self.figure.bbox.height - box.y0) - 1)
             self._boxes.append((rows, slice(int(np.ceil(box.x0)) + 1, int(box.x1) - 1), box))
-        solid = np.uint32(round(256 * drawer.opacity))
+        solid = np.uint32(round(256 * movie.opacity))
         self._grey_part = 256 - int(solid)
         self._packed = []
-        for name in drawer.colours:
-            red, green, blue = (colormaps[name](np.arange(PALETTE) / (PALETTE - 1))[:, :3].T * 255).astype(np.uint32)
-            parts = [part * solid >> np.uint32(8) for part in (red, green, blue)]
-            self._packed.append(parts[0] | parts[1] << 8 | parts[2] << 16 | np.uint32(0xFF000000))
-        if drawer.times is not None:  # as many decimals in all frames: a text that changes its length jumps
-            factor, unit = style.time_unit(drawer.times)
-            interval = factor * np.nanmedian(np.diff(drawer.times)) if len(drawer.times) > 1 else 1.0
+        for panel in panels:
+            shades = colormaps[panel.colours](np.arange(PALETTE) / (PALETTE - 1))[:, :3].T
+            red, green, blue = (255 * shades).astype(np.uint32) * solid >> np.uint32(8)
+            self._packed.append(red | green << 8 | blue << 16 | np.uint32(0xFF000000))
+        if self._times is not None:  # as many decimals in all frames: a text that changes its length jumps
+            factor, unit = style.time_unit(self._times)
+            interval = factor * np.nanmedian(np.diff(self._times)) if len(self._times) > 1 else 1.0
             self._clock = factor, unit, max(0, int(np.ceil(-np.log10(interval) - 1e-9)))
-        result = drawer.maps.result
+        result = movie.maps.result
         reference = None if result.reference is None else result.reference.mean(axis=0).astype(np.uint8)
         self._reference = None if reference is None else self._resampled(reference, result.reference_origin)
 
@@ -312,13 +335,13 @@ class _Canvas:
         shift = (factor - 1) / 2
         to_image = np.array([[step, 0, left - origin[0] - shift], [0, step, top - origin[1] - shift]]) / factor
         shape = (columns.stop - columns.start, rows.stop - rows.start)
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        return np.asarray(cv2.warpAffine(small, to_image, shape, flags=flags, borderValue=float(_AROUND)), np.uint8)
+        flags, around = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, float(self._movie.constants.around)
+        return np.asarray(cv2.warpAffine(small, to_image, shape, flags=flags, borderValue=around), np.uint8)
 
     def _steps(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return px of the image to a pixel of the panel, and the place of the first pixel, along x and y."""
         rows, columns, box = self._boxes[0]
-        (left, right), (top, _) = self._drawer.limits
+        (left, right), (top, _) = self._limits
         step = (right - left) / box.width
         above = self.figure.bbox.height - box.y1
         return (step, left + step * (columns.start + 0.5 - box.x0)), (step, top + step * (rows.start + 0.5 - above))
@@ -333,58 +356,53 @@ class _Canvas:
 
     def page(self, frame: int) -> Page:
         """Draw the page of a frame."""
-        drawer, canvas = self._drawer, self._canvas
+        movie, canvas, times = self._movie, self._canvas, self._times
         canvas.restore_region(self._bare)
-        result = drawer.maps.result
-        status = QUANTITIES["status"].codes[next(result.each("status", [frame]))]
-        time = (
-            ""
-            if drawer.times is None
-            else f"{self._clock[0] * drawer.times[frame]:.{self._clock[2]}f} {self._clock[1]}   "
-        )
+        result = movie.maps.result
+        status, time = QUANTITIES["status"].codes[next(result.each("status", [frame]))], ""
+        if times is not None:
+            factor, unit, decimals = self._clock
+            time = f"{factor * times[frame]:.{decimals}f} {unit}   "
         remark = "" if status == "converged" else f" ({status})"
         self._title.set_text("\n".join(filter(None, (f"{time}frame {frame}{remark}", self._how))))
         self.figure.draw_artist(self._title)
-        if self._curve is not None:
-            now = frame if not self._curve.timed or drawer.times is None else self._factor * drawer.times[frame]
+        if movie.curve is not None:
+            now = frame if not movie.curve.timed or times is None else self._factor * times[frame]
             axis = self.figure.axes[-1]
             self._cursor.set_data([now, now], axis.get_ylim())
             axis.draw_artist(self._cursor)
         page: npt.NDArray[np.uint32] = np.array(canvas.buffer_rgba()).view(np.uint32)[..., 0]
-        grey = self._reference if drawer.images is None else self._resampled(drawer.images(frame))
+        grey = self._reference if movie.images is None else self._resampled(movie.images(frame))
         (step, left), (_, top) = self._steps()
-        boxes = zip(self._boxes, drawer.fields, drawer.ends, self._packed, strict=True)
-        for (rows, columns, _), part, ends, packed in boxes:
-            read = drawer.maps.read(part.name, frame)
+        for (rows, columns, _), part, packed in zip(self._boxes, self._panels, self._packed, strict=True):
+            read = movie.maps.read(part.field.name, frame)
             panel = np.empty((rows.stop - rows.start, columns.stop - columns.start), dtype=np.uint32)
-            under = np.full(panel.shape, _AROUND, dtype=np.uint8) if grey is None else grey
-            x, y = ((read.moved if drawer.images is not None else result.nodes) - (left, top)).T / step
-            place = [np.ascontiguousarray(axis, dtype=np.float64) for axis in (x, y)]
+            under = np.full(panel.shape, movie.constants.around, dtype=np.uint8) if grey is None else grey
+            places = ((read.moved if movie.images is not None else result.nodes) - (left, top)).T / step
+            x, y = (np.ascontiguousarray(axis, dtype=np.float64) for axis in places)
             paint_field(
-                panel, under, *place, result.elements, read.values, *map(float, ends), packed, self._grey_part,
-                part.stepped,
+                panel, under, x, y, result.elements, read.values, *map(float, part.ends), packed, self._grey_part,
+                part.field.stepped,
             )  # fmt: skip
             page[rows, columns] = panel
         return page.view(np.uint8).reshape(*page.shape, 4)
 
 
-def _pages(drawer: _Drawer, frames: list[int], processes: int) -> Iterator[Page]:
+def _pages(shared: _Shared, frames: list[int], processes: int) -> Iterator[Page]:
     """Yield the pages of frames in their order; each process draws every so many of them and waits until they go."""
     if processes == 1:
-        canvas = drawer.opened()
-        yield from map(canvas.page, frames)
+        yield from map(_Canvas(shared).page, frames)
         return
-    maps = replace(
-        drawer.maps, result=replace(drawer.maps.result)
-    )  # without what was read, which each reads for itself
-    drawer = replace(drawer, maps=maps)
+    maps = shared.movie.maps
+    bare = replace(maps, result=replace(maps.result))  # without what was read, which each reads for itself
+    shared = replace(shared, movie=replace(shared.movie, maps=bare))
     context, started, ends = multiprocessing.get_context("spawn"), [], []
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which they inherit: Ctrl-C reaches all processes
     try:
         try:
             for part in range(processes):
                 receive, send = context.Pipe(duplex=False)
-                process = context.Process(target=_draw, args=(drawer, frames[part::processes], send), daemon=True)
+                process = context.Process(target=_draw, args=(shared, frames[part::processes], send), daemon=True)
                 process.start()
                 send.close()
                 started.append(process)
@@ -405,11 +423,11 @@ def _pages(drawer: _Drawer, frames: list[int], processes: int) -> Iterator[Page]
             process.join()
 
 
-def _draw(drawer: _Drawer, frames: list[int], send: Any) -> None:
+def _draw(shared: _Shared, frames: list[int], send: Any) -> None:
     """Draw pages in a process of its own; what goes wrong is sent in place of a page."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes: the one that encodes ends them
     try:
-        canvas = drawer.opened()
+        canvas = _Canvas(shared)
         for frame in frames:
             send.send(canvas.page(frame))
     except BrokenPipeError:  # who asked for the pages was killed

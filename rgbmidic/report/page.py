@@ -15,8 +15,8 @@ _TEMPLATES = Path(__file__).with_name("templates")
 def render(template: str, folder: Path = _TEMPLATES, **values: Any) -> str:
     """Fill a template in.
 
-    It has three filters beside those of jinja2: ``code`` writes words between backquotes as code, ``gaps`` marks words
-    between brackets, ``embedded`` makes the address of a picture of a figure.
+    It has three filters beside those of jinja2: ``code`` writes words between backquotes as code, ``gaps`` writes a
+    paragraph on one line and marks words between brackets, ``embedded`` makes the address of a picture of a figure.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def render(template: str, folder: Path = _TEMPLATES, **values: Any) -> str:
     )
     environment.filters |= {
         "code": lambda text: Markup(re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(text)))),
-        "gaps": lambda text: Markup(re.sub(r"(\[[^\]]*\])", r"<mark>\1</mark>", str(escape(text)))),
+        "gaps": lambda text: Markup(re.sub(r"(\[[^\]]*\])", r"<mark>\1</mark>", " ".join(escape(text).split()))),
         "embedded": style.embedded,
     }
     return legible(environment.get_template(template).render(values))

@@ -6,6 +6,7 @@ import base64
 import io
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap, Normalize
     from matplotlib.figure import Figure
-    from matplotlib.ticker import Locator
 
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -56,30 +56,80 @@ _PNG = {"compress_level": 1}
 """Measured on maps: three quarters of the time of 3, a third of zlib's usual 6; the files are 12 % larger than of 3."""
 DPI, PAGE_DPI = 150, 130
 """Pixels per inch of a file and of a picture in a page: one of 9 inches fills most screens, or the page's 64 rem."""
-_WIDTH, _TALLEST = 9.0, 9.5
-"""Largest width and height of a figure in inches: with text of 9 points it stays legible on a page of A4."""
 NUMBERS, BAR, GAP, LEGEND = 0.75, 0.95, 0.15, 2.2
 """Inches: room left of a panel for its numbers, right of it for a colour bar, for nothing or for names of lines; the
 text's extent at 9 points."""
-_BELOW, _ABOVE = 0.52, 0.3
-"""Inches: room for the numbers below a panel, and for its title; two lines and one line of 9 points."""
-_LEAST = 0.2
-"""Inches of a panel that still shows something: 3 mm of a page, 20 px of a movie of 960."""
-_CLIPPED, _WILD = 0.5, 0.1
-"""Colours span all values but this percentage at each end, and what lies within this fraction of that span beyond.
-Chosen: a single outlier in a field of 200 nodes does not set the range."""
-_DOUBTFUL = 3.0
-"""Values whose uncertainty exceeds this multiple of the median do not set the colour range: the usual three sigma."""
-_MARGIN = 0.06
-"""What is shown around the mesh, as a fraction of its longer side. Chosen: the edge of the mesh stays visible."""
-_LETTER, _BETWEEN = 0.075, 0.12
-"""Inches: width of a digit of the numbers along an axis, measured at 9 points; room between two numbers."""
-_LONGEST = 60
-"""Letters of a name that are shown: a title has room for twice as many."""
-_SPAN = 4.0
-"""Colours of a positive quantity end at its median over this and times this: else outliers turn the bulk black."""
-_TIP = 0.045
-"""Height of the point of a colour bar, as a fraction of the panel's: as matplotlib's."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FigureConstants:
+    """Sizes of figures and what they leave out.
+
+    Attributes
+    ----------
+    width, tallest
+        Largest width and height of a figure in inches: with text of 9 points it stays legible on a page of A4.
+    below, above
+        Inches: room for the numbers below a panel, and for its title; two lines and one line of 9 points.
+    least
+        Inches of a panel that still shows something: 3 mm of a page, 20 px of a movie of 960.
+    letter, between
+        Inches: width of a digit of the numbers along an axis, measured at 9 points; room between two numbers.
+    tip
+        Height of the point of a colour bar, as a fraction of the panel's: as matplotlib's.
+    margin
+        What is shown around the mesh, as a fraction of its longer side. Chosen: the edge of the mesh stays visible.
+    clipped, wild
+        Colours span all values but this percentage at each end, and what lies within this fraction of that span
+        beyond. Chosen: a single outlier in a field of 200 nodes does not set the range.
+    doubtful
+        Values whose uncertainty exceeds this multiple of the median do not set the colours: the usual three sigma.
+    span
+        Colours of a positive quantity end at its median over this and times this: else outliers turn the bulk black.
+    longest
+        Letters of a name that are shown: a title has room for twice as many.
+    raster
+        Points along the longer side of a map: the panels of two maps have as many pixels at 150 dpi.
+    legend, lines
+        Frames up to which a legend names each, which fills half the height of a panel, and of which lines are drawn at
+        most: more cover each other. Chosen.
+    marked, marked_alone
+        Points up to which each gets a marker, in a panel of half the width and of the whole width: more would touch.
+    panel, panels
+        Height of a panel of histories in inches, its numbers included: four fill a page; most panels of a picture, two
+        screens high. Chosen.
+    named
+        Most quantities of a panel that its legend names: more lines of 7 pt are higher than it; a crack has one a node.
+    direction
+        Two standard uncertainties (degrees) of a principal direction from which it is not drawn: it may be any. Chosen.
+    """
+
+    width: float = 9.0
+    tallest: float = 9.5
+    below: float = 0.52
+    above: float = 0.3
+    least: float = 0.2
+    letter: float = 0.075
+    between: float = 0.12
+    tip: float = 0.045
+    margin: float = 0.06
+    clipped: float = 0.5
+    wild: float = 0.1
+    doubtful: float = 3.0
+    span: float = 4.0
+    longest: int = 60
+    raster: int = 450
+    legend: int = 8
+    lines: int = 100
+    marked: int = 40
+    marked_alone: int = 60
+    panel: float = 2.4
+    panels: int = 24
+    named: int = 14
+    direction: float = 45.0
+
+
+FIGURES = FigureConstants()
 
 
 def draw_figure(
@@ -89,7 +139,7 @@ def draw_figure(
     aspect: float,
     beside: float,
     title: str = "",
-    tallest: float = _TALLEST,
+    tallest: float = FIGURES.tallest,
 ) -> Figure:
     """Draw a figure of panels, side by side, or one below the other when they are flat.
 
@@ -125,20 +175,21 @@ def draw_figure(
     # placed by numbers: matplotlib's layout engines draw every text several times to find the same
     columns = 1 if aspect < 0.5 and count > 1 else count
     rows = count // columns
-    total = min(_WIDTH, max(6.0, 4.5 * columns))
+    total, tall = min(FIGURES.width, max(6.0, 4.5 * columns)), FIGURES.below + FIGURES.above
     width = (total - NUMBERS) / columns - beside
-    highest = (tallest - 2 * GAP) / rows - _BELOW - _ABOVE
-    if min(width, highest) < _LEAST:
-        most = (_WIDTH - NUMBERS) / (beside + _LEAST) if rows == 1 else (tallest - 2 * GAP) / (_LEAST + _BELOW + _ABOVE)
+    highest = (tallest - 2 * GAP) / rows - tall
+    if min(width, highest) < FIGURES.least:
+        wide = (FIGURES.width - NUMBERS) / (beside + FIGURES.least)
+        most = wide if rows == 1 else (tallest - 2 * GAP) / (FIGURES.least + tall)
         raise InputError(f"one picture has room for {int(most)} panels of this shape, not for {count}: show fewer")
     height = min(width * aspect, highest)
     heading = 2 * GAP if title else 0.0
-    whole = rows * (height + _BELOW + _ABOVE) + heading
+    whole = rows * (height + tall) + heading
     with mpl.rc_context({**STYLE, "axes.prop_cycle": rcsetup.cycler(color=CURVES)}):
         figure = Figure(figsize=(total, whole))
         for place in range(count):
             x = NUMBERS + place % columns * (width + beside)
-            y = whole - heading - (place // columns + 1) * (height + _ABOVE) - place // columns * _BELOW
+            y = whole - heading - (place // columns + 1) * (height + tall) + FIGURES.below
             figure.add_axes((x / total, y / whole, width / total, height / whole))
         draw(figure.axes)
         if title:
@@ -156,8 +207,8 @@ def literal(text: str) -> str:
 
     font = get_font(findfont("DejaVu Sans"))
     seen = [c if font.get_char_index(ord(c)) else ascii(c)[1:-1] for c in text]
-    if len(seen) > _LONGEST:
-        seen = [*seen[: _LONGEST // 2], "…", *seen[1 - _LONGEST // 2 :]]
+    if len(seen) > FIGURES.longest:
+        seen = [*seen[: FIGURES.longest // 2], "…", *seen[1 - FIGURES.longest // 2 :]]
     shown = "".join(seen).replace("$", r"\$")
     return f" {shown}" if shown.startswith("_") else shown
 
@@ -242,8 +293,8 @@ def colour_range(known: FloatArray) -> tuple[float, float]:
 
     The range spans the 0.5 % to 99.5 % quantiles, and what lies within 10 % of that span beyond.
     """
-    core = np.percentile(known, [_CLIPPED, 100 - _CLIPPED])
-    reach = _WILD * np.ptp(core)
+    core = np.percentile(known, [FIGURES.clipped, 100 - FIGURES.clipped])
+    reach = FIGURES.wild * np.ptp(core)
     low, high = float(max(known.min(), core[0] - reach)), float(min(known.max(), core[1] + reach))
     return (low, high) if high > low else (low - 1e-9, low + 1e-9)
 
@@ -257,14 +308,14 @@ def ordinary_values(values: FloatArray, std: FloatArray) -> FloatArray:
     stated = known & np.isfinite(std)
     if not stated.any():
         return values[known]
-    kept = known & ~(std > _DOUBTFUL * np.median(std[stated]))
+    kept = known & ~(std > FIGURES.doubtful * np.median(std[stated]))
     return values[kept if kept.any() else known]
 
 
 def view_limits(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the lowest and the highest (x, y) of a view of points (N, 2) with a margin."""
     low, high = points.min(axis=0), points.max(axis=0)
-    margin = _MARGIN * float((high - low).max())
+    margin = FIGURES.margin * float((high - low).max())
     return low - margin, high + margin
 
 
@@ -275,7 +326,7 @@ def colour_scale(known: FloatArray, *, positive: bool = False) -> Normalize:
     if not positive:
         return Normalize(*colour_range(known))
     logarithms = np.log(np.maximum(known, np.finfo(float).tiny))
-    middle, reach = np.median(logarithms), np.log(_SPAN)
+    middle, reach = np.median(logarithms), np.log(FIGURES.span)
     return LogNorm(*np.exp(np.clip(colour_range(logarithms), middle - reach, middle + reach)))
 
 
@@ -322,7 +373,7 @@ def add_colour_bar(
 
     width = axis.get_position().width * cast("Figure", axis.figure).get_figwidth()
     left, middle, right = (1 + inches / width for inches in (0.08, 0.14, 0.20))
-    low, high = (_TIP * end for end in beyond)
+    low, high = (FIGURES.tip * end for end in beyond)
     outline = [(left, low), (middle, 0), (right, low), (right, 1 - high), (middle, 1), (left, 1 - high)]
     bar = Polygon(outline, transform=axis.transAxes, fill=False, linewidth=0.6, clip_on=False)
     axis.add_patch(bar)
@@ -379,6 +430,8 @@ def finish_picture(
 
     The numbers along the axes are in a `unit` of which what is drawn, such as px, has `factor`.
     """
+    from matplotlib.ticker import FixedLocator
+
     axis.set_aspect("equal")
     axis.set_xlim(*x)
     axis.set_ylim(y[1], y[0])
@@ -386,7 +439,7 @@ def finish_picture(
     if first:
         axis.set_ylabel(f"y ({unit})")
     axis.tick_params(labelleft=first)
-    axis.yaxis.set_major_locator(_ticks(5, factor))
+    axis.yaxis.set_major_locator(FixedLocator(_round_numbers(5, y, factor)))
     for one in (axis.xaxis, axis.yaxis) if factor != 1 else ():
         one.set_major_formatter(lambda value, _: f"{factor * value:.6g}")
     _space_out(axis, 5, whole=False, factor=factor)
@@ -416,25 +469,25 @@ def finish_plot(axis: Axes, x: str, y: str, *, whole: bool = True) -> None:
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def _ticks(most: int, factor: float = 1.0, *, whole: bool = False) -> Locator:
-    """Return a locator of at most so many round numbers, of what is `factor` times the axis' own."""
-    from matplotlib.ticker import MaxNLocator
-
-    class Round(MaxNLocator):
-        def tick_values(self, vmin: float, vmax: float) -> Any:
-            return np.asarray(super().tick_values(factor * vmin, factor * vmax)) / factor
-
-    return Round(most, integer=whole)
-
-
 def _space_out(axis: Axes, most: int, *, whole: bool, factor: float = 1.0) -> None:
-    """Set as many numbers along x as there is room for, at most `most`."""
+    """Set as many round numbers along x, of what is `factor` times the axis' own, as there is room for."""
+    from matplotlib.ticker import FixedLocator
+
     box, (width, height) = axis.get_position(), cast("Figure", axis.figure).get_size_inches()
     room = box.width * width
     if axis.get_aspect() != "auto":
         room = min(room, box.height * height * abs(np.ptp(axis.get_xlim()) / np.ptp(axis.get_ylim())))
     for count in range(most, 0, -1):
-        axis.xaxis.set_major_locator(_ticks(count, factor, whole=whole))
-        numbers = axis.xaxis.get_major_formatter().format_ticks(list(axis.xaxis.get_majorticklocs()))
-        if sum(len(number) * _LETTER + _BETWEEN for number in numbers) < room:
+        places = _round_numbers(count, axis.get_xlim(), factor, whole=whole)
+        axis.xaxis.set_major_locator(FixedLocator(places))
+        numbers = axis.xaxis.get_major_formatter().format_ticks(places)
+        if sum(len(number) * FIGURES.letter + FIGURES.between for number in numbers) < room:
             break
+
+
+def _round_numbers(most: int, ends: tuple[float, float], factor: float, *, whole: bool = False) -> list[float]:
+    """Return at most so many round numbers from end to end, of what is `factor` times the axis' own."""
+    from matplotlib.ticker import MaxNLocator
+
+    low, high = sorted(factor * end for end in ends)
+    return [float(number) / factor for number in MaxNLocator(most, integer=whole).tick_values(low, high)]

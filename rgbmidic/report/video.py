@@ -22,13 +22,14 @@ Page = npt.NDArray[np.uint8]
 
 
 PALETTE = 256
-_PATIENCE = 300.0
-"""Seconds after which an ffmpeg that neither takes a page nor ends is ended. Measured: noise of 3840 x 2160 px takes .5
-s a page, and 12 s at the end for the pages held back; the largest page has 8 times as many, and others may compute."""
+"""Colours of a GIF, and of a field."""
 
 
-def video(file: BinaryIO, pages: Iterator[Page], fps: float, encoder: list[str]) -> None:
-    """Encode pages by ffmpeg, which gets the whole path of the open file: `-b.mp4` is an option, `file:b.mp4` a URL."""
+def video(file: BinaryIO, pages: Iterator[Page], fps: float, encoder: list[str], patience: float) -> None:
+    """Encode pages by ffmpeg; one that neither takes a page nor ends for so many seconds is ended.
+
+    It gets the whole path of the open file: `-b.mp4` is an option, `file:b.mp4` a URL.
+    """
     first, path = next(pages), Path(file.name).absolute()
     rows, columns = first.shape[:2]
     exe, *options = encoder
@@ -47,16 +48,16 @@ def video(file: BinaryIO, pages: Iterator[Page], fps: float, encoder: list[str])
         try:
             with suppress(BrokenPipeError):  # it says why on stderr
                 for page in chain([first], pages):
-                    _within(_PATIENCE, partial(pipe.write, page.tobytes()), end)
-                _within(_PATIENCE, pipe.close, end)
-            status = _within(_PATIENCE, process.wait, end)
+                    _within(patience, partial(pipe.write, page.tobytes()), end)
+                _within(patience, pipe.close, end)
+            status = _within(patience, process.wait, end)
         finally:
             process.kill()
             process.wait()
         errors.seek(0)
         said = errors.read().decode(errors="replace").strip().splitlines()
     if late.is_set():
-        raise ResultError(f"ffmpeg could not write the movie: {exe} did nothing for {_PATIENCE:g} s and was ended")
+        raise ResultError(f"ffmpeg could not write the movie: {exe} did nothing for {patience:g} s and was ended")
     if status != 0 or not path.stat().st_size:
         reason = said[-1] if said else f"it ended with status {status} and {path.stat().st_size} bytes"
         raise ResultError(f"ffmpeg could not write the movie: {reason}")

@@ -23,12 +23,12 @@ from bokeh.document import Document
 from bokeh.layouts import column, row
 from bokeh.models import ColumnDataSource
 
+from rgbmidic import report
 from rgbmidic.errors import ResultError, RgbmidicError
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.inspection import Inspection, inspect_frame
 from rgbmidic.mesh import Region
-from rgbmidic.report import write_movie
 from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.results import Maps, Result
 from rgbmidic.settings import ELEMENT_SIZE
@@ -438,7 +438,7 @@ def _write(send: Any, maps: Maps, out: Path, fields: tuple[str, ...], options: d
             send.send(("far", f"{done} of {total} frames"))
 
     try:
-        write_movie(maps, out, fields, progress=progress, **options)
+        report.write_movie(report.Movie(maps=maps, fields=fields, **options), out, progress=progress)
         send.send(("end", ""))
     except (RgbmidicError, OSError) as error:
         send.send(("end", str(error)))

@@ -12,7 +12,7 @@ import pytest
 from results import NODES, corrupt, make_origin, make_result, smooth_record
 from viewer import MISSING, Page, chromium, click, serving
 
-from rgbmidic.report import write_movie
+from rgbmidic.report import Movie, write_movie
 from rgbmidic.results import FrameRecord, Maps, Result, ResultStore
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.profiles import read_profile
@@ -533,7 +533,8 @@ def test_a_movie_of_what_is_in_view_is_written_beside_the_others(driver, wave, t
         page.until(f"model('said').text.startsWith('written: {first} (a .gif; for .mp4: pip install')", patience=60)
         assert not page.run("model('movie').active")
         maps = Maps.of(wave, gauge=60.0, since=1, measure="hencky")
-        write_movie(maps, tmp_path / "a.gif", ["exx", "u"], limits={"exx": (-0.01, 0.02)}, opacity=0.5)
+        movie = Movie(maps=maps, fields=["exx", "u"], limits={"exx": (-0.01, 0.02)}, opacity=0.5)
+        write_movie(movie, tmp_path / "a.gif")
         before = first.read_bytes()
         assert before == (tmp_path / "a.gif").read_bytes()
         page.keys("m")

@@ -20,7 +20,7 @@ from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.lab.resolution import FILES, cut_offs
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.mesh.pixel_map import PixelMap
-from rgbmidic.report.setup import _FINEST
+from rgbmidic.report.document import ReportConstants
 
 STATES = Scene("bump", width=14, height=1.2, noise=0.05, side=144).images()[0]
 TEST = '[frames]\npath = "f*.tif"\nkind = "monochrome"\nwhite_level = 4095\n[region]\nrectangle = [8, 8, 135, 135]\n'
@@ -112,8 +112,8 @@ def test_a_test_that_shows_nothing_is_refused(command, test_file, change, text):
 def test_the_spatial_resolution_is_that_of_a_wave_measured_on_the_mesh():
     displacement, strain, gauges = cut_offs([3, 5, 8, 12, 30])
     assert 2 < displacement < 3 < strain < gauges[0]
-    np.testing.assert_allclose(displacement, _FINEST[0], rtol=0.03)  # what a report states
-    np.testing.assert_allclose(gauges / [3, 5, 8, 12, 30], _FINEST[1], rtol=0.06)
+    np.testing.assert_allclose(displacement, ReportConstants().finest_nodes, rtol=0.03)  # what a report states
+    np.testing.assert_allclose(gauges / [3, 5, 8, 12, 30], ReportConstants().finest_gauge, rtol=0.06)
     # the gain of a linear fit that sees a wave of the stated period at every pixel, without its theory
     side, period = 20, 20 * displacement
     region = Region.from_rectangle((0, 0, 16 * side, 16 * side), (16 * side + 1,) * 2)

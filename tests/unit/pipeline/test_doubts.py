@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 import pytest
 import small_tests
+from results import analysis_rows
 from scipy.ndimage import gaussian_filter, shift
 from small_tests import colour_test
 
@@ -17,8 +18,6 @@ from rgbmidic.frames import read_frame
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.virtual import record
 from rgbmidic.pipeline import Plan, measure, measure_sequence
-from rgbmidic.report.setup import analysis_rows
-from rgbmidic.results.physical import Physical
 from rgbmidic.settings import TestSettings
 
 SIDE, NOISE = 96, 12.0
@@ -171,7 +170,7 @@ def test_what_runs_at_cracks_is_what_the_provenance_says(normalise, brightness, 
     assert {"normalise": plan.normalise, "brightness": plan.solver.brightness} == runs
     result = measure(stated, tmp_path / "out", source=[frame(0), frame(1)])
     assert result.provenance["grey_levels"] == runs
-    rows = dict(analysis_rows(Physical.of(result), None))
+    rows = analysis_rows(result)
     assert rows["grey levels"] == f"divided by their local mean, σ = {sigma:g} px"
     assert rows["grey-level correction"] == correction
 

@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from results import analysis_rows
 from scipy.ndimage import gaussian_filter
 from textures import Affine, Texture
 
 sys.path.append(str(Path(__file__).resolve().parents[3]))
+
 
 from benchmarks.resolution import SIZES, Scene
 from benchmarks.tables import FOLDER, Table
@@ -20,8 +22,6 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import Plan, measure, measure_sequence, resolution
 from rgbmidic.pipeline.resolution import study_sizes
 from rgbmidic.pipeline.size_figures import ErrorFigures, ResolutionStudy, SizeFigures
-from rgbmidic.report.setup import analysis_rows
-from rgbmidic.results.physical import Physical
 from rgbmidic.settings import MeshSettings, TestSettings
 
 STATES = Scene("bump", width=12, height=1.5, noise=0, side=144).images()[0].astype(np.float32)
@@ -252,7 +252,7 @@ def test_a_run_refines_its_mesh_where_the_bump_is_and_goes_on_with_it(tmp_path, 
     assert legs.min() > 3 * 3.4  # speckles
     assert len(mesh.nodes) > 2 * len(coarse.nodes)
 
-    rows = dict(analysis_rows(Physical.of(whole), None))
+    rows = analysis_rows(whole)
     assert rows["data point spacing"].startswith(f"{legs.min():.3g} px to 23.9 px")
     assert rows["refinement of the elements"] == whole.provenance["refinement"]
 

@@ -19,7 +19,7 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.report import curves, document, remove_report, setup, style, write_batch_page, write_report
+from rgbmidic.report import curves, document, remove_pictures, style, summary, write_batch_page, write_report
 from rgbmidic.results import FrameRecord, Maps, Result, ResultStore, read_profile
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import (
@@ -188,7 +188,7 @@ def test_calibration_exposure_and_stress_are_in_the_report(tmp_path: Path, monke
     notes = {"calibration_figures": figures, "reference_exposure": exposure}
     result = make(tmp_path / "r", [still(index, 0.01) for index in range(3)], notes=notes, settings=stated)
     seen: list[Any] = []
-    monkeypatch.setattr(curves, "history_figure", seen.append)
+    monkeypatch.setattr(curves, "history_figure", lambda histories, _: seen.append(histories))
     write_report(result, tmp_path / "a.html")
     page = Reader(tmp_path / "a.html")
     assert page.rows["channel 2"] == "0.20000 ± 0.0002 | 1.00000 | 0.30000 ± 0.0002"
@@ -204,7 +204,7 @@ def test_key_frames_share_the_change_of_the_field(tmp_path: Path) -> None:
     """At rest, then a fast event, then slow motion: frames where the path of the field has equal parts."""
     moved = np.r_[np.zeros(10), np.linspace(0, 9, 10), np.linspace(9, 10, 11)[1:]]
     result = make(tmp_path / "r", [still(i, 1e-9, u=np.full(NODES, u)) for i, u in enumerate(moved)])
-    history = setup.TimeHistory(Physical.of(result), range(len(moved)))
+    history = summary.TimeHistory(Physical.of(result), range(len(moved)))
     assert history.key_frames(5) == (12, 14, 16, 18, 29)
 
 
@@ -285,8 +285,8 @@ def test_the_page_of_a_batch_links_its_reports_and_escapes_what_it_is_given(tmp_
 def test_the_report_of_an_earlier_run_is_removed_and_nothing_else(tmp_path: Path) -> None:
     for name in ("report.html", "mine.html"):
         (tmp_path / name).touch()
-    remove_report(tmp_path)
-    remove_report(tmp_path)
+    remove_pictures(tmp_path)
+    remove_pictures(tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["mine.html"]
 
 
@@ -299,7 +299,7 @@ def test_the_noise_floor_is_what_a_frame_scatters_by_against_the_reference(tmp_p
     frames = FrameSettings(path=("a",), reference=tuple(range(count)))
     stated = TestSettings(frames=frames, region=RegionSettings(rectangle=(0, 0, 9, 9)))
     origin = {"references": range(count), "settings": stated}
-    floor = setup.noise_floor(Physical.of(make(tmp_path / "r", records, **origin), ScaleSettings(mm_per_pixel=0.1)))
+    floor = summary.noise_floor(Physical.of(make(tmp_path / "r", records, **origin), ScaleSettings(mm_per_pixel=0.1)))
     assert floor is not None
     assert floor.count == count
     accuracy = 4 / np.sqrt(2 * (count - 1) * NODES)
@@ -310,7 +310,7 @@ def test_the_noise_floor_is_what_a_frame_scatters_by_against_the_reference(tmp_p
 
 
 def test_one_static_frame_tells_no_noise(tmp_path: Path) -> None:
-    assert setup.noise_floor(Physical.of(make(tmp_path / "r", [still(0, 0.0), still(1, 0.1)]))) is None
+    assert summary.noise_floor(Physical.of(make(tmp_path / "r", [still(0, 0.0), still(1, 0.1)]))) is None
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
@@ -320,7 +320,7 @@ def test_speckle_size_is_the_width_of_the_autocorrelation(tmp_path: Path, sigma:
     white, more = np.random.default_rng(0).normal(size=(2, 3, 80, 120)).astype(np.float32)
     texture = np.stack([cv2.GaussianBlur(image, (0, 0), sigma) for image in white])
     reference = texture / texture.std() + noise * more
-    size = setup.speckle_size(make(tmp_path / "r", [still(0, 0.01)], reference=reference))
+    size = summary.speckle_size(make(tmp_path / "r", [still(0, 0.01)], reference=reference))
     assert size == pytest.approx(2 * np.sqrt(2 * np.log(2)) * np.sqrt(2) * sigma, rel=0.08)
 
 

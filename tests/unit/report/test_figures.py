@@ -18,7 +18,7 @@ from results import LIGHTS, MESH, NODES, make_origin, make_result
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.report import figures, gallery, remove_figures, save_figure, style, write_figures, write_maps
+from rgbmidic.report import figures, gallery, remove_pictures, save_figure, style, write_figures, write_maps
 from rgbmidic.results import QUANTITIES, FrameRecord, Maps, Origin, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 from rgbmidic.typing import AnyArray
@@ -150,10 +150,10 @@ def test_a_derived_field_has_its_uncertainty_beside_it_and_hatches_where_it_may_
     assert not figure.axes[0].collections[0].get_paths()[0].vertices.size, "a stretch of 10 standard uncertainties"
     figure = drawer.fields(0, ["eyy"], std=True, hatched=True)
     assert figure.axes[0].collections[0].get_paths()[0].vertices.size
-    files = write_maps(maps, ["eyy", "node_status"], tmp_path / "maps", [0])
+    files = write_maps(maps, ["eyy", "node_status"], tmp_path / "figures", [0])
     assert [file.name for file in files] == ["map_eyy_000000.png", "map_node_status_000000.png"]
-    remove_figures(tmp_path / "maps")
-    assert not [*(tmp_path / "maps").iterdir()]
+    remove_pictures(tmp_path)
+    assert not [*(tmp_path / "figures").iterdir()]
 
 
 def test_blank_where_not_measured(tmp_path: Path) -> None:
@@ -196,12 +196,11 @@ def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gallery, "save_figure", lambda _, path: path.touch())
 
 
-def test_all_figures_can_be_written_by_two_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gallery, "_FEW", 5)
+def test_all_figures_can_be_written_by_two_processes(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=12, reference=np.stack([IMAGE] * 3))
     told_once = {"convergence", "residual", "brightness"}
     with_pictures = {*EVERY_FRAME, "masks", "reflections"}
-    files = write_figures(result, tmp_path / "figures", [4], processes=2)
+    files = write_figures(result, tmp_path / "figures", [4], processes=2, few=5)
     assert {file.stem for file in files} == told_once | {f"{name}_000004" for name in with_pictures}
     assert all(file.stat().st_size > 5000 for file in files)
 
@@ -367,10 +366,10 @@ def test_pictures_of_an_earlier_run_are_removed_and_no_others(tmp_path: Path) ->
     files = write_figures(result, tmp_path / "figures", [2])
     mine = tmp_path / "figures" / "my_displacement.png"
     mine.write_bytes(b"kept")
-    remove_figures(tmp_path / "figures")
+    remove_pictures(tmp_path)
     assert not any(file.exists() for file in files)
     assert mine.read_bytes() == b"kept"
-    remove_figures(tmp_path / "nowhere")
+    remove_pictures(tmp_path / "nowhere")
 
 
 def test_frame_where_nothing_is_measured_still_has_figures(tmp_path: Path) -> None:

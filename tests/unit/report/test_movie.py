@@ -18,8 +18,8 @@ from results import NODES, make_result, smooth_record
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import FrameError, InputError, ResultError
-from rgbmidic.report import movie, video
-from rgbmidic.report.movie import write_movie
+from rgbmidic.report import movie
+from rgbmidic.report.movie import Movie, MovieConstants, _Canvas, _Shared, write_movie
 from rgbmidic.report.movie_curve import Curve
 from rgbmidic.results import FrameRecord, Maps
 from rgbmidic.view.picture import RawPictures
@@ -41,11 +41,11 @@ def decoded(path: Path) -> np.ndarray:
 
 @pytest.mark.parametrize("ending", [".mp4", ".webm", ".gif"])
 def test_a_movie_shows_the_field_in_each_frame(maps: Maps, tmp_path: Path, ending: str) -> None:
-    out = write_movie(maps, tmp_path / f"m{ending}", ["u", "exx"], width=640, frames=[1, 3, 5])
+    shown = Movie(maps=maps, fields=("u", "exx"), frames=[1, 3, 5], width=640)
+    out = write_movie(shown, tmp_path / f"m{ending}")
     frames = decoded(out).astype(int)
     assert frames.shape[0] == 3
-    canvas = movie._Drawer.of(maps, ("u", "exx"), [1, 3, 5], None, images=None, curve=None, colours=None)
-    page = replace(canvas, width=640).opened().page(3)[..., :3].astype(int)
+    page = _Canvas(_Shared.of(shown)).page(3)[..., :3].astype(int)
     part = frames[1][: page.shape[0], : page.shape[1]]
     assert np.abs(part - page).mean() < 4  # what the encoders leave: 1 to 3 of 255
     assert np.abs(frames[0] - frames[2]).mean() > 2
@@ -54,8 +54,8 @@ def test_a_movie_shows_the_field_in_each_frame(maps: Maps, tmp_path: Path, endin
 def test_the_colour_of_a_node_is_that_of_its_value(maps: Maps) -> None:
     from matplotlib import colormaps
 
-    drawer = movie._Drawer.of(maps, ("u",), [5], (-0.5, 0.5), images=None, curve=None, colours=None)
-    canvas = drawer.opened()
+    drawer = _Shared.of(Movie(maps=maps, fields=("u",), frames=[5], limits=(-0.5, 0.5)))
+    canvas = _Canvas(drawer)
     page, (step, left), (_, top) = canvas.page(5), *canvas._steps()
     rows, columns, _ = canvas._boxes[0]
     for x, y in ((30, 40), (60, 30), (95, 60)):
@@ -66,8 +66,8 @@ def test_the_colour_of_a_node_is_that_of_its_value(maps: Maps) -> None:
 
 def test_a_page_states_how_its_fields_are_derived(maps: Maps) -> None:
     since = replace(maps, since=2)
-    drawer = movie._Drawer.of(since, ("u", "exx_std"), [4], None, images=None, curve=None, colours=None)
-    canvas = drawer.opened()
+    drawer = _Shared.of(Movie(maps=since, fields=("u", "exx_std"), frames=[4]))
+    canvas = _Canvas(drawer)
     canvas.page(4)
     first, how = canvas._title.get_text().splitlines()
     assert first.endswith("frame 4")
@@ -87,7 +87,7 @@ def test_pages_are_the_same_for_any_number_of_processes(maps: Maps, monkeypatch:
     monkeypatch.setattr(SpawnProcess, "start", starting)
     before = signal.getsignal(signal.SIGINT)
     curve = Curve(name="force_N", times=np.linspace(0, 5e-5, 9), values=np.arange(9.0), timed=True)
-    drawer = movie._Drawer.of(maps, ("exx", "velocity"), [0, 2, 4], None, images=None, curve=curve, colours=None)
+    drawer = _Shared.of(Movie(maps=maps, fields=("exx", "velocity"), frames=[0, 2, 4], curve=curve))
     alone, shared = (list(movie._pages(drawer, [0, 2, 4], count)) for count in (1, 2))
     assert all(np.array_equal(a, b) for a, b in zip(alone, shared, strict=True))
     assert not np.array_equal(alone[0], alone[1])
@@ -96,7 +96,7 @@ def test_pages_are_the_same_for_any_number_of_processes(maps: Maps, monkeypatch:
 
 
 def test_a_process_whose_pages_nobody_takes_ends_in_silence(maps: Maps) -> None:
-    drawer = movie._Drawer.of(maps, ("u",), [0, 1], None, images=None, curve=None, colours=None)
+    drawer = _Shared.of(Movie(maps=maps, fields=("u",), frames=[0, 1]))
     receive, send = multiprocessing.Pipe(duplex=False)
     receive.close()
     before = signal.getsignal(signal.SIGINT)
@@ -121,8 +121,8 @@ def test_over_raw_frames_the_field_lies_where_the_specimen_is(tmp_path: Path) ->
 
     maps = Maps.of(make_result(tmp_path / "r", frames=2, record=shifted, notes={"frame_shape": [80, 200]}))
     grey = lambda index: np.full((80, 200), 100, dtype=np.uint8)  # noqa: E731
-    drawer = movie._Drawer.of(maps, ("u",), [0, 1], None, images=grey, curve=None, colours=None)
-    canvas = drawer.opened()
+    drawer = _Shared.of(Movie(maps=maps, fields=("u",), frames=[0, 1], images=grey))
+    canvas = _Canvas(drawer)
     (step, left), (_, top) = canvas._steps()
     rows, columns, _ = canvas._boxes[0]
     page = canvas.page(1)[rows, columns]
@@ -137,7 +137,7 @@ def test_nothing_is_left_of_a_movie_that_is_interrupted(maps: Maps, tmp_path: Pa
 
     for ending in (".mp4", ".gif"):
         with pytest.raises(KeyboardInterrupt):
-            write_movie(maps, tmp_path / f"m{ending}", ["u"], width=320, progress=stop)
+            write_movie(Movie(maps=maps, fields=["u"], width=320), tmp_path / f"m{ending}", progress=stop)
     assert not list(tmp_path.iterdir())
 
 
@@ -159,10 +159,9 @@ def test_an_ffmpeg_that_does_not_do_its_work_is_an_error_and_nothing_is_left(
     exe.chmod(0o700)
     out.mkdir()
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(exe))
-    if "sleep" in does:
-        monkeypatch.setattr(video, "_PATIENCE", 0.2)
+    constants = MovieConstants(patience=0.2 if "sleep" in does else 300.0)
     with pytest.raises(ResultError, match=told):
-        write_movie(maps, out / "m.mp4", ["u"], width=320)
+        write_movie(Movie(maps=maps, fields=["u"], width=320, constants=constants), out / "m.mp4")
     assert not list(out.iterdir())
 
 
@@ -172,7 +171,7 @@ def test_a_movie_is_in_the_file_of_its_name_whatever_that_means_to_ffmpeg(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path(name).parent.mkdir(exist_ok=True)
-    write_movie(maps, name, ["u"], width=320, frames=[1, 3])
+    write_movie(Movie(maps=maps, fields=["u"], width=320, frames=[1, 3]), name)
     assert decoded(tmp_path / name).shape[0] == 2
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [tmp_path / name]
 
@@ -204,14 +203,15 @@ def test_wrong_input_is_refused_and_nothing_is_overwritten(maps: Maps, tmp_path:
         ("no colours", "m.gif", ["u"], {"colours": "none"}),
         ("room for 7 panels of this shape, not for 30: show fewer", "m.gif", ["u"] * 30, {}),
     ):
+        options = {"fps": more.pop("fps")} if "fps" in more else {}
         with pytest.raises(InputError, match=message):
-            write_movie(maps, tmp_path / name, fields, **more)
+            write_movie(Movie(maps=maps, fields=fields, **more), tmp_path / name, **options)
     with pytest.raises(FrameError, match=r"result does not state where its raw frames are"):
-        write_movie(maps, tmp_path / "m.gif", ["u"], images=RawPictures(result=maps.result))
+        write_movie(Movie(maps=maps, fields=["u"], images=RawPictures(result=maps.result)), tmp_path / "m.gif")
     assert not list(tmp_path.iterdir())
     (tmp_path / "there.gif").write_text("kept")
     with pytest.raises(ResultError, match="already exists"):
-        write_movie(maps, tmp_path / "there.gif", ["u"])
+        write_movie(Movie(maps=maps, fields=["u"]), tmp_path / "there.gif")
     assert (tmp_path / "there.gif").read_text() == "kept"
 
 
