@@ -348,7 +348,7 @@ def viewer(demo: Path) -> None:
             page = Page(driver, f"{address}?theme=light")
             driver.execute_script(*click("Inspect"))
             page.until(
-                "model('plot').title.text.startsWith('expected uncertainty') && model('tiles').data.x.length > 1"
+                "model('plot').title.text.startsWith('expected uncertainty') && model('tiles').text"
             )
             keep("setup")
 

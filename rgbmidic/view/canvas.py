@@ -1,13 +1,12 @@
-"""Plots of the image window with its field and marks, of principal directions on it, and of small pictures in rows."""
+"""Plots of the image window with its field and marks, and of what is drawn on it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import bokeh.models as bk
-import cv2
 import numpy as np
 import numpy.typing as npt
 from bokeh.core.property.descriptors import UnsetValueError
@@ -354,43 +353,3 @@ def contour_lines(
             ends.append(nodes[a] + part * (nodes[b] - nodes[a]))
         lines.append(np.concatenate(ends, axis=1))
     return np.concatenate(lines) if lines else np.zeros((0, 4))
-
-
-_WIDE = 260
-"""Columns of a small picture."""
-_STEP, _GAP = 1.06, 0.2
-"""From one to the next, and the room for a name over each, in widths of one."""
-_TILE = "image x y dw name"
-
-
-class Tiles:
-    """Plot of small pictures in rows; hidden until there are some."""
-
-    def __init__(self) -> None:
-        self._shown = bk.ColumnDataSource(columns(_TILE), name="tiles")
-        bare = dict.fromkeys(("background_fill_color", "border_fill_color", "outline_line_color"))
-        ranges = {"x_range": bk.Range1d(0, 1), "y_range": bk.Range1d(1, 0)}
-        self.plot = plain_plot(sizing_mode="scale_width", min_border=0, visible=False, **ranges, **bare)
-        self.plot.axis.visible = self.plot.grid.visible = False
-        greys = [f"#{level:02x}{level:02x}{level:02x}" for level in range(256)]
-        self._drawn = self.plot.image("image", "x", "y", "dw", 1, source=self._shown, palette=greys)
-        self._drawn.glyph.color_mapper.update(low=0, high=255)
-        letters = {"text_font_size": "11px", "text_color": "#808890", "text_baseline": "bottom", "y_offset": -1}
-        self.plot.text("x", "y", "name", source=self._shown, **letters)
-
-    def show(self, rows: Sequence[Mapping[str, npt.NDArray[np.uint8]]]) -> None:
-        """Show rows of pictures (H, W) of one size by their names, aligned at the right."""
-        height, width = next(iter(rows[0].values())).shape
-        tall, across = height / width, max(map(len, rows))
-        size = (_WIDE, max(1, round(_WIDE * tall)))
-        self._drawn.glyph.dh = tall
-        tiles = [
-            (picture, x * _STEP, y * (tall + _GAP) + _GAP, 1.0, name)
-            for y, row in enumerate(rows)
-            for x, (name, picture) in enumerate(row.items(), start=across - len(row))
-        ]
-        small = [(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), *place) for picture, *place in tiles]
-        self._shown.data = columns(_TILE, small)
-        down = len(rows) * (tall + _GAP)
-        self.plot.x_range.end, self.plot.y_range.start = across * _STEP, down
-        self.plot.update(visible=True, aspect_ratio=across * _STEP / down)

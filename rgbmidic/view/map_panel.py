@@ -119,7 +119,7 @@ class MapPanel:
         shown = self._shown
         view, field, values = shown.view, shown.maps.all[name], shown.values(name)
         first = canvas is self.canvas
-        suits = palette_name(field.kind, symmetric=view.symmetric and field.signed)
+        suits = palette_name(field, symmetric=view.symmetric)
         colours = palette((first and not field.codes and view.palette) or suits, view.levels)
         over = Overlay(
             nodes=nodes,

@@ -173,7 +173,7 @@ class ResultControls(Controls):
         self.name = bk.TextInput(title="its name", name="name", **wide)
         self.drag = bk.Toggle(label="Drag the channel along the time", name="drag", **wide)
         self.scale = bk.RadioButtonGroup(labels=["Move", "Two points of a distance"], name="scale", **wide)
-        self.file = bk.TextInput(title="TEST.toml, beside test or result", name="file", **wide)
+        self.file = bk.TextInput(title="TEST.toml, beside test or result", name="file", value="TEST.toml", **wide)
         self.what = bk.CheckboxButtonGroup(labels=list(WRITTEN), active=[0], name="what", **wide)
         self.told, self.written, self.scaled = (bk.Div(name=name, **wide) for name in ("told", "written", "scaled"))
         groups: dict[Any, str] = {self.over: "image", self.section: "controls shown", self.mode: "what a click sets"}

@@ -23,7 +23,7 @@ from rgbmidic.errors import FrameError, InputError, RgbmidicError
 from rgbmidic.fields import Area, Mean, Nodal, make_probe
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.series import FrameSeries, open_series
-from rgbmidic.report.figures import spread
+from rgbmidic.report.figures import field_colours, spread
 from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, time_text
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, MapField, Maps, MapValues, Result
 from rgbmidic.settings import ProbeSettings, TestSettings
@@ -40,10 +40,6 @@ _COLOURS = 256
 """Colours of a palette: the screen has as many levels."""
 AROUND = {False: 235, True: 30}
 """Grey level outside the image, by whether the page is dark."""
-_PALETTES = {
-    "displacement": "viridis", "strain": "viridis", "positive": "plasma", "fraction": "cividis", "angle": "twilight",
-    "codes": "codes",
-}  # fmt: skip
 _SIDES, _APART = ("#010203", "#ffffff"), 8
 """Colours of what lies below and above 0, of which the first is no grey, and pixels from one hatch to the next."""
 
@@ -192,9 +188,9 @@ def _packed(colours: tuple[str, ...], grey_part: int) -> npt.NDArray[np.uint32]:
     return np.asarray(red | green << 8 | blue << 16 | 0xFF000000, dtype=np.uint32)
 
 
-def palette_name(kind: str, *, symmetric: bool) -> str:
-    """Return matplotlib's name of the colours that suit a kind of field; all are safe for the colour-blind."""
-    return "RdBu_r" if symmetric and kind not in ("codes", "angle") else _PALETTES[kind]
+def palette_name(field: MapField, *, symmetric: bool) -> str:
+    """Return the name of the colours that suit a field, symmetric about 0 where asked; safe for the colour-blind."""
+    return "RdBu_r" if symmetric and field.signed else "codes" if field.codes else field_colours(field)
 
 
 @cache

@@ -7,10 +7,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from rgbmidic.fields import MEASURES
 from rgbmidic.fields.strain import shortest_gauge
 from rgbmidic.results import Maps, MapValues, Result
 from rgbmidic.results.physical import scale_of
-from rgbmidic.settings import ScaleSettings
+from rgbmidic.settings import ChannelSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import BESIDE, UNCERTAINTY, ViewState
 from rgbmidic.view.picture import Picture, Pictures, pointer_text, range_of_test, robust_range
@@ -45,9 +46,24 @@ class ShownFields:
         self._moved = lru_cache(2)(lambda frame, changes, chosen: self.maps.displacement(frame))
         self._test_range = lru_cache(8)(lambda name, changes, chosen: range_of_test(self.maps, name))
 
-    def rescale(self, base: Path) -> bool:
-        """Take the scale of the view, with files relative to a folder; returns whether it is another one."""
-        scale = self.view.scale_settings(base, scale_of(self.result))
+    @property
+    def base(self) -> Path:
+        """Folder that the paths of the view are relative to."""
+        return Path(self.result.provenance.get("base", self.result.path.parent))
+
+    @property
+    def channels(self) -> ChannelSettings:
+        """``[channels]`` as it is in view."""
+        return self.view.channel_settings(self.base)
+
+    @property
+    def measure(self) -> str | None:
+        """Strain measure of the probes; None: the one that they state."""
+        return self.view.measure if self.view.measure != MEASURES[0] else None
+
+    def rescale(self) -> bool:
+        """Take the scale of the view; returns whether it is another one."""
+        scale = self.view.scale_settings(self.base, scale_of(self.result))
         if scale == self.scale:
             return False
         self.maps, self.scale = Maps.of(self.result, scale), scale

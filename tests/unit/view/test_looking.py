@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from bokeh.document import Document
 from bokeh.events import MouseMove
-from bokeh.models import Div, Select
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from results import LIGHTS, MESH, NODES, corrupt, make_origin, make_result, random_record, smooth_record
@@ -27,6 +26,7 @@ from rgbmidic.view import curves
 from rgbmidic.view.address import CLOCKS, MARKS, PALETTES, UNCERTAINTY, Mark, Steps, ViewState, probe_marks
 from rgbmidic.view.canvas import arrow_lines, beside, contour_lines
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
+from rgbmidic.view.models import ResultControls
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import (
     Overlay,
@@ -42,6 +42,7 @@ from rgbmidic.view.picture import (
     robust_range,
     watched,
 )
+from rgbmidic.view.shown import ShownFields
 
 NAMES = ("u", "v", "e1")
 
@@ -172,7 +173,7 @@ def test_channels_off_the_frames_are_shown_where_they_are_and_told(tmp_path):
     result = make_result(tmp_path / "result", frames=4, record=lambda index: timed(index, 20_000))
     (tmp_path / "daq.csv").write_text("time_s,a_N\n" + "".join(f"{5 + n},{n}\n" for n in range(9)), encoding="utf-8")
     page = ResultPage(Document(), result, ViewState(channels="daq.csv", beside="a_N"), Progress(4))
-    page._read_curves()
+    page.show()
     assert "span 5 to 13 s" in page.parts.told.text
     assert list(page.curves._recorded.data["ys"][0]) == list(range(9))
     page.parts.of["offset"].value = -5.0
@@ -389,7 +390,7 @@ def test_a_place_is_found_in_its_element(result):
 def test_every_field_has_colours(result):
     for field in Maps.of(result).all.values():
         for symmetric in {False, field.signed}:
-            assert all(len(colour) == 7 for colour in palette(palette_name(field.kind, symmetric=symmetric)))
+            assert all(len(colour) == 7 for colour in palette(palette_name(field, symmetric=symmetric)))
 
 
 def test_marks_make_probes_in_the_order_set_and_a_lone_end_waits():
@@ -462,8 +463,9 @@ def test_a_frame_that_the_curves_do_not_hold_is_not_pointed_at(tmp_path):
     store = ResultStore.create(tmp_path / "result", make_origin(5))
     for index in (0, 1, 4):
         store.write_frame(index, smooth_record(index))
-    panel = CurvePanel(Document(), chosen="", select=Select(), message=Div(), told=Div(), hint="")
-    panel.histories = curves.read(Result.open(store.path, partial=True), [Mark("point", 50, 40)], 60.0)
+    result = Result.open(store.path, partial=True)
+    panel = CurvePanel(Document(), ShownFields(result, ViewState()), ResultControls(4, 0, dark=False), lambda: None)
+    panel.histories = curves.read(result, [Mark("point", 50, 40)], 60.0)
     shown = []
     for frame in range(5):
         panel.point(frame)
