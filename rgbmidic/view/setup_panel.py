@@ -271,11 +271,8 @@ class SetupControls(Controls):
         )
         self.light = bk.Select(title="Masks are of", name="light", **wide)
         self.size = bk.Spinner(title="Element size (px)", name="size", low=4, value=size, step=1, **wide)
-        ends = {
-            "Reference": frames.reference[0],
-            "First": frames.first,
-            "Last": last if frames.last is None else frames.last,
-        }
+        end = last if frames.last is None else frames.last
+        chosen = {"Reference": frames.reference[0], "First": frames.first, "Last": end}
         self.reference, self.first, self.last = (
             bk.Spinner(title=title, name=title.lower(), value=at, low=0, high=last, step=1, **wide)
             for title, at in chosen.items()
