@@ -21,6 +21,7 @@ from rgbmidic.results.profiles import Profile
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.view.canvas import columns, plain_plot
 from rgbmidic.view.curves import NOW, band
+from rgbmidic.view.models import labelled
 from rgbmidic.view.picture import Background, warning
 
 _SLICE = 0.25
@@ -105,7 +106,7 @@ class LinePanel:
         self._reader = Background(document)
         self._view: tuple[int, MapValues | None] = (0, None)
         self.choice = bk.RadioButtonGroup(labels=[], name="beside_map", visible=False, **look)
-        self.choice.html_attributes = {"role": "group", "aria-label": "curves over time, or the field along a line"}
+        self.choice.html_attributes = labelled("curves over time, or the field along a line")
         self.told = bk.Div(name="told_of_line", **look)
         self.told.html_attributes = {"aria-live": "polite"}
         self._image = bk.ColumnDataSource(columns(_IMAGE), name="wave")

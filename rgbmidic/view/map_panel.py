@@ -12,8 +12,8 @@ from bokeh.events import MouseMove
 
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import MARKS, SCALE, probe_marks, probe_place
-from rgbmidic.view.canvas import Canvas, LabelLayer, LineLayer, arrow_lines, contour_lines, direction_lines
-from rgbmidic.view.models import MarkLayer
+from rgbmidic.view.canvas import Canvas
+from rgbmidic.view.layers import LabelLayer, LineLayer, MarkLayer, arrow_lines, contour_lines, direction_lines
 from rgbmidic.view.picture import (
     AROUND,
     Overlay,

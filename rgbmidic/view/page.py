@@ -107,7 +107,7 @@ class ResultPage:
         p.of["since"].high = len(self.result) - 1
         p.over.active = OVER.index(view.over)
         p.head.text = self._title()
-        for entry, _, kind, *_ in CONTROLS:
+        for entry, (kind, *_) in CONTROLS.items():
             key = "active" if kind is bk.Checkbox else "value"
             p.of[entry].update(**{key: getattr(view, entry)})
             p.of[entry].on_change(key, partial(self._set, entry))

@@ -262,9 +262,8 @@ class SetupControls(Controls):
         self.head.text = f"<b>{html.escape(str(draft.file))}</b> &nbsp; a test to set up"
         self.picture = bk.Select(title="Picture", name="picture", options=[RAW], value=RAW, **wide)
         self.glare = bk.Checkbox(label="mark saturated samples", active=True, **self.small)
-        shapes = ["Move", "Rectangle", "Polygon", "Circle"]
-        self.mode = bk.RadioButtonGroup(labels=shapes, active=0, name="mode", **wide)
-        self.hole = bk.RadioButtonGroup(labels=["Hole", "Round hole", "Lamp mask"], active=None, name="hole", **wide)
+        self.mode = self.group("mode", "shape that a click begins", ["Move", "Rectangle", "Polygon", "Circle"])
+        self.hole = self.group("hole", "what is left out", ["Hole", "Round hole", "Lamp mask"], active=None)
         labels = ("Undo", "Redo", "Next", "Clear", "Inspect", "Write TEST.toml")
         self.undo, self.redo, self.next, self.clear, self.inspect, self.write = (
             bk.Button(label=name, name=name.lower(), **wide) for name in labels

@@ -24,8 +24,8 @@ from rgbmidic.results.histories import read_histories, write_histories
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, TestSettings
 from rgbmidic.view import curves
 from rgbmidic.view.address import CLOCKS, MARKS, PALETTES, UNCERTAINTY, Mark, Steps, ViewState, probe_marks
-from rgbmidic.view.canvas import arrow_lines, beside, contour_lines
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
+from rgbmidic.view.layers import arrow_lines, beside, contour_lines
 from rgbmidic.view.models import ResultControls
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import (
