@@ -54,11 +54,7 @@ def marks_of(stated: ProbeSettings) -> tuple[Mark, ...]:
 
 
 def read(
-    result: Result,
-    marks: Sequence[Mark],
-    gauge: float,
-    measure: str | None = None,
-    scale: ScaleSettings | None = None,
+    result: Result, marks: Sequence[Mark], gauge: float, measure: str | None = None, scale: ScaleSettings | None = None
 ) -> Histories | None:
     """Read the probes that marks make off a result, as `read_histories`; None where they make none."""
     made = probes(marks, gauge, probes_of(result), measure)

@@ -193,12 +193,7 @@ class MarkLayer:
         canvas.plot.text("x", "y", "text", source=self._joined, border_line_color="colour", **LETTERS)
 
     def place(
-        self,
-        marks: Sequence[Mark],
-        reference: FloatArray,
-        nodes: FloatArray,
-        values: Mapping[str, str],
-        gauge: float,
+        self, marks: Sequence[Mark], reference: FloatArray, nodes: FloatArray, values: Mapping[str, str], gauge: float
     ) -> None:
         """Draw marks, which lie on the `reference` (N, 2) of the nodes, where the nodes (N, 2) carry them.
 

@@ -14,16 +14,7 @@ from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import MARKS, SCALE, probe_marks, probe_place
 from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.layers import LabelLayer, LineLayer, MarkLayer, arrow_lines, contour_lines, direction_lines
-from rgbmidic.view.picture import (
-    AROUND,
-    Overlay,
-    Picture,
-    extremes,
-    paint,
-    palette,
-    palette_name,
-    probe_text,
-)
+from rgbmidic.view.picture import AROUND, Overlay, Picture, extremes, paint, palette, palette_name, probe_text
 from rgbmidic.view.shown import ShownFields
 
 _CONTOURS = 10

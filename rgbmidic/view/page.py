@@ -16,17 +16,7 @@ from bokeh.events import DocumentReady, Tap
 from rgbmidic.errors import RgbmidicError
 from rgbmidic.fields import uncertain
 from rgbmidic.results import Result, channels_of
-from rgbmidic.view.address import (
-    BESIDE,
-    OVER,
-    SCALE,
-    UNCERTAINTY,
-    Mark,
-    Steps,
-    ViewState,
-    probe_marks,
-    probe_place,
-)
+from rgbmidic.view.address import BESIDE, OVER, SCALE, UNCERTAINTY, Mark, Steps, ViewState, probe_marks, probe_place
 from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv
 from rgbmidic.view.film import FilmButton
