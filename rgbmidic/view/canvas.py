@@ -16,15 +16,10 @@ from bokeh.plotting import figure
 from rgbmidic.report.style import view_limits
 from rgbmidic.typing import AnyArray, FloatArray
 from rgbmidic.view.address import Mark
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.picture import Window
 
 _IMAGE = "image x y dw dh"
-_BAR = 80
-"""Px of the screen for the colour bar: seven digits of 12 px, which change with the frame."""
-_SOON = 40
-"""Ms in which the moves of a view are collected: the picture follows at 25 a second."""
-_SENT = 100
-"""States of the marks that the browser may not have yet: it asks for one frame at a time, each of which moves them."""
 
 
 def plain_plot(**options: Any) -> Any:
@@ -90,7 +85,7 @@ class Canvas:
             x_range=like.plot.x_range if like else bk.Range1d(self.window.left, self.window.right),
             y_range=like.plot.y_range if like else bk.Range1d(self.window.bottom, self.window.top),
             title=" ",
-            min_border_right=_BAR,
+            min_border_right=VIEWER.bar_width,
             x_axis_label="x (px)",
             y_axis_label="y (px)",
             toolbar_location="above",
@@ -159,7 +154,7 @@ class Canvas:
         self.set, last = list(marks), max(self._states)
         if self._states[last] != self.set:
             self._states[last + 1] = self.set
-            self._states = dict(list(self._states.items())[-_SENT:])
+            self._states = dict(list(self._states.items())[-VIEWER.mark_states :])
             rows = [(mark.x, mark.y, mark.kind, mark.name, 0) for mark in marks]
             self.marks.data = columns(f"x y kind name {last + 1}", rows)
 
@@ -216,4 +211,4 @@ class Canvas:
 
         if not self._coming:
             self._coming = True
-            self._document.add_timeout_callback(come, _SOON)
+            self._document.add_timeout_callback(come, VIEWER.view_ms)

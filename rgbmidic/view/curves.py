@@ -21,6 +21,7 @@ from rgbmidic.settings import ProbeSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import KINDS, Mark, probe_marks, probe_place
 from rgbmidic.view.canvas import columns, plain_plot
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.models import ResultControls
 from rgbmidic.view.picture import Background, warning
 from rgbmidic.view.shown import ShownFields
@@ -105,10 +106,6 @@ _HINT = (
     "Choose a probe, click on the field (Gauge, Line, Box, Circle: twice). Drag marks; Backspace removes one. "
     "Keys: ← → a frame, space plays, 1 to 7 sections, Ctrl-Z undoes, Ctrl-Y redoes."
 )
-_STRETCHES = 1500
-"""Stretches of a channel that are drawn: as many as a wide screen has columns for them."""
-_AT_ONCE = 100
-"""Frames that are read before the page is served again. Measured: 10 ms."""
 _NOT_YET, _DAMAGED = -1, 3
 """Status of a frame that was not read yet, and of one whose record cannot be read, beside those of the field table."""
 _FAULTS = {1: OKABE_ITO["orange"], 2: "#d1495b", _DAMAGED: "#d1495b"}
@@ -152,7 +149,7 @@ class Progress:
         now = result.table.written
         stale = (self.status != _NOT_YET) & (now != self._written)
         self.status[stale], self.fraction[stale] = _NOT_YET, np.nan
-        frames = np.flatnonzero(result.finished & (self.status == _NOT_YET))[:_AT_ONCE]
+        frames = np.flatnonzero(result.finished & (self.status == _NOT_YET))[: VIEWER.frames_at_once]
         self._written[frames] = now[frames]
         self.changes += bool(stale.any() or len(frames))
         for frame in frames.tolist():
@@ -411,7 +408,7 @@ class CurvePanel:
 
 def _thinned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Thin a curve out to the smallest and the largest value of each stretch of what a screen shows."""
-    step = -(-len(y) // _STRETCHES)
+    step = -(-len(y) // VIEWER.screen_columns)
     if step < 3:
         return x, y
     rows = y[: len(y) // step * step].reshape(-1, step)

@@ -30,6 +30,7 @@ from rgbmidic.settings import (
     read_toml,
 )
 from rgbmidic.view.address import KINDS, Mark
+from rgbmidic.view.constants import VIEWER
 
 _FILES = (
     *("frames.path", "calibration.file", "region.mask", "mesh.file", "scale.camera", "channels.file"),
@@ -296,8 +297,6 @@ HOLES = {"hole": 3, "round hole": 2}
 MASK = "mask"
 """Kind of a polygon in which a light does not count; its marks have its number and the light too."""
 _LEAST = {**OUTLINES, **HOLES, MASK: 3}
-_ROUND = 48
-"""Corners of the polygon that stands for a circle: within 1 - cos(pi / 48) = 0.2 % of its radius."""
 
 Ring = list[list[float]]
 
@@ -340,7 +339,8 @@ def _complete(marks: Sequence[Mark], shapes: Iterable[str]) -> dict[str, Ring]:
             places = [(mark.x, mark.y) for mark in own]
             if _shape(kind) in ("circle", "round hole"):
                 (x, y), on = places[:2]
-                radius, angles = math.dist((x, y), on), np.arange(_ROUND) * 2 * np.pi / _ROUND
+                radius, corners = math.dist((x, y), on), VIEWER.circle_corners
+                angles = np.arange(corners) * 2 * np.pi / corners
                 places = list(zip(x + radius * np.cos(angles), y + radius * np.sin(angles), strict=True))
             found[kind] = [[round(float(x), 1), round(float(y), 1)] for x, y in places]
     return found

@@ -14,10 +14,9 @@ from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import SCALE, Mark, probe_marks
 from rgbmidic.view.canvas import Canvas, columns
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.picture import Window, element_at
 
-_ACROSS = 24
-"""Lines across the view: each then has some 30 px of a screen of 800, longer than wide and apart from the next."""
 _ENDS, _LABEL = "x0 y0 x1 y1", "x y text colour side along down"
 LETTERS = {
     "text_color": "#ffffff",
@@ -98,7 +97,7 @@ def beside(texts: Sequence[tuple[float, float, str]], window: Window) -> list[tu
 
 def _thinned(window: Window, nodes: FloatArray, known: Any) -> tuple[npt.NDArray[np.int64], float]:
     """Thin out the nodes (N, 2) that are known, evenly over the view; return their indices, and their distance."""
-    cell = max(window.right - window.left, window.bottom - window.top) / _ACROSS
+    cell = max(window.right - window.left, window.bottom - window.top) / VIEWER.lines_across
     kept = np.flatnonzero(known & np.isfinite(nodes).all(axis=1))
     places = np.floor(nodes[kept] / cell).astype(int)
     return kept[np.unique(places, axis=0, return_index=True)[1]], cell

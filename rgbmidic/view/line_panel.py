@@ -20,14 +20,11 @@ from rgbmidic.results import HistoryColumn, Maps, MapValues
 from rgbmidic.results.profiles import Profile
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.view.canvas import columns, plain_plot
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.curves import NOW, band
 from rgbmidic.view.models import labelled
 from rgbmidic.view.picture import Background, warning
 
-_SLICE = 0.25
-"""Seconds for which frames are read along a line before they are drawn, or before another line has its turn."""
-_ACROSS = 1500
-"""Columns of a position-time picture at most: its place on a screen of 3840 has as many."""
 _IMAGE = "image x y dw dh"
 
 
@@ -66,7 +63,7 @@ class _Reading:
 
     def further(self) -> _Reading:
         """Read for a while; a damaged frame stays blank."""
-        end = time.monotonic() + _SLICE
+        end = time.monotonic() + VIEWER.slice_s
         for frame in self.missing.tolist():
             with suppress(ResultError):
                 self.profile.fill(self.maps, [frame])
@@ -191,7 +188,7 @@ class LinePanel:
         steps = np.diff(clock[there])
         steps = steps[steps > 0]
         step = float(steps.min()) if len(steps) else 1.0
-        count = min(round(float(steps.sum()) / step) + 1, _ACROSS)
+        count = min(round(float(steps.sum()) / step) + 1, VIEWER.screen_columns)
         grid = np.linspace(clock[there[0]], clock[there[-1]], count)
         nearest = there[np.searchsorted((clock[there][1:] + clock[there][:-1]) / 2, grid)]
         half, apart = float(grid[-1] - grid[0]) / max(count - 1, 1) / 2 or 0.5, float(profile.positions[1])

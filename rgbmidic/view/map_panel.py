@@ -13,12 +13,10 @@ from bokeh.events import MouseMove
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import MARKS, SCALE, probe_marks, probe_place
 from rgbmidic.view.canvas import Canvas
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.layers import LabelLayer, LineLayer, MarkLayer, arrow_lines, contour_lines, direction_lines
 from rgbmidic.view.picture import AROUND, Overlay, Picture, extremes, paint, palette, palette_name, probe_text
 from rgbmidic.view.shown import ShownFields
-
-_CONTOURS = 10
-"""Steps between contour lines at most. Chosen; more cover the field."""
 
 
 class MapPanel:
@@ -131,7 +129,7 @@ class MapPanel:
         field, values, elements = shown.maps.all[view.field], shown.values(view.field), shown.result.elements
         direction = shown.values("direction").values if view.directions else None
         self._directions.show(None if direction is None else direction_lines(window, nodes, direction))
-        levels = np.linspace(*shown.ends(view.field), min(view.levels, _CONTOURS) + 1)[1:-1]
+        levels = np.linspace(*shown.ends(view.field), min(view.levels, VIEWER.contour_steps) + 1)[1:-1]
         smooth = view.contours and not field.stepped
         self._contours.show(contour_lines(nodes, elements, values.values, levels.tolist()) if smooth else None)
         arrows, title = None, "times their length (0: as there is room)"

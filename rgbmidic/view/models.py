@@ -11,11 +11,8 @@ from bokeh.core.properties import Int, String
 from bokeh.layouts import column, row
 from bokeh.model import DataModel
 
-from rgbmidic.fields import MEASURES
-from rgbmidic.view.address import PALETTES
-
-_SHORT = 150
-"""Smallest number of ms between two frames that are played: 6 to 7 a second, which the eye can follow."""
+from rgbmidic.view.address import ViewState
+from rgbmidic.view.constants import VIEWER
 
 
 def page_file(name: str) -> str:
@@ -88,7 +85,7 @@ class Controls:
 
     def ask(self, state: SharedState) -> None:
         """Let the slider ask for frames, and play them."""
-        asks = script("pump", state=state, slider=self.frame, play=self.play, step=self.step, wait=_SHORT)
+        asks = script("pump", state=state, slider=self.frame, play=self.play, step=self.step, wait=VIEWER.play_ms)
         self.frame.js_on_change("value", asks)
         self.play.js_on_change("active", asks)
         state.js_on_change("shown", asks)
@@ -100,59 +97,15 @@ SECTIONS: Mapping[str, Sequence[str | tuple[str, ...]]] = {
     "Layers": ("directions", "contours", "extremes", "blank", "vectors", "longer"),
     "Derived": ("gauge", "measure", "since", "rigid", "rate_window"),
     "Probes": ("mode", ("curve", "along"), ("probe", "name"), ("undo", "redo", "clear"), ("csv", "png"), "message"),
-    "Channels": (
-        *("channels", ("beside", "clock"), "trigger", ("align", "align_to"), "offset", "drag", ("force", "area")),
-        "told",
-    ),
+    "Channels": ("channels", ("beside", "clock"), "trigger", ("align", "align_to"), "offset", "drag", ("force", "area"),
+                 "told"),
     "File": ("scale", ("distance", "distance_std", "camera"), "scaled", "file", "what", ("write", "take"), "written"),
-}
+}  # fmt: skip
 """Controls of a result by the section under which they stand, some in one row: one section is shown at a time, and fits
 a screen of 720 rows."""
 WRITTEN = ("probes", "channels", "scale")
 """Sections of a TEST.toml that the page can write."""
 MODES = ("Move", "Point", "Gauge", "Line", "Strain", "Box", "Circle")
-_ENDS = [("frame", "this frame"), ("test", "the whole test"), ("hand", "the two numbers")]
-_NUMBER = {"mode": "float"}
-_CLOCKS = [("offset", "an offset"), ("trigger", "a trigger"), ("correlation", "correlation")]
-CONTROLS: Mapping[str, tuple[type[bk.Widget], str, dict[str, Any]]] = {
-    "field": (bk.Select, "Field", {}),
-    "second": (bk.Select, "Second field", {}),
-    "third": (bk.Select, "Third field", {}),
-    "fourth": (bk.Select, "Fourth field", {}),
-    "opacity": (bk.Slider, "Opacity", {"start": 0, "end": 1, "step": 0.05, "value": 1}),
-    "range": (bk.Select, "Colours from", {"options": _ENDS}),
-    "low": (bk.NumericInput, "lowest", _NUMBER),
-    "high": (bk.NumericInput, "highest", _NUMBER),
-    "symmetric": (bk.Checkbox, "symmetric about 0", {}),
-    "palette": (bk.Select, "Palette", {"options": [("", "as suits the field"), *PALETTES]}),
-    "levels": (bk.Spinner, "Number of colours", {"low": 2, "high": 256}),
-    "hatched": (bk.Checkbox, "hatch what is within 2 σ of 0", {}),
-    "directions": (bk.Checkbox, "principal directions", {}),
-    "contours": (bk.Checkbox, "contour lines", {}),
-    "extremes": (bk.Checkbox, "smallest and largest value", {}),
-    "blank": (bk.Checkbox, "nodes without data", {}),
-    "vectors": (bk.Checkbox, "displacement as arrows", {}),
-    "longer": (bk.NumericInput, "times their length (0: as there is room)", {**_NUMBER, "low": 0}),
-    "gauge": (bk.NumericInput, "Strain gauge length, px (0: shortest)", {**_NUMBER, "low": 0}),
-    "measure": (bk.Select, "Strain measure", {"options": list(MEASURES)}),
-    "since": (bk.Spinner, "Since frame (-1: the reference)", {"low": -1}),
-    "rigid": (bk.Checkbox, "rigid motion removed", {}),
-    "rate_window": (bk.Spinner, "Rates over frames (0: as stated, or 9)", {"low": 0}),
-    "along": (bk.Select, "Along x", {}),
-    "channels": (bk.TextInput, "CSV file beside the test", {}),
-    "beside": (bk.Select, "Beside the curves", {}),
-    "clock": (bk.Select, "Its time by", {"options": _CLOCKS}),
-    "offset": (bk.NumericInput, "Offset, s", _NUMBER),
-    "trigger": (bk.Select, "Trigger channel", {}),
-    "align": (bk.Select, "Channel", {}),
-    "align_to": (bk.Select, "alike to", {}),
-    "force": (bk.Select, "Force", {}),
-    "area": (bk.NumericInput, "Section, mm²", {**_NUMBER, "low": 0}),
-    "distance": (bk.NumericInput, "Length, mm", {**_NUMBER, "low": 0}),
-    "distance_std": (bk.NumericInput, "± mm", {**_NUMBER, "low": 0}),
-    "camera": (bk.TextInput, "or camera", {}),
-}
-"""Kind, text and options of every control that sets an entry of the view."""
 
 
 class ResultControls(Controls):
@@ -167,7 +120,7 @@ class ResultControls(Controls):
     def __init__(self, last: int, frame: int, *, dark: bool) -> None:
         super().__init__(last, frame, dark=dark)
         wide, self.of = self.wide, dict[str, Any]()
-        for entry, (kind, text, options) in CONTROLS.items():
+        for entry, (kind, text, options) in ViewState.controls().items():
             name = {"field": "quantity"}.get(entry, entry)
             told, look = ("label", self.small) if kind is bk.Checkbox else ("title", wide)
             self.of[entry] = kind(name=name, **{told: text}, **options, **look)

@@ -18,19 +18,15 @@ from rgbmidic.fields import uncertain
 from rgbmidic.results import Result, channels_of
 from rgbmidic.view.address import BESIDE, OVER, SCALE, UNCERTAINTY, Mark, Steps, ViewState, probe_marks, probe_place
 from rgbmidic.view.canvas import Canvas
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv
 from rgbmidic.view.film import FilmButton
 from rgbmidic.view.line_panel import LinePanel
 from rgbmidic.view.map_panel import MapPanel
-from rgbmidic.view.models import CONTROLS, ResultControls, SharedState, script
+from rgbmidic.view.models import ResultControls, SharedState, script
 from rgbmidic.view.picture import every, frame_text, guarded, warning
 from rgbmidic.view.sections import ChannelControls, FileButtons, ProbeNames
 from rgbmidic.view.shown import ShownFields
-
-_TICK, _IDLE = 200, 1000
-"""Ms between two parts of the time line; between two checks whether a result has grown, and pictures of that."""
-_SETTLED = 2_000_000_000
-"""Ns after which a folder that is changed has another date, whatever the disk's clock ticks in."""
 
 
 class ResultPage:
@@ -97,7 +93,7 @@ class ResultPage:
         p.of["since"].high = len(self.result) - 1
         p.over.active = OVER.index(view.over)
         p.head.text = self._title()
-        for entry, (kind, *_) in CONTROLS.items():
+        for entry, (kind, *_) in view.controls().items():
             key = "active" if kind is bk.Checkbox else "value"
             p.of[entry].update(**{key: getattr(view, entry)})
             p.of[entry].on_change(key, partial(self._set, entry))
@@ -158,9 +154,9 @@ class ResultPage:
     def _ready(self) -> None:
         self.maps.canvas.resize()
         self.show()
-        every(_TICK, self.document, lambda: self.progress.advance(self.result), self.complain)
+        every(VIEWER.progress_ms, self.document, lambda: self.progress.advance(self.result), self.complain)
         for act in (self._grow, self._draw_progress, self.film.tell):
-            every(_IDLE, self.document, act, self.complain)
+            every(VIEWER.idle_ms, self.document, act, self.complain)
 
     def complain(self, text: str) -> None:
         """Report an error; the page goes on."""
@@ -288,7 +284,7 @@ class ResultPage:
     def _grow(self) -> None:
         """Take in frames that a run has added or measured again; a view of the last frame follows it."""
         grown = (self.result.path / "solution").stat().st_mtime_ns
-        if grown == self._grown and time.time_ns() > grown + _SETTLED:
+        if grown == self._grown and time.time_ns() > grown + VIEWER.settled_ns:
             return
         self._grown, new = grown, self.result.refresh()
         if np.array_equal(new.table.written, self.result.table.written):

@@ -28,16 +28,13 @@ from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values,
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, MapField, Maps, MapValues, Result
 from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.typing import AnyArray, FloatArray
+from rgbmidic.view.constants import VIEWER
 
 logger = logging.getLogger(__name__)
 
 Picture = npt.NDArray[np.uint8]
 """A grey picture (H, W)."""
 
-_LARGEST = 2_000_000
-"""Pixels of a picture that is sent to the screen: all of a window of 1920 x 1080, less than all of a larger one."""
-_COLOURS = 256
-"""Colours of a palette: the screen has as many levels."""
 AROUND = {False: 235, True: 30}
 """Grey level outside the image, by whether the page is dark."""
 _SIDES, _APART = ("#010203", "#ffffff"), 8
@@ -78,7 +75,7 @@ class Window:
     @property
     def size(self) -> tuple[int, int]:
         """Rows and columns of the picture."""
-        shrink = max(1.0, (self.width * self.height / _LARGEST) ** 0.5)
+        shrink = max(1.0, (self.width * self.height / VIEWER.picture_pixels) ** 0.5)
         return max(int(self.height / shrink), 2), max(int(self.width / shrink), 2)
 
     @property
@@ -194,12 +191,12 @@ def palette_name(field: MapField, *, symmetric: bool) -> str:
 
 
 @cache
-def palette(name: str, levels: int = _COLOURS) -> tuple[str, ...]:
-    """Return so many colours of a palette as ``"#rrggbb"``."""
+def palette(name: str, levels: int = 256) -> tuple[str, ...]:
+    """Return so many colours of a palette, up to 256 as a screen has levels, as ``"#rrggbb"``."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
-    places = np.linspace(0, 1, min(max(levels, 2), _COLOURS))
+    places = np.linspace(0, 1, min(max(levels, 2), 256))
     return STATUS_COLOURS if name == "codes" else tuple(map(to_hex, colormaps[name](places)))
 
 
@@ -264,14 +261,6 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 T = TypeVar("T")
-_SPREAD = 24
-"""Frames, evenly spread, whose values set the colour range of a whole test: they are read within a second."""
-_KEPT = 8
-"""Raw frames that are kept as pictures: those around the one in view."""
-_WHOLE = 1 - 1e-9
-"""Part of the weights of a point's nodes that must be measured: all but what rounding leaves of a node beside it."""
-_REASON = 90
-"""Letters of a frame's reason that are shown at once: two lines of the column."""
 _REASONS = ("measured", "no light sees enough texture here", "the images around it do not match", "carried over")
 """What a node's status means, under the pointer."""
 _FAILED = QUANTITIES["status"].codes.index("failed")
@@ -280,7 +269,7 @@ _FAILED = QUANTITIES["status"].codes.index("failed")
 def range_of_test(maps: Maps, name: str) -> tuple[float, float]:
     """Return the colour range of a field over the whole test, from frames evenly spread over those measured."""
     there = np.flatnonzero(maps.result.finished).tolist()
-    ends = [robust_range(maps.read(name, frame)) for frame in (spread(there, _SPREAD) if there else ())]
+    ends = [robust_range(maps.read(name, frame)) for frame in (spread(there, VIEWER.range_frames) if there else ())]
     measured = [pair for pair in ends if pair is not None]
     return (min(low for low, _ in measured), max(high for _, high in measured)) if measured else (0.0, 1.0)
 
@@ -322,7 +311,7 @@ class Pictures:
 
     @cached_property
     def _read(self) -> Callable[[int], Picture]:
-        return lru_cache(_KEPT)(RawPictures(result=self.result))
+        return lru_cache(VIEWER.raw_frames)(RawPictures(result=self.result))
 
 
 def warning(text: str) -> str:
@@ -390,7 +379,7 @@ def frame_text(maps: Maps, place: int, field: MapField, values: MapValues, remar
     without = f", {missing:.1%} of the nodes not measured" if missing and read["status"] != _FAILED else ""
     lines = [f"Frame {place} of 0 to {len(result) - 1}: {html.escape(result.names[place])}{time}", f"{end}{without}"]
     if read["reason"] and measured:
-        first, rest = read["reason"][:_REASON], read["reason"][_REASON:]
+        first, rest = read["reason"][: VIEWER.reason_letters], read["reason"][VIEWER.reason_letters :]
         lines[1] = warning(f"{end}: {first}")
         if rest:
             lines[1] = f"<details><summary>{lines[1]} … more</summary>… {html.escape(rest)}</details>"
@@ -422,9 +411,9 @@ def pointer_text(
     found = element_at(nodes, maps.result.elements, x, y)
     if found is None:
         return "outside the mesh"
-    corners, weights = found
-    there = corners.astype(np.int64)
-    mean = Mean(name="", nodes=there, weights=weights, correlation=maps.physical.covariance.part(there), least=_WHOLE)
+    corners, weights = found[0].astype(np.int64), found[1]
+    correlation, least = maps.physical.covariance.part(corners), VIEWER.least_weight
+    mean = Mean(name="", nodes=corners, weights=weights, correlation=correlation, least=least)
     value, std = mean_of(maps, field, values, moved, mean)
     text = f"{field.symbol} = {field.text(value, std)}"
     blank = values.status[corners].max()

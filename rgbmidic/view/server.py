@@ -34,18 +34,13 @@ from rgbmidic.results import Maps, Result
 from rgbmidic.results.provenance import PROVENANCE
 from rgbmidic.settings import read_table, read_toml
 from rgbmidic.view.address import ViewState
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.curves import Progress
 from rgbmidic.view.models import page_file
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.setup_panel import Run
 
 _HOST = "127.0.0.1"
-_FORGOTTEN = 15_000
-"""Ms after which the data of a closed page are freed: a page that is loaded anew takes less."""
-_BREATH = 0.05
-"""Seconds for other pages after each page that is freed: an answer takes as long."""
-_LISTED = 200
-"""Results and tests that a folder's page lists at most, the newest: some 5 ms each."""
 _LIST_STYLE = """<style>a { color: inherit; } td { padding: 3px 24px 3px 0; overflow-wrap: anywhere; }
 h1 { font-size: 22px; }</style>"""
 _THEMES = {"dark": "dark_minimal"}
@@ -59,7 +54,7 @@ class _Site(Application):  # type: ignore[misc]  # see pyproject.toml
 
     async def on_session_destroyed(self, session_context: Any) -> None:
         await super().on_session_destroyed(session_context)
-        await asyncio.sleep(_BREATH)
+        await asyncio.sleep(VIEWER.breath_s)
 
 
 class _Application(BokehTornado):  # type: ignore[misc]  # see pyproject.toml
@@ -129,8 +124,8 @@ def start(path: Path, *, port: int = 0, statement: Mapping[str, Any] | None = No
         sign_sessions=True,
         secret_key=secrets.token_bytes(32),
         extra_websocket_origins=[f"{_HOST}:{port}"],
-        unused_session_lifetime_milliseconds=_FORGOTTEN,
-        check_unused_sessions_milliseconds=_FORGOTTEN,
+        unused_session_lifetime_milliseconds=VIEWER.forgotten_ms,
+        check_unused_sessions_milliseconds=VIEWER.forgotten_ms,
         include_headers=[],
         include_cookies=[],
     )
@@ -199,7 +194,7 @@ def _found(folder: Path) -> list[Path]:
                     times[file.parent if file.name == PROVENANCE else file] = file.stat().st_mtime
             except (ConfigurationError, OSError):  # of another program, or gone by now
                 continue
-    return sorted(times, key=lambda file: times[file], reverse=True)[:_LISTED]
+    return sorted(times, key=lambda file: times[file], reverse=True)[: VIEWER.listed]
 
 
 def _fill_list(folder: Path, document: Document) -> None:

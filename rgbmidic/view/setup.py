@@ -23,6 +23,7 @@ from rgbmidic.report.style import colour_range
 from rgbmidic.results.files import write_complete
 from rgbmidic.settings import ELEMENT_SIZE, RegionSettings, TestSettings, read_section
 from rgbmidic.view.canvas import Canvas
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.draft import (
     HOLES,
     MASK,
@@ -40,10 +41,6 @@ from rgbmidic.view.models import SharedState, script
 from rgbmidic.view.picture import AROUND, Background, Overlay, every, guarded, paint, palette, warning
 from rgbmidic.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, overview, pictures
 
-_MOST_EDGES = 20_000
-"""Elements whose edges are drawn: more are a grey surface on a screen of two million pixels."""
-_TICK = 500
-"""Ms between two reports of the run."""
 _EXPECTED = "expected uncertainty"
 _GLARE = np.uint32(0xFF2030FF)
 _HELP = (
@@ -114,7 +111,7 @@ class SetupPage:
         p.mode.js_on_change("active", script("choose", group=p.mode, tools=tools[:4], other=p.hole))
         p.hole.js_on_change("active", script("choose", group=p.hole, tools=tools[4:], other=p.mode))
         self.document.on_event(DocumentReady, lambda event: self._ready())
-        every(_TICK, self.document, self._tick, self._complain)
+        every(VIEWER.run_ms, self.document, self._tick, self._complain)
 
     def _ready(self) -> None:
         self.canvas.resize()
@@ -176,7 +173,7 @@ class SetupPage:
             return
         mesh = made[0]
         self.parts.message.text = f"{len(mesh.nodes)} nodes, {len(mesh.elements)} elements.<br>{_HELP}"
-        if len(mesh.elements) <= _MOST_EDGES:
+        if len(mesh.elements) <= VIEWER.mesh_edges:
             corners = mesh.nodes[mesh.elements][:, [0, 1, 2, 0]]
             self._edges.data = {"xs": list(corners[..., 0]), "ys": list(corners[..., 1])}
 

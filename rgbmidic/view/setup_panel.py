@@ -31,13 +31,12 @@ from rgbmidic.results import Result
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.view.address import Mark, Steps
 from rgbmidic.view.canvas import Canvas, columns
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.draft import HOLES, MASK, Draft, arranged, masks_of, rings
 from rgbmidic.view.models import Controls
 from rgbmidic.view.picture import Picture, grey_picture, stretched
 
 RAW = "raw frame"
-_TILE = 260
-"""Columns of a small picture."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,7 +126,7 @@ def overview(inspection: Inspection, named: Mapping[str, Picture], raw: Picture)
     cells = []
     for name, picture in ((RAW, raw), *named.items()):
         height, width = picture.shape
-        size = (_TILE, max(1, round(_TILE * height / width)))
+        size = (VIEWER.tile_columns, max(1, round(VIEWER.tile_columns * height / width)))
         png = cv2.imencode(".png", cv2.resize(picture, size, interpolation=cv2.INTER_AREA))[1]
         title, source = html.escape(name.replace("reflection index", "index")), base64.b64encode(png).decode()
         image = f'<img alt="{title}" style="width:100%" src="data:image/png;base64,{source}">'
@@ -137,8 +136,6 @@ def overview(inspection: Inspection, named: Mapping[str, Picture], raw: Picture)
     return f'<div style="{grid}">{"".join(cells)}</div>'
 
 
-_SOON = 60
-"""Ms in which the moves of a mark are collected: a mesh of some 1,000 elements is made in that time."""
 _COLOURS = list(OKABE_ITO.values())
 """Of the masks; the first two are those of holes and outline."""
 
@@ -231,7 +228,7 @@ class RegionDrawing:
         self._canvas.place(marks)
         if not self._coming:
             self._coming = True
-            self._document.add_timeout_callback(self.settle, _SOON)
+            self._document.add_timeout_callback(self.settle, VIEWER.mark_ms)
 
 
 class SetupControls(Controls):
