@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Self, TypeVar, cast
+from typing import Any, Self
 from urllib.parse import urlencode
 
 import bokeh.models as bk
@@ -32,7 +32,6 @@ _CLOCKS = {"offset": "an offset", "trigger": "a trigger", "correlation": "correl
 CLOCKS = tuple(_CLOCKS)
 """Ways to relate the time of channels to that of the frames."""
 _RANGES = [("frame", "this frame"), ("test", "the whole test"), ("hand", "the two numbers")]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +114,9 @@ def probe_place(marks: Sequence[Mark], gauge: float) -> tuple[float, ...]:
     return tuple(places)
 
 
-def entry(usual: T, kind: type[bk.Widget] | None = None, text: str = "", **options: Any) -> T:
+def entry(usual: Any, kind: type[bk.Widget] | None = None, text: str = "", **options: Any) -> Any:
     """Entry of the view with its usual value, and kind, text and options of its control, which limit the value too."""
-    return cast(T, field(default=usual, metadata={"control": (kind, text, options)}))
+    return field(default=usual, metadata={"control": (kind, text, options)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

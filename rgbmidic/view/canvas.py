@@ -98,7 +98,7 @@ class Canvas:
         )
         numbers = bk.BasicTickFormatter(power_limit_low=-6)  # else each number has a power of ten of its own
         look = {"width": 14, "major_label_text_font_size": "12px", "formatter": numbers}
-        self.bar = bk.ColorBar(color_mapper=self.colours, **look)
+        self.bar = bk.ColorBar(color_mapper=self.colours, visible=False, **look)
         self.plot.add_layout(self.bar, "right")
         self.marks = bk.ColumnDataSource(columns("x y kind name 0"), name="marks" if like is None else None)
         self._states, self.set = {0: list[Mark]()}, list[Mark]()

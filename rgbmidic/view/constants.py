@@ -23,6 +23,8 @@ class ViewerConstants:
     screen_columns
         Columns of a position-time picture, and stretches of a recorded channel, at most: as many as a screen of 3840
         has for them.
+    print_columns
+        Columns of a picture for print: 17 cm, two columns of a journal, at 300 dpi.
     tile_columns
         Columns of a small picture.
     bar_width
@@ -73,6 +75,7 @@ class ViewerConstants:
     mark_states: int = 100
     picture_pixels: int = 2_000_000
     screen_columns: int = 1500
+    print_columns: int = 2000
     tile_columns: int = 260
     bar_width: int = 80
     lines_across: int = 24

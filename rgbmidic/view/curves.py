@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,7 +20,7 @@ from rgbmidic.results import Channels, Histories, HistoryColumn, Result, probes_
 from rgbmidic.results.histories import frames_alone, history_csv, read_histories, with_channels
 from rgbmidic.settings import ProbeSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.address import KINDS, Mark, probe_marks, probe_place
+from rgbmidic.view.address import KINDS, Mark, ViewState, probe_marks, probe_place
 from rgbmidic.view.canvas import columns, plain_plot
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.models import ResultControls
@@ -52,6 +53,14 @@ def marks_of(stated: ProbeSettings) -> tuple[Mark, ...]:
         if KINDS[kind] > 1:
             marks.append(Mark(kind, x + end[0], y) if kind == "circle" else Mark(kind, end[0], end[1]))
     return tuple(marks)
+
+
+def with_probes(view: ViewState, stated: ProbeSettings) -> ViewState:
+    """Return the view with the probes stated, where its address has none; strain gauges if all have one length."""
+    lengths = {length for *_, length in stated.strain_gauges}
+    marks = tuple(mark for mark in marks_of(stated) if mark.kind != "strain_gauge" or len(lengths) == 1)
+    gauge = lengths.pop() if len(lengths) == 1 and not view.gauge else view.gauge
+    return view if view.marks or not marks else replace(view, marks=marks, gauge=gauge)
 
 
 def read(

@@ -51,6 +51,11 @@ class LineLayer:
         for colour, wide in (("#15181c", width + 1.6), ("#ffffff", width)):
             canvas.plot.segment(*_ENDS.split(), source=self._lines, line_color=colour, line_width=wide)
 
+    @property
+    def lines(self) -> FloatArray:
+        """The lines (M, 4) that are shown."""
+        return np.stack([np.asarray(self._lines.data[name], dtype=np.float64) for name in _ENDS.split()], axis=1)
+
     def show(self, ends: FloatArray | None) -> None:
         """Show lines (M, 4) from x0, y0 to x1, y1; None: none."""
         if ends is not None or len(self._lines.data["x0"]):
@@ -215,6 +220,11 @@ class MarkLayer:
         placed = beside(texts, self._canvas.window)
         parts = zip(lines, self.colours.values(), texts, placed, strict=True)
         self._joined.data = columns(_PROBE, [(*line, colour, *text, *side) for line, colour, text, side in parts])
+
+    @property
+    def drawn(self) -> list[tuple[Any, ...]]:
+        """Line (xs, ys), colour, place (x, y), text, and side and offsets of the text on the screen, of each probe."""
+        return list(zip(*(self._joined.data[name] for name in _PROBE.split()), strict=True))
 
     def taken(self, nodes: FloatArray, reference: FloatArray) -> tuple[Mark, ...] | None:
         """Return the marks, set over nodes (N, 2), on the `reference` (N, 2); None where none has changed."""

@@ -31,12 +31,13 @@ def labelled(says: str) -> dict[str, str]:
 
 
 class SharedState(DataModel):  # type: ignore[misc]  # see pyproject.toml
-    """State that browser and server share: frame asked for, frame shown, rest of the address, a file to keep."""
+    """State that browser and server share: frame asked for, frame shown, rest of the address, files to keep."""
 
     asked = Int(0)
     shown = Int(0)
     query = String("")
     csv = String("")
+    png = String("")
 
 
 class Controls:
@@ -92,7 +93,7 @@ class Controls:
 
 
 SECTIONS: Mapping[str, Sequence[str | tuple[str, ...]]] = {
-    "Field": ("field", "second", "third", "fourth", "over", "opacity"),
+    "Field": ("field", "second", "third", "fourth", "over", "opacity", "print"),
     "Colours": ("range", ("low", "high"), "lock", "symmetric", "palette", "levels", "hatched"),
     "Layers": ("directions", "contours", "extremes", "blank", "vectors", "longer"),
     "Derived": ("gauge", "measure", "since", "rigid", "rate_window"),
@@ -143,6 +144,7 @@ class ResultControls(Controls):
         self.lock, self.undo, self.redo, self.clear, self.csv, self.png, self.write, self.take = (
             bk.Button(label=name, name=name.lower(), **wide) for name in labels
         )
+        self.print = bk.Button(label="Save PNG for print", name="print", **wide)
         texts = ("under", "told", "written", "scaled")
         self.under, self.told, self.written, self.scaled = (bk.Div(name=name, **wide) for name in texts)
 
@@ -150,7 +152,7 @@ class ResultControls(Controls):
     def side(self) -> Any:
         """The column of all controls, of which one section is shown."""
         flat, named = {"sizing_mode": "stretch_width"}, {**vars(self), **self.of}
-        shown = []
+        shown: list[Any] = []
         for names in SECTIONS.values():
             parts = [named[name] if isinstance(name, str) else row(*map(named.get, name), **flat) for name in names]
             shown.append(column(*parts, visible=not shown, **flat))
@@ -163,6 +165,7 @@ class ResultControls(Controls):
         for name in ("shown", "query"):
             state.js_on_change(name, script("shown", state=state, now=now))
         state.js_on_change("csv", script("keepCsv", state=state))
+        state.js_on_change("png", script("keepMap", state=state))
         self.png.js_on_click(script("keepPng", plots=list(curves)))
         groups = (self.mode, tools[:-1], self.scale), (self.scale, [tools[0], tools[-1]], self.mode)
         for group, own, other in groups:

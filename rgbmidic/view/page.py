@@ -15,11 +15,12 @@ from bokeh.events import DocumentReady, Tap
 
 from rgbmidic.errors import RgbmidicError
 from rgbmidic.fields import uncertain
-from rgbmidic.results import Result, channels_of
-from rgbmidic.view.address import BESIDE, OVER, SCALE, UNCERTAINTY, Mark, Steps, ViewState, probe_marks, probe_place
+from rgbmidic.report.style import embedded
+from rgbmidic.results import Result, channels_of, probes_of
+from rgbmidic.view.address import BESIDE, OVER, SCALE, UNCERTAINTY, Mark, Steps, ViewState
 from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv
+from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv, with_probes
 from rgbmidic.view.film import FilmButton
 from rgbmidic.view.line_panel import LinePanel
 from rgbmidic.view.map_panel import MapPanel
@@ -45,7 +46,7 @@ class ResultPage:
     """
 
     def __init__(self, document: Document, result: Result, view: ViewState, progress: Progress) -> None:
-        view = view.with_channels(channels_of(result))
+        view = with_probes(view.with_channels(channels_of(result)), probes_of(result))
         self.document, self.progress, self.shown = document, progress, ShownFields(result, view)
         self._told = False
         self._pointer: tuple[float, float] | None = None
@@ -59,7 +60,7 @@ class ResultPage:
         self.curves = CurvePanel(document, self.shown, p, self._offer)
         self.channels, self.line = (
             ChannelControls(p, self.curves),
-            LinePanel(document, self.maps.canvas.colours, p.wide),
+            LinePanel(document, self.shown, self.maps.canvas.colours, p.wide),
         )
         panels = [self.line.choice, self.curves.plot, *self.line.parts]
         self.panel = bk.Column(children=panels, sizing_mode="stretch_both")
@@ -139,14 +140,15 @@ class ResultPage:
         self.maps.canvas.marks.on_change("data", lambda attr, old, new: self._marked())
         for button, act in (
             (p.write, self.file.write), (p.take, lambda: self._take_marks(self.file.probes())), (p.csv, self._save),
-            (p.lock, lambda: p.of["range"].update(value="hand")), (p.clear, lambda: self._take_marks(())),
+            (p.print, self._print), (p.lock, lambda: p.of["range"].update(value="hand")),
+            (p.clear, lambda: self._take_marks(())),
             (p.undo, lambda: self.show(marks=self.steps.go(back=True))),
             (p.redo, lambda: self.show(marks=self.steps.go(back=False))),
         ):  # fmt: skip
             button.on_click(partial(guarded, act, lambda text: p.written.update(text=warning(text))))
         p.drag.js_on_change("active", script("hold", toggle=p.drag, pan=self.curves.pan))
         p.movie.on_change("active", lambda attr, old, new: guarded(self.film.press, self.film.stop))
-        self.line.choice.on_change("active", lambda attr, old, new: self._choose_line(["", *self._lines][new]))
+        self.line.choice.on_change("active", lambda attr, old, new: self._choose_line(self.line.names[new]))
         for plot in (self.timeline.plot, self.curves.plot, self.line.wave):
             plot.on_event(Tap, self._jump)
         self.document.on_event(DocumentReady, lambda event: self._ready())
@@ -179,7 +181,7 @@ class ResultPage:
         self._told = False
         self.maps.clear()
         self._read_out()
-        self.line.show(self.view.frame, None)
+        self.line.show(None)
         self.state.query = self.view.query()
         self.complain(text)
 
@@ -196,12 +198,7 @@ class ResultPage:
         of["symmetric"].visible = field.signed and view.range != "hand"
         self.parts.description.text = frame_text(shown.maps, view.frame, field, values, remark)
         self._read_out()
-        lines = self._lines
-        along = self.line.offer(list(lines), view.line)
-        self.curves.plot.visible = not along
-        if along:
-            self.line.ask(shown.maps, view.field, lines[view.line], shown.chosen, shown.changes)
-            self.line.show(view.frame, values)
+        self.curves.plot.visible = not self.line.update(values)
         self.state.query, self.state.shown = view.query(), self.state.asked
 
     def _choose(self) -> None:
@@ -247,12 +244,6 @@ class ResultPage:
         self.steps.keep(marks)
         self.show(marks=marks)
 
-    @property
-    def _lines(self) -> dict[str, tuple[float, ...]]:
-        """Ends of the lines that are marked, by their names."""
-        probes = probe_marks(self.view.marks).items()
-        return {name: probe_place(marks, 0) for name, marks in probes if marks[0].kind == "line"}
-
     def _choose_line(self, name: str) -> None:
         if name != self.view.line:
             self.show(line=name)
@@ -264,6 +255,11 @@ class ResultPage:
             self.parts.message.text = "There is no curve yet: set a mark on the field first."
         else:
             self.state.csv = as_csv(self.curves.histories)
+
+    def _print(self) -> None:
+        """Send the maps in view as a picture for print, as a data URL."""
+        figure = self.maps.figure()
+        self.state.png = embedded(figure, dpi=round(VIEWER.print_columns / figure.get_figwidth()))
 
     def _jump(self, event: Any) -> None:
         """Go to the frame that was clicked in the time line or among the curves."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import html
 import logging
+import math
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -25,7 +26,7 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.report.figures import field_colours, spread
 from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, time_text
-from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, MapField, Maps, MapValues, Result
+from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, MapField, Maps, MapValues, Profile, Result
 from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.typing import AnyArray, FloatArray
 from rgbmidic.view.constants import VIEWER
@@ -274,8 +275,8 @@ def range_of_test(maps: Maps, name: str) -> tuple[float, float]:
     return (min(low for low, _ in measured), max(high for _, high in measured)) if measured else (0.0, 1.0)
 
 
-def robust_range(read: MapValues) -> tuple[float, float] | None:
-    """Return the colour range of one frame without doubtful nodes and outliers; None where nothing is measured."""
+def robust_range(read: MapValues | Profile) -> tuple[float, float] | None:
+    """Return the colour range of what was read without doubtful nodes and outliers; None where nothing is measured."""
     ordinary = ordinary_values(read.values, read.std)
     return colour_range(ordinary) if ordinary.size else None
 
@@ -367,17 +368,22 @@ class Background:
         task.add_done_callback(lambda _: self._document.add_next_tick_callback(taken))
 
 
+def frame_title(result: Result, place: int, seconds: float) -> str:
+    """Return a frame's place, name and time; NaN: it is not known."""
+    time = f", {time_text(seconds, np.array([seconds]))}" if math.isfinite(seconds) else ""
+    return f"Frame {place} of 0 to {len(result) - 1}: {result.names[place]}{time}"
+
+
 def frame_text(maps: Maps, place: int, field: MapField, values: MapValues, remark: str) -> str:
     """Describe what is in view, as HTML: the frame, how it ended, the field with its extremes, and a remark."""
     result = maps.result
-    read = next(result.table.each(["status", "reason", "iterations", "node_status", "time_ns"], [place]))
+    read = next(result.table.each(["status", "reason", "node_status", "time_ns"], [place]))
     missing = float(np.mean(read["node_status"] != 0))
     measured = bool(result.finished[place])
     end = QUANTITIES["status"].codes[read["status"]] if measured else "not measured yet"
-    seconds = read["time_ns"] * 1e-9
-    time = "" if read["time_ns"] == UNKNOWN_TIME else f", {time_text(seconds, np.array([seconds]))}"
     without = f", {missing:.1%} of the nodes not measured" if missing and read["status"] != _FAILED else ""
-    lines = [f"Frame {place} of 0 to {len(result) - 1}: {html.escape(result.names[place])}{time}", f"{end}{without}"]
+    seconds = math.nan if read["time_ns"] == UNKNOWN_TIME else read["time_ns"] * 1e-9
+    lines = [html.escape(frame_title(result, place, seconds)), f"{end}{without}"]
     if read["reason"] and measured:
         first, rest = read["reason"][: VIEWER.reason_letters], read["reason"][VIEWER.reason_letters :]
         lines[1] = warning(f"{end}: {first}")

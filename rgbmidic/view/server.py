@@ -41,8 +41,8 @@ from rgbmidic.view.page import ResultPage
 from rgbmidic.view.setup_panel import Run
 
 _HOST = "127.0.0.1"
-_LIST_STYLE = """<style>a { color: inherit; } td { padding: 3px 24px 3px 0; overflow-wrap: anywhere; }
-h1 { font-size: 22px; }</style>"""
+_LIST_STYLE = """<style>a { color: inherit; } h1 { font-size: 22px; }
+th, td { padding: 3px 24px 3px 0; overflow-wrap: anywhere; text-align: left; }</style>"""
 _THEMES = {"dark": "dark_minimal"}
 
 
@@ -167,6 +167,7 @@ def _pages(path: Path, statement: Mapping[str, Any]) -> dict[str, Callable[[Docu
         if (found := {str(file.relative_to(path)): file for file in _found(path)}.get(name)) is None:
             raise InputError(f"{path} has no result and no test {name!r}")
         opened(found)(document)
+        document.template_variables["back"] = True
 
     def result(document: Document) -> None:
         if not runs:
@@ -184,8 +185,8 @@ def _pages(path: Path, statement: Mapping[str, Any]) -> dict[str, Callable[[Docu
     return {route: partial(_or_error, page) for route, page in {**pages, "/result": result}.items()}
 
 
-def _found(folder: Path) -> list[Path]:
-    """Return the results and the TEST.toml files in a folder and in two levels of folders below, newest first."""
+def _found(folder: Path) -> dict[Path, float]:
+    """Return the results and TEST.toml files in a folder and two levels below with the time of change, newest first."""
     times: dict[Path, float] = {}
     for pattern in ("", "*/", "*/*/"):
         for file in (*folder.glob(f"{pattern}{PROVENANCE}"), *folder.glob(f"{pattern}*.toml")):
@@ -194,28 +195,24 @@ def _found(folder: Path) -> list[Path]:
                     times[file.parent if file.name == PROVENANCE else file] = file.stat().st_mtime
             except (ConfigurationError, OSError):  # of another program, or gone by now
                 continue
-    return sorted(times, key=lambda file: times[file], reverse=True)[: VIEWER.listed]
+    return dict(sorted(times.items(), key=lambda pair: pair[1], reverse=True)[: VIEWER.listed])
 
 
 def _fill_list(folder: Path, document: Document) -> None:
     """Fill the page that lists the results and tests of a folder."""
-    rows = []
-    for file in _found(folder):
-        name = str(file.relative_to(folder))
-        about, when = "test to set up or run", datetime.fromtimestamp(file.stat().st_mtime)
+    rows = ['<tr><th scope="col">Name</th><th scope="col">What it is</th><th scope="col">Changed</th></tr>']
+    for file, changed in _found(folder).items():
+        name, about = str(file.relative_to(folder)), "test to set up or run"
         if file.suffix != ".toml":
             try:
                 result = Result.open(file, partial=True, check=False)
                 about = f"result: {int(result.finished.sum())} of {len(result)} frames, {', '.join(result.lights)}"
             except RgbmidicError as error:
                 about = f"result that cannot be opened: {error}"
-        cells = (
-            f'<a href="open?path={quote(name)}">{html.escape(name)}</a>',
-            html.escape(about),
-            f"{when:%Y-%m-%d %H:%M}",
-        )
-        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
-    head = f"<h1>{html.escape(folder.resolve().name)}</h1><p>Results and tests, newest first.</p>"
+        link = f'<a href="open?path={quote(name)}">{html.escape(name)}</a>'
+        when = f"{datetime.fromtimestamp(changed):%Y-%m-%d %H:%M}"
+        rows.append(f"<tr><td>{link}</td><td>{html.escape(about)}</td><td>{when}</td></tr>")
+    head = f"<h1>{html.escape(folder.resolve().name)}</h1><p>Results and tests, those changed last first.</p>"
     theme = _query(document).get("theme", [b""])[-1].decode("utf-8", "replace")
     table = Div(text=f"{_LIST_STYLE}{head}<table>{''.join(rows)}</table>", sizing_mode="stretch_width")
     _place(document, {"list": table}, f"rgbmidic: {folder.resolve().name}", theme)

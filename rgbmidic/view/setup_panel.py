@@ -128,7 +128,7 @@ def overview(inspection: Inspection, named: Mapping[str, Picture], raw: Picture)
         height, width = picture.shape
         size = (VIEWER.tile_columns, max(1, round(VIEWER.tile_columns * height / width)))
         png = cv2.imencode(".png", cv2.resize(picture, size, interpolation=cv2.INTER_AREA))[1]
-        title, source = html.escape(name.replace("reflection index", "index")), base64.b64encode(png).decode()
+        title, source = html.escape(name.replace("reflection index", "index")), base64.b64encode(png.tobytes()).decode()
         image = f'<img alt="{title}" style="width:100%" src="data:image/png;base64,{source}">'
         cells.append(f'<figure style="margin:0"><figcaption>{title}</figcaption>{image}</figure>')
     cells[across:across] = ["<span></span>"]  # the raw frame has no index

@@ -434,9 +434,9 @@ def test_a_line_shows_its_profile_and_position_against_time(driver, wave):
             rim = array(page, "model('profile bands').data.ys[0]")
             known = np.isfinite(curve)
             np.testing.assert_allclose(rim[: known.sum()], (curve - 2 * expected.std[frame])[known])
-            ends = page.run("[model('colours').low, model('colours').high]")
-            assert page.run("model('wave_plot').renderers[0].glyph.color_mapper === model('colours')")
-            assert ends == pytest.approx(robust_range(Maps.of(wave).read("exx", frame)))
+            for name, read in (("colours", Maps.of(wave).read("exx", frame)), ("wave_colours", expected)):
+                ends = page.run(f"[model('{name}').low, model('{name}').high]")
+                assert ends == pytest.approx(robust_range(read)), "the map has those of the frame, the line of the test"
         held = parse_qs(urlsplit(driver.current_url).query)
         assert held["line"] == ["line_1"]
         box = page.run(

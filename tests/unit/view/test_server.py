@@ -125,7 +125,7 @@ def test_a_folder_lists_its_results_and_tests_newest_first_and_opens_only_those(
     (tmp_path / "test.toml").write_text("[frames]\npath = 'none/*.tif'\n")
     os.utime(tmp_path / "test.toml", (1.1e9, 1.1e9))
     (tmp_path / "pyproject.toml").write_text("[frames]\n")
-    assert _found(tmp_path) == [newer, tmp_path / "test.toml", older]
+    assert list(_found(tmp_path)) == [newer, tmp_path / "test.toml", older]
     with serving(tmp_path) as told:
         path = urlsplit(told).path
         assert ask(told, "GET", path)[0] == 200
