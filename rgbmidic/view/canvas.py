@@ -84,23 +84,19 @@ class Canvas:
         self.plot = plain_plot(
             x_range=like.plot.x_range if like else bk.Range1d(self.window.left, self.window.right),
             y_range=like.plot.y_range if like else bk.Range1d(self.window.bottom, self.window.top),
-            title=" ",
-            min_border_right=VIEWER.bar_width,
-            x_axis_label="x (px)",
-            y_axis_label="y (px)",
-            toolbar_location="above",
+            **{"title": " ", "x_axis_label": "x (px)", "y_axis_label": "y (px)"},
+            **{"min_border_right": VIEWER.bar_width, "toolbar_location": "above"},
         )
         self.plot.grid.visible = False
-        self._image = bk.ColumnDataSource(columns(_IMAGE), name="image" if like is None else None)
+        names = ("image", "colours", "marks") if like is None else (None,) * 3
+        self._image = bk.ColumnDataSource(columns(_IMAGE), name=names[0])
         self.plot.image_rgba(*_IMAGE.split(), source=self._image)
-        self.colours = bk.LinearColorMapper(
-            palette=["#000000"], low=0, high=1, name="colours" if like is None else None
-        )
+        self.colours = bk.LinearColorMapper(palette=["#000000"], low=0, high=1, name=names[1])
         numbers = bk.BasicTickFormatter(power_limit_low=-6)  # else each number has a power of ten of its own
         look = {"width": 14, "major_label_text_font_size": "12px", "formatter": numbers}
         self.bar = bk.ColorBar(color_mapper=self.colours, visible=False, **look)
         self.plot.add_layout(self.bar, "right")
-        self.marks = bk.ColumnDataSource(columns("x y kind name 0"), name="marks" if like is None else None)
+        self.marks = bk.ColumnDataSource(columns("x y kind name 0"), name=names[2])
         self._states, self.set = {0: list[Mark]()}, list[Mark]()
         self.marks.on_change("data", lambda attr, old, new: self._merge())
         dot = {"size": 9, "fill_color": "white", "line_color": "black", "line_width": 1.5}
@@ -187,8 +183,7 @@ class Canvas:
         except UnsetValueError:  # it has not reported yet
             return
         if min(width, height) > 1 and (width, height) != (self.window.width, self.window.height):
-            left, top, right, bottom = self.wanted
-            edges = {"left": left, "top": top, "right": right, "bottom": bottom}
+            edges = dict(zip(("left", "top", "right", "bottom"), self.wanted, strict=True))
             self._set(replace(self.window, **edges, width=width, height=height))
 
     def _moved(self, event: Any) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import bokeh.models as bk
 import numpy as np
@@ -105,7 +105,7 @@ class MapPanel:
                 for colour, width in (("#15181c", 1.4), ("#ffffff", 0.7)):
                     segments = LineCollection(list(lines.reshape(-1, 2, 2)), colors=colour, linewidths=width)
                     axes[0].add_collection(segments)
-            points = 72 * axes[0].get_position().width * axes[0].get_figure().get_figwidth() / window.width
+            points = 72 * axes[0].get_position().width * cast("Figure", axes[0].figure).get_figwidth() / window.width
             for xs, ys, colour, x, y, text, side, along, down in self.marks.drawn:
                 axes[0].plot(xs, ys, color=colour, marker="o" if len(xs) == 1 else "")
                 look = {"color": "w", "size": 10 * points, "ha": side, "va": "bottom"}

@@ -38,11 +38,13 @@ const rgbmidic = {
   // Say what each input is for, to screen readers: checkboxes, sliders and numbers without a title do not.
   label() {
     for (const model of Bokeh.documents[0]._all_models.values()) {
-      const text = model.title || model.label || model.html_attributes?.["aria-label"], view = Bokeh.index.get(model);
-      if (typeof text !== "string" || !view?.shadow_el) continue;
-      view.shadow_el.querySelectorAll("input, [role=slider]").forEach((one) => {
-        if (!one.labels?.length) one.ariaLabel = text;
-      });
+      const text = model.title || model.label || model.html_attributes?.["aria-label"];
+      if (typeof text !== "string") continue;
+      try {
+        Bokeh.index.get_one(model).shadow_el.querySelectorAll("input, [role=slider]").forEach((one) => {
+          if (!one.labels?.[0]?.textContent.trim()) one.ariaLabel = text;
+        });
+      } catch { /* it is on no page */ }
     }
   },
 

@@ -58,10 +58,8 @@ class ResultPage:
         self.names, self.film = ProbeNames(p, self._take_marks), FilmButton(p, self.shown)
         self.file, self.timeline = FileButtons(p, self.shown), TimeLine(len(result), view.frame)
         self.curves = CurvePanel(document, self.shown, p, self._offer)
-        self.channels, self.line = (
-            ChannelControls(p, self.curves),
-            LinePanel(document, self.shown, self.maps.canvas.colours, p.wide),
-        )
+        self.channels = ChannelControls(p, self.curves)
+        self.line = LinePanel(document, self.shown, self.maps.canvas.colours, p.wide)
         panels = [self.line.choice, self.curves.plot, *self.line.parts]
         self.panel = bk.Column(children=panels, sizing_mode="stretch_both")
         self._begin()
@@ -93,7 +91,7 @@ class ResultPage:
         self._offer()
         p.of["since"].high = len(self.result) - 1
         p.over.active = OVER.index(view.over)
-        p.head.text = self._title()
+        self._draw_progress()
         for entry, (kind, *_) in view.controls().items():
             key = "active" if kind is bk.Checkbox else "value"
             p.of[entry].update(**{key: getattr(view, entry)})
@@ -140,12 +138,12 @@ class ResultPage:
         self.maps.canvas.marks.on_change("data", lambda attr, old, new: self._marked())
         for button, act in (
             (p.write, self.file.write), (p.take, lambda: self._take_marks(self.file.probes())), (p.csv, self._save),
-            (p.print, self._print), (p.lock, lambda: p.of["range"].update(value="hand")),
-            (p.clear, lambda: self._take_marks(())),
+            (p.lock, lambda: p.of["range"].update(value="hand")), (p.clear, lambda: self._take_marks(())),
             (p.undo, lambda: self.show(marks=self.steps.go(back=True))),
             (p.redo, lambda: self.show(marks=self.steps.go(back=False))),
         ):  # fmt: skip
             button.on_click(partial(guarded, act, lambda text: p.written.update(text=warning(text))))
+        p.print.on_click(partial(guarded, self._print, self.complain))
         p.drag.js_on_change("active", script("hold", toggle=p.drag, pan=self.curves.pan))
         p.movie.on_change("active", lambda attr, old, new: guarded(self.film.press, self.film.stop))
         self.line.choice.on_change("active", lambda attr, old, new: self._choose_line(self.line.names[new]))
@@ -271,11 +269,8 @@ class ResultPage:
 
     def _draw_progress(self) -> None:
         self.timeline.draw(self.progress)
-        self.parts.head.text = self._title()
-
-    def _title(self) -> str:
         summary = self.progress.summary(int(self.result.finished.sum()))
-        return f"<b>{html.escape(str(self.result.path))}</b> &nbsp; {summary}"
+        self.parts.head.text = f"<b>{html.escape(str(self.result.path))}</b> &nbsp; {summary}"
 
     def _grow(self) -> None:
         """Take in frames that a run has added or measured again; a view of the last frame follows it."""

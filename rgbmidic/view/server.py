@@ -36,9 +36,11 @@ from rgbmidic.settings import read_table, read_toml
 from rgbmidic.view.address import ViewState
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.curves import Progress
+from rgbmidic.view.draft import Draft
 from rgbmidic.view.models import page_file
 from rgbmidic.view.page import ResultPage
-from rgbmidic.view.setup_panel import Run
+from rgbmidic.view.setup import SetupPage
+from rgbmidic.view.setup_panel import DraftFrames, Run
 
 _HOST = "127.0.0.1"
 _LIST_STYLE = """<style>a { color: inherit; } h1 { font-size: 22px; }
@@ -149,21 +151,17 @@ def _pages(path: Path, statement: Mapping[str, Any]) -> dict[str, Callable[[Docu
         if (place / PROVENANCE).exists():
             Result.open(place, partial=True, check=False)
             return partial(_fill, place, shared)
-        from rgbmidic.view.draft import Draft
-        from rgbmidic.view.setup import SetupPage
-        from rgbmidic.view.setup_panel import DraftFrames
-
         DraftFrames.of(Draft.of(place, statement))
 
         def setup(document: Document) -> None:
-            theme = _query(document).get("theme", [b""])[-1].decode("utf-8", "replace")
+            theme = _asked(document, "theme")
             page = SetupPage(document, Draft.of(place, statement), runs, dark=theme == "dark")
             _place(document, page.roots, f"rgbmidic: {place.name}", theme)
 
         return setup
 
     def one(document: Document) -> None:
-        name = _query(document).get("path", [b""])[-1].decode("utf-8", "replace")
+        name = _asked(document, "path")
         if (found := {str(file.relative_to(path)): file for file in _found(path)}.get(name)) is None:
             raise InputError(f"{path} has no result and no test {name!r}")
         opened(found)(document)
@@ -213,7 +211,7 @@ def _fill_list(folder: Path, document: Document) -> None:
         when = f"{datetime.fromtimestamp(changed):%Y-%m-%d %H:%M}"
         rows.append(f"<tr><td>{link}</td><td>{html.escape(about)}</td><td>{when}</td></tr>")
     head = f"<h1>{html.escape(folder.resolve().name)}</h1><p>Results and tests, those changed last first.</p>"
-    theme = _query(document).get("theme", [b""])[-1].decode("utf-8", "replace")
+    theme = _asked(document, "theme")
     table = Div(text=f"{_LIST_STYLE}{head}<table>{''.join(rows)}</table>", sizing_mode="stretch_width")
     _place(document, {"list": table}, f"rgbmidic: {folder.resolve().name}", theme)
 
@@ -230,6 +228,10 @@ def _or_error(fill: Callable[[Document], None], document: Document) -> None:
 def _query(document: Document) -> dict[str, list[bytes]]:
     context = document.session_context
     return {} if context is None or context.request is None else context.request.arguments
+
+
+def _asked(document: Document, key: str) -> str:
+    return _query(document).get(key, [b""])[-1].decode("utf-8", "replace")
 
 
 def _fill(path: Path, shared: dict[tuple[Path, str], Progress], document: Document) -> None:

@@ -138,6 +138,18 @@ CUT = """(() => {
 })()"""
 
 
+UNLABELLED = """(() => {
+  const found = [];
+  const walk = (root) => root.querySelectorAll("*").forEach((one) => {
+    const input = ["INPUT", "SELECT"].includes(one.tagName) || one.getAttribute("role") === "slider";
+    if (input && !one.ariaLabel && !one.labels?.[0]?.textContent.trim()) found.push(one.outerHTML);
+    if (one.shadowRoot) walk(one.shadowRoot);
+  });
+  walk(document);
+  return found;
+})()"""
+
+
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("size", [(1280, 720), (1920, 1080)])
 def test_no_control_is_cut_off(driver, address, size, theme):
@@ -157,6 +169,7 @@ def test_no_control_is_cut_off(driver, address, size, theme):
         assert cut == []
         assert beyond <= 0
         assert below <= 0, section
+    assert page.run(UNLABELLED) == []
     driver.set_window_size(1280, 940)
 
 
@@ -361,6 +374,7 @@ def test_a_folder_s_page_opens_its_results_and_a_reload_stays(driver, result):
         driver.get(told)
         page = Page(driver, f"{told}open?path={result.path.name}")
         shown(page, 6)
+        assert driver.execute_script("return document.querySelector('.head a').href") == told
         page.keys(LEFT)
         shown(page, 5)
         page.until("new URL(location.href).searchParams.get('frame') === '5'")
@@ -513,6 +527,9 @@ def test_the_picture_that_is_saved_is_of_the_plot_that_is_there(driver, wave):
         driver.execute_script("window.kept = []; rgbmidic.keep = (blob, name) => window.kept.push([name, blob.size])")
         page.driver.execute_script(*click("Save PNG"))
         page.until("window.kept.length === 2")
+        page.driver.execute_script(*click("Save PNG for print"))
+        page.until("window.kept.length === 3")
+        assert page.run("window.kept.pop()[0]") == "exx_000005.png"
         kept = dict(page.run("window.kept"))
         assert kept.keys() == {"wave.png", "profile.png"}
         assert min(kept.values()) > 3000, "an empty picture has 300 x 150 px"

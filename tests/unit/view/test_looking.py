@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import random
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import parse_qs
 
+import cv2
 import numpy as np
 import pytest
 from bokeh.document import Document
@@ -645,6 +647,51 @@ def test_a_camera_s_plane_is_that_of_the_page_and_a_wrong_file_changes_nothing(t
     assert page.maps.canvas.plot.title.text == "u (mm)"
     page.parts.of["camera"].value = ""
     assert page.maps.canvas.plot.title.text == "u (px)"
+
+
+PROBES = ProbeSettings(points=((50, 40),), lines=((25, 40, 95, 45),), strain_gauges=((60, 40, 60),))
+
+
+@pytest.fixture(scope="module")
+def probed(tmp_path_factory):
+    stated = replace(in_mm(), probes=PROBES)
+    folder = tmp_path_factory.mktemp("probed")
+    return make_result(folder / "result", frames=4, record=lambda index: timed(index, 20_000), settings=stated)
+
+
+def test_probes_that_the_test_states_are_shown_at_opening(probed):
+    page = ResultPage(Document(), probed, ViewState(), Progress(4))
+    assert curves.probes(page.view.marks, page.view.gauge, ProbeSettings()) == PROBES
+    own = (Mark("point", 30, 30),)
+    assert ResultPage(Document(), probed, ViewState(marks=own), Progress(4)).view.marks == own
+    other = replace(PROBES, strain_gauges=((60, 40, 60), (60, 40, 80)))  # the page has one length for all
+    assert {mark.kind for mark in curves.with_probes(ViewState(), other).marks} == {"point", "line"}
+
+
+def test_a_picture_for_print_is_light_wide_and_says_what_it_shows(probed):
+    view = ViewState(frame=3, field="exx", second="u", theme="dark", vectors=True, contours=True)
+    page = ResultPage(Document(), probed, view, Progress(4))
+    page.show()
+    figure = page.maps.figure()
+    title = figure.texts[0].get_text()
+    assert "Frame 3 of 0 to 3" in title
+    assert "60 µs" in title
+    assert "εxx: Green-Lagrange, virtual strain gauge of 60 px" in title
+    assert [axis.get_title() for axis in figure.axes] == ["εxx", "u (mm)"]
+    assert sum("point 1" in text.get_text() for text in figure.axes[0].texts) == 1
+    assert figure.get_facecolor()[:3] == (1, 1, 1)
+    page._print()
+    png = base64.b64decode(page.state.png.removeprefix("data:image/png;base64,"))
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[1] == pytest.approx(2000, abs=5)
+    assert (picture[:5] == 255).mean() > 0.9
+
+
+def test_there_is_no_colour_bar_before_there_are_colours(probed):
+    page = ResultPage(Document(), probed, ViewState(), Progress(4))
+    assert not page.maps.canvas.bar.visible
+    page.show()
+    assert page.maps.canvas.bar.visible
 
 
 def test_a_page_whose_browser_has_gone_is_not_watched():
