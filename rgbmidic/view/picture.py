@@ -437,13 +437,16 @@ def probe_text(
     has `moved`.
     """
     name = field.name.removesuffix("_std")
+
+    def told(value: float, std: float) -> str:
+        return field.text(value, std) if name == field.name else field.text(std)
+
     if kind == "gauge" or (field.stepped and kind in ("line", "region", "circle")):
         return ""
     try:
         if kind == "strain_gauge" and maps.field(name).group == "Strain":
             strain = maps.strain_at(frame, *place)
-            value, std = float(strain[name][0]), float(strain[f"{name}_std"][0])
-            return f": {field.text(value, std) if name == field.name else field.text(std)}"
+            return f": {told(float(strain[name][0]), float(strain[f'{name}_std'][0]))}"
         kind, place = ("point", place[:2]) if kind == "strain_gauge" else (kind, place)
         stated = ProbeSettings(measure=cast(Any, maps.physical.measure))
         probe = make_probe(maps.physical.covariance, kind, 1, place, stated, maps.physical.rectified)
@@ -454,8 +457,7 @@ def probe_text(
         part = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), moved[:, None, probe.nodes], strict=True)))
         for one in probe.histories(part) if maps.field(name).group == "Strain" else ():
             if one.name == f"{probe.name}_{name}" and one.std is not None:
-                value, std = float(one.values[0]), float(one.std[0])
-                return f" mean: {field.text(value, std) if name == field.name else field.text(std)}"
+                return f" mean: {told(float(one.values[0]), float(one.std[0]))}"
     value, std = mean_of(maps, field, values, moved, probe)
     most = " at most" if kind != "point" and name not in ("u", "v") and np.isfinite(std) else ""
     return f"{' mean' if kind != 'point' else ''}: {field.text(value, std)}{most}"

@@ -139,12 +139,8 @@ class SetupPage:
         over, ends, colours, window = None, (0.0, 1.0), palette("plasma"), self.canvas.window
         if chosen == _EXPECTED and (found := self.inspection) is not None:
             ends = colour_range(found.prediction.std[np.isfinite(found.prediction.std)])
-            mesh: dict[str, Any] = {
-                "nodes": found.mesh.nodes,
-                "elements": found.mesh.elements,
-                "values": found.prediction.std,
-            }
-            over = Overlay(**mesh, ends=ends, colours=colours, opacity=0.8)
+            mesh: dict[str, Any] = {"nodes": found.mesh.nodes, "elements": found.mesh.elements}
+            over = Overlay(**mesh, values=found.prediction.std, ends=ends, colours=colours, opacity=0.8)
         image = paint(window, picture, over, AROUND[self.dark])
         if self.parts.glare.active:
             saturated = paint(window, full.astype(np.uint8) * 255, around=0)
@@ -167,8 +163,7 @@ class SetupPage:
         self._guarded(self._make_mesh)
 
     def _make_mesh(self) -> None:
-        made = self._meshed()
-        if made is None:
+        if (made := self._meshed()) is None:
             self.parts.message.text = _HELP
             return
         mesh = made[0]
@@ -214,10 +209,8 @@ class SetupPage:
         expected = f"median uncertainty to expect {np.median(known):.2g} px" if known.size else "no node is measured"
         lines = [f"<b>{html.escape(found.name)}</b>: {expected}"]
         self.parts.message.text = "<br>".join(lines + [f"• {html.escape(finding.text)}" for finding in found.findings])
-        if self.parts.picture.value == _EXPECTED:
-            self.show()
-        else:
-            self.parts.picture.value = _EXPECTED
+        self.parts.picture.value = _EXPECTED
+        self.show()
 
     def _changed(self) -> Draft:
         """Return the draft with the values of all controls."""
