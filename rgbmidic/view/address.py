@@ -5,39 +5,33 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import Field, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Self
 from urllib.parse import urlencode
 
+import bokeh.models as bk
+
 from rgbmidic.fields import MEASURES, Units
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ScaleSettings
+from rgbmidic.view.constants import VIEWER
 
 KINDS = {"point": 1, "gauge": 2, "line": 2, "strain_gauge": 1, "region": 2, "circle": 2}
 """Probes that can be set with the pointer, and how many places each takes."""
 SCALE = "scale"
 MARKS = (*KINDS, SCALE)
 """Kinds of marks: those of probes, and two points of a known distance."""
-CLOCKS = ("offset", "trigger", "correlation")
-"""Ways to relate the time of channels to that of the frames."""
 OVER = ("reference", "deformed")
-_LEAST, _LARGEST = {"levels": 2, "rate_window": 0}, 10**9
-_LONGEST = 1000
-"""Letters of a text in an address: a path on a disk has seldom more."""
-_MOST_MARKS = 200
-"""Marks that an address may set: it has 8 kB at most, of some 25 a mark."""
-_KEPT = 100
-"""Steps that can be undone: more than a hand takes back one by one, at some hundred bytes each."""
 BESIDE = ("second", "third", "fourth")
 """Entries of the view that name fields beside the first."""
 UNCERTAINTY = "uncertainty"
 """Name of the field beside the first that is its standard uncertainty, whatever that is."""
 PALETTES = ("viridis", "cividis", "plasma", "inferno", "RdBu_r", "PuOr_r", "twilight")
 """Colours that can be chosen, safe for the colour-blind: perceptually uniform ones, diverging ones, a cyclic one."""
-_CHOICES = {
-    "over": OVER, "range": ("frame", "test", "hand"), "theme": ("light", "dark"), "palette": PALETTES,
-    "measure": MEASURES, "clock": CLOCKS,
-}  # fmt: skip
+_CLOCKS = {"offset": "an offset", "trigger": "a trigger", "correlation": "correlation"}
+CLOCKS = tuple(_CLOCKS)
+"""Ways to relate the time of channels to that of the frames."""
+_RANGES = [("frame", "this frame"), ("test", "the whole test"), ("hand", "the two numbers")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +80,7 @@ class Steps:
         one = len(marks) == len(self.now) and len(other) == 1
         moved = other[0] if one and replace(marks[other[0]], x=0, y=0) == replace(self.now[other[0]], x=0, y=0) else -1
         if moved < 0 or moved != self._moved:
-            self._past = [*self._past[-_KEPT:], self.now]
+            self._past = [*self._past[-VIEWER.undo_steps :], self.now]
         self.now, self._future, self._moved = marks, [], moved
 
     def go(self, *, back: bool) -> tuple[Mark, ...]:
@@ -118,6 +112,11 @@ def probe_place(marks: Sequence[Mark], gauge: float) -> tuple[float, ...]:
     if marks[0].kind == "circle":
         return (*places[:2], math.dist(places[:2], places[2:]))
     return tuple(places)
+
+
+def entry(usual: Any, kind: type[bk.Widget] | None = None, text: str = "", **options: Any) -> Any:
+    """Entry of the view with its usual value, and kind, text and options of its control, which limit the value too."""
+    return field(default=usual, metadata={"control": (kind, text, options)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -179,48 +178,54 @@ class ViewState:
     """
 
     frame: int = 0
-    field: str = "u"
-    over: str = "reference"
-    range: str = "frame"
-    low: float = -1.0
-    high: float = 1.0
-    symmetric: bool = False
-    directions: bool = False
-    opacity: float = 0.85
-    second: str = ""
-    third: str = ""
-    fourth: str = ""
-    palette: str = ""
-    levels: int = 256
-    hatched: bool = False
-    vectors: bool = False
-    longer: float = 0.0
-    contours: bool = False
-    extremes: bool = False
-    blank: bool = False
-    gauge: float = 0.0
-    measure: str = MEASURES[0]
-    since: int = -1
-    rigid: bool = False
-    rate_window: int = 0
-    curve: str = ""
-    along: str = ""
-    channels: str = ""
-    clock: str = CLOCKS[0]
-    offset: float = 0.0
-    trigger: str = ""
-    align: str = ""
-    align_to: str = ""
-    area: float = 0.0
-    force: str = ""
-    beside: str = ""
-    distance: float = 0.0
-    distance_std: float = 0.0
-    camera: str = ""
-    line: str = ""
-    theme: str = ""
+    field: str = entry("u", bk.Select, "Field")
+    over: str = entry(OVER[0], options=OVER)
+    range: str = entry("frame", bk.Select, "Colours from", options=_RANGES)
+    low: float = entry(-1.0, bk.NumericInput, "lowest", mode="float")
+    high: float = entry(1.0, bk.NumericInput, "highest", mode="float")
+    symmetric: bool = entry(False, bk.Checkbox, "symmetric about 0")
+    directions: bool = entry(False, bk.Checkbox, "principal directions")
+    opacity: float = entry(0.85, bk.Slider, "Opacity", start=0, end=1, step=0.05, value=1)
+    second: str = entry("", bk.Select, "Second field")
+    third: str = entry("", bk.Select, "Third field")
+    fourth: str = entry("", bk.Select, "Fourth field")
+    palette: str = entry("", bk.Select, "Palette", options=[("", "as suits the field"), *PALETTES])
+    levels: int = entry(256, bk.Spinner, "Number of colours", low=2, high=256)
+    hatched: bool = entry(False, bk.Checkbox, "hatch what is within 2 σ of 0")
+    vectors: bool = entry(False, bk.Checkbox, "displacement as arrows")
+    longer: float = entry(0.0, bk.NumericInput, "times their length (0: as there is room)", mode="float", low=0)
+    contours: bool = entry(False, bk.Checkbox, "contour lines")
+    extremes: bool = entry(False, bk.Checkbox, "smallest and largest value")
+    blank: bool = entry(False, bk.Checkbox, "nodes without data")
+    gauge: float = entry(0.0, bk.NumericInput, "Strain gauge length, px (0: shortest)", mode="float", low=0)
+    measure: str = entry(MEASURES[0], bk.Select, "Strain measure", options=list(MEASURES))
+    since: int = entry(-1, bk.Spinner, "Since frame (-1: the reference)", low=-1)
+    rigid: bool = entry(False, bk.Checkbox, "rigid motion removed")
+    rate_window: int = entry(0, bk.Spinner, "Rates over frames (0: as stated, or 9)", low=0)
+    curve: str = entry("")
+    along: str = entry("", bk.Select, "Along x")
+    channels: str = entry("", bk.TextInput, "CSV file beside the test")
+    clock: str = entry(CLOCKS[0], bk.Select, "Its time by", options=[*_CLOCKS.items()])
+    offset: float = entry(0.0, bk.NumericInput, "Offset, s", mode="float")
+    trigger: str = entry("", bk.Select, "Trigger channel")
+    align: str = entry("", bk.Select, "Channel")
+    align_to: str = entry("", bk.Select, "alike to")
+    area: float = entry(0.0, bk.NumericInput, "Section, mm²", mode="float", low=0)
+    force: str = entry("", bk.Select, "Force")
+    beside: str = entry("", bk.Select, "Beside the curves")
+    distance: float = entry(0.0, bk.NumericInput, "Length, mm", mode="float", low=0)
+    distance_std: float = entry(0.0, bk.NumericInput, "± mm", mode="float", low=0)
+    camera: str = entry("", bk.TextInput, "or camera")
+    line: str = entry("")
+    theme: str = entry("", options=("light", "dark"))
     window: tuple[float, ...] = ()
     marks: tuple[Mark, ...] = ()
+
+    @classmethod
+    def controls(cls) -> dict[str, tuple[type[bk.Widget], str, dict[str, Any]]]:
+        """Return kind, text and options of the controls, by the entries that they set."""
+        stated = {entry.name: entry.metadata.get("control", (None,)) for entry in fields(cls)}
+        return {name: control for name, control in stated.items() if control[0] is not None}
 
     @classmethod
     def from_query(cls, query: Mapping[str, Sequence[bytes]], *, frames: int, names: Sequence[str], frame: int) -> Self:
@@ -243,7 +248,7 @@ class ViewState:
             A valid view of the result.
         """
         texts = {key: values[-1].decode("utf-8", "replace") for key, values in query.items() if values}
-        asked = {entry.name: _value(entry.name, texts.get(entry.name, ""), names) for entry in fields(cls)}
+        asked = {entry.name: _value(entry, texts[entry.name], names) for entry in fields(cls) if entry.name in texts}
         stated: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
         view = cls(**{"frame": frame, **stated})
         view, plain = replace(view, frame=min(max(view.frame, 0), frames - 1), since=min(view.since, frames - 1)), cls()
@@ -307,37 +312,35 @@ def _text(value: object) -> str:
     return str(int(value) if isinstance(value, bool) else value)
 
 
-def _value(name: str, text: str, names: Sequence[str]) -> object:
+def _value(entry: Field[Any], text: str, names: Sequence[str]) -> object:
     """Return the value that a text states for an entry; None where it is invalid."""
+    _, _, options = entry.metadata.get("control", (None, "", {}))
     try:
-        plain = getattr(ViewState(), name)
-        if isinstance(plain, bool):
+        if isinstance(entry.default, bool):
             return bool(int(text))
-        if isinstance(plain, int):
-            return min(max(int(text), _LEAST.get(name, -1)), _LARGEST)
-        if isinstance(plain, float):
-            number = _number(text)
-            return min(max(number, 0.0), 1.0) if name == "opacity" else number
-        if name == "window":
+        if isinstance(entry.default, (int, float)):
+            low, high = options.get("low", options.get("start")), options.get("high", options.get("end"))
+            number = max(_number(text), -math.inf if low is None else low)
+            return type(entry.default)(min(number, math.inf if high is None else high))
+        if entry.name == "window":
             left, top, right, bottom = map(_number, text.split(","))
             return (left, top, right, bottom) if left < right and top < bottom else None
-        if name == "marks":
-            places = [re.split("[:,]", mark) for mark in text.split(";")[:_MOST_MARKS]]
+        if entry.name == "marks":
+            places = [re.split("[:,]", mark) for mark in text.split(";")[: VIEWER.address_marks]]
             marks = tuple(Mark(kind, _number(x), _number(y), *name) for kind, x, y, *name in places)
             named = [mark.name for mark in marks if mark.name]
             known = all(mark.kind in MARKS for mark in marks) and all(map(PROBE_NAME.fullmatch, named))
             return marks if known and len(set(named)) == len(named) else None
     except (TypeError, ValueError):
         return None
-    if name in ("field", *BESIDE):
-        return text if text in names or (text == UNCERTAINTY and name in BESIDE) else None
-    if name in _CHOICES:
-        return text if text in _CHOICES[name] else None
-    return text[:_LONGEST]
+    if entry.name in ("field", *BESIDE):
+        return text if text in names or (text == UNCERTAINTY and entry.name in BESIDE) else None
+    if "options" in options:
+        return text if text in [one if isinstance(one, str) else one[0] for one in options["options"]] else None
+    return text[: VIEWER.address_letters]
 
 
 def _number(text: str) -> float:
-    number = float(text)
-    if not math.isfinite(number) or abs(number) > 1e10:  # seconds since 1970 are 2e9
+    if not abs(number := float(text)) <= VIEWER.address_number:
         raise ValueError(text)
     return number

@@ -1,15 +1,13 @@
-"""Plots of the image window with its field and marks, of principal directions on it, and of small pictures in rows."""
+"""Plot of the image window with its field and marks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import bokeh.models as bk
-import cv2
 import numpy as np
-import numpy.typing as npt
 from bokeh.core.property.descriptors import UnsetValueError
 from bokeh.document import Document
 from bokeh.events import RangesUpdate
@@ -18,15 +16,10 @@ from bokeh.plotting import figure
 from rgbmidic.report.style import view_limits
 from rgbmidic.typing import AnyArray, FloatArray
 from rgbmidic.view.address import Mark
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.picture import Window
 
 _IMAGE = "image x y dw dh"
-_BAR = 80
-"""Px of the screen for the colour bar: seven digits of 12 px, which change with the frame."""
-_SOON = 40
-"""Ms in which the moves of a view are collected: the picture follows at 25 a second."""
-_SENT = 100
-"""States of the marks that the browser may not have yet: it asks for one frame at a time, each of which moves them."""
 
 
 def plain_plot(**options: Any) -> Any:
@@ -91,23 +84,19 @@ class Canvas:
         self.plot = plain_plot(
             x_range=like.plot.x_range if like else bk.Range1d(self.window.left, self.window.right),
             y_range=like.plot.y_range if like else bk.Range1d(self.window.bottom, self.window.top),
-            title=" ",
-            min_border_right=_BAR,
-            x_axis_label="x (px)",
-            y_axis_label="y (px)",
-            toolbar_location="above",
+            **{"title": " ", "x_axis_label": "x (px)", "y_axis_label": "y (px)"},
+            **{"min_border_right": VIEWER.bar_width, "toolbar_location": "above"},
         )
         self.plot.grid.visible = False
-        self._image = bk.ColumnDataSource(columns(_IMAGE), name="image" if like is None else None)
+        names = ("image", "colours", "marks") if like is None else (None,) * 3
+        self._image = bk.ColumnDataSource(columns(_IMAGE), name=names[0])
         self.plot.image_rgba(*_IMAGE.split(), source=self._image)
-        self.colours = bk.LinearColorMapper(
-            palette=["#000000"], low=0, high=1, name="colours" if like is None else None
-        )
+        self.colours = bk.LinearColorMapper(palette=["#000000"], low=0, high=1, name=names[1])
         numbers = bk.BasicTickFormatter(power_limit_low=-6)  # else each number has a power of ten of its own
         look = {"width": 14, "major_label_text_font_size": "12px", "formatter": numbers}
-        self.bar = bk.ColorBar(color_mapper=self.colours, **look)
+        self.bar = bk.ColorBar(color_mapper=self.colours, visible=False, **look)
         self.plot.add_layout(self.bar, "right")
-        self.marks = bk.ColumnDataSource(columns("x y kind name 0"), name="marks" if like is None else None)
+        self.marks = bk.ColumnDataSource(columns("x y kind name 0"), name=names[2])
         self._states, self.set = {0: list[Mark]()}, list[Mark]()
         self.marks.on_change("data", lambda attr, old, new: self._merge())
         dot = {"size": 9, "fill_color": "white", "line_color": "black", "line_width": 1.5}
@@ -161,7 +150,7 @@ class Canvas:
         self.set, last = list(marks), max(self._states)
         if self._states[last] != self.set:
             self._states[last + 1] = self.set
-            self._states = dict(list(self._states.items())[-_SENT:])
+            self._states = dict(list(self._states.items())[-VIEWER.mark_states :])
             rows = [(mark.x, mark.y, mark.kind, mark.name, 0) for mark in marks]
             self.marks.data = columns(f"x y kind name {last + 1}", rows)
 
@@ -194,8 +183,7 @@ class Canvas:
         except UnsetValueError:  # it has not reported yet
             return
         if min(width, height) > 1 and (width, height) != (self.window.width, self.window.height):
-            left, top, right, bottom = self.wanted
-            edges = {"left": left, "top": top, "right": right, "bottom": bottom}
+            edges = dict(zip(("left", "top", "right", "bottom"), self.wanted, strict=True))
             self._set(replace(self.window, **edges, width=width, height=height))
 
     def _moved(self, event: Any) -> None:
@@ -218,179 +206,4 @@ class Canvas:
 
         if not self._coming:
             self._coming = True
-            self._document.add_timeout_callback(come, _SOON)
-
-
-_ACROSS = 24
-"""Lines across the view: each then has some 30 px of a screen of 800, longer than wide and apart from the next."""
-_ENDS, _LABEL = "x0 y0 x1 y1", "x y text colour side along down"
-LETTERS = {
-    "text_color": "#ffffff",
-    "text_align": "side",
-    "x_offset": "along",
-    "y_offset": "down",
-    "background_fill_color": "#15181c",
-    "background_fill_alpha": 0.75,
-    "text_font_size": "12px",
-    "padding": 2,
-}
-"""Look of a text over the image, where `beside` places it."""
-_AWAY, _LETTER, _LINE = 8, 7, 20
-"""Pixels of the screen: from a place to its text; width of a letter and height of a line of 12 px."""
-
-
-class LineLayer:
-    """Lines on a canvas, light with a dark edge.
-
-    Parameters
-    ----------
-    canvas
-        Plot on which they are drawn.
-    name
-        Name of their data.
-    width
-        Of the light part, in pixels of the screen.
-    """
-
-    def __init__(self, canvas: Canvas, name: str, width: float = 1.4) -> None:
-        self._lines = bk.ColumnDataSource(columns(_ENDS), name=name)
-        for colour, wide in (("#15181c", width + 1.6), ("#ffffff", width)):
-            canvas.plot.segment(*_ENDS.split(), source=self._lines, line_color=colour, line_width=wide)
-
-    def show(self, ends: FloatArray | None) -> None:
-        """Show lines (M, 4) from x0, y0 to x1, y1; None: none."""
-        if ends is not None or len(self._lines.data["x0"]):
-            self._lines.data = dict(zip(_ENDS.split(), (np.zeros((0, 4)) if ends is None else ends).T, strict=True))
-
-
-class LabelLayer:
-    """Points with a text on a canvas.
-
-    Parameters
-    ----------
-    canvas
-        Plot on which they are drawn.
-    name
-        Name of their data.
-    """
-
-    def __init__(self, canvas: Canvas, name: str, **look: Any) -> None:
-        self._canvas, self._points = canvas, bk.ColumnDataSource(columns(_LABEL), name=name)
-        canvas.plot.scatter("x", "y", source=self._points, line_color="#15181c", fill_color="colour", **look)
-        canvas.plot.text("x", "y", "text", source=self._points, **LETTERS)
-
-    def show(self, points: Sequence[tuple[float, float, str, str]] = ()) -> None:
-        """Show points with their texts and colours."""
-        if points or len(self._points.data["x"]):
-            placed = beside([(x, y, text) for x, y, text, _ in points], self._canvas.window)
-            self._points.data = columns(_LABEL, [(*one, *place) for one, place in zip(points, placed, strict=True)])
-
-
-def beside(texts: Sequence[tuple[float, float, str]], window: Window) -> list[tuple[str, int, int]]:
-    """Return alignment and offsets of texts at (x, y) that end within a window and do not lie on each other."""
-    step = (window.right - window.left) / window.width  # px of the image to one of the screen
-    placed, taken = [], list[tuple[float, float, float]]()
-    for x, y, text in texts:
-        left, wide, top = (x - window.left) / step + _AWAY, _LETTER * len(text), (y - window.top) / step
-        turned = left + wide > window.width
-        left, low = left - (wide + 2 * _AWAY if turned else 0), top
-        while any(abs(low - other) < _LINE and left < end and begin < left + wide for begin, end, other in taken):
-            low += _LINE
-        taken.append((left, left + wide, low))
-        placed.append(("right" if turned else "left", -_AWAY if turned else _AWAY, round(low - top)))
-    return placed
-
-
-def _thinned(window: Window, nodes: FloatArray, known: Any) -> tuple[npt.NDArray[np.int64], float]:
-    """Thin out the nodes (N, 2) that are known, evenly over the view; return their indices, and their distance."""
-    cell = max(window.right - window.left, window.bottom - window.top) / _ACROSS
-    kept = np.flatnonzero(known & np.isfinite(nodes).all(axis=1))
-    places = np.floor(nodes[kept] / cell).astype(int)
-    return kept[np.unique(places, axis=0, return_index=True)[1]], cell
-
-
-def direction_lines(window: Window, nodes: FloatArray, degrees: FloatArray) -> FloatArray:
-    """Lines (M, 4) along directions (N,), in degrees from x towards y, at nodes (N, 2), evenly thinned out."""
-    thinned, cell = _thinned(window, nodes, np.isfinite(degrees))
-    angle = np.radians(degrees[thinned])
-    half = 0.4 * cell * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return np.concatenate([nodes[thinned] - half, nodes[thinned] + half], axis=1)
-
-
-def arrow_lines(window: Window, nodes: FloatArray, moved: FloatArray, longer: float) -> tuple[FloatArray, float]:
-    """Lines (M, 4) of arrows along displacements (N, 2) at nodes (N, 2), thinned out, and how much longer they are.
-
-    With `longer` 0 the longest reaches to the next arrow.
-    """
-    thinned, cell = _thinned(window, nodes, np.isfinite(moved).all(axis=1))
-    start, along = nodes[thinned], moved[thinned]
-    reach = np.hypot(*along.T).max(initial=0)
-    longer = longer or (0.9 * cell / reach if reach > 0 else 1.0)
-    end = start + longer * along
-    parts = [np.concatenate([start, end], axis=1)]
-    for turn in (2.6, -2.6):  # rad from the arrow to the sides of its point
-        c, s = 0.3 * np.cos(turn), 0.3 * np.sin(turn)
-        parts.append(np.concatenate([end, end + longer * along @ np.array([[c, s], [-s, c]])], axis=1))
-    return np.concatenate(parts), float(longer)
-
-
-def contour_lines(
-    nodes: FloatArray, elements: npt.NDArray[np.int32], values: FloatArray, levels: Sequence[float]
-) -> FloatArray:
-    """Lines (M, 4) on which a field, linear in each element, has one of the levels; none beside nodes without data."""
-    whole = elements[np.isfinite(values[elements] + nodes[elements].sum(axis=2)).all(axis=1)]
-    lines = []
-    for level in levels:
-        above = values[whole] > level
-        cut = whole[above.any(axis=1) & ~above.all(axis=1)]
-        ends = []
-        # the corner that is alone on its side: from it, the line cuts both edges
-        side = values[cut] > level
-        alone = np.where(side.sum(axis=1) == 1, side.argmax(axis=1), side.argmin(axis=1))
-        row = np.arange(len(cut))
-        for step in (1, 2):
-            a, b = cut[row, alone], cut[row, (alone + step) % 3]
-            part = ((level - values[a]) / (values[b] - values[a]))[:, None]
-            ends.append(nodes[a] + part * (nodes[b] - nodes[a]))
-        lines.append(np.concatenate(ends, axis=1))
-    return np.concatenate(lines) if lines else np.zeros((0, 4))
-
-
-_WIDE = 260
-"""Columns of a small picture."""
-_STEP, _GAP = 1.06, 0.2
-"""From one to the next, and the room for a name over each, in widths of one."""
-_TILE = "image x y dw name"
-
-
-class Tiles:
-    """Plot of small pictures in rows; hidden until there are some."""
-
-    def __init__(self) -> None:
-        self._shown = bk.ColumnDataSource(columns(_TILE), name="tiles")
-        bare = dict.fromkeys(("background_fill_color", "border_fill_color", "outline_line_color"))
-        ranges = {"x_range": bk.Range1d(0, 1), "y_range": bk.Range1d(1, 0)}
-        self.plot = plain_plot(sizing_mode="scale_width", min_border=0, visible=False, **ranges, **bare)
-        self.plot.axis.visible = self.plot.grid.visible = False
-        greys = [f"#{level:02x}{level:02x}{level:02x}" for level in range(256)]
-        self._drawn = self.plot.image("image", "x", "y", "dw", 1, source=self._shown, palette=greys)
-        self._drawn.glyph.color_mapper.update(low=0, high=255)
-        letters = {"text_font_size": "11px", "text_color": "#808890", "text_baseline": "bottom", "y_offset": -1}
-        self.plot.text("x", "y", "name", source=self._shown, **letters)
-
-    def show(self, rows: Sequence[Mapping[str, npt.NDArray[np.uint8]]]) -> None:
-        """Show rows of pictures (H, W) of one size by their names, aligned at the right."""
-        height, width = next(iter(rows[0].values())).shape
-        tall, across = height / width, max(map(len, rows))
-        size = (_WIDE, max(1, round(_WIDE * tall)))
-        self._drawn.glyph.dh = tall
-        tiles = [
-            (picture, x * _STEP, y * (tall + _GAP) + _GAP, 1.0, name)
-            for y, row in enumerate(rows)
-            for x, (name, picture) in enumerate(row.items(), start=across - len(row))
-        ]
-        small = [(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), *place) for picture, *place in tiles]
-        self._shown.data = columns(_TILE, small)
-        down = len(rows) * (tall + _GAP)
-        self.plot.x_range.end, self.plot.y_range.start = across * _STEP, down
-        self.plot.update(visible=True, aspect_ratio=across * _STEP / down)
+            self._document.add_timeout_callback(come, VIEWER.view_ms)

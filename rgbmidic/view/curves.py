@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -17,11 +18,14 @@ from rgbmidic.errors import ResultError, RgbmidicError
 from rgbmidic.report.style import OKABE_ITO, time_axis, time_unit
 from rgbmidic.results import Channels, Histories, HistoryColumn, Result, probes_of
 from rgbmidic.results.histories import frames_alone, history_csv, read_histories, with_channels
-from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
+from rgbmidic.settings import ProbeSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.address import KINDS, Mark, probe_marks, probe_place
+from rgbmidic.view.address import KINDS, Mark, ViewState, probe_marks, probe_place
 from rgbmidic.view.canvas import columns, plain_plot
+from rgbmidic.view.constants import VIEWER
+from rgbmidic.view.models import ResultControls
 from rgbmidic.view.picture import Background, warning
+from rgbmidic.view.shown import ShownFields
 
 
 def probes(marks: Sequence[Mark], gauge: float, stated: ProbeSettings, measure: Any = None) -> ProbeSettings:
@@ -51,12 +55,16 @@ def marks_of(stated: ProbeSettings) -> tuple[Mark, ...]:
     return tuple(marks)
 
 
+def with_probes(view: ViewState, stated: ProbeSettings) -> ViewState:
+    """Return the view with the probes stated, where its address has none; strain gauges if all have one length."""
+    lengths = {length for *_, length in stated.strain_gauges}
+    marks = tuple(mark for mark in marks_of(stated) if mark.kind != "strain_gauge" or len(lengths) == 1)
+    gauge = lengths.pop() if len(lengths) == 1 and not view.gauge else view.gauge
+    return view if view.marks or not marks else replace(view, marks=marks, gauge=gauge)
+
+
 def read(
-    result: Result,
-    marks: Sequence[Mark],
-    gauge: float,
-    measure: str | None = None,
-    scale: ScaleSettings | None = None,
+    result: Result, marks: Sequence[Mark], gauge: float, measure: str | None = None, scale: ScaleSettings | None = None
 ) -> Histories | None:
     """Read the probes that marks make off a result, as `read_histories`; None where they make none."""
     made = probes(marks, gauge, probes_of(result), measure)
@@ -101,12 +109,12 @@ def _probe(quantity: HistoryColumn, names: Iterable[str]) -> str:
 
 
 _LINES, _BANDS = "xs ys colour name", "xs ys colour"
-_BESIDE, _MARGIN = OKABE_ITO["vermillion"], 0.1
-"""Colour of a channel beside the curves; room above and below it, as Bokeh's own ranges have."""
-_STRETCHES = 1500
-"""Stretches of a channel that are drawn: as many as a wide screen has columns for them."""
-_AT_ONCE = 100
-"""Frames that are read before the page is served again. Measured: 10 ms."""
+_BESIDE = OKABE_ITO["vermillion"]
+"""Colour of a channel beside the curves."""
+_HINT = (
+    "Choose a probe, click on the field (Gauge, Line, Box, Circle: twice). Drag marks; Backspace removes one. "
+    "Keys: ← → a frame, space plays, 1 to 7 sections, Ctrl-Z undoes, Ctrl-Y redoes."
+)
 _NOT_YET, _DAMAGED = -1, 3
 """Status of a frame that was not read yet, and of one whose record cannot be read, beside those of the field table."""
 _FAULTS = {1: OKABE_ITO["orange"], 2: "#d1495b", _DAMAGED: "#d1495b"}
@@ -150,7 +158,7 @@ class Progress:
         now = result.table.written
         stale = (self.status != _NOT_YET) & (now != self._written)
         self.status[stale], self.fraction[stale] = _NOT_YET, np.nan
-        frames = np.flatnonzero(result.finished & (self.status == _NOT_YET))[:_AT_ONCE]
+        frames = np.flatnonzero(result.finished & (self.status == _NOT_YET))[: VIEWER.frames_at_once]
         self._written[frames] = now[frames]
         self.changes += bool(stale.any() or len(frames))
         for frame in frames.tolist():
@@ -216,12 +224,12 @@ class CurvePanel:
     ----------
     document
         Document of the page.
-    chosen
-        Name of the curve that is shown first.
-    select, message, told
-        Control by which the curve is chosen, and the texts for remarks on the probes and on the channels.
-    hint
-        Text where there is no remark.
+    shown
+        What is in view, with its probes and channels.
+    parts
+        Controls of the page: the choice of a curve, and the texts on probes and channels.
+    offer
+        Called when probes were read.
 
     Attributes
     ----------
@@ -231,35 +239,32 @@ class CurvePanel:
         The channels by the clock of the frames; None: there are none.
     reading
         Whether the probes are being read anew; the histories are those of before until then.
-    stated, along, beside
-        What is known of the channels; name of the quantity along x, empty: the time; and of the channel drawn beside.
     """
 
     def __init__(
-        self, document: Document, *, chosen: str, select: bk.Select, message: bk.Div, told: bk.Div, hint: str
+        self, document: Document, shown: ShownFields, parts: ResultControls, offer: Callable[[], None]
     ) -> None:
         self.histories: Histories | None = None
         self.channels: Channels | None = None
         self.reading = False
-        self.colours: Mapping[str, str] = {}
-        self.stated, self.along, self.beside = ChannelSettings(), "", ""
+        self._colours: Mapping[str, str] = {}
         self._probed: Histories | None = None
         self._grabbed: tuple[float, Channels] | None = None
-        self._select, self._message, self._told, self._hint, self._chosen = select, message, told, hint, chosen
-        self._reader = Background(document)
+        self._asked: object = None
+        self._drawn: object = None
+        self._shown, self._parts, self._offer, self._reader = shown, parts, offer, Background(document)
         self._lines = bk.ColumnDataSource(columns(_LINES), name="lines")
         self._bands = bk.ColumnDataSource(columns(_BANDS), name="bands")
         self._recorded = bk.ColumnDataSource(columns("xs ys"), name="recorded")
-        self.plot, self.now = self._new_plot(), bk.Span(**NOW)
-        self.plot.add_layout(self.now)
-        select.on_change("value", lambda attr, old, new: self.draw())
+        self._make_plot()
+        parts.message.text = _HINT
+        parts.curve.on_change("value", lambda attr, old, new: self.draw())
 
-    def _new_plot(self) -> Any:
-        wheel, hover = bk.WheelZoomTool(visible=False), bk.HoverTool(visible=False)
-        self.pan = bk.PanTool()
+    def _make_plot(self) -> None:
+        wheel, hover, self.pan = bk.WheelZoomTool(visible=False), bk.HoverTool(visible=False), bk.PanTool()
         tools = [self.pan, wheel, bk.BoxZoomTool(), bk.ResetTool(), hover]
-        plot = plain_plot(tools=tools, title="Curves", toolbar_location="above", name="curves_plot")
-        plot.toolbar.logo, plot.toolbar.active_scroll, plot.toolbar.active_drag = None, wheel, self.pan
+        self.plot = plot = plain_plot(tools=tools, title="Curves", toolbar_location="above", name="curves_plot")
+        plot.toolbar.update(logo=None, active_scroll=wheel, active_drag=self.pan)
         plot.patches("xs", "ys", source=self._bands, fill_color="colour", fill_alpha=0.25, line_alpha=0)
         style = {"line_color": "colour", "line_width": 1.5, "legend_field": "name"}
         drawn = plot.multi_line("xs", "ys", source=self._lines, **style)
@@ -272,48 +277,58 @@ class CurvePanel:
         self._axis = bk.LinearAxis(y_range_name="channel", visible=False, axis_label_text_color=_BESIDE, **texts)
         plot.add_layout(self._axis, "right")
         self._curves, self._all = [drawn], [drawn, beside]
-        hover.renderers, hover.tooltips = [drawn], [("", "@name"), ("at", "$snap_x"), ("value", "$snap_y")]
-        plot.legend.visible, plot.legend.label_text_font_size, plot.legend.ncols = False, "11px", 2
+        hover.update(renderers=[drawn], tooltips=[("", "@name"), ("at", "$snap_x"), ("value", "$snap_y")])
+        plot.legend.update(visible=False, label_text_font_size="11px", ncols=2)
         plot.add_layout(plot.legend[0], "below")
-        return plot
+        self.now = bk.Span(**NOW)
+        plot.add_layout(self.now)
 
-    def read(
-        self, result: Result, marks: Sequence[Mark], gauge: float, shown: Callable[[], None], **chosen: Any
-    ) -> None:
-        """Read the probes off all frames in another thread, then call `shown`; only the last request counts."""
-        self.reading = bool(probe_marks(marks))
-        if self.reading:
-            self._message.text = "reading all frames …"
-            work = partial(read, result, tuple(marks), gauge, **chosen)
-            self._reader.ask(work, partial(self._have, shown))
-        else:
-            self._reader.drop()
-            self._have(shown, lambda: None if self.stated.file is None else frames_alone(result))
+    def update(self, colours: Mapping[str, str]) -> None:
+        """Show the curves of the probes and channels in view, with the probes' colours by their names.
 
-    def _have(self, shown: Callable[[], None], read: Callable[[], Histories | None]) -> None:
+        Probes that have changed, or are of more frames, are read in another thread; only the last request counts.
+        """
+        shown, view = self._shown, self._shown.view
+        marks = probe_marks(view.marks)
+        alone = not marks and shown.channels.file is not None
+        asked = (marks, shown.gauge, view.measure, shown.scale, shown.changes, alone)
+        if asked != self._asked:
+            self._asked, self._colours, self.reading = asked, colours, bool(marks)
+            if marks:
+                self._parts.message.text = "reading all frames …"
+                work = partial(read, shown.result, view.marks, shown.gauge, shown.measure, shown.scale)
+                self._reader.ask(work, self._have)
+            else:
+                self._reader.drop()
+                self._have(lambda: frames_alone(shown.result) if alone else None)
+        elif self._drawn != (shown.channels, view.along, view.beside):
+            self._combine()
+            self.draw()
+        self.point(view.frame)
+
+    def _have(self, read: Callable[[], Histories | None]) -> None:
         self.reading = False
-        before = set() if self._probed is None else {_probe(each, self.colours) for each in self._probed.quantities}
+        before = set() if self._probed is None else {_probe(each, self._colours) for each in self._probed.quantities}
         try:
             self._probed = read()
             remarks = () if self._probed is None else self._probed.remarks
-            self._message.text = "<br>".join(map(html.escape, remarks)) or self._hint
+            self._parts.message.text = "<br>".join(map(html.escape, remarks)) or _HINT
         except Exception as error:  # a probe outside the region and the like: reported where the probes are
             self._probed = None
-            self._message.text = warning(str(error))
-        self.combine()
-        found = {} if self.histories is None else groups(self.histories, self.colours)
-        self._select.options = list(found)
+            self._parts.message.text = warning(str(error))
+        found = self._combine()
         # the chosen quantity stays unless a new probe does not have it
-        new = [name for name, own in found.items() if any(_probe(one, self.colours) not in before for one in own)]
-        wanted = new or list(found)
-        current = self._select.value or self._chosen
-        self._select.value = current if current in wanted or not wanted else wanted[0]
+        new = [name for name, own in found.items() if any(_probe(one, self._colours) not in before for one in own)]
+        wanted, current = new or list(found), self._shown.view.curve
+        self._parts.curve.value = current if current in wanted or not wanted else wanted[0]
         self.draw()
-        shown()
+        self._offer()
+        self.point(self._shown.view.frame)
 
-    def combine(self) -> None:
-        """Add the channels to the probes, as they are stated now; what is wrong with them is reported."""
-        self.histories, self.channels, text, stated = self._probed, None, "", self.stated
+    def _combine(self) -> dict[str, list[HistoryColumn]]:
+        """Add the channels as they are stated to the probes; what is wrong with them is reported. Return the groups."""
+        stated, view, text = self._shown.channels, self._shown.view, ""
+        self.histories, self.channels, self._drawn = self._probed, None, (stated, view.along, view.beside)
         if self._probed is not None and stated.file is not None:
             try:
                 self.channels = Channels.read(stated.file, stated.offset, stated.trigger)
@@ -322,46 +337,43 @@ class CurvePanel:
                 text = "<br>".join(map(html.escape, self.histories.remarks[len(self._probed.remarks) :]))
             except RgbmidicError as error:
                 text = warning(str(error))
-        self._told.text = text
-        self._select.options = [] if self.histories is None else list(groups(self.histories, self.colours))
+        self._parts.told.text = text
+        found = {} if self.histories is None else groups(self.histories, self._colours)
+        self._parts.curve.options = list(found)
+        return found
 
     def draw(self) -> None:
         """Draw the chosen curve of all probes."""
-        if self.histories is None:
-            self._bands.data, self._lines.data = columns(_BANDS), columns(_LINES)
-            self._recorded.data, self._axis.visible = columns("xs ys"), False
-            self.plot.legend.visible = False
-            self.plot.xaxis.axis_label = self.plot.yaxis.axis_label = None
-            return
-        quantities = groups(self.histories, self.colours).get(self._select.value, [])
-        (x, axis), bands, lines = self._x, [], []
-        for quantity in quantities:
-            colour = self.colours.get(_probe(quantity, self.colours), OKABE_ITO["grey"])
+        chosen, (x, axis), bands, lines = self._parts.curve.value, self._x, [], []
+        found = {} if self.histories is None else groups(self.histories, self._colours)
+        for quantity in found.get(chosen, []):
+            colour = self._colours.get(_probe(quantity, self._colours), OKABE_ITO["grey"])
             if not self._over:
                 bands += [(xs, ys, colour) for xs, ys in zip(*band(x, quantity), strict=True)]
             lines.append((x, quantity.values, colour, quantity.name.replace("_", " ")))
         self._bands.data, self._lines.data = columns(_BANDS, bands), columns(_LINES, lines)
-        self.plot.xaxis.axis_label, self.plot.yaxis[0].axis_label = axis, self._select.value
-        self.plot.legend.visible = True
+        there = self.histories is not None
+        self.plot.xaxis.axis_label, self.plot.yaxis[0].axis_label = (axis, chosen) if there else (None, None)
+        self.plot.legend.visible = there
         self._draw_beside(self.channels)
 
     def _draw_beside(self, channels: Channels | None) -> None:
         """Draw the channel beside the curves as it was recorded, around the frames or, off them, all of it."""
-        rows, times = [], None if self.histories is None else self.histories.times
+        rows, times, name = [], None if self.histories is None else self.histories.times, self._shown.view.beside
         self.plot.x_range.renderers = self._curves
-        if channels is not None and self.beside in channels.values and times is not None and not self._over:
+        if channels is not None and name in channels.values and times is not None and not self._over:
             first, last = np.nanmin(times), np.nanmax(times)
             ends = np.searchsorted(channels.times, [2 * first - last, 2 * last - first])
             part = slice(*ends) if ends[0] < ends[1] else slice(None)
-            x, y = _thinned(time_unit(times)[0] * channels.times[part], channels.values[self.beside][part])
+            x, y = _thinned(time_unit(times)[0] * channels.times[part], channels.values[name][part])
             rows = [(x, y)]
             low, high = np.nanmin(y), np.nanmax(y)
-            margin = (high - low or 1.0) * _MARGIN
+            margin = 0.1 * (high - low or 1.0)  # as of Bokeh's own ranges
             self._range.update(start=low - margin, end=high + margin)
             if ends[0] == ends[1] or not self._lines.data["xs"]:
                 self.plot.x_range.renderers = self._all
         self._recorded.data = columns("xs ys", rows)
-        self._axis.update(visible=bool(rows), axis_label=self.beside)
+        self._axis.update(visible=bool(rows), axis_label=name)
 
     def grab(self, x: float) -> None:
         """Take hold of the channels at a place of the axis."""
@@ -378,10 +390,8 @@ class CurvePanel:
 
     def point(self, frame: int) -> None:
         """Mark a frame, where the curves hold it."""
-        self.now.location = None
-        if self.histories is not None and len(at := np.flatnonzero(self.histories.frames == frame)):
-            place = float(self._x[0][at[0]])
-            self.now.location = place if np.isfinite(place) else None
+        at = [] if self.histories is None else self._x[0][self.histories.frames == frame]
+        self.now.location = float(at[0]) if len(at) and np.isfinite(at[0]) else None
 
     def frame(self, x: float) -> int:
         """Return the index of the frame at a place of the axis."""
@@ -393,7 +403,7 @@ class CurvePanel:
     def _over(self) -> HistoryColumn | None:
         """The quantity along x; None: the time."""
         quantities = () if self.histories is None else self.histories.quantities
-        return next((one for one in quantities if one.name == self.along), None)
+        return next((one for one in quantities if one.name == self._shown.view.along), None)
 
     @property
     def _x(self) -> tuple[FloatArray, str]:
@@ -407,7 +417,7 @@ class CurvePanel:
 
 def _thinned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Thin a curve out to the smallest and the largest value of each stretch of what a screen shows."""
-    step = -(-len(y) // _STRETCHES)
+    step = -(-len(y) // VIEWER.screen_columns)
     if step < 3:
         return x, y
     rows = y[: len(y) // step * step].reshape(-1, step)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -30,6 +30,7 @@ from rgbmidic.settings import (
     read_toml,
 )
 from rgbmidic.view.address import KINDS, Mark
+from rgbmidic.view.constants import VIEWER
 
 _FILES = (
     *("frames.path", "calibration.file", "region.mask", "mesh.file", "scale.camera", "channels.file"),
@@ -292,11 +293,10 @@ class Confirmation:
 OUTLINES = {"rectangle": 2, "polygon": 3, "circle": 2}
 """Kinds of an outline and the marks that it takes at least: opposite corners; corners; the centre and a place on it."""
 HOLES = {"hole": 3, "round hole": 2}
-"""Kinds of a hole and the marks that it takes at least."""
+"""Kinds of a hole, whose marks have its number too, and the marks that it takes at least."""
 MASK = "mask"
-"""Kind of a polygon in which a light does not count."""
-_ROUND = 48
-"""Corners of the polygon that stands for a circle: within 1 - cos(pi / 48) = 0.2 % of its radius."""
+"""Kind of a polygon in which a light does not count; its marks have its number and the light too."""
+_LEAST = {**OUTLINES, **HOLES, MASK: 3}
 
 Ring = list[list[float]]
 
@@ -314,22 +314,46 @@ def arranged(marks: Sequence[Mark], new: str) -> tuple[Mark, ...]:
 
 def region_section(draft: Draft, marks: Sequence[Mark]) -> dict[str, Any]:
     """Return the keys of ``[region]`` for what is drawn; without an outline a mask that is stated stays."""
-    outline, stated = region_of(marks), draft.section("region")
-    keys = {"mask": None if outline else stated.get("mask"), "holes": _holes(marks) or None, **(outline or {})}
+    outline, holes, stated = region_of(marks), [*_complete(marks, HOLES).values()], draft.section("region")
+    keys = {"mask": None if outline else stated.get("mask"), "holes": holes or None, **(outline or {})}
     return {"rectangle": None, "polygon": None, **keys} if stated or any(keys.values()) else {}
+
+
+def _shape(mark: str) -> str:
+    """Return the kind of shape that a kind of marks makes: they may have its number, and a light."""
+    return next(shape for shape in _LEAST if mark.startswith(shape))
+
+
+def _by_kind(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
+    return {kind: [mark for mark in marks if mark.kind == kind] for kind in dict.fromkeys(mark.kind for mark in marks)}
+
+
+def _complete(marks: Sequence[Mark], shapes: Iterable[str]) -> dict[str, Ring]:
+    """Return the corners of the complete shapes of some kinds, by the kind of their marks.
+
+    They are rounded to a tenth of a pixel: a pointer's precision.
+    """
+    found = {}
+    for kind, own in _by_kind(marks).items():
+        if _shape(kind) in shapes and len(own) >= _LEAST[_shape(kind)]:
+            places = [(mark.x, mark.y) for mark in own]
+            if _shape(kind) in ("circle", "round hole"):
+                (x, y), on = places[:2]
+                radius, corners = math.dist((x, y), on), VIEWER.circle_corners
+                angles = np.arange(corners) * 2 * np.pi / corners
+                places = list(zip(x + radius * np.cos(angles), y + radius * np.sin(angles), strict=True))
+            found[kind] = [[round(float(x), 1), round(float(y), 1)] for x, y in places]
+    return found
 
 
 def region_of(marks: Sequence[Mark]) -> dict[str, Any] | None:
     """Return the keys of ``[region]`` for an outline and its holes; None where no outline is complete."""
-    outline = next((kind for kind in OUTLINES if any(mark.kind == kind for mark in marks)), "")
-    if not outline or sum(mark.kind == outline for mark in marks) < OUTLINES[outline]:
+    outline, holes = _complete(marks, OUTLINES), [*_complete(marks, HOLES).values()]
+    if not outline:
         return None
-    corners, holes = _corners(outline, marks), _holes(marks)
-    if outline == "rectangle":
-        low, high = map(min, zip(*corners, strict=True)), map(max, zip(*corners, strict=True))
-        shape: dict[str, Any] = {"rectangle": [*low, *high]}
-    else:
-        shape = {"polygon": corners}
+    (kind, corners), *_ = outline.items()
+    low, high = map(min, zip(*corners, strict=True)), map(max, zip(*corners, strict=True))
+    shape: dict[str, Any] = {"rectangle": [*low, *high]} if kind == "rectangle" else {"polygon": corners}
     return {**shape, **({"holes": holes} if holes else {})}
 
 
@@ -341,20 +365,18 @@ def check_complete(marks: Sequence[Mark]) -> None:
     ConfigurationError
         One does: it would be left out.
     """
-    for kind in dict.fromkeys(mark.kind for mark in marks):
-        shape = kind if kind in OUTLINES else MASK if kind.startswith(MASK) else kind.rpartition(" ")[0]
-        least, there = {**OUTLINES, **HOLES, MASK: HOLES["hole"]}[shape], sum(mark.kind == kind for mark in marks)
-        if there < least:
-            raise ConfigurationError(f"the {kind} needs {least} marks or more and has {there}: finish or remove it")
+    for kind, own in _by_kind(marks).items():
+        if len(own) < (least := _LEAST[_shape(kind)]):
+            raise ConfigurationError(f"the {kind} needs {least} marks or more and has {len(own)}: finish or remove it")
 
 
 def rings(marks: Sequence[Mark]) -> tuple[Ring, list[Ring]]:
     """Return the corners of the outline, as far as it is drawn, and of the complete holes."""
-    region = region_of(marks) or {}
+    region, holes = region_of(marks) or {}, [*_complete(marks, HOLES).values()]
     if "rectangle" in region:
         x0, y0, x1, y1 = region["rectangle"]
-        return [[x0, y0], [x1, y0], [x1, y1], [x0, y1]], _holes(marks)
-    return region.get("polygon") or [[mark.x, mark.y] for mark in marks if mark.kind in OUTLINES], _holes(marks)
+        return [[x0, y0], [x1, y0], [x1, y1], [x0, y1]], holes
+    return region.get("polygon") or [[mark.x, mark.y] for mark in marks if mark.kind in OUTLINES], holes
 
 
 def marks_of(region: RegionSettings) -> tuple[Mark, ...]:
@@ -368,19 +390,11 @@ def marks_of(region: RegionSettings) -> tuple[Mark, ...]:
     return (*outline, *holes)
 
 
-def _holes(marks: Sequence[Mark]) -> list[Ring]:
-    """Return the corners of the complete holes."""
-    names = [mark.kind for mark in marks if mark.kind not in OUTLINES and not mark.kind.startswith(MASK)]
-    complete = [name for name in dict.fromkeys(names) if names.count(name) >= HOLES[name.rpartition(" ")[0]]]
-    return [_corners(name, marks) for name in complete]
-
-
 def masks_of(marks: Sequence[Mark]) -> dict[str, list[Ring]]:
     """Return the corners of the complete masks of each light that has some."""
-    names, found = [mark.kind for mark in marks if mark.kind.startswith(MASK)], dict[str, list[Ring]]()
-    for name in dict.fromkeys(names):
-        if names.count(name) >= HOLES["hole"]:
-            found.setdefault(name.split(" ", 2)[2], []).append(_corners(name, marks))
+    found: dict[str, list[Ring]] = {}
+    for kind, ring in _complete(marks, [MASK]).items():
+        found.setdefault(kind.split(" ", 2)[2], []).append(ring)
     return found
 
 
@@ -397,13 +411,3 @@ def mask_images(masks: Mapping[str, Sequence[Ring]], lights: Sequence[str], shap
     whole = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1), shape)
     kept = [whole.without(masks.get(light, ())).mask for light in lights]
     return [cv2.imencode(".png", np.uint8(255) * mask.astype(np.uint8))[1].tobytes() for mask in kept]
-
-
-def _corners(name: str, marks: Sequence[Mark]) -> Ring:
-    """Return the corners that the marks of an outline or a hole make, to a tenth of a pixel: a pointer's precision."""
-    places = [(mark.x, mark.y) for mark in marks if mark.kind == name]
-    if name.startswith(("circle", "round hole")):
-        (x, y), on = places[:2]
-        radius, angles = math.dist((x, y), on), np.arange(_ROUND) * 2 * np.pi / _ROUND
-        places = list(zip(x + radius * np.cos(angles), y + radius * np.sin(angles), strict=True))
-    return [[round(float(x), 1), round(float(y), 1)] for x, y in places]

@@ -1,10 +1,22 @@
-"""The button that writes a movie of what is in view, and stops the one that is being written."""
+"""The button that writes a movie of what is in view, in a process of its own, and stops the one being written."""
 
 from __future__ import annotations
 
+import html
+import multiprocessing
+import signal
+import sys
+from dataclasses import replace
+from importlib.util import find_spec
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from rgbmidic.errors import RgbmidicError
+from rgbmidic.report import Movie, write_movie
+from rgbmidic.results import Maps
 from rgbmidic.view.models import ResultControls
-from rgbmidic.view.picture import warning
-from rgbmidic.view.setup_panel import Movie
+from rgbmidic.view.picture import RawPictures, warning
 from rgbmidic.view.shown import ShownFields
 
 
@@ -20,40 +32,72 @@ class FilmButton:
     """
 
     def __init__(self, parts: ResultControls, shown: ShownFields) -> None:
-        self._parts, self._shown = parts, shown
-        self._movie: Movie | None = None
+        self._parts, self._shown, self._out = parts, shown, Path()
+        self._process: Any = None
+        self._reports: Any = None
 
     def press(self) -> None:
-        """Write a movie of what is in view, or stop the one that is being written."""
+        """Write a movie of what is in view, into a file that is not there yet; or stop the one that is written."""
         if not self._parts.movie.active:
-            if self._movie is not None and self._movie.going:
-                self.stop(f"{self._movie.out.name} was stopped; no file is left")
+            if self._process is not None:
+                self.stop(f"{self._out.name} was stopped; no file is left")
             return
         shown, view, names = self._shown, self._shown.view, self._shown.names
-        limits: dict[str, tuple[float, float]] = {}
-        for name in names:
-            first = name == view.field
-            if view.range == "test" or (view.range == "hand" and first):
-                limits[name] = shown.ends(name, by_hand=first)
-        self._movie = Movie.start(
-            shown.maps, names, limits=limits, opacity=view.opacity, raw=view.over == "deformed",
-            colours=view.palette if len(names) == 1 else "",
-        )  # fmt: skip
-        self.tell()
+        limited = {"test": names, "hand": names[:1]}.get(view.range, [])
+        result = replace(shown.maps.result)  # without what was read
+        options = {
+            "limits": {name: shown.ends(name) for name in limited},
+            "opacity": view.opacity,
+            "colours": (view.palette if len(names) == 1 else "") or None,
+            "images": RawPictures(result=result) if view.over == "deformed" else None,
+        }
+        maps = replace(shown.maps, result=result, physical=replace(shown.maps.physical, result=result))
+        ending = ".mp4" if find_spec("imageio_ffmpeg") else ".gif"
+        name = f"movie_{'_'.join(names)}".replace(" ", "_")
+        files = (result.path / f"{name}{f'_{number}' if number > 1 else ''}{ending}" for number in count(1))
+        self._out = next(file for file in files if not file.exists())
+        context = multiprocessing.get_context("spawn")
+        self._reports, send = context.Pipe(duplex=False)
+        self._process = context.Process(target=_write, args=(send, maps, self._out, names, options), daemon=True)
+        self._process.start()
+        send.close()
+        self._tell(f"{self._out.name}: starting")
 
     def tell(self) -> None:
-        """Show how far the movie is."""
-        if self._movie is None:
-            return
-        text, going = self._movie.summary(), self._movie.going
-        self._parts.said.text, self._parts.said.visible = text, True
-        self._parts.movie.label = "■ Movie" if going else "Movie"
-        if not going:
-            self._movie, self._parts.movie.active = None, False
+        """Show how far the movie is, where its file is, or why there is none."""
+        try:
+            while self._process is not None and self._reports.poll():
+                self._tell(*self._reports.recv())
+        except EOFError:
+            self.stop(f"no {self._out.name}: its process was ended")
 
     def stop(self, text: str) -> None:
-        """Stop the movie, and show why."""
-        if self._movie is not None:
-            self._movie.stop()
-        self._movie, self._parts.movie.label, self._parts.movie.active = None, "Movie", False
-        self._parts.said.text, self._parts.said.visible = warning(text), True
+        """End the process, which leaves nothing of its file, and show why."""
+        if self._process is not None:
+            self._process.terminate()
+            self._process.join()
+        self._tell(warning(text), ended=True)
+
+    def _tell(self, text: str, ended: bool = False) -> None:
+        p = self._parts
+        p.said.text, p.said.visible = text, True
+        p.movie.label = "Movie" if ended else "■ Movie"
+        if ended:
+            self._process, p.movie.active = None, False
+
+
+def _write(send: Any, maps: Maps, out: Path, fields: list[str], options: dict[str, Any]) -> None:
+    """Write a movie, and report each hundredth of it and its end, as HTML."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # what is begun is removed
+
+    def progress(done: int, total: int, _: str) -> None:
+        if 100 * done // total > 100 * (done - 1) // total:
+            send.send((f"{html.escape(out.name)}: {done} of {total} frames",))
+
+    try:
+        write_movie(Movie(maps=maps, fields=fields, **options), out, progress=progress)
+        gif = ' (a .gif; for .mp4: pip install "rgbmidic[movie]")' if out.suffix == ".gif" else ""
+        send.send((f"written: {html.escape(str(out))}{gif}", True))
+    except (RgbmidicError, OSError) as error:
+        send.send((warning(f"no {out.name}: {error}"), True))

@@ -19,14 +19,14 @@ from rgbmidic.report.style import time_axis
 from rgbmidic.results import HistoryColumn, Maps, MapValues
 from rgbmidic.results.profiles import Profile
 from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.view.address import probe_marks, probe_place
 from rgbmidic.view.canvas import columns, plain_plot
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.curves import NOW, band
+from rgbmidic.view.models import labelled
 from rgbmidic.view.picture import Background, warning
+from rgbmidic.view.shown import ShownFields
 
-_SLICE = 0.25
-"""Seconds for which frames are read along a line before they are drawn, or before another line has its turn."""
-_ACROSS = 1500
-"""Columns of a position-time picture at most: its place on a screen of 3840 has as many."""
 _IMAGE = "image x y dw dh"
 
 
@@ -65,7 +65,7 @@ class _Reading:
 
     def further(self) -> _Reading:
         """Read for a while; a damaged frame stays blank."""
-        end = time.monotonic() + _SLICE
+        end = time.monotonic() + VIEWER.slice_s
         for frame in self.missing.tolist():
             with suppress(ResultError):
                 self.profile.fill(self.maps, [frame])
@@ -76,7 +76,7 @@ class _Reading:
 
 
 class LinePanel:
-    """Field along a line: position against time in its colours, and the profile in the frame in view.
+    """Field along a line: position against time in colours of the whole test, and the profile in the frame in view.
 
     The frames are read in slices in another thread, and drawn after each.
 
@@ -84,6 +84,8 @@ class LinePanel:
     ----------
     document
         Document of the page.
+    shown
+        What is in view.
     colours
         Colours of the field on the map.
     look
@@ -91,21 +93,25 @@ class LinePanel:
 
     Attributes
     ----------
-    choice
-        Control that chooses the curves over time, or one of the lines.
+    choice, names
+        Control that chooses the curves over time, or one of the lines; and their names, the first empty.
     told
         How far the frames are read, or what went wrong.
     wave, profile
         The plots.
     """
 
-    def __init__(self, document: Document, colours: bk.LinearColorMapper, look: Mapping[str, Any]) -> None:
+    def __init__(
+        self, document: Document, shown: ShownFields, colours: bk.LinearColorMapper, look: Mapping[str, Any]
+    ) -> None:
         self._reading: _Reading | None = None
         self._asked: tuple[Any, ...] = ()
-        self._reader = Background(document)
-        self._view: tuple[int, MapValues | None] = (0, None)
+        self._values: MapValues | None = None
+        self._look: object = None
+        self._shown, self._map_colours, self._reader = shown, colours, Background(document)
+        self.names: list[str] = []
         self.choice = bk.RadioButtonGroup(labels=[], name="beside_map", visible=False, **look)
-        self.choice.html_attributes = {"role": "group", "aria-label": "curves over time, or the field along a line"}
+        self.choice.html_attributes = labelled("curves over time, or the field along a line")
         self.told = bk.Div(name="told_of_line", **look)
         self.told.html_attributes = {"aria-live": "polite"}
         self._image = bk.ColumnDataSource(columns(_IMAGE), name="wave")
@@ -115,64 +121,61 @@ class LinePanel:
         tools = [bk.PanTool(), bk.BoxZoomTool(), bk.ResetTool(), hover]
         self.wave = plain_plot(tools=tools, title="Along the line", toolbar_location="above", name="wave_plot")
         self.wave.toolbar.logo, self.wave.grid.visible = None, False
-        colours.nan_color = "#00000000"  # what is not measured, or not read yet
-        self.wave.image(*_IMAGE.split(), source=self._image, color_mapper=colours)
+        nothing = "#00000000"  # what is not measured, or not read yet
+        self._colours = bk.LinearColorMapper(palette=colours.palette, nan_color=nothing, name="wave_colours")
+        self.wave.image(*_IMAGE.split(), source=self._image, color_mapper=self._colours)
+        self.wave.add_layout(bk.ColorBar(color_mapper=self._colours, width=10), "right")
         self.now = bk.Span(name="wave_now", **NOW)
         self.wave.add_layout(self.now)
-        self.profile = plain_plot(title="Profile", name="profile_plot")
-        self.profile.patches(
-            "xs", "ys", source=self._bands, fill_color=NOW["line_color"], fill_alpha=0.25, line_alpha=0
-        )
-        drawn = self.profile.line("x", "y", source=self._line, line_color=NOW["line_color"], line_width=1.5)
+        self.profile, colour = plain_plot(title="Profile", name="profile_plot"), NOW["line_color"]
+        self.profile.patches("xs", "ys", source=self._bands, fill_color=colour, fill_alpha=0.25, line_alpha=0)
+        drawn = self.profile.line("x", "y", source=self._line, line_color=colour, line_width=1.5)
         self.profile.y_range.renderers = [drawn]
         self.parts = (self.told, self.wave, self.profile)
-        self._show(shown=False)
 
-    def _show(self, *, shown: bool) -> None:
-        for part in self.parts:
-            part.visible = shown
-        self.told.visible = shown and bool(self.told.text)
-
-    def offer(self, lines: Sequence[str], chosen: str) -> bool:
-        """Offer lines by their names; return whether the chosen one is among them, and thus shown."""
+    def update(self, values: MapValues) -> bool:
+        """Show the field, of which the map has `values`, along the line in view; return whether there is one."""
+        shown, view = self._shown, self._shown.view
+        probes = probe_marks(view.marks).items()
+        lines = {name: probe_place(marks, 0) for name, marks in probes if marks[0].kind == "line"}
+        self.names, there = ["", *lines], view.line in lines
         self.choice.labels = ["over time", *(f"along {name.replace('_', ' ')}" for name in lines)]
-        self.choice.visible = bool(lines)
-        self.choice.active = lines.index(chosen) + 1 if chosen in lines else 0
-        self._show(shown=chosen in lines)
-        if chosen not in lines:
+        self.choice.update(visible=bool(lines), active=self.names.index(view.line) if there else 0)
+        for part in self.parts:
+            part.visible = there
+        if not there:
             self._reader.drop()
-            self._asked, self._reading = (), None
-        return chosen in lines
-
-    def ask(self, maps: Maps, field: str, place: Sequence[float], key: tuple[Any, ...], changes: int) -> None:
-        """Read a field along a line; `key` states how it is derived, `changes` how often the result has grown."""
-        asked = (field, tuple(place), key, changes)
-        if asked == self._asked:
-            return
-        before = self._reading if asked[:-1] == self._asked[:-1] else None
-        self._asked, self._reading = asked, before
-        if before is None:
+            self._asked, self._reading, self.told.visible = (), None, False
+            return False
+        asked = (view.field, lines[view.line], shown.chosen, shown.changes)
+        look = (view.range, view.low, view.high, view.symmetric, view.palette, view.levels)
+        if asked != self._asked:
+            before = self._reading if asked[:-1] == self._asked[:-1] else None
+            self._asked, self._reading = asked, before
+            self.told.text = "reading the frames …"
+            self._reader.ask(partial(_Reading.begin, shown.maps, view.field, lines[view.line], before), self._take)
+            self._look = None
+        if look != self._look:
+            self._look = look
             self._draw()
-        self._tell("reading the frames …")
-        self._reader.ask(partial(_Reading.begin, maps, field, place, before), self._take)
-
-    def _tell(self, text: str) -> None:
-        self.told.text, self.told.visible = text, bool(text)
+        self.told.visible = bool(self.told.text)
+        self.show(values)
+        return True
 
     def _take(self, read: Callable[[], _Reading]) -> None:
         """Draw what was read, and read on."""
         try:
             reading = self._reading = read()
         except Exception as error:  # a line outside the mesh, a field without uncertainty: reported where it would be
-            self._reading = None
-            self._tell(warning(str(error)))
+            self._reading, self.told.text = None, warning(str(error))
         else:
             missing = len(reading.missing)
-            self._tell(f"{int(reading.read.sum())} frames read, {missing} to go" if missing else "")
+            self.told.text = f"{int(reading.read.sum())} frames read, {missing} to go" if missing else ""
             if missing:
                 self._reader.ask(reading.further, self._take)
+        self.told.visible = bool(self.told.text)
         self._draw()
-        self.show(*self._view)
+        self.show(self._values)
 
     @property
     def _clock(self) -> tuple[FloatArray, str]:
@@ -190,21 +193,25 @@ class LinePanel:
         steps = np.diff(clock[there])
         steps = steps[steps > 0]
         step = float(steps.min()) if len(steps) else 1.0
-        count = min(round(float(steps.sum()) / step) + 1, _ACROSS)
+        count = min(round(float(steps.sum()) / step) + 1, VIEWER.screen_columns)
         grid = np.linspace(clock[there[0]], clock[there[-1]], count)
         nearest = there[np.searchsorted((clock[there][1:] + clock[there][:-1]) / 2, grid)]
         half, apart = float(grid[-1] - grid[0]) / max(count - 1, 1) / 2 or 0.5, float(profile.positions[1])
         image = profile.values[nearest].T.astype(np.float32)
         left, wide = float(grid[0]) - half, float(grid[-1] - grid[0]) + 2 * half
         self._image.data = columns(_IMAGE, [(image, left, -apart / 2, wide, apart * len(profile.positions))])
+        low, high = self._shown.ends(profile.field.name, along=profile)
+        self._colours.update(low=low, high=high)
+        if self._colours.palette != self._map_colours.palette:
+            self._colours.palette = self._map_colours.palette
         position = f"position ({profile.units.length})"
         self.wave.xaxis.axis_label, self.wave.yaxis.axis_label = label, position
         self.profile.xaxis.axis_label, self.profile.yaxis.axis_label = position, profile.field.label
         self.wave.title.text = f"{profile.field.label} along the line"
 
-    def show(self, frame: int, values: MapValues | None) -> None:
-        """Show the profile of a frame, of which the map has the values."""
-        self._view = (frame, values)
+    def show(self, values: MapValues | None) -> None:
+        """Show the profile of the frame in view, of which the map has the values; None: it shows nothing."""
+        self._values, frame = values, self._shown.view.frame
         if self._reading is None or values is None:
             self._line.data, self._bands.data, self.now.location = columns("x y"), columns("xs ys"), None
             return
@@ -219,4 +226,4 @@ class LinePanel:
     def frame(self, x: float) -> int:
         """Return the index of the frame at a place of the time axis."""
         clock = self._clock[0]
-        return int(np.nanargmin(np.abs(clock - x))) if np.isfinite(clock).any() else self._view[0]
+        return int(np.nanargmin(np.abs(clock - x))) if np.isfinite(clock).any() else self._shown.view.frame

@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
 
 import bokeh.models as bk
 import numpy as np
 from bokeh.document import Document
 from bokeh.events import MouseMove
 
+from rgbmidic.report.style import BAR, add_colour_bar, draw_figure, finish_picture, literal
+from rgbmidic.results import frame_times
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import MARKS, SCALE, probe_marks, probe_place
-from rgbmidic.view.canvas import Canvas, LabelLayer, LineLayer, arrow_lines, contour_lines, direction_lines
-from rgbmidic.view.models import MarkLayer
-from rgbmidic.view.picture import (
-    AROUND,
-    Overlay,
-    Picture,
-    extremes,
-    paint,
-    palette,
-    palette_name,
-    probe_text,
-)
+from rgbmidic.view.canvas import Canvas
+from rgbmidic.view.constants import VIEWER
+from rgbmidic.view.layers import LabelLayer, LineLayer, MarkLayer, arrow_lines, contour_lines, direction_lines
+from rgbmidic.view.picture import AROUND, Picture, extremes, frame_title, paint, palette, probe_text
 from rgbmidic.view.shown import ShownFields
 
-_CONTOURS = 10
-"""Steps between contour lines at most. Chosen; more cover the field."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 class MapPanel:
@@ -83,12 +80,54 @@ class MapPanel:
         self._ends.show()
         self._blank.show()
 
+    def figure(self) -> Figure:
+        """Draw the maps for print: light, with the frame, its time and how the fields are derived in the title."""
+        from matplotlib.collections import LineCollection
+        from matplotlib.colors import ListedColormap, Normalize
+
+        shown, view, window = self._shown, self._shown.view, self.canvas.window
+        (picture, _), (unit, factor), names = shown.picture, shown.maps.physical.axes, shown.names
+        height = round(VIEWER.print_columns * window.height / window.width)
+        large = replace(window, width=VIEWER.print_columns, height=height)
+        layers = [layer.lines for layer in (self._directions, self._contours, self._arrows)]
+
+        def draw(axes: list[Axes]) -> None:
+            for axis, name in zip(axes, names, strict=True):
+                over, field = shown.overlay(name), shown.maps.all[name]
+                pixels = paint(large, picture, over, AROUND[False])
+                edges = (window.left, window.right, window.bottom, window.top)
+                axis.imshow(pixels.view(np.uint8).reshape(*pixels.shape, 4), extent=edges)
+                limits = edges[:2], (window.top, window.bottom)
+                finish_picture(axis, *limits, first=axis is axes[0], unit=unit, factor=factor)
+                axis.set_title(literal(field.label))
+                add_colour_bar(axis, Normalize(*over.ends), ListedColormap(over.colours), names=field.codes)
+            for lines in layers:
+                for colour, width in (("#15181c", 1.4), ("#ffffff", 0.7)):
+                    segments = LineCollection(list(lines.reshape(-1, 2, 2)), colors=colour, linewidths=width)
+                    axes[0].add_collection(segments)
+            points = 72 * axes[0].get_position().width * cast("Figure", axes[0].figure).get_figwidth() / window.width
+            for xs, ys, colour, x, y, text, side, along, down in self.marks.drawn:
+                axes[0].plot(xs, ys, color=colour, marker="o" if len(xs) == 1 else "")
+                look = {"color": "w", "size": 10 * points, "ha": side, "va": "bottom"}
+                look["bbox"] = {"facecolor": "#15181c", "edgecolor": colour, "alpha": 0.75, "pad": 1}
+                shift = along * points, -down * points
+                axes[0].annotate(literal(text), (x, y), shift, textcoords="offset points", **look)
+
+        derived = {shown.maps.all[name].symbol: shown.maps.how(name) for name in names}
+        times = frame_times(shown.result, shown.maps.physical.scale)
+        title = frame_title(shown.result, view.frame, math.nan if times is None else float(times[view.frame]))
+        how = "; ".join(f"{symbol}: {text}" for symbol, text in derived.items() if text)
+        aspect, title = window.height / window.width, f"{literal(title)}\n{literal(how)}".strip()
+        figure = draw_figure(draw, count=len(names), aspect=aspect, beside=BAR, title=title)
+        figure.texts[0].set_fontsize(8)  # two lines have room
+        return figure
+
     def draw(self, picture: Picture) -> str:
         """Draw the fields over an image; returns what is to be said of the arrows."""
         names, nodes = self._shown.names, self._shown.nodes
         self._arrange(len(names))
         for canvas, name in zip((self.canvas, *self.beside), names, strict=False):
-            self._paint(canvas, name, nodes, picture)
+            self._paint(canvas, name, picture)
         return self._draw_layers(nodes)
 
     def _arrange(self, count: int) -> None:
@@ -114,25 +153,10 @@ class MapPanel:
             rows[-1].children = [*rows[-1].children, bk.Spacer(sizing_mode="stretch_both")]
         self.column.children = rows if count > 1 else plots
 
-    def _paint(self, canvas: Canvas, name: str, nodes: FloatArray, picture: Picture) -> None:
-        """Paint a field on a canvas; palette, range by hand and number of colours are those of the first."""
-        shown = self._shown
-        view, field, values = shown.view, shown.maps.all[name], shown.values(name)
-        first = canvas is self.canvas
-        suits = palette_name(field.kind, symmetric=view.symmetric and field.signed)
-        colours = palette((first and not field.codes and view.palette) or suits, view.levels)
-        over = Overlay(
-            nodes=nodes,
-            elements=shown.result.elements,
-            values=values.values,
-            ends=shown.ends(name, by_hand=first),
-            colours=colours,
-            opacity=view.opacity,
-            stepped=field.stepped,
-            beyond=np.abs(values.values) - 2 * values.std if view.hatched else None,
-        )
+    def _paint(self, canvas: Canvas, name: str, picture: Picture) -> None:
+        field, over = self._shown.maps.all[name], self._shown.overlay(name)
         canvas.show(paint(self.canvas.window, picture, over, AROUND[self._dark]), self.canvas.window)
-        canvas.colour(over.ends, colours, field.label, field.codes)
+        canvas.colour(over.ends, over.colours, field.label, field.codes)
 
     def _draw_layers(self, nodes: FloatArray) -> str:
         """Draw what lies over the first field: lines, arrows, extremes, nodes without data, marks."""
@@ -140,7 +164,7 @@ class MapPanel:
         field, values, elements = shown.maps.all[view.field], shown.values(view.field), shown.result.elements
         direction = shown.values("direction").values if view.directions else None
         self._directions.show(None if direction is None else direction_lines(window, nodes, direction))
-        levels = np.linspace(*shown.ends(view.field), min(view.levels, _CONTOURS) + 1)[1:-1]
+        levels = np.linspace(*shown.ends(view.field), min(view.levels, VIEWER.contour_steps) + 1)[1:-1]
         smooth = view.contours and not field.stepped
         self._contours.show(contour_lines(nodes, elements, values.values, levels.tolist()) if smooth else None)
         arrows, title = None, "times their length (0: as there is room)"

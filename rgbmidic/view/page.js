@@ -32,6 +32,20 @@ const rgbmidic = {
   // Show one of the sections of the controls.
   turnTo({group, sections}) {
     sections.forEach((one, place) => { one.visible = place === group.active; });
+    setTimeout(rgbmidic.label, 200);
+  },
+
+  // Say what each input is for, to screen readers: checkboxes, sliders and numbers without a title do not.
+  label() {
+    for (const model of Bokeh.documents[0]._all_models.values()) {
+      const text = model.title || model.label || model.html_attributes?.["aria-label"];
+      if (typeof text !== "string") continue;
+      try {
+        Bokeh.index.get_one(model).shadow_el.querySelectorAll("input, [role=slider]").forEach((one) => {
+          if (!one.labels?.[0]?.textContent.trim()) one.ariaLabel = text;
+        });
+      } catch { /* it is on no page */ }
+    }
   },
 
   // While a curve can be dragged the plot itself stays where it is.
@@ -59,6 +73,13 @@ const rgbmidic = {
     state.csv = "";
   },
 
+  keepMap({state}) {
+    if (!state.png) return;
+    const name = (new URLSearchParams(state.query).get("field") || "u") + "_" + String(state.shown).padStart(6, "0") + ".png";
+    fetch(state.png).then((answer) => answer.blob()).then((blob) => rgbmidic.keep(blob, name));
+    state.png = "";
+  },
+
   // Of plots that take each other's place those that are there: one that is hidden has no size.
   keepPng({plots}) {
     for (const plot of plots.filter((one) => one.visible)) {
@@ -68,6 +89,11 @@ const rgbmidic = {
   },
 };
 window.rgbmidic = rgbmidic;
+const waiting = setInterval(() => {
+  if (!Bokeh.documents[0]?.is_idle) return;
+  clearInterval(waiting);
+  rgbmidic.label();
+}, 200);
 
 // Keys: a frame back and forth, first and last, play; the page is asked for one frame at a time (`pump`).
 document.addEventListener("keydown", (event) => {

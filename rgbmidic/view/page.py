@@ -6,51 +6,28 @@ import html
 import time
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import bokeh.models as bk
 import numpy as np
 from bokeh.document import Document
-from bokeh.events import DocumentReady, Pan, PanEnd, PanStart, Tap
+from bokeh.events import DocumentReady, Tap
 
 from rgbmidic.errors import RgbmidicError
-from rgbmidic.fields import MEASURES, uncertain
-from rgbmidic.results import Result, channels_of
-from rgbmidic.settings import ScaleSettings
-from rgbmidic.view.address import (
-    BESIDE,
-    OVER,
-    SCALE,
-    UNCERTAINTY,
-    Mark,
-    Steps,
-    ViewState,
-    probe_marks,
-    probe_place,
-)
+from rgbmidic.fields import uncertain
+from rgbmidic.report.style import embedded
+from rgbmidic.results import Result, channels_of, probes_of
+from rgbmidic.view.address import BESIDE, OVER, SCALE, UNCERTAINTY, Mark, Steps, ViewState
 from rgbmidic.view.canvas import Canvas
-from rgbmidic.view.channel_controls import ChannelControls
-from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv
-from rgbmidic.view.file_buttons import FileButtons
+from rgbmidic.view.constants import VIEWER
+from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv, with_probes
 from rgbmidic.view.film import FilmButton
 from rgbmidic.view.line_panel import LinePanel
 from rgbmidic.view.map_panel import MapPanel
-from rgbmidic.view.models import CONTROLS, ResultControls, SharedState, script
+from rgbmidic.view.models import ResultControls, SharedState, script
 from rgbmidic.view.picture import every, frame_text, guarded, warning
-from rgbmidic.view.probe_names import ProbeNames
+from rgbmidic.view.sections import ChannelControls, FileButtons, ProbeNames
 from rgbmidic.view.shown import ShownFields
-
-_TICK, _IDLE = 200, 1000
-"""Ms between two parts of the time line; between two checks whether a result has grown, and pictures of that."""
-_SETTLED = 2_000_000_000
-"""Ns after which a folder that is changed has another date, whatever the disk's clock ticks in."""
-_CURVES = {entry for entry, section, *_ in CONTROLS if section == "Channels"} | {"along"}
-"""Entries of the view that the curves alone depend on."""
-_HELP = (
-    "Choose a probe, click on the field (Gauge, Line, Box, Circle: twice). Drag marks; Backspace removes one. "
-    "Keys: ← → a frame, space plays, 1 to 7 sections, Ctrl-Z undoes, Ctrl-Y redoes."
-)
 
 
 class ResultPage:
@@ -69,30 +46,25 @@ class ResultPage:
     """
 
     def __init__(self, document: Document, result: Result, view: ViewState, progress: Progress) -> None:
-        view = view.with_channels(channels_of(result))
+        view = with_probes(view.with_channels(channels_of(result)), probes_of(result))
         self.document, self.progress, self.shown = document, progress, ShownFields(result, view)
         self._told = False
         self._pointer: tuple[float, float] | None = None
         self._grown = 0
-        self._scale_read: ScaleSettings | None = None
-        self.state, self.dark = SharedState(name="state", asked=view.frame, shown=view.frame), view.theme == "dark"
-        self._base = Path(result.provenance.get("base", result.path.parent))
+        self.state, dark = SharedState(name="state", asked=view.frame, shown=view.frame), view.theme == "dark"
         self.steps = Steps(view.marks)
-        self.parts = p = ResultControls(len(result) - 1, view.frame, dark=self.dark)
-        self.maps = MapPanel(document, self.shown, self._redraw, self._hover, dark=self.dark)
-        self.names = ProbeNames(p, self._take_marks)
-        self.film, self.file = FilmButton(p, self.shown), FileButtons(p, self.shown, self._base)
-        self.timeline = TimeLine(len(result), view.frame)
-        texts: dict[str, Any] = {"message": p.message, "told": p.told, "hint": _HELP}
-        self.curves = CurvePanel(document, chosen=view.curve, select=p.curve, **texts)
-        self.channels = ChannelControls(p, self.curves, self.shown, self._base, self._read_curves)
-        self.line = LinePanel(document, self.maps.canvas.colours, p.wide)
+        self.parts = p = ResultControls(len(result) - 1, view.frame, dark=dark)
+        self.maps = MapPanel(document, self.shown, self._redraw, self._hover, dark=dark)
+        self.names, self.film = ProbeNames(p, self._take_marks), FilmButton(p, self.shown)
+        self.file, self.timeline = FileButtons(p, self.shown), TimeLine(len(result), view.frame)
+        self.curves = CurvePanel(document, self.shown, p, self._offer)
+        self.channels = ChannelControls(p, self.curves)
+        self.line = LinePanel(document, self.shown, self.maps.canvas.colours, p.wide)
         panels = [self.line.choice, self.curves.plot, *self.line.parts]
         self.panel = bk.Column(children=panels, sizing_mode="stretch_both")
         self._begin()
-        p.wire(
-            self.state, self.maps.canvas.tools, self.timeline.now, (self.curves.plot, self.line.wave, self.line.profile)
-        )
+        plots = self.curves.plot, self.line.wave, self.line.profile
+        p.wire(self.state, self.maps.canvas.tools, self.timeline.now, plots)
         self._listen()
 
     @property
@@ -117,11 +89,10 @@ class ResultPage:
         p, view = self.parts, self.view
         self._offer_fields()
         self._offer()
-        p.file.value = "TEST.toml"
         p.of["since"].high = len(self.result) - 1
         p.over.active = OVER.index(view.over)
-        p.message.text, p.head.text = _HELP, self._title()
-        for entry, _, kind, *_ in CONTROLS:
+        self._draw_progress()
+        for entry, (kind, *_) in view.controls().items():
             key = "active" if kind is bk.Checkbox else "value"
             p.of[entry].update(**{key: getattr(view, entry)})
             p.of[entry].on_change(key, partial(self._set, entry))
@@ -144,45 +115,38 @@ class ResultPage:
 
     def _offer(self) -> None:
         """Offer channels, curves and probes as they are now."""
-        self.channels.offer()
+        self.channels.offer(self.view)
         self.names.offer(self.view.marks)
 
     def _set(self, entry: str, attribute: str, old: Any, new: Any) -> None:
         """Take the value of a control into the view; a range by hand starts from that in view."""
-        of = self.parts.of
+        low, high = (self.parts.of[name] for name in ("low", "high"))
         if new is None:  # a number that was deleted
             return
-        if entry in ("low", "high"):
-            low, high = of["low"].value, of["high"].value
-            self.show(**({"low": low, "high": high} if None not in (low, high) and low < high else {}))
-        elif entry == "range" and new == "hand":
+        if entry == "range" and new == "hand":
+            mapper = self.maps.canvas.colours
             self.shown.view = replace(self.view, range="hand")
-            of["low"].value, of["high"].value = (
-                float(end) for end in (self.maps.canvas.colours.low, self.maps.canvas.colours.high)
-            )
-            self._set("low", "value", None, 0)
+            low.value, high.value = float(mapper.low), float(mapper.high)
+        if entry in ("low", "high", "range") and self.parts.of["range"].value == "hand":
+            whole = None not in (low.value, high.value) and low.value < high.value
+            self.show(range="hand", **({"low": low.value, "high": high.value} if whole else {}))
         else:
             self.show(**{entry: new})
-            if entry in ("gauge", "measure", "distance", "distance_std", "camera") and self.view.marks:
-                self._read_curves()
-            if entry in _CURVES:
-                self.channels.change()
 
     def _listen(self) -> None:
         p = self.parts
         self.maps.canvas.marks.on_change("data", lambda attr, old, new: self._marked())
-        p.lock.on_click(lambda: p.of["range"].update(value="hand"))
-        p.clear.on_click(lambda: self._take_marks(()))
-        for button, back in ((p.undo, True), (p.redo, False)):
-            button.on_click(partial(self._undo, back=back))
-        for button, act in ((p.write, self.file.write), (p.take, self._take_probes)):
+        for button, act in (
+            (p.write, self.file.write), (p.take, lambda: self._take_marks(self.file.probes())), (p.csv, self._save),
+            (p.lock, lambda: p.of["range"].update(value="hand")), (p.clear, lambda: self._take_marks(())),
+            (p.undo, lambda: self.show(marks=self.steps.go(back=True))),
+            (p.redo, lambda: self.show(marks=self.steps.go(back=False))),
+        ):  # fmt: skip
             button.on_click(partial(guarded, act, lambda text: p.written.update(text=warning(text))))
+        p.print.on_click(partial(guarded, self._print, self.complain))
         p.drag.js_on_change("active", script("hold", toggle=p.drag, pan=self.curves.pan))
-        for event in (PanStart, Pan, PanEnd):
-            self.curves.plot.on_event(event, self.channels.drag)
-        p.csv.on_click(self._save)
-        self.line.choice.on_change("active", lambda attr, old, new: self._choose_line(new))
         p.movie.on_change("active", lambda attr, old, new: guarded(self.film.press, self.film.stop))
+        self.line.choice.on_change("active", lambda attr, old, new: self._choose_line(self.line.names[new]))
         for plot in (self.timeline.plot, self.curves.plot, self.line.wave):
             plot.on_event(Tap, self._jump)
         self.document.on_event(DocumentReady, lambda event: self._ready())
@@ -190,11 +154,9 @@ class ResultPage:
     def _ready(self) -> None:
         self.maps.canvas.resize()
         self.show()
-        if self.view.marks or self.view.channels:
-            self._read_curves()
-        every(_TICK, self.document, lambda: self.progress.advance(self.result), self.complain)
+        every(VIEWER.progress_ms, self.document, lambda: self.progress.advance(self.result), self.complain)
         for act in (self._grow, self._draw_progress, self.film.tell):
-            every(_IDLE, self.document, act, self.complain)
+            every(VIEWER.idle_ms, self.document, act, self.complain)
 
     def complain(self, text: str) -> None:
         """Report an error; the page goes on."""
@@ -207,6 +169,8 @@ class ResultPage:
         self.document.hold("combine")
         try:
             guarded(self._draw, self._blank)
+            self.curves.update(self.maps.marks.colours)
+            self._offer()
         finally:
             self.document.unhold()
 
@@ -215,33 +179,30 @@ class ResultPage:
         self._told = False
         self.maps.clear()
         self._read_out()
-        self.curves.point(self.view.frame)
-        self.line.show(self.view.frame, None)
+        self.line.show(None)
         self.state.query = self.view.query()
         self.complain(text)
 
     def _draw(self) -> None:
-        view = self.view
+        view, shown, of = self.view, self.shown, self.parts.of
         self._choose()
-        field, values = self.shown.maps.all[view.field], self.shown.values(view.field)
-        picture, remark = self.shown.picture
+        field, values = shown.maps.all[view.field], shown.values(view.field)
+        picture, remark = shown.picture
         self._told = True
-        low, high = (self.parts.of[name] for name in ("low", "high"))
-        if view.range == "hand" and (low.value, high.value) != (view.low, view.high):
+        if view.range == "hand" and (of["low"].value, of["high"].value) != (view.low, view.high):
             remark = f"The colours go from {view.low:g} to {view.high:g}: the lowest number must be below the highest."
-        self.parts.of["longer"].title = self.maps.draw(picture)
-        low.visible = high.visible = view.range == "hand"
-        self.parts.of["symmetric"].visible = field.signed and view.range != "hand"
-        self.parts.description.text = frame_text(self.shown.maps, view.frame, field, values, remark)
+        of["longer"].title = self.maps.draw(picture)
+        of["low"].visible = of["high"].visible = view.range == "hand"
+        of["symmetric"].visible = field.signed and view.range != "hand"
+        self.parts.description.text = frame_text(shown.maps, view.frame, field, values, remark)
         self._read_out()
-        self.curves.point(view.frame)
-        self._show_line()
+        self.curves.plot.visible = not self.line.update(values)
         self.state.query, self.state.shown = view.query(), self.state.asked
 
     def _choose(self) -> None:
         """Derive fields as the view has it."""
         try:
-            if self.shown.rescale(self._base):
+            if self.shown.rescale():
                 self._offer_fields()
             scale, told = self.shown.scale, ""
             if scale and not self.view.camera and scale.mm_per_pixel is not None:
@@ -279,54 +240,11 @@ class ResultPage:
     def _take_marks(self, marks: tuple[Mark, ...]) -> None:
         """Take marks as a step that can be undone."""
         self.steps.keep(marks)
-        self._show_marks()
-
-    def _undo(self, *, back: bool) -> None:
-        self.steps.go(back=back)
-        self._show_marks()
-
-    def _show_marks(self) -> None:
-        before, marks = self.view.marks, self.steps.now
         self.show(marks=marks)
-        if probe_marks(before) != probe_marks(marks) or self.shown.scale != self._scale_read:
-            self._read_curves()
-        self._offer()
 
-    def _read_curves(self) -> None:
-        view, curves = self.view, self.curves
-        curves.colours, self._scale_read = self.maps.marks.colours, self.shown.scale
-        curves.along, curves.beside, curves.stated = view.along, view.beside, view.channel_settings(self._base)
-        measure = view.measure if view.measure != MEASURES[0] else None
-
-        def shown() -> None:
-            self._offer()
-            curves.point(self.view.frame)
-
-        curves.read(self.result, view.marks, self.shown.gauge, shown, measure=measure, scale=self.shown.scale)
-
-    def _take_probes(self) -> None:
-        """Set the marks of the probes that a TEST.toml states."""
-        self._take_marks(self.file.probes())
-
-    @property
-    def _lines(self) -> dict[str, tuple[float, ...]]:
-        """Ends of the lines that are marked, by their names."""
-        probes = probe_marks(self.view.marks).items()
-        return {name: probe_place(marks, 0) for name, marks in probes if marks[0].kind == "line"}
-
-    def _choose_line(self, active: int) -> None:
-        name = ["", *self._lines][active]
+    def _choose_line(self, name: str) -> None:
         if name != self.view.line:
             self.show(line=name)
-
-    def _show_line(self) -> None:
-        """Show the field along the chosen line in place of the curves."""
-        lines, name = self._lines, self.view.line
-        shown = self.line.offer(list(lines), name)
-        self.curves.plot.visible = not shown
-        if shown:
-            self.line.ask(self.shown.maps, self.view.field, lines[name], self.shown.chosen, self.shown.changes)
-            self.line.show(self.view.frame, self.shown.values(self.view.field))
 
     def _save(self) -> None:
         if self.curves.reading:
@@ -335,6 +253,11 @@ class ResultPage:
             self.parts.message.text = "There is no curve yet: set a mark on the field first."
         else:
             self.state.csv = as_csv(self.curves.histories)
+
+    def _print(self) -> None:
+        """Send the maps in view as a picture for print, as a data URL."""
+        figure = self.maps.figure()
+        self.state.png = embedded(figure, dpi=round(VIEWER.print_columns / figure.get_figwidth()))
 
     def _jump(self, event: Any) -> None:
         """Go to the frame that was clicked in the time line or among the curves."""
@@ -346,23 +269,19 @@ class ResultPage:
 
     def _draw_progress(self) -> None:
         self.timeline.draw(self.progress)
-        self.parts.head.text = self._title()
-
-    def _title(self) -> str:
         summary = self.progress.summary(int(self.result.finished.sum()))
-        return f"<b>{html.escape(str(self.result.path))}</b> &nbsp; {summary}"
+        self.parts.head.text = f"<b>{html.escape(str(self.result.path))}</b> &nbsp; {summary}"
 
     def _grow(self) -> None:
         """Take in frames that a run has added or measured again; a view of the last frame follows it."""
         grown = (self.result.path / "solution").stat().st_mtime_ns
-        if grown == self._grown and time.time_ns() > grown + _SETTLED:
+        if grown == self._grown and time.time_ns() > grown + VIEWER.settled_ns:
             return
         self._grown, new = grown, self.result.refresh()
         if np.array_equal(new.table.written, self.result.table.written):
             return
         before, after = np.flatnonzero(self.result.finished), np.flatnonzero(new.finished)
         self.shown.grow(new)
-        self._read_curves()
         follows = not len(before) or self.view.frame == before[-1]
         if follows and self.parts.frame.value != after[-1]:
             self.parts.frame.value = int(after[-1])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import html
 import logging
+import math
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -23,27 +24,20 @@ from rgbmidic.errors import FrameError, InputError, RgbmidicError
 from rgbmidic.fields import Area, Mean, Nodal, make_probe
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.series import FrameSeries, open_series
-from rgbmidic.report.figures import spread
+from rgbmidic.report.figures import field_colours, spread
 from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, time_text
-from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, MapValues, Quantity, Result
+from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, MapValues, Profile, Quantity, Result
 from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.typing import AnyArray, FloatArray
+from rgbmidic.view.constants import VIEWER
 
 logger = logging.getLogger(__name__)
 
 Picture = npt.NDArray[np.uint8]
 """A grey picture (H, W)."""
 
-_LARGEST = 2_000_000
-"""Pixels of a picture that is sent to the screen: all of a window of 1920 x 1080, less than all of a larger one."""
-_COLOURS = 256
-"""Colours of a palette: the screen has as many levels."""
 AROUND = {False: 235, True: 30}
 """Grey level outside the image, by whether the page is dark."""
-_PALETTES = {
-    "displacement": "viridis", "strain": "viridis", "positive": "plasma", "fraction": "cividis", "angle": "twilight",
-    "codes": "codes",
-}  # fmt: skip
 _SIDES, _APART = ("#010203", "#ffffff"), 8
 """Colours of what lies below and above 0, of which the first is no grey, and pixels from one hatch to the next."""
 
@@ -82,7 +76,7 @@ class Window:
     @property
     def size(self) -> tuple[int, int]:
         """Rows and columns of the picture."""
-        shrink = max(1.0, (self.width * self.height / _LARGEST) ** 0.5)
+        shrink = max(1.0, (self.width * self.height / VIEWER.picture_pixels) ** 0.5)
         return max(int(self.height / shrink), 2), max(int(self.width / shrink), 2)
 
     @property
@@ -192,18 +186,18 @@ def _packed(colours: tuple[str, ...], grey_part: int) -> npt.NDArray[np.uint32]:
     return np.asarray(red | green << 8 | blue << 16 | 0xFF000000, dtype=np.uint32)
 
 
-def palette_name(kind: str, *, symmetric: bool) -> str:
-    """Return matplotlib's name of the colours that suit a kind of field; all are safe for the colour-blind."""
-    return "RdBu_r" if symmetric and kind not in ("codes", "angle") else _PALETTES[kind]
+def palette_name(field: Quantity, *, symmetric: bool) -> str:
+    """Return the name of the colours that suit a field, symmetric about 0 where asked; safe for the colour-blind."""
+    return "RdBu_r" if symmetric and field.signed else "codes" if field.codes else field_colours(field)
 
 
 @cache
-def palette(name: str, levels: int = _COLOURS) -> tuple[str, ...]:
-    """Return so many colours of a palette as ``"#rrggbb"``."""
+def palette(name: str, levels: int = 256) -> tuple[str, ...]:
+    """Return so many colours of a palette, up to 256 as a screen has levels, as ``"#rrggbb"``."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
-    places = np.linspace(0, 1, min(max(levels, 2), _COLOURS))
+    places = np.linspace(0, 1, min(max(levels, 2), 256))
     return STATUS_COLOURS if name == "codes" else tuple(map(to_hex, colormaps[name](places)))
 
 
@@ -268,14 +262,6 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 T = TypeVar("T")
-_SPREAD = 24
-"""Frames, evenly spread, whose values set the colour range of a whole test: they are read within a second."""
-_KEPT = 8
-"""Raw frames that are kept as pictures: those around the one in view."""
-_WHOLE = 1 - 1e-9
-"""Part of the weights of a point's nodes that must be measured: all but what rounding leaves of a node beside it."""
-_REASON = 90
-"""Letters of a frame's reason that are shown at once: two lines of the column."""
 _REASONS = ("measured", "no light sees enough texture here", "the images around it do not match", "carried over")
 """What a node's status means, under the pointer."""
 _FAILED = QUANTITIES["status"].codes.index("failed")
@@ -284,13 +270,13 @@ _FAILED = QUANTITIES["status"].codes.index("failed")
 def range_of_test(maps: Maps, name: str) -> tuple[float, float]:
     """Return the colour range of a field over the whole test, from frames evenly spread over those measured."""
     there = np.flatnonzero(maps.result.finished).tolist()
-    ends = [robust_range(maps.read(name, frame)) for frame in (spread(there, _SPREAD) if there else ())]
+    ends = [robust_range(maps.read(name, frame)) for frame in (spread(there, VIEWER.range_frames) if there else ())]
     measured = [pair for pair in ends if pair is not None]
     return (min(low for low, _ in measured), max(high for _, high in measured)) if measured else (0.0, 1.0)
 
 
-def robust_range(read: MapValues) -> tuple[float, float] | None:
-    """Return the colour range of one frame without doubtful nodes and outliers; None where nothing is measured."""
+def robust_range(read: MapValues | Profile) -> tuple[float, float] | None:
+    """Return the colour range of what was read without doubtful nodes and outliers; None where nothing is measured."""
     ordinary = ordinary_values(read.values, read.std)
     return colour_range(ordinary) if ordinary.size else None
 
@@ -326,7 +312,7 @@ class Pictures:
 
     @cached_property
     def _read(self) -> Callable[[int], Picture]:
-        return lru_cache(_KEPT)(RawPictures(result=self.result))
+        return lru_cache(VIEWER.raw_frames)(RawPictures(result=self.result))
 
 
 def warning(text: str) -> str:
@@ -382,19 +368,24 @@ class Background:
         task.add_done_callback(lambda _: self._document.add_next_tick_callback(taken))
 
 
+def frame_title(result: Result, place: int, seconds: float) -> str:
+    """Return a frame's place, name and time; NaN: it is not known."""
+    time = f", {time_text(seconds, np.array([seconds]))}" if math.isfinite(seconds) else ""
+    return f"Frame {place} of 0 to {len(result) - 1}: {result.names[place]}{time}"
+
+
 def frame_text(maps: Maps, place: int, field: Quantity, values: MapValues, remark: str) -> str:
     """Describe what is in view, as HTML: the frame, how it ended, the field with its extremes, and a remark."""
     result = maps.result
-    read = next(result.table.each(["status", "reason", "iterations", "node_status", "time_ns"], [place]))
+    read = next(result.table.each(["status", "reason", "node_status", "time_ns"], [place]))
     missing = float(np.mean(read["node_status"] != 0))
     measured = bool(result.finished[place])
     end = QUANTITIES["status"].codes[read["status"]] if measured else "not measured yet"
-    seconds = read["time_ns"] * 1e-9
-    time = "" if read["time_ns"] == UNKNOWN_TIME else f", {time_text(seconds, np.array([seconds]))}"
     without = f", {missing:.1%} of the nodes not measured" if missing and read["status"] != _FAILED else ""
-    lines = [f"Frame {place} of 0 to {len(result) - 1}: {html.escape(result.names[place])}{time}", f"{end}{without}"]
+    seconds = math.nan if read["time_ns"] == UNKNOWN_TIME else read["time_ns"] * 1e-9
+    lines = [html.escape(frame_title(result, place, seconds)), f"{end}{without}"]
     if read["reason"] and measured:
-        first, rest = read["reason"][:_REASON], read["reason"][_REASON:]
+        first, rest = read["reason"][: VIEWER.reason_letters], read["reason"][VIEWER.reason_letters :]
         lines[1] = warning(f"{end}: {first}")
         if rest:
             lines[1] = f"<details><summary>{lines[1]} … more</summary>… {html.escape(rest)}</details>"
@@ -426,9 +417,9 @@ def pointer_text(
     found = element_at(nodes, maps.result.elements, x, y)
     if found is None:
         return "outside the mesh"
-    corners, weights = found
-    there = corners.astype(np.int64)
-    mean = Mean(name="", nodes=there, weights=weights, correlation=maps.physical.covariance.part(there), least=_WHOLE)
+    corners, weights = found[0].astype(np.int64), found[1]
+    correlation, least = maps.physical.covariance.part(corners), VIEWER.least_weight
+    mean = Mean(name="", nodes=corners, weights=weights, correlation=correlation, least=least)
     value, std = mean_of(maps, field, values, moved, mean)
     text = f"{field.symbol} = {field.text(value, std)}"
     blank = values.status[corners].max()
@@ -446,13 +437,16 @@ def probe_text(
     has `moved`.
     """
     name = field.name.removesuffix("_std")
+
+    def told(value: float, std: float) -> str:
+        return field.text(value, std) if name == field.name else field.text(std)
+
     if kind == "gauge" or (field.stepped and kind in ("line", "region", "circle")):
         return ""
     try:
         if kind == "strain_gauge" and maps.field(name).group == "Strain":
             strain = maps.strain_at(frame, *place)
-            value, std = float(strain[name][0]), float(strain[f"{name}_std"][0])
-            return f": {field.text(value, std) if name == field.name else field.text(std)}"
+            return f": {told(float(strain[name][0]), float(strain[f'{name}_std'][0]))}"
         kind, place = ("point", place[:2]) if kind == "strain_gauge" else (kind, place)
         stated = ProbeSettings(measure=cast(Any, maps.physical.measure))
         probe = make_probe(maps.physical.covariance, kind, 1, place, stated, maps.physical.rectified)
@@ -463,8 +457,7 @@ def probe_text(
         part = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), moved[:, None, probe.nodes], strict=True)))
         for one in probe.histories(part) if maps.field(name).group == "Strain" else ():
             if one.name == f"{probe.name}_{name}" and one.std is not None:
-                value, std = float(one.values[0]), float(one.std[0])
-                return f" mean: {field.text(value, std) if name == field.name else field.text(std)}"
+                return f" mean: {told(float(one.values[0]), float(one.std[0]))}"
     value, std = mean_of(maps, field, values, moved, probe)
     most = " at most" if kind != "point" and name not in ("u", "v") and np.isfinite(std) else ""
     return f"{' mean' if kind != 'point' else ''}: {field.text(value, std)}{most}"

@@ -34,20 +34,17 @@ from rgbmidic.results import Maps, Result
 from rgbmidic.results.provenance import PROVENANCE
 from rgbmidic.settings import read_table, read_toml
 from rgbmidic.view.address import ViewState
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.curves import Progress
+from rgbmidic.view.draft import Draft
 from rgbmidic.view.models import page_file
 from rgbmidic.view.page import ResultPage
-from rgbmidic.view.setup_panel import Run
+from rgbmidic.view.setup import SetupPage
+from rgbmidic.view.setup_panel import DraftFrames, Run
 
 _HOST = "127.0.0.1"
-_FORGOTTEN = 15_000
-"""Ms after which the data of a closed page are freed: a page that is loaded anew takes less."""
-_BREATH = 0.05
-"""Seconds for other pages after each page that is freed: an answer takes as long."""
-_LISTED = 200
-"""Results and tests that a folder's page lists at most, the newest: some 5 ms each."""
-_LIST_STYLE = """<style>a { color: inherit; } td { padding: 3px 24px 3px 0; overflow-wrap: anywhere; }
-h1 { font-size: 22px; }</style>"""
+_LIST_STYLE = """<style>a { color: inherit; } h1 { font-size: 22px; }
+th, td { padding: 3px 24px 3px 0; overflow-wrap: anywhere; text-align: left; }</style>"""
 _THEMES = {"dark": "dark_minimal"}
 
 
@@ -59,7 +56,7 @@ class _Site(Application):  # type: ignore[misc]  # see pyproject.toml
 
     async def on_session_destroyed(self, session_context: Any) -> None:
         await super().on_session_destroyed(session_context)
-        await asyncio.sleep(_BREATH)
+        await asyncio.sleep(VIEWER.breath_s)
 
 
 class _Application(BokehTornado):  # type: ignore[misc]  # see pyproject.toml
@@ -129,8 +126,8 @@ def start(path: Path, *, port: int = 0, statement: Mapping[str, Any] | None = No
         sign_sessions=True,
         secret_key=secrets.token_bytes(32),
         extra_websocket_origins=[f"{_HOST}:{port}"],
-        unused_session_lifetime_milliseconds=_FORGOTTEN,
-        check_unused_sessions_milliseconds=_FORGOTTEN,
+        unused_session_lifetime_milliseconds=VIEWER.forgotten_ms,
+        check_unused_sessions_milliseconds=VIEWER.forgotten_ms,
         include_headers=[],
         include_cookies=[],
     )
@@ -154,24 +151,21 @@ def _pages(path: Path, statement: Mapping[str, Any]) -> dict[str, Callable[[Docu
         if (place / PROVENANCE).exists():
             Result.open(place, partial=True, check=False)
             return partial(_fill, place, shared)
-        from rgbmidic.view.draft import Draft
-        from rgbmidic.view.setup import SetupPage
-        from rgbmidic.view.setup_panel import DraftFrames
-
         DraftFrames.of(Draft.of(place, statement))
 
         def setup(document: Document) -> None:
-            theme = _query(document).get("theme", [b""])[-1].decode("utf-8", "replace")
+            theme = _asked(document, "theme")
             page = SetupPage(document, Draft.of(place, statement), runs, dark=theme == "dark")
             _place(document, page.roots, f"rgbmidic: {place.name}", theme)
 
         return setup
 
     def one(document: Document) -> None:
-        name = _query(document).get("path", [b""])[-1].decode("utf-8", "replace")
+        name = _asked(document, "path")
         if (found := {str(file.relative_to(path)): file for file in _found(path)}.get(name)) is None:
             raise InputError(f"{path} has no result and no test {name!r}")
         opened(found)(document)
+        document.template_variables["back"] = True
 
     def result(document: Document) -> None:
         if not runs:
@@ -189,8 +183,8 @@ def _pages(path: Path, statement: Mapping[str, Any]) -> dict[str, Callable[[Docu
     return {route: partial(_or_error, page) for route, page in {**pages, "/result": result}.items()}
 
 
-def _found(folder: Path) -> list[Path]:
-    """Return the results and the TEST.toml files in a folder and in two levels of folders below, newest first."""
+def _found(folder: Path) -> dict[Path, float]:
+    """Return the results and TEST.toml files in a folder and two levels below with the time of change, newest first."""
     times: dict[Path, float] = {}
     for pattern in ("", "*/", "*/*/"):
         for file in (*folder.glob(f"{pattern}{PROVENANCE}"), *folder.glob(f"{pattern}*.toml")):
@@ -199,29 +193,25 @@ def _found(folder: Path) -> list[Path]:
                     times[file.parent if file.name == PROVENANCE else file] = file.stat().st_mtime
             except (ConfigurationError, OSError):  # of another program, or gone by now
                 continue
-    return sorted(times, key=lambda file: times[file], reverse=True)[:_LISTED]
+    return dict(sorted(times.items(), key=lambda pair: pair[1], reverse=True)[: VIEWER.listed])
 
 
 def _fill_list(folder: Path, document: Document) -> None:
     """Fill the page that lists the results and tests of a folder."""
-    rows = []
-    for file in _found(folder):
-        name = str(file.relative_to(folder))
-        about, when = "test to set up or run", datetime.fromtimestamp(file.stat().st_mtime)
+    rows = ['<tr><th scope="col">Name</th><th scope="col">What it is</th><th scope="col">Changed</th></tr>']
+    for file, changed in _found(folder).items():
+        name, about = str(file.relative_to(folder)), "test to set up or run"
         if file.suffix != ".toml":
             try:
                 result = Result.open(file, partial=True, check=False)
                 about = f"result: {int(result.finished.sum())} of {len(result)} frames, {', '.join(result.lights)}"
             except RgbmidicError as error:
                 about = f"result that cannot be opened: {error}"
-        cells = (
-            f'<a href="open?path={quote(name)}">{html.escape(name)}</a>',
-            html.escape(about),
-            f"{when:%Y-%m-%d %H:%M}",
-        )
-        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
-    head = f"<h1>{html.escape(folder.resolve().name)}</h1><p>Results and tests, newest first.</p>"
-    theme = _query(document).get("theme", [b""])[-1].decode("utf-8", "replace")
+        link = f'<a href="open?path={quote(name)}">{html.escape(name)}</a>'
+        when = f"{datetime.fromtimestamp(changed):%Y-%m-%d %H:%M}"
+        rows.append(f"<tr><td>{link}</td><td>{html.escape(about)}</td><td>{when}</td></tr>")
+    head = f"<h1>{html.escape(folder.resolve().name)}</h1><p>Results and tests, those changed last first.</p>"
+    theme = _asked(document, "theme")
     table = Div(text=f"{_LIST_STYLE}{head}<table>{''.join(rows)}</table>", sizing_mode="stretch_width")
     _place(document, {"list": table}, f"rgbmidic: {folder.resolve().name}", theme)
 
@@ -238,6 +228,10 @@ def _or_error(fill: Callable[[Document], None], document: Document) -> None:
 def _query(document: Document) -> dict[str, list[bytes]]:
     context = document.session_context
     return {} if context is None or context.request is None else context.request.arguments
+
+
+def _asked(document: Document, key: str) -> str:
+    return _query(document).get(key, [b""])[-1].decode("utf-8", "replace")
 
 
 def _fill(path: Path, shared: dict[tuple[Path, str], Progress], document: Document) -> None:

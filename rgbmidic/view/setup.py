@@ -22,7 +22,8 @@ from rgbmidic.pipeline.region import finite_elements_of, read_region
 from rgbmidic.report.style import colour_range
 from rgbmidic.results.files import write_complete
 from rgbmidic.settings import ELEMENT_SIZE, RegionSettings, TestSettings, read_section
-from rgbmidic.view.canvas import Canvas, Tiles
+from rgbmidic.view.canvas import Canvas
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.draft import (
     HOLES,
     MASK,
@@ -38,12 +39,8 @@ from rgbmidic.view.draft import (
 )
 from rgbmidic.view.models import SharedState, script
 from rgbmidic.view.picture import AROUND, Background, Overlay, every, guarded, paint, palette, warning
-from rgbmidic.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, pictures, side_by_side
+from rgbmidic.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, overview, pictures
 
-_MOST_EDGES = 20_000
-"""Elements whose edges are drawn: more are a grey surface on a screen of two million pixels."""
-_TICK = 500
-"""Ms between two reports of the run."""
 _EXPECTED = "expected uncertainty"
 _GLARE = np.uint32(0xFF2030FF)
 _HELP = (
@@ -78,7 +75,7 @@ class SetupPage:
         reference, out = draft.frames.reference[0], runs[-1].out if runs else draft.file.parent / "result"
         self.state = SharedState(name="state", asked=reference, shown=reference)
         self.parts = SetupControls(draft, len(self.source.series) - 1, out, dark=dark)
-        self.tiles, self._reader = Tiles(), Background(document)
+        self._reader = Background(document)
         rows, columns = self.source.shape
         kinds = (*OUTLINES, *HOLES, MASK)
         self.canvas = Canvas(document, kinds, (-0.5, -0.5, columns - 0.5, rows - 0.5), self.show)
@@ -94,7 +91,7 @@ class SetupPage:
     def roots(self) -> dict[str, Any]:
         """The parts of the page by the names that its template gives their places."""
         p = self.parts
-        beside = column(p.message, p.file, p.write, p.out, p.go, p.ran, self.tiles.plot, sizing_mode="stretch_width")
+        beside = column(p.message, p.file, p.write, p.out, p.go, p.ran, p.tiles, sizing_mode="stretch_width")
         return {"head": p.head, "side": p.side, "plot": self.canvas.plot, "curves": beside, "player": p.player}
 
     def _listen(self) -> None:
@@ -114,7 +111,7 @@ class SetupPage:
         p.mode.js_on_change("active", script("choose", group=p.mode, tools=tools[:4], other=p.hole))
         p.hole.js_on_change("active", script("choose", group=p.hole, tools=tools[4:], other=p.mode))
         self.document.on_event(DocumentReady, lambda event: self._ready())
-        every(_TICK, self.document, self._tick, self._complain)
+        every(VIEWER.run_ms, self.document, self._tick, self._complain)
 
     def _ready(self) -> None:
         self.canvas.resize()
@@ -142,12 +139,8 @@ class SetupPage:
         over, ends, colours, window = None, (0.0, 1.0), palette("plasma"), self.canvas.window
         if chosen == _EXPECTED and (found := self.inspection) is not None:
             ends = colour_range(found.prediction.std[np.isfinite(found.prediction.std)])
-            mesh: dict[str, Any] = {
-                "nodes": found.mesh.nodes,
-                "elements": found.mesh.elements,
-                "values": found.prediction.std,
-            }
-            over = Overlay(**mesh, ends=ends, colours=colours, opacity=0.8)
+            mesh: dict[str, Any] = {"nodes": found.mesh.nodes, "elements": found.mesh.elements}
+            over = Overlay(**mesh, values=found.prediction.std, ends=ends, colours=colours, opacity=0.8)
         image = paint(window, picture, over, AROUND[self.dark])
         if self.parts.glare.active:
             saturated = paint(window, full.astype(np.uint8) * 255, around=0)
@@ -164,66 +157,60 @@ class SetupPage:
         self._reader.drop()
         if self.inspection is not None:
             self.inspection, self.pictures = None, {}
-            self.tiles.plot.visible = False
+            self.parts.tiles.text = ""
             self.parts.picture.value, self.parts.picture.options = RAW, [RAW]
         self._edges.data = {"xs": [], "ys": []}
         self._guarded(self._make_mesh)
 
     def _make_mesh(self) -> None:
-        content = region_of(self.drawing.marks)
-        if self.draft.section("mesh").get("file"):
-            mesh = self._of_file()[0]
-        elif content is None or not self.parts.size.value:
+        if (made := self._meshed()) is None:
             self.parts.message.text = _HELP
             return
-        else:
-            mesh = Tri3Mesh.from_region(self._region(content), float(self.parts.size.value))
+        mesh = made[0]
         self.parts.message.text = f"{len(mesh.nodes)} nodes, {len(mesh.elements)} elements.<br>{_HELP}"
-        if len(mesh.elements) <= _MOST_EDGES:
+        if len(mesh.elements) <= VIEWER.mesh_edges:
             corners = mesh.nodes[mesh.elements][:, [0, 1, 2, 0]]
             self._edges.data = {"xs": list(corners[..., 0]), "ys": list(corners[..., 1])}
 
-    def _of_file(self) -> tuple[Tri3Mesh, Region]:
-        """Place the mesh of ``mesh.file`` by its points; what is drawn restricts it."""
-        document = {**self.draft.document, "region": region_of(self.drawing.marks) or self.draft.section("region")}
-        settings = TestSettings.from_mapping(document, self.draft.file.parent)
-        _, _, mesh, region = finite_elements_of(settings, self.source.shape)
-        return mesh, region
+    def _meshed(self) -> tuple[Tri3Mesh, Region, float] | None:
+        """Make the mesh and region of the run, with the element size: ``mesh.file``, which what is drawn restricts.
 
-    def _region(self, content: dict[str, Any]) -> Region:
-        return read_region(read_section(RegionSettings, "region", content), self.source.shape)
+        None where there is neither a file nor a region with an element size.
+        """
+        content, size = region_of(self.drawing.marks), self.parts.size.value
+        if self.draft.section("mesh").get("file"):
+            document = {**self.draft.document, "region": content or self.draft.section("region")}
+            settings = TestSettings.from_mapping(document, self.draft.file.parent)
+            _, _, mesh, region = finite_elements_of(settings, self.source.shape)
+            return mesh, region, mesh.size
+        if content is None or not size:
+            return None
+        region = read_region(read_section(RegionSettings, "region", content), self.source.shape)
+        return Tri3Mesh.from_region(region, float(size)), region, float(size)
 
     def _inspect(self) -> None:
         """Inspect the frame in view as `rgbmidic inspect` does, in another thread."""
         self.drawing.settle()  # else it drops the inspection
-        content, size = region_of(self.drawing.marks), float(self.parts.size.value)
-        if self.draft.section("mesh").get("file"):
-            mesh, region = self._of_file()
-            size = mesh.size
-        elif content is None:
+        if (made := self._meshed()) is None:
             self.parts.message.text = "Draw the region first."
             return
-        else:
-            region = self._region(content)
         self.parts.message.text = "inspecting …"
         index = int(self.parts.frame.value)
-        work = partial(self.source.inspected, index, region, size)
+        work = partial(self.source.inspected, index, *made[1:])
         self._reader.ask(work, lambda found: self._guarded(partial(self._have, found, index)))
 
     def _have(self, inspected: Callable[[], Inspection], index: int) -> None:
         found, self._inspected = inspected(), index
         self.inspection = found
         self.pictures = pictures(found, self.source.shape)
-        self.tiles.show(side_by_side(found, self.pictures, self.source.raw(index)[0]))
+        self.parts.tiles.text = overview(found, self.pictures, self.source.raw(index)[0])
         self.parts.picture.options = [RAW, *self.pictures, _EXPECTED]
         known = found.prediction.std[np.isfinite(found.prediction.std)]
         expected = f"median uncertainty to expect {np.median(known):.2g} px" if known.size else "no node is measured"
         lines = [f"<b>{html.escape(found.name)}</b>: {expected}"]
         self.parts.message.text = "<br>".join(lines + [f"• {html.escape(finding.text)}" for finding in found.findings])
-        if self.parts.picture.value == _EXPECTED:
-            self.show()
-        else:
-            self.parts.picture.value = _EXPECTED
+        self.parts.picture.value = _EXPECTED
+        self.show()
 
     def _changed(self) -> Draft:
         """Return the draft with the values of all controls."""

@@ -1,42 +1,40 @@
-"""Parts of the page that sets a test up: frames, raw and inspected, controls, its run; and a result's movie."""
+"""Parts of the page that sets a test up: frames, raw and inspected, the drawn region, controls, the run."""
 
 from __future__ import annotations
 
+import base64
 import html
-import multiprocessing
-import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.util import find_spec
-from itertools import count
 from pathlib import Path
 from typing import IO, Any, Self
 
 import bokeh.models as bk
+import cv2
 import numpy as np
 import numpy.typing as npt
 from bokeh.document import Document
 from bokeh.layouts import column, row
 from bokeh.models import ColumnDataSource
 
-from rgbmidic import report
-from rgbmidic.errors import ResultError, RgbmidicError
+from rgbmidic.errors import ResultError
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.inspection import Inspection, inspect_frame
 from rgbmidic.mesh import Region
 from rgbmidic.report.style import OKABE_ITO
-from rgbmidic.results import Maps, Result
+from rgbmidic.results import Result
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.view.address import Mark, Steps
 from rgbmidic.view.canvas import Canvas, columns
+from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.draft import HOLES, MASK, Draft, arranged, masks_of, rings
 from rgbmidic.view.models import Controls
-from rgbmidic.view.picture import Picture, RawPictures, grey_picture, stretched
+from rgbmidic.view.picture import Picture, grey_picture, stretched
 
 RAW = "raw frame"
 
@@ -122,15 +120,22 @@ def pictures(inspection: Inspection, shape: tuple[int, int]) -> dict[str, Pictur
     return found
 
 
-def side_by_side(inspection: Inspection, named: dict[str, Picture], raw: Picture) -> list[dict[str, Picture]]:
-    """Arrange pictures in rows: the raw frame and the separated lights, their reflection index."""
-    lights = len(inspection.images.names)
-    pairs = [(RAW, raw), *((name.replace("reflection index", "index"), picture) for name, picture in named.items())]
-    return [dict(row) for row in (pairs[: lights + 1], pairs[lights + 1 :]) if row]
+def overview(inspection: Inspection, named: Mapping[str, Picture], raw: Picture) -> str:
+    """Return small pictures in rows, as HTML: the raw frame and the separated lights, their reflection index."""
+    across = 1 + len(inspection.images.names)
+    cells = []
+    for name, picture in ((RAW, raw), *named.items()):
+        height, width = picture.shape
+        size = (VIEWER.tile_columns, max(1, round(VIEWER.tile_columns * height / width)))
+        png = cv2.imencode(".png", cv2.resize(picture, size, interpolation=cv2.INTER_AREA))[1]
+        title, source = html.escape(name.replace("reflection index", "index")), base64.b64encode(png.tobytes()).decode()
+        image = f'<img alt="{title}" style="width:100%" src="data:image/png;base64,{source}">'
+        cells.append(f'<figure style="margin:0"><figcaption>{title}</figcaption>{image}</figure>')
+    cells[across:across] = ["<span></span>"]  # the raw frame has no index
+    grid = f"display:grid;gap:4px;font-size:11px;grid-template-columns:repeat({across},1fr)"
+    return f'<div style="{grid}">{"".join(cells)}</div>'
 
 
-_SOON = 60
-"""Ms in which the moves of a mark are collected: a mesh of some 1,000 elements is made in that time."""
 _COLOURS = list(OKABE_ITO.values())
 """Of the masks; the first two are those of holes and outline."""
 
@@ -223,7 +228,7 @@ class RegionDrawing:
         self._canvas.place(marks)
         if not self._coming:
             self._coming = True
-            self._document.add_timeout_callback(self.settle, _SOON)
+            self._document.add_timeout_callback(self.settle, VIEWER.mark_ms)
 
 
 class SetupControls(Controls):
@@ -248,32 +253,34 @@ class SetupControls(Controls):
 
     def __init__(self, draft: Draft, last: int, out: Path, *, dark: bool) -> None:
         frames = draft.frames
-        reference, end = frames.reference[0], last if frames.last is None else frames.last
-        super().__init__(last, reference, dark=dark)
-        wide, number = self.wide, {"low": 0, "high": last, "step": 1, **self.wide}
-        size = draft.section("mesh").get("element_size", ELEMENT_SIZE)
+        super().__init__(last, frames.reference[0], dark=dark)
+        wide, size = self.wide, draft.section("mesh").get("element_size", "auto")
         size = ELEMENT_SIZE if size == "auto" else size
-        calibration = str(draft.section("calibration").get("file", ""))
         self.head.text = f"<b>{html.escape(str(draft.file))}</b> &nbsp; a test to set up"
         self.picture = bk.Select(title="Picture", name="picture", options=[RAW], value=RAW, **wide)
         self.glare = bk.Checkbox(label="mark saturated samples", active=True, **self.small)
-        shapes = ["Move", "Rectangle", "Polygon", "Circle"]
-        self.mode = bk.RadioButtonGroup(labels=shapes, active=0, name="mode", **wide)
-        self.hole = bk.RadioButtonGroup(labels=["Hole", "Round hole", "Lamp mask"], active=None, name="hole", **wide)
+        self.mode = self.group("mode", "shape that a click begins", ["Move", "Rectangle", "Polygon", "Circle"])
+        self.hole = self.group("hole", "what is left out", ["Hole", "Round hole", "Lamp mask"], active=None)
         labels = ("Undo", "Redo", "Next", "Clear", "Inspect", "Write TEST.toml")
         self.undo, self.redo, self.next, self.clear, self.inspect, self.write = (
             bk.Button(label=name, name=name.lower(), **wide) for name in labels
         )
         self.light = bk.Select(title="Masks are of", name="light", **wide)
         self.size = bk.Spinner(title="Element size (px)", name="size", low=4, value=size, step=1, **wide)
-        self.reference = bk.Spinner(title="Reference", name="reference", value=reference, **number)
-        self.first = bk.Spinner(title="First", name="first", value=frames.first, **number)
-        self.last = bk.Spinner(title="Last", name="last", value=end, **number)
-        self.calibration = bk.TextInput(title="Calibration file", name="calibration", value=calibration, **wide)
-        self.file = bk.TextInput(title="Write to", name="file", value=str(draft.file), **wide)
-        self.out = bk.TextInput(title="Result folder", name="out", value=str(out), **wide)
+        end = last if frames.last is None else frames.last
+        chosen = {"Reference": frames.reference[0], "First": frames.first, "Last": end}
+        self.reference, self.first, self.last = (
+            bk.Spinner(title=title, name=title.lower(), value=at, low=0, high=last, step=1, **wide)
+            for title, at in chosen.items()
+        )
+        calibration = str(draft.section("calibration").get("file", ""))
+        texts = {"Calibration file": calibration, "Write to": str(draft.file), "Result folder": str(out)}
+        self.calibration, self.file, self.out = (
+            bk.TextInput(title=title, name=name, value=text, **wide)
+            for name, (title, text) in zip(("calibration", "file", "out"), texts.items(), strict=True)
+        )
         self.go = bk.Button(label="Run", button_type="primary", **wide)
-        self.ran = bk.Div(name="ran", **wide)
+        self.ran, self.tiles = bk.Div(name="ran", **wide), bk.Div(name="tiles", **wide)
         line = partial(row, sizing_mode="stretch_width")
         buttons = line(self.undo, self.redo, self.next, self.clear)
         sizes, numbers = line(self.light, self.size), line(self.reference, self.first, self.last)
@@ -345,100 +352,3 @@ class Run:
         lines = [line for line in self.output.read().decode("utf-8", "replace").splitlines() if line.strip()]
         errors = [line for line in lines if line.startswith("error: ")]
         return f"failed: {[*errors, *lines[-1:], 'it printed nothing'][0]}"
-
-
-class Movie:
-    """A movie that a process of its own writes into the folder of a result.
-
-    Parameters
-    ----------
-    out
-        The file.
-    process, receive
-        The process, and the end of the pipe at which it reports.
-
-    Attributes
-    ----------
-    out
-        The file.
-    """
-
-    def __init__(self, out: Path, process: Any, receive: Any) -> None:
-        self.out, self._process, self._receive, self._end = out, process, receive, ""
-        self._far = "starting"
-
-    @classmethod
-    def start(
-        cls, maps: Maps, fields: Sequence[str], *, limits: Mapping[str, Any], opacity: float, raw: bool, colours: str
-    ) -> Self:
-        """Start the process; a file that is there is never written over.
-
-        Parameters
-        ----------
-        maps, fields
-            The result, how its fields are derived, and their names.
-        limits
-            Ends of the colours by the fields' names; of others those of all frames.
-        opacity
-            Of the fields over the image.
-        raw
-            Whether they lie over the raw frames.
-        colours
-            Their name; empty: as suits each field.
-        """
-        result = replace(maps.result)  # without what was read
-        maps = replace(maps, result=result, physical=replace(maps.physical, result=result))
-        ending = ".mp4" if find_spec("imageio_ffmpeg") else ".gif"
-        name = f"movie_{'_'.join(fields)}".replace(" ", "_")
-        names = (f"{name}{f'_{number}' if number > 1 else ''}{ending}" for number in count(1))
-        out = next(file for file in (result.path / name for name in names) if not file.exists())
-        options = {"limits": limits, "opacity": opacity, "colours": colours or None}
-        options["images"] = RawPictures(result=result) if raw else None
-        context = multiprocessing.get_context("spawn")
-        receive, send = context.Pipe(duplex=False)
-        process = context.Process(target=_write, args=(send, maps, out, tuple(fields), options), daemon=True)
-        process.start()
-        send.close()
-        return cls(out, process, receive)
-
-    @property
-    def going(self) -> bool:
-        """Whether it goes on, as far as `summary` has heard."""
-        return not self._end
-
-    def stop(self) -> None:
-        """End the process; nothing is left of its file."""
-        self._process.terminate()
-        self._process.join()
-
-    def summary(self) -> str:
-        """Return, as HTML, how far it is, where the file is, or why there is none."""
-        try:
-            while not self._end and self._receive.poll():
-                kind, text = self._receive.recv()
-                self._far, self._end = (text, "") if kind == "far" else ("", text or "written")
-        except EOFError:
-            self._end = "its process was ended"
-        name = html.escape(self.out.name)
-        if self.going:
-            return f"{name}: {self._far}"
-        if self._end != "written":
-            return f'<b style="color:var(--warn)">no {name}: {html.escape(self._end)}</b>'
-        gif = "" if self.out.suffix != ".gif" else ' (a .gif; for .mp4: pip install "rgbmidic[movie]")'
-        return f"written: {html.escape(str(self.out))}{gif}"
-
-
-def _write(send: Any, maps: Maps, out: Path, fields: tuple[str, ...], options: dict[str, Any]) -> None:
-    """Write a movie in a process of its own, and report each hundredth of it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # what is begun is removed
-
-    def progress(done: int, total: int, _: str) -> None:
-        if 100 * done // total > 100 * (done - 1) // total:
-            send.send(("far", f"{done} of {total} frames"))
-
-    try:
-        report.write_movie(report.Movie(maps=maps, fields=fields, **options), out, progress=progress)
-        send.send(("end", ""))
-    except (RgbmidicError, OSError) as error:
-        send.send(("end", str(error)))

@@ -7,13 +7,25 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from rgbmidic.fields import MEASURES
 from rgbmidic.fields.strain import shortest_gauge
-from rgbmidic.results import Maps, MapValues, Result
+from rgbmidic.results import Maps, MapValues, Profile, Result
 from rgbmidic.results.physical import scale_of
-from rgbmidic.settings import ScaleSettings
+from rgbmidic.settings import ChannelSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import BESIDE, UNCERTAINTY, ViewState
-from rgbmidic.view.picture import Picture, Pictures, pointer_text, range_of_test, robust_range
+from rgbmidic.view.picture import (
+    Overlay,
+    Picture,
+    Pictures,
+    palette,
+    palette_name,
+    pointer_text,
+    range_of_test,
+    robust_range,
+)
 
 
 class ShownFields:
@@ -45,9 +57,24 @@ class ShownFields:
         self._moved = lru_cache(2)(lambda frame, changes, chosen: self.maps.displacement(frame))
         self._test_range = lru_cache(8)(lambda name, changes, chosen: range_of_test(self.maps, name))
 
-    def rescale(self, base: Path) -> bool:
-        """Take the scale of the view, with files relative to a folder; returns whether it is another one."""
-        scale = self.view.scale_settings(base, scale_of(self.result))
+    @property
+    def base(self) -> Path:
+        """Folder that the paths of the view are relative to."""
+        return Path(self.result.provenance.get("base", self.result.path.parent))
+
+    @property
+    def channels(self) -> ChannelSettings:
+        """``[channels]`` as it is in view."""
+        return self.view.channel_settings(self.base)
+
+    @property
+    def measure(self) -> str | None:
+        """Strain measure of the probes; None: the one that they state."""
+        return self.view.measure if self.view.measure != MEASURES[0] else None
+
+    def rescale(self) -> bool:
+        """Take the scale of the view; returns whether it is another one."""
+        scale = self.view.scale_settings(self.base, scale_of(self.result))
         if scale == self.scale:
             return False
         self.maps, self.scale = Maps.of(self.result, scale), scale
@@ -94,8 +121,8 @@ class ShownFields:
         """Length of the virtual strain gauges, px."""
         return self.view.gauge or shortest_gauge(self.maps.physical.mesh)
 
-    def ends(self, name: str, *, by_hand: bool = True) -> tuple[float, float]:
-        """Return the values of the first and the last colour of a field."""
+    def ends(self, name: str, *, by_hand: bool = True, along: Profile | None = None) -> tuple[float, float]:
+        """Return the values of the first and the last colour of a field, in one frame or, `along` a line, in all."""
         view, field = self.view, self.maps.all[name]
         if view.range == "hand" and by_hand:
             return view.low, view.high
@@ -104,9 +131,24 @@ class ShownFields:
         if view.range == "test":
             low, high = self._test_range(name, self.changes, self.chosen)
         else:
-            low, high = robust_range(self.values(name)) or (0.0, 1.0)
+            low, high = robust_range(along or self.values(name)) or (0.0, 1.0)
         even = view.symmetric and field.signed
         return (-max(abs(low), abs(high)), max(abs(low), abs(high))) if even else (low, high)
+
+    def overlay(self, name: str) -> Overlay:
+        """Return a field as it is painted; palette, range by hand and number of colours are those of the first."""
+        view, field, values, first = self.view, self.maps.all[name], self.values(name), name == self.view.field
+        suits = palette_name(field, symmetric=view.symmetric)
+        return Overlay(
+            nodes=self.nodes,
+            elements=self.result.elements,
+            values=values.values,
+            ends=self.ends(name, by_hand=first),
+            colours=palette((first and not field.codes and view.palette) or suits, view.levels),
+            opacity=view.opacity,
+            stepped=field.stepped,
+            beyond=np.abs(values.values) - 2 * values.std if view.hatched else None,
+        )
 
     @property
     def nodes(self) -> FloatArray:

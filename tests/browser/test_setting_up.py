@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import tomllib
 
@@ -121,7 +122,7 @@ def test_what_the_frame_tells_is_shown_and_bad_input_is_told(test_file):
         page.driver.execute_script(*click("Inspect"))
         page.until("model('picture').value === 'expected uncertainty'", patience=120)
         page.until("model('message').text.includes('uncertainty to expect')")
-        assert page.run("Array.from(model('tiles').data.name)") == ["raw frame", "light: light"]
+        assert re.findall("<figcaption>(.*?)</", page.run("model('tiles').text")) == ["raw frame", "light: light"]
         low, high = page.run("[model('colours').low, model('colours').high]")
         assert 0 < low < high < 0.1
         page.do("model('picture').value = 'light: light'")

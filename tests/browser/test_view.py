@@ -17,7 +17,7 @@ from rgbmidic.results import FrameRecord, Maps, Result, ResultStore
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.profiles import read_profile
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings
-from rgbmidic.view import setup_panel
+from rgbmidic.view import film
 from rgbmidic.view.picture import element_at, robust_range
 
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
@@ -138,6 +138,18 @@ CUT = """(() => {
 })()"""
 
 
+UNLABELLED = """(() => {
+  const found = [];
+  const walk = (root) => root.querySelectorAll("*").forEach((one) => {
+    const input = ["INPUT", "SELECT"].includes(one.tagName) || one.getAttribute("role") === "slider";
+    if (input && !one.ariaLabel && !one.labels?.[0]?.textContent.trim()) found.push(one.outerHTML);
+    if (one.shadowRoot) walk(one.shadowRoot);
+  });
+  walk(document);
+  return found;
+})()"""
+
+
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("size", [(1280, 720), (1920, 1080)])
 def test_no_control_is_cut_off(driver, address, size, theme):
@@ -157,6 +169,7 @@ def test_no_control_is_cut_off(driver, address, size, theme):
         assert cut == []
         assert beyond <= 0
         assert below <= 0, section
+    assert page.run(UNLABELLED) == []
     driver.set_window_size(1280, 940)
 
 
@@ -361,6 +374,7 @@ def test_a_folder_s_page_opens_its_results_and_a_reload_stays(driver, result):
         driver.get(told)
         page = Page(driver, f"{told}open?path={result.path.name}")
         shown(page, 6)
+        assert driver.execute_script("return document.querySelector('.head a').href") == told
         page.keys(LEFT)
         shown(page, 5)
         page.until("new URL(location.href).searchParams.get('frame') === '5'")
@@ -434,9 +448,9 @@ def test_a_line_shows_its_profile_and_position_against_time(driver, wave):
             rim = array(page, "model('profile bands').data.ys[0]")
             known = np.isfinite(curve)
             np.testing.assert_allclose(rim[: known.sum()], (curve - 2 * expected.std[frame])[known])
-            ends = page.run("[model('colours').low, model('colours').high]")
-            assert page.run("model('wave_plot').renderers[0].glyph.color_mapper === model('colours')")
-            assert ends == pytest.approx(robust_range(Maps.of(wave).read("exx", frame)))
+            for name, read in (("colours", Maps.of(wave).read("exx", frame)), ("wave_colours", expected)):
+                ends = page.run(f"[model('{name}').low, model('{name}').high]")
+                assert ends == pytest.approx(robust_range(read)), "the map has those of the frame, the line of the test"
         held = parse_qs(urlsplit(driver.current_url).query)
         assert held["line"] == ["line_1"]
         box = page.run(
@@ -513,6 +527,9 @@ def test_the_picture_that_is_saved_is_of_the_plot_that_is_there(driver, wave):
         driver.execute_script("window.kept = []; rgbmidic.keep = (blob, name) => window.kept.push([name, blob.size])")
         page.driver.execute_script(*click("Save PNG"))
         page.until("window.kept.length === 2")
+        page.driver.execute_script(*click("Save PNG for print"))
+        page.until("window.kept.length === 3")
+        assert page.run("window.kept.pop()[0]") == "exx_000005.png"
         kept = dict(page.run("window.kept"))
         assert kept.keys() == {"wave.png", "profile.png"}
         assert min(kept.values()) > 3000, "an empty picture has 300 x 150 px"
@@ -527,7 +544,7 @@ def test_a_movie_of_what_is_in_view_is_written_beside_the_others(driver, wave, t
         view = "frame=5&field=exx&second=u&range=hand&low=-0.01&high=0.02&opacity=0.5&gauge=60&since=1&measure=hencky"
         page = Page(driver, f"{told}?{view}")
         shown(page, 5)
-        monkeypatch.setattr(setup_panel, "find_spec", lambda name: None)
+        monkeypatch.setattr(film, "find_spec", lambda name: None)
         page.driver.execute_script(*click("Movie"))
         page.until("model('said').text.startsWith('movie_exx_u') && model('movie').label === '■ Movie'")
         page.until(f"model('said').text.startsWith('written: {first} (a .gif; for .mp4: pip install')", patience=60)

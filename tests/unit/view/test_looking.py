@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 import random
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import parse_qs
 
+import cv2
 import numpy as np
 import pytest
 from bokeh.document import Document
 from bokeh.events import MouseMove
-from bokeh.models import Div, Select
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from results import LIGHTS, MESH, NODES, corrupt, make_origin, make_result, random_record, smooth_record
@@ -25,8 +26,9 @@ from rgbmidic.results.histories import read_histories, write_histories
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, TestSettings
 from rgbmidic.view import curves
 from rgbmidic.view.address import CLOCKS, MARKS, PALETTES, UNCERTAINTY, Mark, Steps, ViewState, probe_marks
-from rgbmidic.view.canvas import arrow_lines, beside, contour_lines
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
+from rgbmidic.view.layers import arrow_lines, beside, contour_lines
+from rgbmidic.view.models import ResultControls
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import (
     Overlay,
@@ -42,6 +44,7 @@ from rgbmidic.view.picture import (
     robust_range,
     watched,
 )
+from rgbmidic.view.shown import ShownFields
 
 NAMES = ("u", "v", "e1")
 
@@ -172,7 +175,7 @@ def test_channels_off_the_frames_are_shown_where_they_are_and_told(tmp_path):
     result = make_result(tmp_path / "result", frames=4, record=lambda index: timed(index, 20_000))
     (tmp_path / "daq.csv").write_text("time_s,a_N\n" + "".join(f"{5 + n},{n}\n" for n in range(9)), encoding="utf-8")
     page = ResultPage(Document(), result, ViewState(channels="daq.csv", beside="a_N"), Progress(4))
-    page._read_curves()
+    page.show()
     assert "span 5 to 13 s" in page.parts.told.text
     assert list(page.curves._recorded.data["ys"][0]) == list(range(9))
     page.parts.of["offset"].value = -5.0
@@ -389,7 +392,7 @@ def test_a_place_is_found_in_its_element(result):
 def test_every_field_has_colours(result):
     for field in Maps.of(result).all.values():
         for symmetric in {False, field.signed}:
-            assert all(len(colour) == 7 for colour in palette(palette_name(field.kind, symmetric=symmetric)))
+            assert all(len(colour) == 7 for colour in palette(palette_name(field, symmetric=symmetric)))
 
 
 def test_marks_make_probes_in_the_order_set_and_a_lone_end_waits():
@@ -462,8 +465,9 @@ def test_a_frame_that_the_curves_do_not_hold_is_not_pointed_at(tmp_path):
     store = ResultStore.create(tmp_path / "result", make_origin(5))
     for index in (0, 1, 4):
         store.write_frame(index, smooth_record(index))
-    panel = CurvePanel(Document(), chosen="", select=Select(), message=Div(), told=Div(), hint="")
-    panel.histories = curves.read(Result.open(store.path, partial=True), [Mark("point", 50, 40)], 60.0)
+    result = Result.open(store.path, partial=True)
+    panel = CurvePanel(Document(), ShownFields(result, ViewState()), ResultControls(4, 0, dark=False), lambda: None)
+    panel.histories = curves.read(result, [Mark("point", 50, 40)], 60.0)
     shown = []
     for frame in range(5):
         panel.point(frame)
@@ -643,6 +647,51 @@ def test_a_camera_s_plane_is_that_of_the_page_and_a_wrong_file_changes_nothing(t
     assert page.maps.canvas.plot.title.text == "u (mm)"
     page.parts.of["camera"].value = ""
     assert page.maps.canvas.plot.title.text == "u (px)"
+
+
+PROBES = ProbeSettings(points=((50, 40),), lines=((25, 40, 95, 45),), strain_gauges=((60, 40, 60),))
+
+
+@pytest.fixture(scope="module")
+def probed(tmp_path_factory):
+    stated = replace(in_mm(), probes=PROBES)
+    folder = tmp_path_factory.mktemp("probed")
+    return make_result(folder / "result", frames=4, record=lambda index: timed(index, 20_000), settings=stated)
+
+
+def test_probes_that_the_test_states_are_shown_at_opening(probed):
+    page = ResultPage(Document(), probed, ViewState(), Progress(4))
+    assert curves.probes(page.view.marks, page.view.gauge, ProbeSettings()) == PROBES
+    own = (Mark("point", 30, 30),)
+    assert ResultPage(Document(), probed, ViewState(marks=own), Progress(4)).view.marks == own
+    other = replace(PROBES, strain_gauges=((60, 40, 60), (60, 40, 80)))  # the page has one length for all
+    assert {mark.kind for mark in curves.with_probes(ViewState(), other).marks} == {"point", "line"}
+
+
+def test_a_picture_for_print_is_light_wide_and_says_what_it_shows(probed):
+    view = ViewState(frame=3, field="exx", second="u", theme="dark", vectors=True, contours=True)
+    page = ResultPage(Document(), probed, view, Progress(4))
+    page.show()
+    figure = page.maps.figure()
+    title = figure.texts[0].get_text()
+    assert "Frame 3 of 0 to 3" in title
+    assert "60 µs" in title
+    assert "εxx: Green-Lagrange, virtual strain gauge of 60 px" in title
+    assert [axis.get_title() for axis in figure.axes] == ["εxx", "u (mm)"]
+    assert sum("point 1" in text.get_text() for text in figure.axes[0].texts) == 1
+    assert figure.get_facecolor()[:3] == (1, 1, 1)
+    page._print()
+    png = base64.b64decode(page.state.png.removeprefix("data:image/png;base64,"))
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[1] == pytest.approx(2000, abs=5)
+    assert (picture[:5] == 255).mean() > 0.9
+
+
+def test_there_is_no_colour_bar_before_there_are_colours(probed):
+    page = ResultPage(Document(), probed, ViewState(), Progress(4))
+    assert not page.maps.canvas.bar.visible
+    page.show()
+    assert page.maps.canvas.bar.visible
 
 
 def test_a_page_whose_browser_has_gone_is_not_watched():

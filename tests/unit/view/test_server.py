@@ -11,9 +11,11 @@ import socket
 import subprocess
 import sys
 from contextlib import suppress
+from datetime import datetime
 from urllib.parse import quote, urlsplit
 
 import pytest
+from bokeh.document import Document
 from results import make_result
 from small_tests import grey_frame
 from tornado.httpclient import AsyncHTTPClient
@@ -24,7 +26,7 @@ from rgbmidic.command import execute
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.view.address import ViewState
 from rgbmidic.view.draft import Draft
-from rgbmidic.view.server import _found, start
+from rgbmidic.view.server import _fill_list, _found, start
 
 REQUESTS = 300
 """Enough for every kind of request below to come a few times; 20,000 were sent once before this was merged."""
@@ -125,10 +127,17 @@ def test_a_folder_lists_its_results_and_tests_newest_first_and_opens_only_those(
     (tmp_path / "test.toml").write_text("[frames]\npath = 'none/*.tif'\n")
     os.utime(tmp_path / "test.toml", (1.1e9, 1.1e9))
     (tmp_path / "pyproject.toml").write_text("[frames]\n")
-    assert _found(tmp_path) == [newer, tmp_path / "test.toml", older]
+    assert list(_found(tmp_path)) == [newer, tmp_path / "test.toml", older]
+    _fill_list(tmp_path, document := Document())
+    rows = re.findall("<tr>(.*?)</tr>", document.roots[0].text)
+    assert re.findall('<th scope="col">(.*?)</th>', rows[0]) == ["Name", "What it is", "Changed"]
+    times = [re.findall("<td>(.*?)</td>", row)[2] for row in rows[1:]]
+    assert times == sorted(times, reverse=True)
+    assert times[1:] == [f"{datetime.fromtimestamp(at):%Y-%m-%d %H:%M}" for at in (1.1e9, 1e9)]
     with serving(tmp_path) as told:
         path = urlsplit(told).path
         assert ask(told, "GET", path)[0] == 200
+        assert b"all results and tests</a>" in ask(told, "GET", f"{path}open?path=deep/new")[1]
         for name in ("deep/new", "../x", "/etc/passwd", "", "test.toml"):
             status, body = ask(told, "GET", f"{path}open?path={quote(name)}")
             assert status == 200
