@@ -205,7 +205,7 @@ def prediction_filters(
     _, first, index, number = np.unique(code, return_index=True, return_inverse=True, return_counts=True)
     index = index.ravel()
 
-    variance = 2.0 ** level.reshape(3, -1).T[first]
+    variance: FloatArray = np.exp2(level.reshape(3, -1).T[first].astype(np.float64))
     moved = DISPLACEMENT_STEP * np.moveaxis(steps.reshape(*steps.shape[:2], -1)[..., first], -1, 0)
     # a specimen's colour has no slope on the common texture that could tell how the channels see it
     together = texture.specific * np.eye(3) + (1 - texture.specific) * _correlations(variance, seen)

@@ -25,6 +25,8 @@ LAGS = np.array(
 the speckles, not on their edges."""
 WIDTHS: FloatArray = np.asarray(0.6 * 1.3 ** np.arange(12), dtype=np.float64)
 """Standard deviations (px) of the Gaussians: the narrowest is what a square pixel lets through."""
+COLOURED = 0.5
+"""Below this mean correlation of any two colours they do not show the same texture."""
 
 _BINOMIAL = np.array([1, 5, 10, 10, 5, 1]) / 16
 _OFFSETS = np.array([-2, -1, 0, 1, 2, 3])
@@ -156,7 +158,7 @@ def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, 
     """
     best = float(np.max(correlations))
     distance = np.hypot(*LAGS.T)
-    if best < 0.5:  # no two colours show the same texture
+    if best < COLOURED:
         met = counts[:, :3] > 0
         r = np.broadcast_to(distance[:, None], met.shape)[met]
         # one colour's samples are two pixels apart and show nothing of what is finer
