@@ -16,47 +16,20 @@ import math
 import re
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import BinaryIO
 from xml.etree import ElementTree
 
 import numpy as np
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import SECOND, Integers, Recording, even_times, fraction
-from rgbmidic.frames.source import Movie, MovieHeader, remembered
-from rgbmidic.frames.stored import Layout, StoredFrame, damaged, unpack_bits
+from rgbmidic.frames.source import EvenFrames, Movie, remembered
+from rgbmidic.frames.stored import Layout, StoredFrame, damaged
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Header(MovieHeader):
-    """What is known of the frames of a movie.
-
-    A sample is stored `shift` above the lowest of `stored_bits`, in the byte `order` of numpy; `stated` has its bits
-    and the pattern, without samples; `oldest` is the place in the file of the frame that was recorded first.
-    """
-
-    stored_bits: int
-    order: Literal["<", ">"] = "<"
-    shift: int
-    stated: StoredFrame
-    oldest: int = 0
-    layout: Layout
-
-    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
-        """Read some rows of a frame."""
-        index = (index + self.oldest) % self.layout.count
-        if self.stored_bits in (8, 16):
-            stored = np.dtype(f"{self.order}u{self.stored_bits // 8}")
-            values = self.layout.samples(path, index, rows, self.shape[0], stored)
-        else:
-            packed = self.layout.read(path, index, rows, self.shape[0])
-            values = unpack_bits(packed, self.stored_bits).reshape(len(rows), -1)
-        return replace(self.stated, values=values >> self.shift)
 
 
 # Photron .mraw
@@ -92,7 +65,7 @@ class MrawFile(Movie):
         if self.path.suffix.lower() != ".mraw":
             object.__setattr__(self, "path", _beside(self.path, ".mraw") or self.path.with_suffix(".mraw"))
 
-    def _header(self) -> _Header:
+    def _header(self) -> EvenFrames:
         found = _beside(self.path, *MRAW_ENDINGS[1:])
         if found is None:
             raise FrameError(f"{self.path} needs its header {self.path.stem}.cihx or {self.path.stem}.cih beside it")
@@ -106,7 +79,7 @@ def _beside(path: Path, *endings: str) -> Path | None:
 
 
 @remembered
-def _mraw_header(path: Path) -> _Header:
+def _mraw_header(path: Path) -> EvenFrames:
     with path.open("rb") as file:
         content = file.read(4 * 2**20)  # those seen have 9 and 19 kB
     entries = _Entries(path=path, found=_xml(content, path) if path.suffix.lower() == ".cihx" else _lines(content))
@@ -121,7 +94,7 @@ def _mraw_header(path: Path) -> _Header:
         raise damaged(path, f'it announces {depth} effective bits, "{side}"; allowed are lower and higher')
     if side == "lower" and depth > stored_bits:
         logger.warning("%s holds the lower %d of %d bits: brighter samples are lost", path, stored_bits, depth)
-    return _Header(
+    return EvenFrames(
         shape=(rows, columns),
         stored_bits=stored_bits,
         stated=StoredFrame(bits=min(stored_bits, depth)),
@@ -216,7 +189,7 @@ _SEQ_FIELDS = struct.Struct("<I24xi4x512x6I3Id16xi8xI32xI364x")
 """Magic; version; width, height, bits stored, bits used, bytes, format; frames, origin, distance; rate; pattern;
 compression; oldest frame."""
 
-_RAW: dict[int, tuple[Literal["<", ">"], bool]] = dict.fromkeys((100, 101), ("<", False))
+_RAW = dict.fromkeys((100, 101), ("<", False))
 _RAW |= dict.fromkeys((112, 113), ("<", True)) | dict.fromkeys((114, 115), (">", True))
 """Monochrome (even) and raw Bayer (odd) formats: byte order, and whether a sample's highest bit is its type's."""
 _PACKED = range(131, 135)
@@ -227,12 +200,12 @@ _PATTERNS = {1: "GRBG", 2: "BGGR", 3: "RGGB"}
 class SeqFile(Movie):
     """An uncompressed sequence of StreamPix, of monochrome or raw samples with a time stamp behind each frame."""
 
-    def _header(self) -> _Header:
+    def _header(self) -> EvenFrames:
         return _seq_header(self.path)
 
 
 @remembered
-def _seq_header(path: Path) -> _Header:
+def _seq_header(path: Path) -> EvenFrames:
     with path.open("rb") as file:
         content = file.read(_SEQ_FIELDS.size)
         if len(content) < _SEQ_FIELDS.size or int.from_bytes(content[:4], "little") != 0xFEED:
@@ -253,7 +226,7 @@ def _seq_header(path: Path) -> _Header:
         times = _stamps_ns(file, layout, oldest, "<iHH" if version >= 5 else "<iH")
     order, upper = _RAW[form]
     cfa = _PATTERNS.get(pattern) if form % 2 else None
-    return _Header(
+    return EvenFrames(
         shape=(rows, columns),
         stored_bits=stored_bits,
         order=order,

@@ -11,9 +11,11 @@ from functools import lru_cache, wraps
 from pathlib import Path
 from typing import ClassVar, TypeVar
 
+import numpy as np
+
 from rgbmidic.errors import FrameError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.stored import Camera, StoredFrame, damaged, raw_frame
+from rgbmidic.frames.stored import Camera, Layout, StoredFrame, damaged, raw_frame, unpack_bits
 from rgbmidic.settings import FrameSettings, regular
 
 _T = TypeVar("_T")
@@ -219,6 +221,43 @@ class Movie(FrameSource):
 
     @abstractmethod
     def _header(self) -> MovieHeader: ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvenFrames(MovieHeader):
+    """Frames of one size that lie uncompressed at even distances in a file.
+
+    Attributes
+    ----------
+    layout
+        Where they lie.
+    channels
+        ``(3,)`` of colour pictures, whose samples lie pixel after pixel.
+    stored_bits, order
+        Bits in which a sample is stored, 8 or 16 in the byte order of numpy, else packed; `shift` of them lie below it.
+    stated
+        What the header states of every frame, without samples.
+    oldest
+        Place in the file of the frame that was recorded first.
+    """
+
+    layout: Layout
+    channels: tuple[int, ...] = ()
+    stored_bits: int
+    order: str = "<"
+    shift: int = 0
+    stated: StoredFrame
+    oldest: int = 0
+
+    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        """Read some rows of a frame."""
+        index = (index + self.oldest) % self.layout.count
+        if self.stored_bits in (8, 16):
+            stored = np.dtype(f"{self.order}u{self.stored_bits // 8}")
+            values = self.layout.samples(path, index, rows, self.shape[0], stored)
+        else:
+            values = unpack_bits(self.layout.read(path, index, rows, self.shape[0]), self.stored_bits)
+        return replace(self.stated, values=values.reshape(len(rows), -1, *self.channels) >> self.shift)
 
 
 @contextmanager

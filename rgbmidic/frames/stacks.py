@@ -12,16 +12,16 @@ import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rgbmidic.errors import FrameError, first_line, legible
 from rgbmidic.frames.data import Integers, Recording, even_times
-from rgbmidic.frames.source import Movie, MovieHeader, remembered
+from rgbmidic.frames.source import EvenFrames, Movie, MovieHeader, remembered
 from rgbmidic.frames.stored import (
     MAXIMUM_BYTES,
     MAXIMUM_FRAMES,
@@ -38,66 +38,33 @@ if TYPE_CHECKING:
     import h5py
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Stack(MovieHeader):
-    """An array of frames: the shape of one, (H, W) or (H, W, 3), and the type of its samples.
+def _take_apart(shape: tuple[int, ...], dtype: np.dtype[Any], what: object) -> tuple[int, tuple[int, ...]]:
+    """Number of frames in an array, and the shape of one, (H, W) or (H, W, 3).
 
-    `place` is where it lies: the byte where it begins in a .npy file, the name of the dataset in an HDF5 file.
+    Raises
+    ------
+    FrameError
+        It is no stack, or its values are no unsigned integers of 8 or 16 bit.
     """
-
-    frame: tuple[int, ...]
-    dtype: np.dtype[Any]
-    place: Any
-
-    @classmethod
-    def of(cls, shape: tuple[int, ...], dtype: np.dtype[Any], what: object, place: Any) -> Self:
-        """Take apart the shape of an array.
-
-        Raises
-        ------
-        FrameError
-            It is no stack, or its values are no unsigned integers of 8 or 16 bit.
-        """
-        axes = 3 if len(shape) > 2 and shape[-1] == 3 else 2
-        count = (1, *shape)[-axes - 1] if len(shape) in (axes, axes + 1) else 0
-        if not count or not all(shape) or dtype.kind != "u" or dtype.itemsize > 2:
-            raise FrameError(
-                f"{what} is an array of shape {shape} and type {dtype}; allowed are (frames, rows, columns), the same "
-                "with 3 channels behind, or one frame alone, of uint8 or uint16"
-            )
-        frame = shape[-axes:]
-        return cls(shape=(frame[0], frame[1]), frame=frame, dtype=dtype, recording=Recording(count=count), place=place)
-
-    @property
-    def count(self) -> int:
-        return self.recording.count
-
-    @property
-    def size(self) -> int:
-        """Bytes of a frame."""
-        return math.prod(self.frame) * self.dtype.itemsize
+    axes = 3 if len(shape) > 2 and shape[-1] == 3 else 2
+    count = (1, *shape)[-axes - 1] if len(shape) in (axes, axes + 1) else 0
+    if not count or not all(shape) or dtype.kind != "u" or dtype.itemsize > 2:
+        raise FrameError(
+            f"{what} is an array of shape {shape} and type {dtype}; allowed are (frames, rows, columns), the same with "
+            "3 channels behind, or one frame alone, of uint8 or uint16"
+        )
+    return count, shape[-axes:]
 
 
 class NpyFile(Movie):
     """A numpy array of frames, of which one is read at a time."""
 
-    def _header(self) -> _NpyStack:
-        return _npy_stack(self.path)
-
-
-class _NpyStack(_Stack):
-    """The array of a .npy file."""
-
-    def layout(self, path: Path) -> Layout:
-        return Layout.checked(path, count=self.count, start=self.place, size=self.size)
-
-    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
-        samples = self.layout(path).samples(path, index, rows, self.frame[0], self.dtype)
-        return StoredFrame.plain(samples.reshape(len(rows), *self.frame[1:]), path)
+    def _header(self) -> EvenFrames:
+        return _npy_header(self.path)
 
 
 @remembered
-def _npy_stack(path: Path) -> _NpyStack:
+def _npy_header(path: Path) -> EvenFrames:
     with path.open("rb") as file:
         # numpy refuses to parse more than 10,000 bytes, but reads as many as a damaged header announces, up to 4 GB
         head = io.BytesIO(file.read(2**16))
@@ -107,13 +74,21 @@ def _npy_stack(path: Path) -> _NpyStack:
         shape, fortran, dtype = read(head)
     except Exception as error:  # a damaged header is parsed as Python and fails in many ways
         raise damaged(path, f"its header is not numpy's: {first_line(error)}") from None
-    stack = _NpyStack.of(shape, dtype, path, head.tell())
+    count, (height, width, *channels) = _take_apart(shape, dtype, path)
     if fortran:
         raise FrameError(
             f"{path} is stored in Fortran order; save it with numpy.save(file, numpy.ascontiguousarray(stack))"
         )
-    stack.layout(path)  # refused at once where it cannot be
-    return stack
+    size = math.prod((height, width, *channels)) * dtype.itemsize
+    return EvenFrames(
+        shape=(height, width),
+        recording=Recording(count=count),
+        layout=Layout.checked(path, count=count, start=head.tell(), size=size),
+        channels=tuple(channels),
+        stored_bits=8 * dtype.itemsize,
+        order=dtype.str[0],
+        stated=StoredFrame(kind="rgb" if channels else None),
+    )
 
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".nxs")
@@ -156,7 +131,7 @@ class Hdf5File(Movie):
         if self.dataset:
             name = "/" + self.dataset.strip("/")
         else:  # the only dataset of several frames, else the only one
-            names = [name for name, stack in stacks.items() if stack.count > 1] or list(stacks)
+            names = [name for name, stack in stacks.items() if stack.recording.count > 1] or list(stacks)
             if not names:
                 raise FrameError(
                     f"{self.path} holds no dataset of shape (frames, rows, columns) and type uint8 or uint16"
@@ -168,17 +143,22 @@ class Hdf5File(Movie):
         if name not in stacks:
             there = ", ".join(stacks) or "none"
             raise FrameError(f"{self.path} has no dataset of frames {name}; those there are: {there}")
-        check_count(self.path, stacks[name].count)
+        check_count(self.path, stacks[name].recording.count)
         return stacks[name]
 
 
-class _Dataset(_Stack):
-    """A dataset of an HDF5 file."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Dataset(MovieHeader):
+    """A dataset of an HDF5 file: the shape of a frame, (H, W) or (H, W, 3), the type of its samples, and its name."""
+
+    frame: tuple[int, ...]
+    dtype: np.dtype[Any]
+    name: str
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         part = slice(rows.start, rows.stop)
         with _opened(path) as file:
-            dataset = file[self.place]
+            dataset = file[self.name]
             _check_written(dataset, index, self, path)
             values = np.asarray(dataset[index, part] if dataset.ndim > len(self.frame) else dataset[part])
         return StoredFrame.plain(values.astype(self.dtype.newbyteorder("="), copy=False), path)
@@ -204,10 +184,16 @@ def _hdf5_stacks(path: Path) -> dict[str, _Dataset]:
         if not isinstance(item, h5py.Dataset):
             return
         try:
-            stack = _Dataset.of(item.shape or (), item.dtype, name, f"/{name}")
+            count, frame = _take_apart(item.shape or (), item.dtype, name)
         except (FrameError, TypeError):
             return
-        found[f"/{name}"] = replace(stack, recording=_recording(item, stack.count))
+        found[f"/{name}"] = _Dataset(
+            shape=(frame[0], frame[1]),
+            recording=_recording(item, count),
+            frame=frame,
+            dtype=item.dtype,
+            name=f"/{name}",
+        )
 
     with _opened(path) as file:
         file.visititems(look)
@@ -228,19 +214,19 @@ def _recording(dataset: h5py.Dataset, count: int) -> Recording:
     return Recording(count=count, frame_rate=float(rate) if known else None, times_ns=times)
 
 
-def _check_written(dataset: h5py.Dataset, index: int, stack: _Stack, path: Path) -> None:
+def _check_written(dataset: h5py.Dataset, index: int, stack: _Dataset, path: Path) -> None:
     """Refuse a frame of absurd size, or of which something is not in the file: libhdf5 fills it up with zeros."""
     import h5py
 
-    size = path.stat().st_size
-    check_size(path, needed=stack.size, stored=min(dataset.id.get_storage_size(), size))
+    size, needed, count = path.stat().st_size, math.prod(stack.frame) * stack.dtype.itemsize, stack.recording.count
+    check_size(path, needed=needed, stored=min(dataset.id.get_storage_size(), size))
     if dataset.external or dataset.is_virtual:
         raise FrameError(f"{path}: the samples of {dataset.name} lie in other files; name the file that holds them")
     created = dataset.id.get_create_plist()
     if dataset.chunks is None:
         offset, inside_header = dataset.id.get_offset(), created.get_layout() == h5py.h5d.COMPACT
-        if not inside_header and (offset is None or offset + (index + 1) * stack.size > size):
-            raise cut_short(path, whole=max(size - offset, 0) // stack.size if offset else 0, count=stack.count)
+        if not inside_header and (offset is None or offset + (index + 1) * needed > size):
+            raise cut_short(path, whole=max(size - offset, 0) // needed if offset else 0, count=count)
         return
     whole = math.prod(dataset.chunks) * dataset.dtype.itemsize
     if whole > MAXIMUM_BYTES:
@@ -255,9 +241,7 @@ def _check_written(dataset: h5py.Dataset, index: int, stack: _Stack, path: Path)
         place = (*before, *corner)
         chunk = dataset.id.get_chunk_info_by_coord(place)
         if chunk.byte_offset is None or chunk.byte_offset + chunk.size > size:
-            raise FrameError(
-                f"{path}: frame {index} of {stack.count} is not all there: truncated or still being written"
-            )
+            raise FrameError(f"{path}: frame {index} of {count} is not all there: truncated or still being written")
         used = {code for number, code in enumerate(filters) if not chunk.filter_mask >> number & 1}
         # the list of chunks may name one that a damaged index does not lead to: libhdf5 gives what memory holds instead
         found = len(dataset.id.read_direct_chunk(place)[1])

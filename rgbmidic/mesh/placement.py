@@ -24,26 +24,6 @@ from rgbmidic.typing import FloatArray
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlacementConstants:
-    """Constants of `Placement.fit`, all chosen.
-
-    Attributes
-    ----------
-    pointing
-        Residuals (px) that a point set by hand may have, and that decide nothing: a click is on a whole pixel.
-    decided
-        How many times larger the residuals of the other sense must be for pairs to decide: beyond any scatter.
-    stretched
-        Ratio of lengths on the mesh and on a camera's plane beyond which they contradict each other: a wrong unit is 25
-        or more, a scale that is known to 5 % is no calibration.
-    """
-
-    pointing: float = 0.5
-    decided: float = 3.0
-    stretched: float = 1.05
-
-
 class Plane(Protocol):
     """Map between px of the image and mm on a plane: `rgbmidic.CameraCalibration`."""
 
@@ -79,14 +59,7 @@ class Placement:
     pairs: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
 
     @classmethod
-    def fit(
-        cls,
-        pairs: npt.ArrayLike,
-        camera: Plane | None = None,
-        *,
-        where: str = "mesh.points",
-        constants: PlacementConstants = PlacementConstants(),
-    ) -> Self:
+    def fit(cls, pairs: npt.ArrayLike, camera: Plane | None = None, *, where: str = "mesh.points") -> Self:
         """Fit a placement to pairs of points by least squares.
 
         Without a camera it is a similarity: shift, rotation and scale. With one it is a rigid motion, for both have mm.
@@ -102,8 +75,6 @@ class Placement:
             Lens and plane.
         where
             Name of the pairs in messages.
-        constants
-            Of the doubts that are reported.
 
         Returns
         -------
@@ -124,20 +95,23 @@ class Placement:
         if camera is not None:
             on_plane, on_mesh = (part - part.mean(axis=0) for part in (camera.to_mm(given[:, 2:]), given[:, :2]))
             stretch = np.linalg.norm(on_plane) / np.linalg.norm(on_mesh)
-            if not 1 / constants.stretched < stretch < constants.stretched:
+            # a wrong unit is 25 or more, a scale that is known to 5 % is no calibration (chosen)
+            if not 1 / 1.05 < stretch < 1.05:
                 raise InputError(
                     f"the pairs of {where} lie {stretch:.4g} times as far apart on the camera's plane as on the mesh, "
                     "where both are in mm: look at mesh.unit, the points and the calibration"
                 )
         best, other = (cls._fitted(given, camera, reflected) for reflected in (True, False))
+        # a point set by hand is a click on a whole pixel; three times as much is beyond any scatter (both chosen)
+        pointing_px, decided = 0.5, 3.0
         if len(given) > 2:
             small, large = sorted((best.rms, other.rms))
-            if large < constants.decided * max(small, constants.pointing):
+            if large < decided * max(small, pointing_px):
                 text = "%s does not decide whether the image shows the mesh or its mirror image: up is taken"
                 logger.warning(text, where)
             elif other.rms < best.rms:
                 best = other
-        if best.rms > constants.decided * constants.pointing:
+        if best.rms > decided * pointing_px:
             off = np.hypot(*best.residuals.T)
             text = "%s leaves residuals of %.1f px rms, the largest, %.1f px, at %s[%d]: check the pairs"
             logger.warning(text, where, best.rms, off.max(), where, off.argmax())

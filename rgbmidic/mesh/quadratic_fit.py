@@ -6,7 +6,6 @@ The recovery of Zhang and Naga, SIAM J. Sci. Comput. 26, 2005, with weights that
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -23,32 +22,6 @@ TERMS = ("value", "x", "y", "xx", "xy", "yy")
 """Results of the operators of `quadratic_fit`: the value, its first and its second derivatives."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FitConstants:
-    """Constants of `quadratic_fit`.
-
-    Attributes
-    ----------
-    width
-        Standard deviation of the weights around an inner node, in sides of an element. Waves of 3, 4 and 6 elements
-        then have .95 to 1.02, .99 to 1.01 and 1.00 of their height at the nodes, at a third less noise than the linear
-        fit's; with .45 1.05 and with .7 .86 of it at 3 elements (regular and outlined meshes, waves along the mesh and
-        at 45 degrees). Its square goes with the inverse of the angle that the mesh fills: with .58 everywhere corners
-        scattered 2 times as much as the linear fit's, and waves at an edge were seen no better.
-    tip
-        Fraction of the full angle from which a corner of the mesh counts as a crack's tip: an opening of 70 degrees.
-    slope_ridge, curvature_ridge
-        Weights with which slopes and curvatures are held at 0, where too few nodes determine them: the second
-        derivatives of waves of 5 to 6 elements, crack tips among them, change by 2e-5 of the largest at most
-        (measured).
-    """
-
-    width: float = 0.58
-    tip: float = 0.8
-    slope_ridge: float = 1e-9
-    curvature_ridge: float = 1e-6
-
-
 def quadratic_fit(
     mesh: Tri3Mesh,
     used: BoolArray,
@@ -56,7 +29,6 @@ def quadratic_fit(
     information: FloatArray | None = None,
     offset: FloatArray | None = None,
     first: int | None = None,
-    constants: FitConstants = FitConstants(),
 ) -> tuple[sp.csr_matrix, ...]:
     """Linear operators (N, N), one for each of `TERMS`, from nodal values to those of the polynomial at each node.
 
@@ -75,16 +47,14 @@ def quadratic_fit(
         Excess of the given values over a field whose second derivative xx, xy or yy is 1, square px; 0 without.
     first
         Fit the polynomials of so many first nodes only; None: of all.
-    constants
-        Weights of the nodes.
 
     Returns
     -------
     tuple of csr_matrix, shape (N, N) or (`first`, N)
         In the order of `TERMS`, per px and square px.
     """
-    other, known, weight, structure = _window(mesh, used.tobytes(), constants)
-    basis = _basis(mesh, used.tobytes(), constants, None if offset is None else offset.tobytes())
+    other, known, weight, structure = _window(mesh, used.tobytes())
+    basis = _basis(mesh, used.tobytes(), None if offset is None else offset.tobytes())
     if first is not None:
         other, weight, basis, structure = other[:first], weight[:first], basis[:first], structure[:first]
         known = known[: structure.nnz]
@@ -93,7 +63,9 @@ def quadratic_fit(
         weight = weight * np.divide(theirs, own + theirs, out=np.full(other.shape, 0.5), where=own + theirs > 0)
     weighted = weight[:, None] * basis
     normal = weighted @ basis.transpose(0, 2, 1)
-    normal[:, range(1, 6), range(1, 6)] += np.repeat([constants.slope_ridge, constants.curvature_ridge], [2, 3])
+    # slopes and curvatures are held at 0 where too few nodes determine them: the second derivatives of waves of 5 to 6
+    # elements, crack tips among them, change by 2e-5 of the largest at most (measured)
+    normal[:, range(1, 6), range(1, 6)] += [1e-9, 1e-9, 1e-6, 1e-6, 1e-6]
     fits = (
         np.linalg.inv(normal) / (mesh.sizes[: len(other), None] ** np.array([0, 1, 1, 2, 2, 2]))[:, :, None]
     ) @ weighted
@@ -125,7 +97,7 @@ def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray])
 
 
 @lru_cache(maxsize=2)  # of a mesh and of its halves
-def _window(mesh: Tri3Mesh, used: bytes, constants: FitConstants) -> tuple[Index, Index, FloatArray, sp.csr_matrix]:
+def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, Index, FloatArray, sp.csr_matrix]:
     """Return the nodes that the polynomial of each node is fitted to.
 
     The last result is kept, for most frames use all elements.
@@ -138,14 +110,20 @@ def _window(mesh: Tri3Mesh, used: bytes, constants: FitConstants) -> tuple[Index
     """
     elements = np.frombuffer(used, dtype=bool)
     surrounded = _surrounded(mesh, elements)
-    reach = _reached(mesh, elements, ~(mesh.on_boundary & (surrounded > constants.tip)))
+    is_tip = mesh.on_boundary & (surrounded > 0.8)  # of a crack that opens by less than 70 degrees
+    reach = _reached(mesh, elements, ~is_tip)
     number = np.diff(reach.indptr)
     known = np.arange(number.max()) < number[:, None]
     other = np.repeat(np.arange(number.size)[:, None], known.shape[1], axis=1)
     other[known] = reach.indices
     square = sum((axis[other] - axis[:, None]) ** 2 for axis in mesh.nodes.T) / mesh.sizes[:, None] ** 2
-    # at an edge the window holds as much of the mesh as inside
-    weight = np.where(known, np.exp(-square * surrounded[:, None] / (2 * constants.width**2)), 0.0)
+    # Standard deviation of the weights around an inner node, in sides of an element. Waves of 3, 4 and 6 elements then
+    # have .95 to 1.02, .99 to 1.01 and 1.00 of their height at the nodes, at a third less noise than the linear fit's;
+    # with .45 1.05 and with .7 .86 of it at 3 elements (regular and outlined meshes, waves along the mesh and at 45
+    # degrees). At an edge the window holds as much of the mesh as inside: with .58 everywhere corners scattered 2 times
+    # as much as the linear fit's, and waves at an edge were seen no better.
+    width = 0.58
+    weight = np.where(known, np.exp(-square * surrounded[:, None] / (2 * width**2)), 0.0)
     return other, np.flatnonzero(known), weight, reach
 
 
@@ -160,9 +138,9 @@ def _surrounded(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:
 
 
 @lru_cache(maxsize=4)  # with and without the offset
-def _basis(mesh: Tri3Mesh, used: bytes, constants: FitConstants, offset: bytes | None) -> FloatArray:
+def _basis(mesh: Tri3Mesh, used: bytes, offset: bytes | None) -> FloatArray:
     """Evaluate 1, x, y, xx/2, xy, yy/2 about each node at those around it, in sides of an element: (N, 6, W)."""
-    other = _window(mesh, used, constants)[0]
+    other = _window(mesh, used)[0]
     sizes = mesh.sizes[:, None]
     x, y = ((axis[other] - axis[:, None]) / sizes for axis in mesh.nodes.T)
     basis = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=1)

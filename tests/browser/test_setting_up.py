@@ -113,7 +113,7 @@ def test_corners_that_are_drawn_while_the_server_makes_a_mesh_are_those_that_are
         page.until("model('message').text.includes('is written, with a polygon as its region')")
         page.until("model('marks').data.kind.length === 4 && model('rings').data.xs[0].length === 5")
         np.testing.assert_allclose(read_test(test_file).region.polygon, corners, atol=0.8)
-        assert read_test(test_file).element_size == 15
+        assert read_test(test_file).mesh.element_size == 15
 
 
 def test_what_the_frame_tells_is_shown_and_bad_input_is_told(test_file):

@@ -160,8 +160,10 @@ def test_it_says_what_is_stated_and_what_is_not(tmp_path: Path) -> None:
     assert page.rows["exposure"] == "1.5 µs"
     assert page.rows["virtual strain gauge"] == f"{3 * MESH.size:.4g} px ({0.15 * MESH.size:.3g} mm), at every node"
     assert page.rows["data point spacing"].endswith("at the nodes")
-    assert page.rows["spatial resolution"].startswith(f"displacement {2.2 * stated.element_size:.2g} px (")
-    assert page.rows["elements"].endswith(f"side {stated.element_size:.4g} px ({0.05 * stated.element_size:.3g} mm)")
+    assert page.rows["spatial resolution"].startswith(f"displacement {2.2 * stated.mesh.element_size:.2g} px (")
+    assert page.rows["elements"].endswith(
+        f"side {stated.mesh.element_size:.4g} px ({0.05 * stated.mesh.element_size:.3g} mm)"
+    )
     assert page.rows["image filter"].startswith("[1 2 1]")
     assert page.rows["u_std"].startswith("mm | ")
     assert "by number or time: 2" in page.words
@@ -170,7 +172,7 @@ def test_it_says_what_is_stated_and_what_is_not(tmp_path: Path) -> None:
     assert "<mark>[camera]</mark> with 50 mm" in (tmp_path / "a.html").read_text(encoding="utf-8")
     assert '[camera] with 50 mm, "f/2" <script> recorded 120 x 80 px at 50000 frames per second' in methods
     assert "exposure 1.5 µs" in methods
-    assert f"triangles of {stated.element_size:.4g} px ({0.05 * stated.element_size:.3g} mm)" in methods
+    assert f"triangles of {stated.mesh.element_size:.4g} px ({0.05 * stated.mesh.element_size:.3g} mm)" in methods
     assert "noise floor is [noise floor of static frames]" in methods
 
 

@@ -58,7 +58,7 @@ def test_a_file_keeps_its_comments_and_what_was_not_changed(tmp_path):
         "region": {"polygon": polygon},
         "mesh": {"element_size": 30.0},
     }
-    assert read_test(file).element_size == 30
+    assert read_test(file).mesh.element_size == 30
 
 
 def test_a_size_that_the_run_finds_is_kept_unless_it_is_changed(tmp_path):
