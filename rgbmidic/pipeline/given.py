@@ -40,9 +40,9 @@ def check_type(name: str, given: object, kind: type | UnionType, allowed: str) -
 def describe(given: Any, longest: int = 120) -> str:
     """What a result keeps of an object that a script gave: its ``describe()`` where it has one, else what it shows.
 
-    More than the `longest` number of characters are cut and get their checksum: people read the text, the comparison
-    reads the checksum. Functions and objects without a representation of their own give their name only: two of one name cannot be told
-    apart.
+    Functions and objects without a representation of their own give their name only: two of one name cannot be told
+    apart. More than the `longest` number of characters are cut and get their checksum: people read the text, the
+    comparison reads the checksum.
     """
     if callable(told := getattr(given, "describe", None)):
         text = f"{class_name(given)}: {told()}"
