@@ -135,11 +135,7 @@ def discretisation_error(
 
 
 def _finer_field(
-    halves: _Halves,
-    deformed: Deformed,
-    solution: Solution,
-    options: SolverSettings,
-    method: PrecisionMethod | None,
+    halves: _Halves, deformed: Deformed, solution: Solution, options: SolverSettings, method: PrecisionMethod | None
 ) -> tuple[FloatArray, FloatArray]:
     """Take Gauss-Newton steps on the halved mesh from the recovered field.
 

@@ -357,7 +357,9 @@ def _separate() -> None:
         true_calibration(scene).write(Path(folder) / "calibration.json")
         (Path(folder) / "test.toml").write_text(_SETTINGS, encoding="utf-8")
         plan = Plan.from_settings(read_test(Path(folder) / "test.toml"))
-        plan.separation(plan.series.read(1))
+        frames = plan.series.read(1)
+        assert isinstance(frames, tuple)
+        plan.separation(frames)
 
 
 def _images(index: int) -> FloatImage:

@@ -20,11 +20,13 @@ import cv2
 import numpy as np
 
 from rgbmidic._kernels.threads import keep_memory, set_threads, threads
-from rgbmidic.correlation import NodeStatus, Solution, Start
+from rgbmidic.correlation import NodeStatus, Solution, Start, Status
+from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError
 from rgbmidic.pipeline.frame import Measured, failed_frame, measure_frame
-from rgbmidic.pipeline.order import STRIDE, better, children, lineage, loses, parent
+from rgbmidic.pipeline.order import STRIDE, children, is_key, lineage, parent
 from rgbmidic.pipeline.plan import Plan
+from rgbmidic.results import FrameRecord
 
 logger = logging.getLogger(__name__)
 
@@ -149,7 +151,8 @@ class Schedule:
         if found.record.unread and (gone := self._plan.series.gone()):
             raise FrameError(f"the frames are gone: {gone}; go on with --resume when they are there again")
         first = self._first_tries.pop(place, None)
-        if first is None and loses(place, found.record, start):
+        lost = found.record.status != Status.CONVERGED or rank_of(found.record)[1] > start.unmeasured + 0.01
+        if first is None and is_key(place) and lost:  # a hundredth of the nodes more than where it started from
             self._first_tries[place] = found
             before = place - 1  # it may have to be measured first
             if self._sink.is_finished(before):
@@ -159,14 +162,18 @@ class Schedule:
                 self.want(before)
             return
         if first is not None:
-            record = better(first.record, found.record)
-            tried = replace(record, values={**record.values, "tries": 2})
-            found = replace(first if record is first.record else found, record=tried)
+            better = min(first, found, key=lambda one: rank_of(one.record))
+            found = replace(better, record=replace(better.record, values={**better.record.values, "tries": 2}))
         after = following(self._plan, found.record.values, start)
         self._sink.keep(place, found, after)
         self._wanted.discard(place)
         released = [child for child in children(place, max(self._wanted, default=0) + 1) if child in self._wanted]
         self._ready += [(one, after) for one in (*released, *self._waiting.pop(place, ()))]
+
+
+def rank_of(record: FrameRecord) -> tuple[bool, float]:
+    """The smaller, the better a frame is measured (`rgbmidic.correlation.solution.rank`)."""
+    return rank(int(record.status), record.node_status)
 
 
 def following(plan: Plan, kept: Mapping[str, Any], start: Start) -> Start:

@@ -11,10 +11,6 @@ import numpy as np
 
 from rgbmidic.errors import InputError
 
-_LONGEST_NAME = 120
-"""Characters of a description that are kept as they are; a longer one is cut and gets its checksum. Chosen; not
-sensitive: it is read by people, the checksum by the comparison."""
-
 
 def check_object(name: str, given: object, *methods: str) -> None:
     """Refuse an object that a script gave, unless it is None or has all of these methods.
@@ -41,11 +37,12 @@ def check_type(name: str, given: object, kind: type | UnionType, allowed: str) -
         raise InputError(f"{name} must be {allowed}, not {class_name(given)}")
 
 
-def describe(given: Any) -> str:
+def describe(given: Any, longest: int = 120) -> str:
     """What a result keeps of an object that a script gave: its ``describe()`` where it has one, else what it shows.
 
     Functions and objects without a representation of their own give their name only: two of one name cannot be told
-    apart.
+    apart. More than the `longest` number of characters are cut and get their checksum: people read the text, the
+    comparison reads the checksum.
     """
     if callable(told := getattr(given, "describe", None)):
         text = f"{class_name(given)}: {told()}"
@@ -58,8 +55,8 @@ def describe(given: Any) -> str:
         text = class_name(given)
     else:
         text = f"{class_name(given)}: " + re.sub(r" at 0x[0-9a-fA-F]+", "", repr(given))
-    if len(text) > _LONGEST_NAME:
-        return f"{text[:_LONGEST_NAME]} ... {hashlib.sha256(text.encode()).hexdigest()[:16]}"
+    if len(text) > longest:
+        return f"{text[:longest]} ... {hashlib.sha256(text.encode()).hexdigest()[:16]}"
     return text
 
 

@@ -3,35 +3,16 @@
 The frames are the leaves of a tree of base `STRIDE`: a frame starts from the one before it, every 16th from the 16th
 before, every 256th from the 256th before, and so on, so that chunks of consecutive frames can be measured side by side
 once their key frame is, and any range of frames needs only some key frames of those before it. A key frame that is not
-measured well from there is measured once more from the frame just before it, and the better of both is kept (`loses`,
-`better`).
+measured well from there is measured once more from the frame just before it, and the better of both is kept
+(`rgbmidic.pipeline.engine`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from rgbmidic.correlation import Start, Status
-from rgbmidic.correlation.solution import rank
-from rgbmidic.results import FrameRecord
-
 STRIDE = 16
 """Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
-
-
-def rank_of(record: FrameRecord) -> tuple[bool, float]:
-    """The smaller, the better a frame is measured (`rgbmidic.correlation.solution.rank`)."""
-    return rank(int(record.status), record.node_status)
-
-
-def loses(position: int, record: FrameRecord, start: Start, most: float = 0.01) -> bool:
-    """Whether a frame is a key frame that has lost more than a fraction of the nodes of the one it starts from."""
-    return is_key(position) and (record.status != Status.CONVERGED or rank_of(record)[1] > start.unmeasured + most)
-
-
-def better(first: FrameRecord, second: FrameRecord) -> FrameRecord:
-    """The better measured of two tries of one frame, the first of two that are alike."""
-    return second if rank_of(second) < rank_of(first) else first
 
 
 def parent(position: int) -> int | None:

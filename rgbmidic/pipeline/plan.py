@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from threading import Lock
@@ -187,9 +187,8 @@ class Plan:
         """
         _check_given(settings, source, separation, weights, mesh)
         camera = None if settings.calibration.file is None else Calibration.read(settings.calibration.file)
-        series: Series
         if source is None:
-            series = open_series(settings.frames, settings.base, camera)
+            series: Series = open_series(settings.frames, settings.base, camera)
         else:
             series = open_sequence(source, settings.frames, camera)
         if settings.scale.camera is not None:
@@ -206,20 +205,13 @@ class Plan:
             region, window = region_and_window(settings, region, series.shape)
             if mesh is not None:
                 mesh = Tri3Mesh(nodes=mesh.nodes - window.origin, elements=mesh.elements)
-        indices, name = settings.frames.reference, ", ".join(map(series.name, settings.frames.reference))
-        states = [series.read(index, window) for index in indices[:2]]
-        if separation is not None and isinstance(states[0], IlluminationImages):
+        state, images, separate = _read_reference(settings, series, separate, window, region, calibration)
+        if separation is not None and isinstance(state, IlluminationImages):
             raise ConfigurationError("the source gives images of the lights, which need no separation: give only one")
-        if calibration is not None and not window.is_whole:
-            calibration = calibration.cropped(window.origin, window.shape)
-        _check_raw(states, name, settings, region, calibration)
-        others = (series.read(index, window) for index in indices[2:])
-        images, separate = reference_images(separate, chain(states, others), window)
         size = settings.mesh.side if mesh is None else mesh.size
         if mesh is None:
-            mesh = Tri3Mesh.from_region(
-                region, size, [np.subtract(path, window.origin) for path in settings.mesh.cracks]
-            )
+            cracks = [np.subtract(path, window.origin) for path in settings.mesh.cracks]
+            mesh = Tri3Mesh.from_region(region, size, cracks)
         cracked = len(mesh.crack_edges) > 0
         sigma, solver = grey_levels(settings.illumination.normalise, settings.solver, cracked=cracked)
         weights = weights or prepare_weights(
@@ -238,7 +230,7 @@ class Plan:
             suitability.tell_small(mesh, speckle, finite_elements)
         elif small := suitability.too_small(size, speckle, suitability.SUITABILITY.hardly_enough):
             logger.warning("%s", small)
-        _check_seen(states[0], name, images, reference, region)
+        _check_seen(state, ", ".join(map(series.name, settings.frames.reference)), images, reference, region)
         return cls(
             settings=settings,
             normalise=sigma,
@@ -250,7 +242,7 @@ class Plan:
             images=images,
             reference=reference,
             speckle=speckle,
-            saturated=suitability.saturated_fraction(states[0], region.mask),
+            saturated=suitability.saturated_fraction(state, region.mask),
             window=window,
             element_size=size,
             finite_elements=finite_elements,
@@ -383,14 +375,22 @@ def _check_given(
         )
 
 
-def _check_raw(
-    states: Sequence[RawState], name: str, settings: TestSettings, region: Region, calibration: Calibration | None
-) -> None:
-    """Refuse raw frames of the reference that contradict the stated levels or their calibration; warn of doubts."""
+def _read_reference(
+    settings: TestSettings,
+    series: Series,
+    separation: LightSeparation,
+    window: Window,
+    region: Region,
+    calibration: Calibration | None,
+) -> tuple[RawState, IlluminationImages, LightSeparation]:
+    """First state of the reference, mean images of all its frames, and the separation that has learnt from them.
+
+    Raw frames that contradict the stated levels or their calibration are refused; doubts are warned of.
+    """
+    indices, name = settings.frames.reference, ", ".join(map(series.name, settings.frames.reference))
+    states = [series.read(index, window) for index in indices[:2]]
     raw = [state for state in states if not isinstance(state, IlluminationImages)]
-    if not raw:
-        return
-    for frame in raw[0]:
+    for frame in raw[0] if raw else ():
         if shifted := suitability.shifted_levels(samples := frame.values[..., region.mask], frame.white_level):
             raise FrameError(f"the reference ({name}): {shifted}")
         # twice as much has a bit more than the level: it is not the camera's, or deliberately low
@@ -399,20 +399,22 @@ def _check_raw(
                 f"the samples of the reference ({name}) reach {largest}, far above white_level {frame.white_level:g}: "
                 "is it that of the camera, and is the order of the bytes (frames.dtype) right?"
             )
-    saturated = suitability.saturated_fraction(raw[0], region.mask)
+    saturated = suitability.saturated_fraction(states[0], region.mask)
     # with .985 lights were still separated, with .99 no texture was left in two of three frames (measured)
     if saturated > 0.98:
-        raise FrameError(
-            f"no light sees the region in the reference ({name}): {suitability.exposure_fault(raw[0], region.mask)}"
-        )
+        fault = suitability.exposure_fault(states[0], region.mask)
+        raise FrameError(f"no light sees the region in the reference ({name}): {fault}")
     if saturated > suitability.SUITABILITY.saturated:
         logger.warning(f"{100 * saturated:.0f} % of the samples in the region of the reference ({name}) are saturated")
-    if calibration is None:
-        return
-    repeat = raw[1] if len(raw) > 1 else None
-    for found in check_state(raw[0], calibration, region.mask, name, accept=settings.calibration.accept, repeat=repeat):
-        if found.passed:
-            logger.warning("%s may not be what %s calibrates: %s", name, settings.calibration.file, found.text)
+    if calibration is not None and raw:
+        seen = calibration if window.is_whole else calibration.cropped(window.origin, window.shape)
+        repeat = raw[1] if len(raw) > 1 else None
+        for found in check_state(raw[0], seen, region.mask, name, accept=settings.calibration.accept, repeat=repeat):
+            if found.passed:
+                logger.warning("%s may not be what %s calibrates: %s", name, settings.calibration.file, found.text)
+    others = (series.read(index, window) for index in indices[2:])
+    images, learnt = reference_images(separation, chain(states, others), window)
+    return states[0], images, learnt
 
 
 def _check_seen(state: RawState, name: str, images: IlluminationImages, reference: Reference, region: Region) -> None:

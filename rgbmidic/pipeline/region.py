@@ -18,9 +18,6 @@ from rgbmidic.typing import FloatArray
 logger = logging.getLogger(__name__)
 
 
-_REACH = 96.0
-"""px around what is looked at that the separation's local statistics use: three standard deviations of their windows
-with all that is between (`rgbmidic.lab.inspection.samples.InspectionConstants`)."""
 _WORTH = 0.5
 """Share of the frame from which all of it is read: what a window saves would be less than half."""
 
@@ -51,11 +48,17 @@ def region_and_window(settings: TestSettings, region: Region | None, frame: tupl
     return region.part(*window.part_of(Window.whole(frame))), window
 
 
-def window_around(points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int]) -> Window:
-    """What lies within `reach` of points (N, 2), and what its images depend on."""
+def window_around(
+    points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int], around: float = 96.0
+) -> Window:
+    """What lies within `reach` of points (N, 2), and what its images depend on.
+
+    The separation's local statistics use `around` px: three standard deviations of their windows with all that is
+    between (`rgbmidic.lab.inspection.samples.InspectionConstants`).
+    """
     may_crack = bool(settings.mesh.cracks) or settings.mesh.file is not None
     sigma, _ = grey_levels(settings.illumination.normalise, settings.solver, cracked=may_crack)
-    return Window.around(points, reach + max(_REACH, 3 * max(sigma, settings.weights.blur)), frame)
+    return Window.around(points, reach + max(around, 3 * max(sigma, settings.weights.blur)), frame)
 
 
 def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:

@@ -223,10 +223,10 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
         mesh = plan.reference.mesh
         solution = solved(plan, key.deformed, key.start(mesh))
         known = discretisation_error(plan.reference, key.deformed, solution, plan.solver, plan.method)
-        error, noise = (  # the squares at the corners of each element; NaN takes no part
+        missed, noise = (  # the squares at the corners of each element; NaN takes no part
             np.nan_to_num(part[mesh.elements] ** 2).sum(axis=(1, 2)) for part in (known.strain_error, known.strain_std)
         )
-        finer = refined(mesh, error > CONSTANTS.worth**2 * noise, least)
+        finer = refined(mesh, missed > CONSTANTS.worth**2 * noise, least)
         if finer is mesh:
             break
         nodes = np.round(finer.nodes / CONSTANTS.exact) * CONSTANTS.exact

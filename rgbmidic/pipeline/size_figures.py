@@ -257,7 +257,6 @@ def measure_size(
     if solution.status is Status.FAILED:
         raise FrameError(solution.reason)
     still = [solved(plan, static, np.zeros_like(mesh.nodes)) for static in rest]
-    single = np.sqrt(1 + 1 / len(plan.settings.frames.reference))
     known = discretisation_error(plan.reference, deformed, solution, plan.solver, plan.method)
     field = Field.of(mesh, known)
     other = [one for one in finer if CONSTANTS.finer * one.mesh.size <= mesh.size]
@@ -269,7 +268,7 @@ def measure_size(
     whole = solution.measured[mesh.elements].all(axis=1)
 
     def errors(name: str, beyond: float) -> dict[str, Any]:
-        bias, scatter = _floor([getattr(one, name) for one in still], single)
+        bias, scatter = _floor([getattr(one, name) for one in still], len(plan.settings.frames.reference))
         stated, error = (rms(getattr(known, f"{name}_{kind}")) for kind in ("std", "error"))
         return {"bias": bias, "scatter": scatter, "stated": stated, "discretisation": float(np.fmax(error, beyond))}
 
@@ -330,8 +329,8 @@ class Field:
         return found
 
 
-def _floor(fields: Sequence[FloatArray], single: float) -> tuple[float, float]:
-    """Bias and scatter of fields (N, C) of static frames, as of a `single` frame against the reference.
+def _floor(fields: Sequence[FloatArray], references: int) -> tuple[float, float]:
+    """Bias and scatter of fields (N, C) of static frames, as of one frame against the mean of `references`.
 
     They are differences among these frames, which do not depend on the reference: one frame scatters against the mean
     of n by sqrt(1 + 1/n) more than they do around their own mean.
@@ -339,7 +338,7 @@ def _floor(fields: Sequence[FloatArray], single: float) -> tuple[float, float]:
     if len(fields) < 2:
         return float("nan"), float("nan")
     stack = np.stack(fields)
-    apart = (stack - stack.mean(axis=0)) * single * np.sqrt(len(fields) / (len(fields) - 1))
+    apart = (stack - stack.mean(axis=0)) * np.sqrt(1 + 1 / references) * np.sqrt(len(fields) / (len(fields) - 1))
     mean = np.nanmean(apart, axis=1, keepdims=True)
     return rms(mean), rms(apart - mean)
 
@@ -353,12 +352,11 @@ def _gauge_figures(
     if not fit:
         return
     covariance = NodalCovariance.from_mesh(mesh)
-    single = np.sqrt(1 + 1 / len(plan.settings.frames.reference))
     for length in fit:
         gauge = StrainGauges.at_nodes(covariance, length)
         strains = [gauge.strain(*one.displacement.T, *one.displacement_std.T, measure=measure) for one in still]
         loaded = gauge.strain(*solution.displacement.T, *solution.displacement_std.T, measure=measure)
-        floor = _floor([one.components for one in strains], single)[1]
+        floor = _floor([one.components for one in strains], len(plan.settings.frames.reference))[1]
         size = np.abs(loaded.components)
         known = size[np.isfinite(size)]
         largest = float(np.quantile(known, CONSTANTS.largest)) if known.size else float("nan")
