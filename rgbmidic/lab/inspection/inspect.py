@@ -89,17 +89,15 @@ def inspect_files(
     shape = frames[0].values.shape[-2], frames[0].values.shape[-1]
     known = known and known.cropped(stated.crop_origin, shape)
     place = Region.from_rectangle(region, shape) if region is not None else None
-    sides = None if test is None else test.side
-    if place is None and test is not None:
-        if test.mesh_file is None:
-            place = read_region(test.region, shape)
-        else:
-            _, _, mesh, place = finite_elements_of(test, shape)
-            sides = mesh.size
     how: dict[str, Any] = {"name": name}
     if test is not None:
-        how |= {"element_size": sides, "accept": test.accept}
+        how |= {"element_size": test.side, "accept": test.accept}
         how |= {"demosaic": test.illumination.demosaic, "prefilter": test.solver.prefilter}
+        if place is None and test.mesh_file is None:
+            place = read_region(test.region, shape)
+        elif place is None:
+            _, _, mesh, place = finite_elements_of(test, shape)
+            how["element_size"] = mesh.size
     how |= {key: value for key, value in options.items() if value is not None}
     try:
         return inspect_frame(frames, calibration=known, region=place, **how)
