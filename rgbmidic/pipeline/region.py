@@ -20,7 +20,7 @@ logger = logging.getLogger(__name__)
 
 _REACH = 96.0
 """px around what is looked at that the separation's local statistics use: three standard deviations of their windows
-with all that is between (`rgbmidic.lab.inspection.samples.InspectionConstants`)."""
+with all that is between (`rgbmidic.lab.inspection.channels.InspectionConstants`)."""
 _WORTH = 0.5
 """Share of the frame from which all of it is read: what a window saves would be less than half."""
 

@@ -19,9 +19,7 @@ from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.lab.inspection.prediction import LocalContrast, Prediction, predict, separated
-from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
-from rgbmidic.lab.inspection.samples import (
+from rgbmidic.lab.inspection.channels import (
     CONSTANTS,
     Channel,
     channels_of,
@@ -29,6 +27,8 @@ from rgbmidic.lab.inspection.samples import (
     speckle_texture,
     surroundings,
 )
+from rgbmidic.lab.inspection.prediction import LocalContrast, Prediction, predict, separated
+from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.region import finite_elements_of, read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
