@@ -161,7 +161,7 @@ def residual_percent(reference: npt.ArrayLike, deformed: npt.ArrayLike, displace
     return float(100 * np.nanstd(back - used) / span)
 
 
-def _over_areas(image: FloatArray, areas: Sequence[Area], statistic: Callable[[FloatArray], float]) -> FloatArray:
+def _over_areas(image: FloatArray, areas: Sequence[Area], statistic: Callable[..., float]) -> FloatArray:
     cuts = [area.cut(image) for area in areas]
     return np.array([statistic(cut) if np.isfinite(cut).mean() >= 0.5 else np.nan for cut in cuts], dtype=np.float64)
 

@@ -54,7 +54,7 @@ def window_around(
     """What lies within `reach` of points (N, 2), and what its images depend on.
 
     The separation's local statistics use `around` px: three standard deviations of their windows with all that is
-    between (`rgbmidic.lab.inspection.samples.InspectionConstants`).
+    between (`rgbmidic.lab.inspection.channels.InspectionConstants`).
     """
     may_crack = bool(settings.mesh.cracks) or settings.mesh.file is not None
     sigma, _ = grey_levels(settings.illumination.normalise, settings.solver, cracked=may_crack)

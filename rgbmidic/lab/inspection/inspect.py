@@ -19,9 +19,7 @@ from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.lab.inspection.prediction import LocalContrast, Prediction, predict, separated
-from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
-from rgbmidic.lab.inspection.samples import (
+from rgbmidic.lab.inspection.channels import (
     CONSTANTS,
     Channel,
     channels_of,
@@ -29,6 +27,8 @@ from rgbmidic.lab.inspection.samples import (
     speckle_texture,
     surroundings,
 )
+from rgbmidic.lab.inspection.prediction import LocalContrast, Prediction, predict, separated
+from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.region import finite_elements_of, read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
@@ -89,17 +89,15 @@ def inspect_files(
     shape = frames[0].values.shape[-2], frames[0].values.shape[-1]
     known = known and known.cropped(stated.crop_origin, shape)
     place = Region.from_rectangle(region, shape) if region is not None else None
-    sides = None if test is None else test.mesh.side
-    if place is None and test is not None:
-        if test.mesh.file is None:
-            place = read_region(test.region, shape)
-        else:
-            _, _, mesh, place = finite_elements_of(test, shape)
-            sides = mesh.size
     how: dict[str, Any] = {"name": name}
     if test is not None:
-        how |= {"element_size": sides, "accept": test.calibration.accept}
+        how |= {"element_size": test.mesh.side, "accept": test.calibration.accept}
         how |= {"demosaic": test.illumination.demosaic, "prefilter": test.solver.prefilter}
+        if place is None and test.mesh.file is None:
+            place = read_region(test.region, shape)
+        elif place is None:
+            _, _, mesh, place = finite_elements_of(test, shape)
+            how["element_size"] = mesh.size
     how |= {key: value for key, value in options.items() if value is not None}
     try:
         return inspect_frame(frames, calibration=known, region=place, **how)

@@ -29,7 +29,7 @@ from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
 from rgbmidic.illumination.separation import DEFAULT_METHOD, reconstructed_lights, separate
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.lab.inspection.samples import CONSTANTS
+from rgbmidic.lab.inspection.channels import CONSTANTS
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.scene.camera import mosaic_samples
 from rgbmidic.scene.forecast import expected_std, light_pull

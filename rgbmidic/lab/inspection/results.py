@@ -11,8 +11,8 @@ from rgbmidic.illumination.checks import Check
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import COLOURED, TextureModel
+from rgbmidic.lab.inspection.channels import CONSTANTS
 from rgbmidic.lab.inspection.prediction import Prediction
-from rgbmidic.lab.inspection.samples import CONSTANTS
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
@@ -57,7 +57,7 @@ class ChannelSummary:
     saturated : float
         Fraction of the samples that are saturated.
     speckle_px : float
-        Full width at half maximum of the autocorrelation, px (`rgbmidic.lab.inspection.samples.speckle_texture`).
+        Full width at half maximum of the autocorrelation, px (`rgbmidic.lab.inspection.channels.speckle_texture`).
     noise_dn : float
         Standard deviation of the camera noise of a sample at the mean level, DN; estimated from the frame where the
         calibration does not know the noise.

@@ -28,9 +28,9 @@ from rgbmidic.illumination.linear import NoiseModel, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection import Inspection, inspect_files, inspect_frame
+from rgbmidic.lab.inspection.channels import Channel, channels_of, noise_estimate, speckle_texture
 from rgbmidic.lab.inspection.prediction import gaussian_field
 from rgbmidic.lab.inspection.report import inspection_document, write_inspection
-from rgbmidic.lab.inspection.samples import Channel, channels_of, noise_estimate, speckle_texture
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import correlate
 from rgbmidic.scene.forecast import expected_std, node_constant

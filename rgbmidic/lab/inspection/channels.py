@@ -1,4 +1,4 @@
-"""Samples of one frame before anything is demosaiced: the part looked at, its channels, speckle size and noise.
+"""Channels of one frame before anything is demosaiced: the part looked at, samples, speckle size and noise.
 
 A channel of a mosaic is an image (H, W) with NaN where another channel was sampled.
 """
