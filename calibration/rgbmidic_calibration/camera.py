@@ -163,7 +163,7 @@ class _Fit:
 
 def _flat(places: FloatArray) -> FloatArray:
     """Places (m, 2) of the target as points of space, (m, 3)."""
-    return np.c_[places, np.zeros(len(places))]
+    return np.pad(places, ((0, 0), (0, 1)))
 
 
 def _fit(views: Sequence[View], radial: int, tangential: int) -> _Fit:
@@ -181,7 +181,7 @@ def _fit(views: Sequence[View], radial: int, tangential: int) -> _Fit:
     )
     return _Fit(
         lens=np.r_[matrix[0, 0], matrix[:2, 2], np.ravel(distortion)[:5]],
-        poses=list(zip(turns, shifts, strict=True)),
+        poses=[(np.asarray(turn), np.asarray(shift)) for turn, shift in zip(turns, shifts, strict=True)],
         squares=float(rms) ** 2 * sum(len(view.points) for view in views),
         unknowns=3 + radial + 2 * tangential + 6 * len(views),
     )
@@ -320,9 +320,11 @@ def estimate_plane(view: View, camera: CameraCalibration, std: float | None = No
 
     # columns scaled alike: by what a px at the edge of the target does
     scale = np.maximum(np.abs(entries), np.r_[[1e-3 * abs(entries[0])] * 6, [1e-6] * 2])
-    found = optimize.least_squares(
-        lambda part: off(part * scale), entries / scale, jac="3-point", method="lm", xtol=1e-14
-    )
+
+    def scaled(part: FloatArray) -> FloatArray:
+        return off(part * scale)
+
+    found = optimize.least_squares(scaled, entries / scale, jac="3-point", method="lm", xtol=1e-14)
     entries, slopes = found.x * scale, np.asarray(found.jac, dtype=np.float64) / scale
     residual = off(entries)
     rms = float(np.sqrt((residual**2).mean()))

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from rgbmidic import command
 from rgbmidic.errors import ConfigurationError
@@ -25,16 +26,14 @@ app = typer.Typer(
     context_settings=command.HELP,
 )
 
-Out = Annotated[Path, typer.Option(help="Calibration file to write (JSON).")]
-Region = Annotated[str | None, typer.Option(help="x0,y0,x1,y1 in px: region of the speckled target.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
+Out = Annotated[Path, Option(help="Calibration file to write (JSON).")]
+Region = Annotated[str | None, Option(help="x0,y0,x1,y1 in px: region of the speckled target.")]
+Overwrite = Annotated[bool, Option("--overwrite", help="Replace an existing file.")]
 CAPTURE_OPTIONS: dict[str, Any] = {
     "light": Annotated[
-        list[str], typer.Option("--light", help="NAME=FILES: captures with only this light on. Once per light.")
+        list[str], Option("--light", help="NAME=FILES: captures with only this light on. Once per light.")
     ],
-    "dark": Annotated[
-        str | None, typer.Option("--dark", help="Captures with all lamps off (and the same ambient light).")
-    ],
+    "dark": Annotated[str | None, Option("--dark", help="Captures with all lamps off (and the same ambient light).")],
     **command.FRAME_OPTIONS,
 }
 
@@ -48,8 +47,7 @@ def main() -> None:
 
 @app.callback(invoke_without_command=True)
 def _root(
-    context: typer.Context,
-    debug: Annotated[bool, typer.Option("--debug", help="Show where an error occurs.")] = False,
+    context: typer.Context, debug: Annotated[bool, Option("--debug", help="Show where an error occurs.")] = False
 ) -> None:
     """Calibrate a colour camera and its lamps for rgbmidic. The laboratory procedure: calibration/README.md."""
     command.help_where_alone(context)
@@ -102,13 +100,11 @@ def _writes(name: str, hint: Any, default: str | None = None) -> Callable[[Comma
 def crosstalk(
     captures: Any,
     out: Path,
-    block: Annotated[int, typer.Option(help="Side of the averaged blocks, px.")] = 16,
+    block: Annotated[int, Option(help="Side of the averaged blocks, px.")] = 16,
     field: Annotated[
-        str, typer.Option(help="Degree of the variation of A over the field: 0 to 4, or auto (chosen by a test).")
+        str, Option(help="Degree of the variation of A over the field: 0 to 4, or auto (chosen by a test).")
     ] = "auto",
-    allow: Annotated[
-        list[str] | None, typer.Option(help="Waive a plausibility check by its name. May be repeated.")
-    ] = None,
+    allow: Annotated[list[str] | None, Option(help="Waive a plausibility check by its name. May be repeated.")] = None,
 ) -> None:
     """Measure how strongly each camera channel sees each light: the matrix A in channels = A . lights."""
     from rgbmidic_calibration import display, jobs
@@ -125,10 +121,10 @@ def crosstalk(
 @_writes("out", Out, "noise.json")
 @command.gather("stated", command.FRAME_OPTIONS, _frames)
 def noise(
-    dark: Annotated[str, typer.Option(help="Dark frames, at least two: lens capped, exposure time of the test.")],
+    dark: Annotated[str, Option(help="Dark frames, at least two: lens capped, exposure time of the test.")],
     flat: Annotated[
         list[str],
-        typer.Option(
+        Option(
             help="Lit frames at rest, at least two per exposure: FILES in one folder per exposure, or TIME=FILES for "
             "one exposure with its time. May be repeated."
         ),
@@ -151,7 +147,7 @@ def registration(
     captures: Any,
     out: Path,
     region: Region = None,
-    element_size: Annotated[float, typer.Option(help="Side of the elements, px; several speckles.")] = 25.0,
+    element_size: Annotated[float, Option(help="Side of the elements, px; several speckles.")] = 25.0,
 ) -> None:
     """Measure lateral colour: the shift of each light's image relative to that of the first light."""
     from rgbmidic_calibration import display, jobs
@@ -167,26 +163,26 @@ def camera(
     stated: Any,
     target: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="KIND:COLUMNSxROWS:SPACINGmm, such as chessboard:9x6:2.5mm (inner corners), circles:9x6:2.5mm, "
             "acircles:4x11:2mm, charuco:8x6:10mm:7.5mm:DICT_5X5_100."
         ),
     ] = None,
     views: Annotated[
-        str | None, typer.Option(help="Photographs of the target at different angles, to calibrate the lens.")
+        str | None, Option(help="Photographs of the target at different angles, to calibrate the lens.")
     ] = None,
     plane: Annotated[
-        str | None, typer.Option(help="Photograph of the target at the position of the specimen's surface.")
+        str | None, Option(help="Photograph of the target at the position of the specimen's surface.")
     ] = None,
-    lens: Annotated[Path | None, typer.Option(help="Earlier camera.json whose lens is used.")] = None,
+    lens: Annotated[Path | None, Option(help="Earlier camera.json whose lens is used.")] = None,
     corners: Annotated[
         str | None,
-        typer.Option(help="Instead of --plane: corners X0,Y0:X1,Y1:X2,Y2:X3,Y3 in px of a rectangle on the specimen."),
+        Option(help="Instead of --plane: corners X0,Y0:X1,Y1:X2,Y2:X3,Y3 in px of a rectangle on the specimen."),
     ] = None,
-    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHTmm of that rectangle.")] = None,
-    corner_std: Annotated[float, typer.Option(help="Standard uncertainty of such a corner, px.")] = 0.5,
-    out: Annotated[Path, typer.Option(help="Camera file to write (JSON).")] = Path("camera.json"),
-    picture: Annotated[Path | None, typer.Option(help="Picture of residuals, distortion and scale.")] = None,
+    size: Annotated[str | None, Option(help="WIDTHxHEIGHTmm of that rectangle.")] = None,
+    corner_std: Annotated[float, Option(help="Standard uncertainty of such a corner, px.")] = 0.5,
+    out: Annotated[Path, Option(help="Camera file to write (JSON).")] = Path("camera.json"),
+    picture: Annotated[Path | None, Option(help="Picture of residuals, distortion and scale.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Calibrate lens distortion and the plane of the specimen, from photographs of a target: px to mm."""
@@ -218,14 +214,13 @@ def camera(
 @app.command()
 @_takes_captures
 def check(
-    file: Annotated[Path, typer.Argument(help="Calibration file.")],
+    file: Annotated[Path, Argument(help="Calibration file.")],
     captures: Any,
     together: Annotated[
-        list[str] | None, typer.Option(help="NAME+NAME=FILES: the same scene with these lights on together.")
+        list[str] | None, Option(help="NAME+NAME=FILES: the same scene with these lights on together.")
     ] = None,
     limit: Annotated[
-        list[str] | None,
-        typer.Option(help="NAME=VALUE: leakage, additivity, strength, noise (in %), registration (in px)."),
+        list[str] | None, Option(help="NAME=VALUE: leakage, additivity, strength, noise (in %), registration (in px).")
     ] = None,
     region: Region = None,
 ) -> None:
@@ -244,21 +239,20 @@ def check(
 
 
 @app.command()
-@_writes("picture", Annotated[Path | None, typer.Option(help="Picture of spectra and matrix of the best set.")])
+@_writes("picture", Annotated[Path | None, Option(help="Picture of spectra and matrix of the best set.")])
 def design(
     camera: Annotated[
-        str,
-        typer.Option(help="FILE.json (rawtoaces), FILE.csv, FILE.csv#NAME, or a camera of colour-science."),
+        str, Option(help="FILE.json (rawtoaces), FILE.csv, FILE.csv#NAME, or a camera of colour-science.")
     ],
     light: Annotated[
         list[str],
-        typer.Option(
+        Option(
             help="NAME=CENTRE:WIDTH (full width at half maximum) in nm, NAME=FILE.csv[#COLUMN], or NAME=source of "
             "colour-science."
         ),
     ],
-    choose: Annotated[int, typer.Option(help="Lamps in a set; from more candidates the best sets are selected.")] = 3,
-    show_sets: Annotated[int, typer.Option("--sets", help="How many of the best sets to list.")] = 5,
+    choose: Annotated[int, Option(help="Lamps in a set; from more candidates the best sets are selected.")] = 3,
+    show_sets: Annotated[int, Option("--sets", help="How many of the best sets to list.")] = 5,
     picture: Path | None = None,
 ) -> None:
     """Predict crosstalk, condition number and noise from spectra, and find the best set of lamps to buy."""
@@ -278,8 +272,7 @@ def design(
 @app.command()
 @_writes("out", Out, "calibration.json")
 def merge(
-    files: Annotated[list[Path], typer.Argument(help="Calibration files; common sections must be equal.")],
-    out: Path,
+    files: Annotated[list[Path], Argument(help="Calibration files; common sections must be equal.")], out: Path
 ) -> None:
     """Merge noise, crosstalk and registration from several files into one."""
     from rgbmidic_calibration import display
@@ -291,11 +284,8 @@ def merge(
 
 
 @app.command()
-@_writes("picture", Annotated[Path | None, typer.Option(help="Write a picture too (PNG, PDF or SVG).")])
-def show(
-    file: Annotated[Path, typer.Argument(help="Calibration file.")],
-    picture: Path | None = None,
-) -> None:
+@_writes("picture", Annotated[Path | None, Option(help="Write a picture too (PNG, PDF or SVG).")])
+def show(file: Annotated[Path, Argument(help="Calibration file.")], picture: Path | None = None) -> None:
     """Show a calibration or camera file as tables, and in one picture."""
     from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic.illumination.calibration import Calibration

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -19,14 +18,6 @@ from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities
 from rgbmidic.settings import regular
 from rgbmidic.typing import FloatArray
-
-
-class Lamp(Protocol):
-    """Anything with a spectrum."""
-
-    def power(self, wavelengths: FloatArray) -> FloatArray:
-        """Spectral power at equally spaced wavelengths (nm), of unit sum."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,6 +50,9 @@ class MeasuredLamp:
         if not values.sum() > 0:
             raise InputError(f"the lamp emits nothing within {wavelengths[0]:g} to {wavelengths[-1]:g} nm")
         return np.asarray(values / values.sum())
+
+
+Lamp = Led | MeasuredLamp
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

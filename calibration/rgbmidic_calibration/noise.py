@@ -110,24 +110,40 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
         Too few frames, frames of different cameras, a lamp that flickers, everything saturated, dark frames as bright
         as the flats.
     """
-    same_camera([dark, *flats])
+    stacks, names = [dark, *flats], dark.camera.names
+    same_camera(stacks)
     _refuse(dark, flats)
-    planes = range(len(dark.camera.names))
-    lines = [_fit_line(dark, flats, plane) for plane in planes]
+    range_ = dark.camera.white - np.array(dark.camera.black)
+    freedom = TILE**2 * (np.array([stack.count for stack in stacks]) - 1)
+    # tiles of every exposure and plane, those of the dark frames first
+    level = np.stack([tile_means(stack.mean) for stack in stacks])
+    variance = np.stack([tile_means(stack.variance) for stack in stacks])
+    free = np.stack([tile_means(stack.clipped) == 0 for stack in stacks])
+    used = free & (level < LIMITS.highest * range_[:, None])
+    used[0] = True
+    mean = level - level[0]
+    lines = [_fit_line(name, mean[:, p], variance[:, p], used[:, p], freedom) for p, name in enumerate(names)]
     drift = dark.strength.var(axis=0, ddof=1)
-    rest = np.array([variance.mean(dtype=np.float64) / variance.size for variance in dark.variance])
+    rest = np.array([plane.mean(dtype=np.float64) / plane.size for plane in dark.variance])
     black = Quantity(
         np.array(dark.camera.black) + dark.strength.mean(axis=0), np.sqrt(np.maximum(drift, rest) / dark.count)
     )
-    knees = [_knee(dark, flats, plane, lines[plane]) for plane in planes]
-    level, std = dark.camera.white - black.value, np.hypot(black.std, 0.5)
-    early = np.nan_to_num(knees, nan=np.inf) < 0.95 * level  # the sensor saturates before the white level does
-    saturation = Quantity(np.where(early, knees, level), np.where(early, 0.05 * np.array(knees), std))
+    knees = []  # lowest level at which the variance of a plane breaks down
+    for plane, line in enumerate(lines):
+        ratio = variance[1:, plane] / (line.read_variance + line.slope * np.maximum(mean[1:, plane], 0))
+        broken = free[1:, plane] & (ratio < LIMITS.knee - 3 * np.sqrt(2 / freedom[1:, None]))
+        broken &= mean[1:, plane] > 0.3 * range_[plane]
+        many = broken.mean(axis=1) > 0.02
+        found = [np.median(level[where]) for level, where in zip(mean[1:, plane][many], broken[many], strict=True)]
+        knees.append(min(found, default=np.nan))
+    white, std = dark.camera.white - black.value, np.hypot(black.std, 0.5)
+    early = np.nan_to_num(knees, nan=np.inf) < 0.95 * white  # the sensor saturates before the white level does
+    saturation = Quantity(np.where(early, knees, white), np.where(early, 0.05 * np.array(knees), std))
     read, gain = np.sqrt([line.read_variance for line in lines]), np.array([1 / line.slope for line in lines])
     read_std, slope_std = np.sqrt([np.diag(line.covariance) for line in lines]).T
     dsnu, prnu, defects, uneven = fixed_pattern(dark, flats, saturation)
     noise = CameraNoise(
-        planes=dark.camera.names,
+        planes=names,
         gain=Quantity(gain, gain**2 * slope_std),
         read_noise=Quantity(read, read_std / (2 * read)),
         black_level=black,
@@ -137,8 +153,8 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
         prnu=prnu,
         defects=defects,
     )
-    found = [check.text for check in reported(_checks(dark, flats, noise, lines, early))]
-    return NoiseEstimate(camera_noise=noise, warnings=(*found, *uneven))
+    warnings = [check.text for check in reported(_checks(dark, flats, noise, lines, early))]
+    return NoiseEstimate(camera_noise=noise, warnings=(*warnings, *uneven))
 
 
 def _refuse(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
@@ -163,31 +179,20 @@ def _refuse(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
         raise CalibrationError("the dark frames are not darker than half of the brightest flat frames: was a lamp on?")
 
 
-def _fit_line(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int) -> _Line:
-    """Line of variance over mean through the blocks of all exposures, weighted by the variance of a variance."""
-    level = tile_means(dark.mean[plane])
-    range_ = dark.camera.white - dark.camera.black[plane]
-    means = [np.zeros_like(level)]
-    for flat in flats:
-        mean = tile_means(flat.mean[plane]) - level
-        good = (tile_means(flat.clipped[plane]) == 0) & (mean + level < LIMITS.highest * range_)
-        means.append(np.where(good, mean, np.nan))
-    stacks, mean = [dark, *flats], np.concatenate(means)
-    variance = np.concatenate([tile_means(stack.variance[plane]) for stack in stacks])
-    exposure = np.repeat(np.arange(float(len(stacks))), len(level))
-    freedom = np.repeat([TILE**2 * (stack.count - 1) for stack in stacks], len(level))
-    used = np.isfinite(mean)
-    if not (used & (exposure > 0)).any():
+def _fit_line(
+    name: str, mean: FloatArray, variance: FloatArray, used: BoolArray, freedom: npt.NDArray[np.intp]
+) -> _Line:
+    """Line of variance over mean through the tiles of all exposures (E, T), weighted by the variance of a variance."""
+    if not used[1:].any():
         raise CalibrationError(
-            f"plane {dark.camera.names[plane]}: every block of every flat exposure is saturated or nearly so; "
-            "shorten the exposure"
+            f"plane {name}: every block of every flat exposure is saturated or nearly so; shorten the exposure"
         )
-    if mean[used].max() <= 0:
-        raise CalibrationError(f"plane {dark.camera.names[plane]}: the flat frames are not brighter than the dark ones")
-    return _weighted_line(mean[used], variance[used], freedom[used], exposure[used])
-
-
-def _weighted_line(mean: FloatArray, variance: FloatArray, freedom: FloatArray, exposure: FloatArray) -> _Line:
+    exposure, freedom = (
+        np.broadcast_to(values[:, None], mean.shape)[used] for values in (np.arange(len(mean)), freedom)
+    )
+    mean, variance = mean[used], variance[used]
+    if mean.max() <= 0:
+        raise CalibrationError(f"plane {name}: the flat frames are not brighter than the dark ones")
     design = np.stack([np.ones_like(mean), mean], axis=1)
     fitted = np.maximum(variance.mean(), 1e-6) * np.ones_like(mean)
     for _ in range(8):
@@ -216,22 +221,6 @@ def _weighted_line(mean: FloatArray, variance: FloatArray, freedom: FloatArray, 
         scatter=scatter,
         bend=float(np.maximum(np.abs(means[1] / means[2] - 1) - 4 * noise, 0).max()),
     )
-
-
-def _knee(dark: TemporalStack, flats: Sequence[TemporalStack], plane: int, line: _Line) -> float:
-    """Lowest level (DN above black) at which the variance breaks down; NaN where it does not."""
-    knees = [np.nan]
-    for flat in flats:
-        mean = tile_means(flat.mean[plane]) - tile_means(dark.mean[plane])
-        free = tile_means(flat.clipped[plane]) == 0
-        ratio = tile_means(flat.variance[plane]) / (line.read_variance + line.slope * np.maximum(mean, 0))
-        noise = np.sqrt(2 / (TILE**2 * (flat.count - 1)))
-        broken = (
-            free & (ratio < LIMITS.knee - 3 * noise) & (mean > 0.3 * (dark.camera.white - dark.camera.black[plane]))
-        )
-        if broken.sum() > 0.02 * len(mean):
-            knees.append(float(np.median(mean[broken])))
-    return float(np.fmin.reduce(knees))
 
 
 def _linearity(dark: TemporalStack, flats: Sequence[TemporalStack], saturation: FloatArray) -> Quantity:

@@ -1,6 +1,7 @@
-"""Plausibility of the captures of a crosstalk before anything is fitted, and of the matrix that was fitted.
+"""Plausibility of the captures of a crosstalk, before anything is fitted.
 
-Limits without a source are chosen; those of warnings decide on nothing else.
+A check that fails is an error, unless it is waived by name; what is merely worth knowing is a warning. Limits without a
+source are chosen.
 """
 
 from __future__ import annotations

@@ -17,7 +17,8 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic_calibration.captures import CaptureFiles
 
 _KINDS = ("chessboard", "charuco", "circles", "acircles")
-_FORM = re.compile(rf"({'|'.join(_KINDS)}):(\d+)x(\d+):([\d.]+)mm(?::([\d.]+)mm)?(?::(DICT_\w+))?")
+_MM = r"(\d+\.?\d*|\.\d+)mm"
+_FORM = re.compile(rf"({'|'.join(_KINDS)}):(\d+)x(\d+):{_MM}(?::{_MM})?(?::(DICT_\w+))?")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,12 +63,9 @@ class Target:
         if found is None:
             raise ConfigurationError(f"{form}; not {text!r}")
         kind, columns, rows, spacing, marker, dictionary = found.groups()
-        try:
-            target = cls(kind=kind, columns=int(columns), rows=int(rows), spacing=float(spacing))
-            if kind == "charuco":
-                target = replace(target, marker=float(marker or 0), dictionary=dictionary or target.dictionary)
-        except ValueError:
-            raise ConfigurationError(f"{form}; not {text!r}") from None
+        target = cls(kind=kind, columns=int(columns), rows=int(rows), spacing=float(spacing))
+        if kind == "charuco":
+            target = replace(target, marker=float(marker or 0), dictionary=dictionary or target.dictionary)
         wrong = min(target.columns, target.rows) < 3 or target.spacing <= 0
         if wrong or (kind == "charuco") != bool(marker) or not target.marker < target.spacing:
             raise ConfigurationError(
@@ -107,11 +105,10 @@ class Target:
             return self.points[np.ravel(numbers)], np.asarray(corners, dtype=np.float64).reshape(-1, 2)
         if self.kind == "chessboard":
             # normalised images (CALIB_CB_NORMALIZE_IMAGE) cost .2 px
-            there, points = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_ACCURACY)
-            if not there:
-                there, points = cv2.findChessboardCornersSB(
-                    image, size, flags=cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
-                )
+            for flags in (cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE):
+                there, points = cv2.findChessboardCornersSB(image, size, flags=flags)
+                if there:
+                    break
         else:
             grid = cv2.CALIB_CB_ASYMMETRIC_GRID if self.kind == "acircles" else cv2.CALIB_CB_SYMMETRIC_GRID
             there, points = cv2.findCirclesGrid(image, size, flags=grid)

@@ -221,8 +221,8 @@ def _noise(samples: _Samples, repeat: _Samples | None, step: int) -> Iterator[Ch
     usable &= np.isfinite(flatness).all(axis=0)
     if usable.sum() < 1000:
         return
-    parts = zip(difference, mean, variance, flatness, strict=True)
-    counts = np.stack([_small_differences(*(part[usable] for part in plane), step) for plane in parts])
+    planes = np.stack([difference, mean, variance, flatness], axis=1)[..., usable]
+    counts = np.stack([_small_differences(plane, step) for plane in planes])
     # of every colour and of all, at every grey level and at all
     counts = np.concatenate([counts, counts.sum(axis=0, keepdims=True)])
     counts = np.concatenate([counts, counts.sum(axis=1, keepdims=True)], axis=1)
@@ -249,19 +249,15 @@ _FLATTEST = 0.01, 0.05, 0.2
 decide how much is found, not what is right (`_noise`)."""
 
 
-def _small_differences(
-    difference: npt.NDArray[Any],
-    mean: npt.NDArray[Any],
-    variance: npt.NDArray[Any],
-    flatness: npt.NDArray[Any],
-    step: int,
-) -> FloatArray:
+def _small_differences(plane: npt.NDArray[Any], step: int) -> FloatArray:
     """Count small differences in a plane, by grey level and by how flat the others are, (levels, len(_FLATTEST), 6).
 
-    Small are those under half their predicted standard deviation. The six are their number, the number that the
+    Of each place the `plane` holds the difference, the mean, the predicted variance, and how flat the others are. Small
+    are differences under half their predicted standard deviation. The six are their number, the number that the
     calibrated noise gives, the variance of that number, the sums of means and of predicted standard deviations of a
     sample, and the number of places.
     """
+    difference, mean, variance, flatness = plane
     levels = 6
     out = np.zeros((levels, len(_FLATTEST), 6))
     bins = np.searchsorted(np.quantile(mean, np.linspace(0, 1, levels + 1)[1:-1]), mean)
@@ -285,7 +281,7 @@ def _differences(samples: _Samples) -> tuple[npt.NDArray[Any], ...]:
     Noise that a row or a column has in common is not in the differences. With as much of it as read noise the count of
     small ones is 1.15 times the predicted one, a warning; hence levels of at least 4 times that variance.
     """
-    x, usable = samples.values[:, *samples.middle], samples.usable[:, *samples.middle].all(axis=0)
+    x, usable = samples.values[:, *samples.middle], np.logical_and.reduce(samples.usable[:, *samples.middle])
     a, b, c, d = x[:, :-1, :-1], x[:, :-1, 1:], x[:, 1:, :-1], x[:, 1:, 1:]
     mean = (a + b + c + d) / 4
     whole = usable[:-1, :-1] & usable[:-1, 1:] & usable[1:, :-1] & usable[1:, 1:]
@@ -307,7 +303,7 @@ def _block_means(values: npt.NDArray[np.float32], side: int) -> FloatArray:
 
 def _whole_blocks(samples: _Samples, side: int) -> BoolArray:
     """Return the blocks of `side` samples that are usable in all planes."""
-    return np.asarray(_block_means(samples.usable.all(axis=0, keepdims=True).astype(np.float32), side)[0] == 1)
+    return np.asarray(_block_means(np.logical_and.reduce(samples.usable)[None].astype(np.float32), side)[0] == 1)
 
 
 def _greens(samples: _Samples) -> Iterator[Check]:
