@@ -70,7 +70,7 @@ class TimeHistory:
     def typical(self, name: str) -> FloatArray:
         """Return the quantiles over the nodes of a quantity, medians of the frames (3,); NaN where it is in none."""
         known = self._known(name)
-        return np.median(known, axis=0) if len(known) else np.full(3, np.nan)
+        return np.asarray(np.median(known, axis=0)) if len(known) else np.full(3, np.nan)
 
     def extreme(self, name: str) -> float:
         """Return the value farthest from 0 of a quantity's median over the nodes; NaN where nothing is measured."""
