@@ -77,7 +77,8 @@ class TimeHistory:
         return float(max(self._known(name)[:, 1], key=abs, default=np.nan))
 
     def _known(self, name: str) -> FloatArray:
-        return self.quantiles[name][np.isfinite(self.quantiles[name]).all(axis=1)]
+        rows = self.quantiles[name]
+        return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 
     def key_frames(self, count: int) -> tuple[int, ...]:
         """Select frames between which the field changes by about as much: its quantiles' path in equal parts."""
