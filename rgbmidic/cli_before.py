@@ -40,22 +40,18 @@ def demo(
     note(f"7 of 7: pictures of the result in {out / 'figures'}")
     write_figures(Result.open(out / "result"), out / "figures", (len(rows),), processes=threads())
     columns = ["angle", "three lights", "red alone", "green alone", "blue alone", "at nodes", "stated u_std"]
-    errors = [(row.rms_px, *row.single_px, row.nodal_px, row.predicted_px) for row in rows]
-    lines = [[f"{row.angle_deg:g} deg", *(f"{e:.4f}" for e in each)] for row, each in zip(rows, errors, strict=True)]
+    lines = []
+    for row in rows:
+        errors = (row.rms_px, *row.single_px, row.nodal_px, row.predicted_px)
+        lines.append([f"{row.angle_deg:g} deg", *(f"{error:.4f}" for error in errors)])
     title = "Displacement error against the exact truth, px (a sphere turning under moving reflections)"
     print_table(title, columns, lines)
     columns = ["plate", "lens and plane", "one scale", "stated", "strain, lens and plane", "one scale", "stated"]
-    lines = [
-        [
-            row.motion,
-            *(f"{1e3 * value:.2f}" for value in (*row.displacement_mm, row.stated_mm)),
-            *(f"{1e6 * value:.0f}" for value in (*row.strain, row.stated_strain)),
-        ]
-        for row in plate
-    ]
-    title = (
-        "Displacement error, um, and strain error, 1e-6, against the exact truth (a flat plate, tilted by 5 degrees)"
-    )
+    lines = []
+    for row in plate:
+        micrometres = [f"{1e3 * value:.2f}" for value in (*row.displacement_mm, row.stated_mm)]
+        lines.append([row.motion, *micrometres, *(f"{1e6 * value:.0f}" for value in (*row.strain, row.stated_strain))])
+    title = "Displacement error, um, and strain error, 1e-6, against the exact truth (a flat plate tilted by 5 degrees)"
     print_table(title, columns, lines)
     print(f"pictures: {out / 'figures'}   result: {out / 'result'}   {time.perf_counter() - started:.0f} s")
 

@@ -25,7 +25,7 @@ Measure = Annotated[str | None, Option(help="green-lagrange, hencky, biot or eng
 Out = Annotated[Path, Option(help="Output folder; created if it does not exist.")]
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
 Test = Annotated[Path, Argument(metavar="TEST.toml", help="Settings of the test.")]
-Workers = Annotated[int, Option(min=0, help="Processes that work at a time; 0: as many as cores.")]
+Workers = Annotated[int, Option(min=0, help="Frames at a time; 0: as many as cores.")]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

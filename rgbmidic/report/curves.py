@@ -37,7 +37,7 @@ def medians_figure(
     Either with a band of 5 to 95 % of the nodes, or, of standard uncertainties, with the noise floor as thin lines.
     """
     times, label_of_times = history.axis
-    marker = "o" if len(times) <= style.FIGURES.marked else None
+    marker = "o" if len(times) <= 40 else None  # more would touch in half the width
 
     def draw(axes: list[Axes]) -> None:
         for axis, (label, names) in zip(axes, panels.items(), strict=True):
@@ -89,11 +89,11 @@ def history_panels(histories: Histories) -> list[Panel]:
     return [*panels.items(), *pair]
 
 
-def history_figure(histories: Histories, panels: Sequence[Panel] = ()) -> Figure:
+def history_figure(histories: Histories, panels: Sequence[Panel] = (), *, most: int = 24) -> Figure:
     """Draw what probes read, over the time, or over the frames where no time is known.
 
     Quantities of one kind and unit share a panel; two standard uncertainties on both sides are shaded. Where a stress
-    is known, a last panel shows it over the strain. Of many kinds the first 24 are shown, and a warning says so.
+    is known, a last panel shows it over the strain. Of many kinds the first are shown, and a warning says so.
 
     Parameters
     ----------
@@ -101,13 +101,15 @@ def history_figure(histories: Histories, panels: Sequence[Panel] = ()) -> Figure
         What the probes read off a result (`rgbmidic.results.histories.read_histories`).
     panels
         Those of its panels that are drawn; none: all.
+    most
+        Kinds of quantities that are shown at most: two screens high.
 
     Returns
     -------
     Figure
         The figure, which `save_figure` writes.
     """
-    panels, most = panels or history_panels(histories), style.FIGURES.panels
+    panels = panels or history_panels(histories)
     kinds = sum(bool(label) for label, _ in panels)
     if kinds > most:
         words = "the picture shows %d of %d kinds of quantities, in their order; the table has them all"
@@ -127,18 +129,17 @@ def history_figure(histories: Histories, panels: Sequence[Panel] = ()) -> Figure
                 label = f"{stress.name} ({stress.unit})"
                 style.finish_plot(axis, style.literal(strain.name), style.literal(label), whole=False)
 
-    count = len(panels)
-    tallest = style.FIGURES.panel * count + 1
-    return style.draw_figure(draw, count=count, aspect=0.45, beside=style.LEGEND, tallest=tallest)
+    tallest = 2.4 * len(panels) + 1  # inches: four panels fill a page
+    return style.draw_figure(draw, count=len(panels), aspect=0.45, beside=style.LEGEND, tallest=tallest)
 
 
 def _draw_quantities(axis: Axes, times: FloatArray, quantities: Sequence[HistoryColumn]) -> None:
     """Draw quantities over the times (T,), with bands of two standard uncertainties; their values set the limits."""
-    limits, colours = style.FIGURES, dict[str, Any]()
-    step = -(-len(quantities) // limits.named)
+    colours: dict[str, Any] = {}
+    step = -(-len(quantities) // 14)  # more names of 7 points are higher than a panel: a crack has a quantity a node
     for number, quantity in enumerate(quantities):
         values, std = quantity.values, quantity.std
-        few = np.isfinite(values).sum() <= limits.marked_alone
+        few = np.isfinite(values).sum() <= 60  # more markers would touch
         marker = style.MARKERS[number % len(style.MARKERS)] if few else None
         look: dict[str, Any] = {"marker": marker, "markersize": 3, "linestyle": style.LINES[number % len(style.LINES)]}
         look["label"] = "_" if number % step else style.literal(quantity.name)
@@ -146,7 +147,7 @@ def _draw_quantities(axis: Axes, times: FloatArray, quantities: Sequence[History
         if of in colours:  # both sides of a kink are single points of the rate
             look |= {"label": "_", "color": colours[of], "linestyle": "none", "marker": "D", "markersize": 4}
         if std is not None and quantity.name.endswith("direction"):
-            values = np.where(2 * std < limits.direction, values, np.nan)
+            values = np.where(2 * std < 45, values, np.nan)  # degrees, from which it may be any
         (line,) = axis.plot(times, values, linewidth=1, **look)
         colours[quantity.name] = line.get_color()
         if std is not None:

@@ -200,8 +200,8 @@ def convergence_figure(result: Result) -> Figure:
     from matplotlib.colors import Normalize
 
     shown = shown_frames(result)
-    frames = shown[:: math.ceil(len(shown) / style.FIGURES.lines)]
-    named = len(frames) <= style.FIGURES.legend  # else no legend, but a colour bar
+    frames = shown[:: math.ceil(len(shown) / 100)]  # more lines cover each other
+    named = len(frames) <= 8  # in a legend, which then fills half the height; else a colour bar
 
     def draw(axes: list[Axes]) -> None:
         (axis,), norm = axes, Normalize(frames[0], frames[-1])
@@ -262,7 +262,7 @@ class MapDrawer:
         self._figures: dict[int, Figure] = {}
         self._mesh = Triangulation(result.nodes[:, 0], result.nodes[:, 1], result.elements)
         low, high = result.nodes.min(axis=0), result.nodes.max(axis=0)
-        step = float((high - low).max()) / style.FIGURES.raster
+        step = float((high - low).max()) / 450  # as many pixels as the panels of two maps have at 150 dpi
         x, y = (np.arange(start + step / 2, end, step) for start, end in zip(low, high, strict=True))
         self._places = np.meshgrid(x, y)
         self._extent = (low[0], low[0] + step * len(x), low[1] + step * len(y), low[1])

@@ -231,11 +231,12 @@ class _Panel:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Shared:
-    """What all pages of a movie share, found from all its frames: the panels, and the limits (px) along x and y."""
+    """What all pages of a movie share, found from all its frames: panels, limits (px) along x and y, times (s)."""
 
     movie: Movie
     panels: tuple[_Panel, ...]
     limits: tuple[_Span, _Span]
+    times: FloatArray | None
 
     @classmethod
     def of(cls, movie: Movie) -> _Shared:
@@ -257,7 +258,8 @@ class _Shared:
             low, high = movie.stated.get(name) or field.ends or style.colour_range(known)
             beyond, colours = (bool(known.min() < low), bool(known.max() > high)), movie.colours or field_colours(field)
             panels.append(_Panel(field=field, ends=(low, high), colours=colours, beyond=beyond))
-        return cls(movie=movie, panels=tuple(panels), limits=picture_limits(result, np.concatenate(corners)))
+        limits = picture_limits(result, np.concatenate(corners))
+        return cls(movie=movie, panels=tuple(panels), limits=limits, times=movie.times)
 
 
 class _Canvas:
@@ -269,7 +271,7 @@ class _Canvas:
         from matplotlib.colors import Normalize
 
         movie, panels, (x, y) = shared.movie, shared.panels, shared.limits
-        self._movie, self._panels, self._limits, self._times = movie, panels, shared.limits, movie.times
+        self._movie, self._panels, self._limits, self._times = movie, panels, shared.limits, shared.times
         unit, factor = movie.maps.physical.axes
 
         def draw(axes: list[Axes]) -> None:

@@ -73,10 +73,6 @@ class FigureConstants:
         Inches: room for the numbers below a panel, and for its title; two lines and one line of 9 points.
     least
         Inches of a panel that still shows something: 3 mm of a page, 20 px of a movie of 960.
-    letter, between
-        Inches: width of a digit of the numbers along an axis, measured at 9 points; room between two numbers.
-    tip
-        Height of the point of a colour bar, as a fraction of the panel's: as matplotlib's.
     margin
         What is shown around the mesh, as a fraction of its longer side. Chosen: the edge of the mesh stays visible.
     clipped, wild
@@ -88,20 +84,6 @@ class FigureConstants:
         Colours of a positive quantity end at its median over this and times this: else outliers turn the bulk black.
     longest
         Letters of a name that are shown: a title has room for twice as many.
-    raster
-        Points along the longer side of a map: the panels of two maps have as many pixels at 150 dpi.
-    legend, lines
-        Frames up to which a legend names each, which fills half the height of a panel, and of which lines are drawn at
-        most: more cover each other. Chosen.
-    marked, marked_alone
-        Points up to which each gets a marker, in a panel of half the width and of the whole width: more would touch.
-    panel, panels
-        Height of a panel of histories in inches, its numbers included: four fill a page; most panels of a picture, two
-        screens high. Chosen.
-    named
-        Most quantities of a panel that its legend names: more lines of 7 pt are higher than it; a crack has one a node.
-    direction
-        Two standard uncertainties (degrees) of a principal direction from which it is not drawn: it may be any. Chosen.
     """
 
     width: float = 9.0
@@ -109,24 +91,12 @@ class FigureConstants:
     below: float = 0.52
     above: float = 0.3
     least: float = 0.2
-    letter: float = 0.075
-    between: float = 0.12
-    tip: float = 0.045
     margin: float = 0.06
     clipped: float = 0.5
     wild: float = 0.1
     doubtful: float = 3.0
     span: float = 4.0
     longest: int = 60
-    raster: int = 450
-    legend: int = 8
-    lines: int = 100
-    marked: int = 40
-    marked_alone: int = 60
-    panel: float = 2.4
-    panels: int = 24
-    named: int = 14
-    direction: float = 45.0
 
 
 FIGURES = FigureConstants()
@@ -373,7 +343,7 @@ def add_colour_bar(
 
     width = axis.get_position().width * cast("Figure", axis.figure).get_figwidth()
     left, middle, right = (1 + inches / width for inches in (0.08, 0.14, 0.20))
-    low, high = (FIGURES.tip * end for end in beyond)
+    low, high = (0.045 * end for end in beyond)  # of the height are points, as matplotlib's
     outline = [(left, low), (middle, 0), (right, low), (right, 1 - high), (middle, 1), (left, 1 - high)]
     bar = Polygon(outline, transform=axis.transAxes, fill=False, linewidth=0.6, clip_on=False)
     axis.add_patch(bar)
@@ -481,7 +451,7 @@ def _space_out(axis: Axes, most: int, *, whole: bool, factor: float = 1.0) -> No
         places = _round_numbers(count, axis.get_xlim(), factor, whole=whole)
         axis.xaxis.set_major_locator(FixedLocator(places))
         numbers = axis.xaxis.get_major_formatter().format_ticks(places)
-        if sum(len(number) * FIGURES.letter + FIGURES.between for number in numbers) < room:
+        if sum(0.075 * len(number) + 0.12 for number in numbers) < room:  # inches of a digit, and between two numbers
             break
 
 

@@ -70,14 +70,15 @@ class TimeHistory:
     def typical(self, name: str) -> FloatArray:
         """Return the quantiles over the nodes of a quantity, medians of the frames (3,); NaN where it is in none."""
         known = self._known(name)
-        return np.median(known, axis=0) if len(known) else np.full(3, np.nan)
+        return np.asarray(np.median(known, axis=0)) if len(known) else np.full(3, np.nan)
 
     def extreme(self, name: str) -> float:
         """Return the value farthest from 0 of a quantity's median over the nodes; NaN where nothing is measured."""
         return float(max(self._known(name)[:, 1], key=abs, default=np.nan))
 
     def _known(self, name: str) -> FloatArray:
-        return self.quantiles[name][np.isfinite(self.quantiles[name]).all(axis=1)]
+        rows = self.quantiles[name]
+        return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 
     def key_frames(self, count: int) -> tuple[int, ...]:
         """Select frames between which the field changes by about as much: its quantiles' path in equal parts."""

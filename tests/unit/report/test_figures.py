@@ -18,7 +18,7 @@ from results import LIGHTS, MESH, NODES, make_origin, make_result
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.report import figures, gallery, remove_pictures, save_figure, style, write_figures, write_maps
+from rgbmidic.report import curves, figures, gallery, remove_pictures, save_figure, style, write_figures, write_maps
 from rgbmidic.results import QUANTITIES, FrameRecord, Maps, Origin, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
 from rgbmidic.typing import AnyArray
@@ -215,6 +215,16 @@ def test_each_frame_has_the_pictures_it_can_have(tmp_path: Path) -> None:
         "reflections",
     }
     assert {file.stem.split("_")[0] for file in files if "000003" in file.stem} == EVERY_FRAME
+
+
+def test_a_profile_shows_the_first_the_last_and_busy_frames_between() -> None:
+    values = np.full((20, 5), np.nan)
+    assert curves._rows_shown(values) == [0, 19]
+    values[8:12] = 1.0
+    assert curves._rows_shown(values) == [0, 8, 9, 10, 11, 19]
+    values[:] = 1.0
+    assert curves._rows_shown(values)[::5] == [0, 19]
+    assert curves._rows_shown(values[:1]) == [0]
 
 
 def test_three_deformed_frames_get_pictures_and_the_reference_none() -> None:
