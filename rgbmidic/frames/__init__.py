@@ -1,15 +1,13 @@
 """Raw frames and where they come from: readers, the series of a test's frames, writers."""
 
-from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window, cfa_channels, shift_cfa
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window, cfa_channels
 from rgbmidic.frames.formats import FrameFormat, known_formats, open_source, read_frame
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.frames.series import FrameSeries, list_frames, open_series
 from rgbmidic.frames.source import FrameSource, Movie, file_fingerprint, file_hash
 from rgbmidic.frames.stored import StoredFrame
-from rgbmidic.settings import BAYER_PATTERNS
 
 __all__ = [
-    "BAYER_PATTERNS",
     "ChannelFrame",
     "FrameFormat",
     "FrameSeries",
@@ -27,7 +25,6 @@ __all__ = [
     "open_series",
     "open_source",
     "read_frame",
-    "shift_cfa",
     "write_dng",
     "write_tiff",
 ]

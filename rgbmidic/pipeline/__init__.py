@@ -5,7 +5,6 @@ from rgbmidic.illumination.separation import LightSeparation, Separation
 from rgbmidic.pipeline.correlate import correlate
 from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import Plan
-from rgbmidic.pipeline.region import read_region
 from rgbmidic.pipeline.run import measure
 from rgbmidic.pipeline.sequence import measure_sequence
 from rgbmidic.pipeline.source import FrameSequence
@@ -20,5 +19,4 @@ __all__ = [
     "measure",
     "measure_frame",
     "measure_sequence",
-    "read_region",
 ]

@@ -3,7 +3,6 @@
 from rgbmidic.report.curves import history_figure, profile_figure, wave_text
 from rgbmidic.report.document import write_batch_page, write_report
 from rgbmidic.report.figures import (
-    MAPS,
     brightness_figure,
     convergence_figure,
     fraction_figure,
@@ -13,14 +12,12 @@ from rgbmidic.report.figures import (
     residual_figure,
 )
 from rgbmidic.report.gallery import REPORT, remove_pictures, write_figures, write_maps
-from rgbmidic.report.movie import MOVIES, Movie, write_movie
+from rgbmidic.report.movie import Movie, write_movie
 from rgbmidic.report.movie_curve import Curve
 from rgbmidic.report.page import render
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
 
 __all__ = [
-    "MAPS",
-    "MOVIES",
     "REPORT",
     "STYLE",
     "Curve",
