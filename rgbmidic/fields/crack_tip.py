@@ -21,7 +21,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields.cracks import at_some, crack_faces, listed, lowest_copies, nearest_node
-from rgbmidic.fields.history import History, Nodal
+from rgbmidic.fields.history import History, Nodal, Part, histories_of
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
@@ -357,18 +357,14 @@ class CrackTip:
                 f"; its chi-square over the degrees of freedom is up to {worst:.3g}, where 1 is expected: the "
                 "field is not the series' within the noise, and what this makes of the factors is not known"
             )
-        parts: list[tuple[str, str, FloatArray | None, FloatArray | None]] = [
+        parts: list[Part] = [
             ("K1", "MPa √m", s.factors[:, 0], s.factors_std[:, 0]),
             ("K2", "MPa √m", s.factors[:, 1], s.factors_std[:, 1]),
             ("T", "MPa", s.t_stress, s.t_stress_std),
-            ("extension", "px", s.extension, s.extension_std),
-            ("chi_square", "", s.chi_square, None),
         ]
-        return [
-            History(name=f"{self.name}_{name}", unit=unit, values=values, std=std, note=note)
-            for name, unit, values, std in parts
-            if values is not None
-        ]
+        if s.extension is not None:
+            parts.append(("extension", "px", s.extension, s.extension_std))
+        return histories_of(self.name, [*parts, ("chi_square", "", s.chi_square, None)], note)
 
 
 class _Weighted:

@@ -13,7 +13,7 @@ frames have in common, cancels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -69,6 +69,18 @@ class History:
     def column(self) -> str:
         """Name of its column in a table, with the unit."""
         return column(self.name, self.unit)
+
+
+Part = tuple[str, str, FloatArray, FloatArray | None]
+"""Name, unit, values (T,) and standard uncertainty of a quantity that a probe measures."""
+
+
+def histories_of(probe: str, parts: Iterable[Part], note: str = "") -> list[History]:
+    """Return the histories of a probe, named by it and their quantity, with one note."""
+    return [
+        History(name=f"{probe}_{name}", unit=unit, values=values, std=std, note=note)
+        for name, unit, values, std in parts
+    ]
 
 
 class Probe(Protocol):

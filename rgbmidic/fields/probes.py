@@ -18,7 +18,7 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.fields.crack_tip import CrackTip, Williams
 from rgbmidic.fields.cracks import JumpAlong
-from rgbmidic.fields.history import History, Nodal, Probe
+from rgbmidic.fields.history import History, Nodal, Probe, histories_of
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
@@ -128,10 +128,7 @@ class Mean:
         known = _known(nodal)
         u, v = (self.average(*pair, known) for pair in ((nodal.u, nodal.u_std), (nodal.v, nodal.v_std)))
         note = _cut(self.name, "mean", self.inside * np.where(np.isfinite(u[0]), known @ self.weights, 1.0))
-        return [
-            History(name=f"{self.name}_{name}", unit="px", values=values, std=std, note=note)
-            for name, (values, std) in {"u": u, "v": v}.items()
-        ]
+        return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], note)
 
     def average(
         self, values: FloatArray, std: FloatArray, known: BoolArray, *, alike: bool = False
@@ -232,13 +229,11 @@ class Gauge:
         now = self.arm + apart if self.moving else np.broadcast_to(self.arm, apart.shape)
         towards = now / np.hypot(*now.T)[:, None]
         extension = np.hypot(*now.T) - length if self.moving else (towards * apart).sum(axis=1)
-        parts = [self.weights * std for std in (nodal.u_std, nodal.v_std)]
-        spread = np.stack([np.einsum("tm,tm->t", part @ self.correlation, part) for part in parts], axis=1)
+        errors = [self.weights * std for std in (nodal.u_std, nodal.v_std)]
+        spread = np.stack([np.einsum("tm,tm->t", part @ self.correlation, part) for part in errors], axis=1)
         std = np.sqrt(np.maximum((towards**2 * spread).sum(axis=1), 0))
-        return [
-            History(name=f"{self.name}_extension", unit="px", values=extension, std=std),
-            History(name=f"{self.name}_strain", unit="", values=extension / length, std=std / length),
-        ]
+        parts = [("extension", "px", extension, std), ("strain", "", extension / length, std / length)]
+        return histories_of(self.name, parts)
 
 
 class StrainGauge:
@@ -286,11 +281,9 @@ def _strain_histories(name: str, strain: Strain, note: str) -> list[History]:
     """Return every quantity of a strain (T,) as a history."""
     values = [*strain.components.T, *strain.principal.T, strain.direction_deg, strain.equivalent]
     stds = [*strain.components_std.T, *strain.principal_std.T, strain.direction_std_deg, strain.equivalent_std]
-    units = {"exx": "", "eyy": "", "exy": "", "e1": "", "e2": "", "direction": "deg", "equivalent": ""}
-    return [
-        History(name=f"{name}_{quantity}", unit=unit, values=value, std=std, note=note)
-        for (quantity, unit), value, std in zip(units.items(), values, stds, strict=True)
-    ]
+    names = "exx", "eyy", "exy", "e1", "e2", "direction", "equivalent"
+    units = ("deg" if quantity == "direction" else "" for quantity in names)
+    return histories_of(name, zip(names, units, values, stds, strict=True), note)
 
 
 class Area(Mean):

@@ -11,36 +11,29 @@ from rgbmidic.results.quantities import QUANTITIES, Quantity, with_uncertainty
 
 _NODE = ("node",)
 UV = ("u", "v")
-OF_LENGTHS = {
+DERIVED = {
     name: Quantity(
-        name, _NODE, "px", "", meaning, symbol=symbol, parts=parts, order=order,
-        group="Rates" if order else "Displacement", kind="positive" if parts == UV else "displacement",
+        name, _NODE, unit, "", meaning, symbol=symbol, parts=parts, order=order,
+        group="Rates" if order else "Displacement",
+        kind="strain" if not unit else "positive" if parts == UV else "displacement",
     )
-    for name, symbol, meaning, parts, order in (
-        ("u", "u", "displacement in x", ("u",), 0),
-        ("v", "v", "displacement in y", ("v",), 0),
-        ("magnitude", "|u|", "length of the displacement", UV, 0),
-        ("u_velocity", "du/dt", "velocity in x", ("u",), 1),
-        ("v_velocity", "dv/dt", "velocity in y", ("v",), 1),
-        ("velocity", "|du/dt|", "magnitude of the velocity", UV, 1),
-        ("u_acceleration", "d²u/dt²", "acceleration in x", ("u",), 2),
-        ("v_acceleration", "d²v/dt²", "acceleration in y", ("v",), 2),
-        ("acceleration", "|d²u/dt²|", "magnitude of the acceleration", UV, 2),
+    for name, unit, symbol, meaning, parts, order in (
+        ("u", "px", "u", "displacement in x", ("u",), 0),
+        ("v", "px", "v", "displacement in y", ("v",), 0),
+        ("magnitude", "px", "|u|", "length of the displacement", UV, 0),
+        ("u_velocity", "px", "du/dt", "velocity in x", ("u",), 1),
+        ("v_velocity", "px", "dv/dt", "velocity in y", ("v",), 1),
+        ("velocity", "px", "|du/dt|", "magnitude of the velocity", UV, 1),
+        ("u_acceleration", "px", "d²u/dt²", "acceleration in x", ("u",), 2),
+        ("v_acceleration", "px", "d²v/dt²", "acceleration in y", ("v",), 2),
+        ("acceleration", "px", "|d²u/dt²|", "magnitude of the acceleration", UV, 2),
+        ("exx_rate", "", "dεxx/dt", "rate of the strain in x", ("exx",), 1),
+        ("eyy_rate", "", "dεyy/dt", "rate of the strain in y", ("eyy",), 1),
+        ("exy_rate", "", "dεxy/dt", "rate of the tensor shear", ("exy",), 1),
+        ("equivalent_rate", "", "dεeq/dt", "rate of the von Mises equivalent strain", ("equivalent",), 1),
     )
 }  # fmt: skip
-"""Displacement and its rates, by name."""
-OF_STRAINS = {
-    f"{part}_rate": Quantity(
-        f"{part}_rate", _NODE, "", "", f"rate of the {meaning}", symbol=symbol, parts=(part,), order=1, group="Rates"
-    )
-    for part, symbol, meaning in (
-        ("exx", "dεxx/dt", "strain in x"),
-        ("eyy", "dεyy/dt", "strain in y"),
-        ("exy", "dεxy/dt", "tensor shear"),
-        ("equivalent", "dεeq/dt", "von Mises equivalent strain"),
-    )
-}
-"""Rates of the strain, by name."""
+"""Displacement, and rates of displacement and strain, by name."""
 _POSITIVE: dict[str, Any] = {"group": "Strain", "kind": "positive"}
 _ANGLE: dict[str, Any] = {"group": "Strain", "kind": "angle"}
 _TOWARDS, _LARGEST = "direction of e1, from x towards y", "largest engineering shear in the plane, e1 - e2"
@@ -101,7 +94,7 @@ def map_quantities(units: Units, lights: tuple[str, ...], *, with_error: bool) -
     -------
     dict of str to Quantity
     """
-    derived = [*OF_LENGTHS.values(), *OF_STRAINS.values(), *STRAINS.values()]
+    derived = [*DERIVED.values(), *STRAINS.values()]
     spread = [entry.uncertainty for entry in derived]
     taken = {entry.name for entry in (*derived, *spread)}
     kept = [

@@ -194,8 +194,8 @@ def read_histories(
                 "says why); place it elsewhere"
             )
     span = (window - 1) * float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
-    shared = {"common_fraction": shared_part(result), "references": reference_frames(result)[there]}
-    rate = partial(rates, clock, window=span, **shared) if window else None
+    common, references = shared_part(result), reference_frames(result)[there]
+    rate = partial(rates, clock, window=span, common_fraction=common, references=references) if window else None
     read = [*rigid, *(history for part in by_probe.values() for history in part)]
     quantities = tuple(quantity for history in read for quantity in _in_units(history, units, rate))
     remarks = [*_remarks(rectified, speed, result.provenance.get("exposure_ns"), there, by_probe)]

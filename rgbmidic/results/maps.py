@@ -20,16 +20,7 @@ from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.results.derived import (
-    COMPONENTS,
-    FINER,
-    OF_LENGTHS,
-    OF_STRAINS,
-    STRAINS,
-    UV,
-    WITH_ERROR,
-    map_quantities,
-)
+from rgbmidic.results.derived import COMPONENTS, DERIVED, FINER, STRAINS, UV, WITH_ERROR, map_quantities
 from rgbmidic.results.physical import MOVED, Physical, frame_times, named, reference_frames, scale_of, shared_part
 from rgbmidic.results.quantities import UNKNOWN_TIME, Quantity
 from rgbmidic.results.result import Result
@@ -212,16 +203,17 @@ class Maps:
         str
         """
         base = name.removesuffix("_std")
-        group = self.field(base if base in self.all else name).group
-        if group == "Rates" and len(self._there) < FEWEST:
-            return ""
+        field = self.field(base if base in self.all else name)
         since = "" if self.since is None else f"since frame {self.since}"
-        rigid = "rigid motion removed" if self.rigid_removed and group == "Displacement" else ""
-        strain = self.physical.strain_words(base) if group == "Strain" or base in OF_STRAINS else ""
-        parts = {"Displacement": [since, rigid], "Strain": [strain, since]}
-        if group == "Rates":
-            parts["Rates"] = [strain, rate_words(self.window, len(self._there))]
-        return ", ".join(filter(None, parts.get(group, [])))
+        parts = list[str]()
+        if field.group == "Displacement":
+            parts = [since, "rigid motion removed" if self.rigid_removed else ""]
+        elif field.group == "Strain":
+            parts = [self.physical.strain_words(base), since]
+        elif field.group == "Rates" and len(self._there) >= FEWEST:
+            strain = "" if DERIVED[base].unit else self.physical.strain_words(base)
+            parts = [strain, rate_words(self.window, len(self._there))]
+        return ", ".join(filter(None, parts))
 
     def read(self, name: str, frame: int) -> MapValues:
         """Read a field in one frame.
@@ -249,7 +241,7 @@ class Maps:
         if not 0 <= frame < len(self.result):
             raise InputError(f"there is no frame {frame} in a result of {len(self.result)} frames")
         base = name.removesuffix("_std")
-        derived = base in OF_LENGTHS | OF_STRAINS | STRAINS or name in WITH_ERROR
+        derived = base in DERIVED | STRAINS or name in WITH_ERROR
         stored = ("light_fraction",) if kind == "fraction" else () if derived else (base,)
         read = next(self.result.table.each([*MOVED, "node_status", *stored], [frame]))
         nothing = np.full(len(self.result.nodes), np.nan)
@@ -296,7 +288,7 @@ class Maps:
         """Compute a length, a strain or a rate, and its uncertainty, each (N,)."""
         if name in STRAINS:
             return self._strain(frame)[name], self._strain(frame)[f"{name}_std"]
-        entry = (OF_LENGTHS | OF_STRAINS)[name]
+        entry = DERIVED[name]
         if entry.order:
             parts = [self._rates(part, frame, entry.order) for part in entry.parts]
         else:
@@ -306,7 +298,7 @@ class Maps:
         if len(parts) > 1:
             vector, error = (np.stack(each, axis=1) for each in zip(*parts, strict=True))
             values, std = length_of(vector, error[:, :, None] ** 2 * np.eye(len(parts)))
-        return self._units.lengths(values, std) if name in OF_LENGTHS else (values, std)
+        return self._units.lengths(values, std) if entry.unit else (values, std)
 
     def displacement(self, frame: int) -> FloatArray:
         """Return u, v and their standard uncertainties (4, N) in rectified px, since `since`, rigid motion removed.
