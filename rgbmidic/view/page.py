@@ -54,7 +54,7 @@ class ResultPage:
         self.state, dark = SharedState(name="state", asked=view.frame, shown=view.frame), view.theme == "dark"
         self.steps = Steps(view.marks)
         self.parts = p = ResultControls(len(result) - 1, view.frame, dark=dark)
-        self.maps = MapPanel(document, self.shown, self._redraw, self._hover, dark)
+        self.maps = MapPanel(document, self.shown, self._redraw, self._hover, dark=dark)
         self.names, self.film = ProbeNames(p, self._take_marks), FilmButton(p, self.shown)
         self.file, self.timeline = FileButtons(p, self.shown), TimeLine(len(result), view.frame)
         self.curves = CurvePanel(document, self.shown, p, self._offer)
