@@ -671,7 +671,9 @@ def test_probes_that_the_test_states_are_shown_at_opening(probed):
     own = (Mark("point", 30, 30),)
     assert ResultPage(Document(), probed, ViewState(marks=own), Progress(4)).view.marks == own
     other = replace(PROBES, strain_gauges=((60, 40, 60), (60, 40, 80)))  # the page has one length for all
-    assert {mark.kind for mark in curves.with_probes(ViewState(), other).marks} == {"point", "line"}
+    assert {mark.kind for mark in curves.with_probes(ViewState(), other, 50.0).marks} == {"point", "line"}
+    assert curves.with_probes(ViewState(), PROBES, 61.0).gauge == 0
+    assert curves.with_probes(ViewState(), PROBES, 60.0).gauge == 60
 
 
 def test_a_picture_for_print_is_light_wide_and_says_what_it_shows(probed):
