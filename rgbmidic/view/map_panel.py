@@ -18,7 +18,7 @@ from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import MARKS, SCALE, probe_marks, probe_place
 from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.layers import LabelLayer, LineLayer, MarkLayer, arrow_lines, contour_lines, direction_lines
+from rgbmidic.view.layers import LabelLayer, LineLayer, MarkLayer, arrow_lines, beside, contour_lines, direction_lines
 from rgbmidic.view.picture import AROUND, Picture, extremes, frame_title, paint, palette
 from rgbmidic.view.shown import ShownFields
 
@@ -104,12 +104,15 @@ class MapPanel:
                 for colour, width in (("#15181c", 1.4), ("#ffffff", 0.7)):
                     segments = LineCollection(list(lines.reshape(-1, 2, 2)), colors=colour, linewidths=width)
                     axes[0].add_collection(segments)
-            points = 72 * axes[0].get_position().width * cast("Figure", axes[0].figure).get_figwidth() / window.width
-            for xs, ys, colour, x, y, text, side, along, down in self.marks.drawn:
+            point = 0.55  # points to a pixel of the screen: letters of 5.5 points
+            wide = 72 * axes[0].get_position().width * cast("Figure", axes[0].figure).get_figwidth() / point
+            drawn = self.marks.drawn
+            sides = beside([(x, y, text) for *_, x, y, text in drawn], replace(window, width=round(wide)))
+            for (xs, ys, colour, x, y, text), (side, along, down) in zip(drawn, sides, strict=True):
                 axes[0].plot(xs, ys, color=colour, marker="o" if len(xs) == 1 else "")
-                look = {"color": "w", "size": 10 * points, "ha": side, "va": "bottom"}
+                look = {"color": "w", "size": 10 * point, "ha": side, "va": "bottom"}
                 look["bbox"] = {"facecolor": "#15181c", "edgecolor": colour, "alpha": 0.75, "pad": 1}
-                shift = along * points, -down * points
+                shift = along * point, -down * point
                 axes[0].annotate(literal(text), (x, y), shift, textcoords="offset points", **look)
 
         times = frame_times(shown.result, shown.maps.physical.scale)
