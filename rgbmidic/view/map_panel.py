@@ -110,7 +110,7 @@ class MapPanel:
             sides = beside([(x, y, text) for *_, x, y, text in drawn], replace(window, width=round(wide)))
             for (xs, ys, colour, x, y, text), (side, along, down) in zip(drawn, sides, strict=True):
                 axes[0].plot(xs, ys, color=colour, marker="o" if len(xs) == 1 else "")
-                look = {"color": "w", "size": 10 * point, "ha": side, "va": "bottom"}
+                look: dict[str, Any] = {"color": "w", "size": 10 * point, "ha": side, "va": "bottom"}
                 look["bbox"] = {"facecolor": "#15181c", "edgecolor": colour, "alpha": 0.75, "pad": 1}
                 shift = along * point, -down * point
                 axes[0].annotate(literal(text), (x, y), shift, textcoords="offset points", **look)
