@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import itertools
 import random
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 from bokeh.document import Document
 from bokeh.events import MouseMove
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from results import LIGHTS, MESH, NODES, corrupt, make_origin, make_result, random_record, smooth_record
 
@@ -141,6 +142,8 @@ def test_the_moves_of_a_drag_are_one_step_and_those_of_another_mark_another():
 @given(named, st.floats(1, 99))
 @settings(max_examples=20)
 def test_marks_of_the_probes_that_marks_make_make_the_same(set_, gauge):
+    boxes = [mark for mark in set_ if mark.kind == "region"]
+    assume(all(one.x != other.x and one.y != other.y for one, other in itertools.pairwise(boxes)))  # else it is refused
     made = curves.probes([mark for mark in set_ if mark.kind != "circle"], gauge, ProbeSettings())
     assert curves.probes(curves.marks_of(made), gauge, ProbeSettings()) == made
 
