@@ -55,12 +55,15 @@ def marks_of(stated: ProbeSettings) -> tuple[Mark, ...]:
     return tuple(marks)
 
 
-def with_probes(view: ViewState, stated: ProbeSettings) -> ViewState:
-    """Return the view with the probes stated, where its address has none; strain gauges if all have one length."""
+def with_probes(view: ViewState, stated: ProbeSettings, least: float) -> ViewState:
+    """Return the view with the probes stated, where its address has none.
+
+    Strain gauges are among them if all have one length, `least` (px) or more, and the address states no other.
+    """
     lengths = {length for *_, length in stated.strain_gauges}
-    marks = tuple(mark for mark in marks_of(stated) if mark.kind != "strain_gauge" or len(lengths) == 1)
-    gauge = lengths.pop() if len(lengths) == 1 and not view.gauge else view.gauge
-    return view if view.marks or not marks else replace(view, marks=marks, gauge=gauge)
+    alike = len(lengths) == 1 and min(lengths) >= least and view.gauge in (0, *lengths)
+    marks = tuple(mark for mark in marks_of(stated) if alike or mark.kind != "strain_gauge")
+    return view if view.marks or not marks else replace(view, marks=marks, gauge=min(lengths) if alike else view.gauge)
 
 
 def read(

@@ -251,8 +251,7 @@ def channel_section(draft: Draft, stated: ChannelSettings) -> dict[str, Any]:
     """
     if stated.file is None:
         raise ConfigurationError("state the channels' file first (channels.file)")
-    beside = stated.file.resolve().parent == draft.file.parent
-    keys = {**plain(stated), "file": stated.file.name if beside else str(stated.file.resolve())}
+    keys = {**plain(stated), "file": _path(draft, stated.file)}
     return {key: value or None for key, value in keys.items()}
 
 
@@ -267,13 +266,15 @@ def scale_section(draft: Draft, stated: ScaleSettings | None) -> dict[str, Any]:
     if stated is None:
         raise ConfigurationError("set two points and state their distance in mm, or name the camera file")
     keys: dict[str, Any] = dict.fromkeys(("mm_per_pixel", "mm_per_pixel_std", "camera"))
-    if (camera := stated.camera) is not None:
-        return {
-            **keys,
-            "camera": camera.name if camera.resolve().parent == draft.file.parent else str(camera.resolve()),
-        }
-    rounded = {"mm_per_pixel": float(f"{stated.mm_per_pixel:.6g}")}
-    return {**keys, **rounded, "mm_per_pixel_std": float(f"{stated.mm_per_pixel_std:.2g}")}
+    if stated.camera is not None:
+        return {**keys, "camera": _path(draft, stated.camera)}
+    std = float(f"{stated.mm_per_pixel_std:.2g}")
+    return {**keys, "mm_per_pixel": float(f"{stated.mm_per_pixel:.6g}"), "mm_per_pixel_std": std}
+
+
+def _path(draft: Draft, file: Path) -> str:
+    """Return the path of a file as a TEST.toml states it: its name where it is beside it."""
+    return file.name if file.resolve().parent == draft.file.parent else str(file.resolve())
 
 
 class Confirmation:

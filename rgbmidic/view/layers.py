@@ -223,8 +223,8 @@ class MarkLayer:
 
     @property
     def drawn(self) -> list[tuple[Any, ...]]:
-        """Line (xs, ys), colour, place (x, y), text, and side and offsets of the text on the screen, of each probe."""
-        return list(zip(*(self._joined.data[name] for name in _PROBE.split()), strict=True))
+        """Line (xs, ys), colour, place (x, y) and text of each probe."""
+        return list(zip(*(self._joined.data[name] for name in _PROBE.split()[:6]), strict=True))
 
     def taken(self, nodes: FloatArray, reference: FloatArray) -> tuple[Mark, ...] | None:
         """Return the marks, set over nodes (N, 2), on the `reference` (N, 2); None where none has changed."""

@@ -18,8 +18,8 @@ from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import MARKS, SCALE, probe_marks, probe_place
 from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.layers import LabelLayer, LineLayer, MarkLayer, arrow_lines, contour_lines, direction_lines
-from rgbmidic.view.picture import AROUND, Picture, extremes, frame_title, paint, palette, probe_text
+from rgbmidic.view.layers import LabelLayer, LineLayer, MarkLayer, arrow_lines, beside, contour_lines, direction_lines
+from rgbmidic.view.picture import AROUND, Picture, extremes, frame_title, paint, palette
 from rgbmidic.view.shown import ShownFields
 
 if TYPE_CHECKING:
@@ -57,7 +57,6 @@ class MapPanel:
         shown: ShownFields,
         redraw: Callable[[], None],
         hover: Callable[[Any], None],
-        *,
         dark: bool,
     ) -> None:
         self._document, self._shown, self._dark = document, shown, dark
@@ -105,21 +104,23 @@ class MapPanel:
                 for colour, width in (("#15181c", 1.4), ("#ffffff", 0.7)):
                     segments = LineCollection(list(lines.reshape(-1, 2, 2)), colors=colour, linewidths=width)
                     axes[0].add_collection(segments)
-            points = 72 * axes[0].get_position().width * cast("Figure", axes[0].figure).get_figwidth() / window.width
-            for xs, ys, colour, x, y, text, side, along, down in self.marks.drawn:
+            point = 0.55  # points to a pixel of the screen: letters of 5.5 points
+            wide = 72 * axes[0].get_position().width * cast("Figure", axes[0].figure).get_figwidth() / point
+            drawn = self.marks.drawn
+            sides = beside([(x, y, text) for *_, x, y, text in drawn], replace(window, width=round(wide)))
+            for (xs, ys, colour, x, y, text), (side, along, down) in zip(drawn, sides, strict=True):
                 axes[0].plot(xs, ys, color=colour, marker="o" if len(xs) == 1 else "")
-                look = {"color": "w", "size": 10 * points, "ha": side, "va": "bottom"}
+                look: dict[str, Any] = {"color": "w", "size": 10 * point, "ha": side, "va": "bottom"}
                 look["bbox"] = {"facecolor": "#15181c", "edgecolor": colour, "alpha": 0.75, "pad": 1}
-                shift = along * points, -down * points
+                shift = along * point, -down * point
                 axes[0].annotate(literal(text), (x, y), shift, textcoords="offset points", **look)
 
-        derived = {shown.maps.all[name].symbol: shown.maps.how(name) for name in names}
         times = frame_times(shown.result, shown.maps.physical.scale)
         title = frame_title(shown.result, view.frame, math.nan if times is None else float(times[view.frame]))
-        how = "; ".join(f"{symbol}: {text}" for symbol, text in derived.items() if text)
-        aspect, title = window.height / window.width, f"{literal(title)}\n{literal(how)}".strip()
+        how = dict.fromkeys(shown.maps.how(name) for name in names)
+        aspect, title = window.height / window.width, f"{title}\n{'; '.join(filter(None, how))}".strip()
         figure = draw_figure(draw, count=len(names), aspect=aspect, beside=BAR, title=title)
-        figure.texts[0].set_fontsize(8)  # two lines have room
+        figure.texts[0].set(fontsize=8, parse_math=False)  # two lines have room
         return figure
 
     def draw(self, picture: Picture) -> str:
@@ -188,8 +189,8 @@ class MapPanel:
         colours = palette("codes")
         self._blank.show([(*shown.result.nodes[node].tolist(), "", colours[values.status[node]]) for node in missing])
         probes = probe_marks(view.marks).items()
-        gauge, place = shown.gauge, (shown.maps, field, values, shown.displacement, view.frame)
-        texts = {name: probe_text(*place, marks[0].kind, probe_place(marks, gauge)) for name, marks in probes}
+        gauge, read = shown.gauge, shown.read(view.field)
+        texts = {name: read.probe_text(marks[0].kind, probe_place(marks, gauge)) for name, marks in probes}
         texts[SCALE] = f": {view.distance:g} mm" if view.distance else ""
         self.marks.place(view.marks, shown.result.nodes, nodes, texts, gauge)
         return title

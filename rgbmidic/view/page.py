@@ -46,8 +46,9 @@ class ResultPage:
     """
 
     def __init__(self, document: Document, result: Result, view: ViewState, progress: Progress) -> None:
-        view = with_probes(view.with_channels(channels_of(result)), probes_of(result))
-        self.document, self.progress, self.shown = document, progress, ShownFields(result, view)
+        self.document, self.progress = document, progress
+        self.shown = ShownFields(result, view.with_channels(channels_of(result)))
+        self.shown.view = view = with_probes(self.shown.view, probes_of(result), self.shown.gauge)
         self._told = False
         self._pointer: tuple[float, float] | None = None
         self._grown = 0

@@ -410,74 +410,90 @@ def extremes(field: Quantity, values: MapValues) -> tuple[int, ...]:
     return int(np.nanargmin(values.values)), int(np.nanargmax(values.values))
 
 
-def pointer_text(
-    maps: Maps, field: Quantity, values: MapValues, moved: FloatArray, nodes: FloatArray, x: float, y: float
-) -> str:
-    """Return the value at a place over nodes (N, 2), as HTML; where there is none, why. `moved` is as of `mean_of`."""
-    found = element_at(nodes, maps.result.elements, x, y)
-    if found is None:
-        return "outside the mesh"
-    corners, weights = found[0].astype(np.int64), found[1]
-    correlation, least = maps.physical.covariance.part(corners), VIEWER.least_weight
-    mean = Mean(name="", nodes=corners, weights=weights, correlation=correlation, least=least)
-    value, std = mean_of(maps, field, values, moved, mean)
-    text = f"{field.symbol} = {field.text(value, std)}"
-    blank = values.status[corners].max()
-    if not np.isfinite(value):
-        text += f" ({_REASONS[blank] if blank else 'a node beside it has no data'})"
-    return f"<b>{html.escape(text)}</b>"
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FieldInFrame:
+    """A field in one frame, as it is stated under the pointer and at probes.
 
-
-def probe_text(
-    maps: Maps, field: Quantity, values: MapValues, moved: FloatArray, frame: int, kind: str, place: tuple[float, ...]
-) -> str:
-    """Return what a probe of a kind measures of a field, with its uncertainty, as its history has it.
-
-    A probe whose history does not have the field shows its value at the centre, or its mean; see `mean_of`, which also
-    has `moved`.
+    Attributes
+    ----------
+    maps, field, values, frame
+        The fields of the result, which one it is, what was read of it, and the index of the frame.
+    moved : ndarray, shape (4, N)
+        As `Maps.displacement` returns it.
     """
-    name = field.name.removesuffix("_std")
 
-    def told(value: float, std: float) -> str:
-        return field.text(value, std) if name == field.name else field.text(std)
+    maps: Maps
+    field: Quantity
+    values: MapValues
+    moved: FloatArray
+    frame: int
 
-    if kind == "gauge" or (field.stepped and kind in ("line", "region", "circle")):
-        return ""
-    try:
-        if kind == "strain_gauge" and maps.field(name).group == "Strain":
-            strain = maps.strain_at(frame, *place)
-            return f": {told(float(strain[name][0]), float(strain[f'{name}_std'][0]))}"
-        kind, place = ("point", place[:2]) if kind == "strain_gauge" else (kind, place)
-        stated = ProbeSettings(measure=cast(Any, maps.physical.measure))
-        probe = make_probe(maps.physical.covariance, kind, 1, place, stated, maps.physical.rectified)
-    except InputError:
-        return ""
-    assert isinstance(probe, Mean)
-    if isinstance(probe, Area) and maps.since is None and not maps.rigid_removed:
-        part = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), moved[:, None, probe.nodes], strict=True)))
-        for one in probe.histories(part) if maps.field(name).group == "Strain" else ():
-            if one.name == f"{probe.name}_{name}" and one.std is not None:
-                return f" mean: {told(float(one.values[0]), float(one.std[0]))}"
-    value, std = mean_of(maps, field, values, moved, probe)
-    most = " at most" if kind != "point" and name not in ("u", "v") and np.isfinite(std) else ""
-    return f"{' mean' if kind != 'point' else ''}: {field.text(value, std)}{most}"
+    @property
+    def measured(self) -> str:
+        """Name of the field, or of that whose uncertainty it is."""
+        return self.field.name.removesuffix("_std")
 
+    def pointer_text(self, nodes: FloatArray, x: float, y: float) -> str:
+        """Return the value at a place over nodes (N, 2), as HTML; where there is none, why."""
+        found = element_at(nodes, self.maps.result.elements, x, y)
+        if found is None:
+            return "outside the mesh"
+        corners, weights = found[0].astype(np.int64), found[1]
+        correlation, least = self.maps.physical.covariance.part(corners), VIEWER.least_weight
+        mean = Mean(name="", nodes=corners, weights=weights, correlation=correlation, least=least)
+        value, std = self.mean_of(mean)
+        text = f"{self.field.symbol} = {self.field.text(value, std)}"
+        blank = self.values.status[corners].max()
+        if not np.isfinite(value):
+            text += f" ({_REASONS[blank] if blank else 'a node beside it has no data'})"
+        return f"<b>{html.escape(text)}</b>"
 
-def mean_of(maps: Maps, field: Quantity, values: MapValues, moved: FloatArray, mean: Mean) -> tuple[float, float]:
-    """Average a field over a place, as a history does, with its standard uncertainty; NaN where it has none.
+    def probe_text(self, kind: str, place: tuple[float, ...]) -> str:
+        """Return what a probe of a kind measures of the field, with its uncertainty, as its history has it.
 
-    That of u and v is exact, from their displacement `moved`, as `Maps.displacement` returns it; the errors of other
-    fields are taken as the same at all nodes, which is the most that they can add up to: gauges overlap.
-    """
-    name = field.name.removesuffix("_std")
-    if field.stepped:
-        return float(values.values[mean.nodes[mean.weights.argmax()]]), float("nan")
-    exact = name in ("u", "v")
-    read = moved["uv".index(name) :: 2] if exact else np.stack([values.values, values.std])
-    of_nodes, stds = read[:, None, mean.nodes]
-    stated = bool(np.isfinite(stds).any())
-    pair = mean.average(of_nodes, stds, np.isfinite(of_nodes + (stds if stated else 0)), alike=not exact)
-    (value,), (std,) = maps.physical.units.lengths(*pair) if exact else pair
-    if exact and name != field.name:
-        return float(std), float("nan")
-    return float(value), float(std) if stated else float("nan")
+        A probe whose history does not have the field shows its value at the centre, or its mean; see `mean_of`.
+        """
+        maps, name = self.maps, self.measured
+        strain = maps.all.get(name, self.field).group == "Strain"
+        if kind == "gauge" or (self.field.stepped and kind in ("line", "region", "circle")):
+            return ""
+        try:
+            if kind == "strain_gauge" and strain:
+                read = maps.strain_at(self.frame, *place)
+                return f": {self._told(float(read[name][0]), float(read[f'{name}_std'][0]))}"
+            kind, place = ("point", place[:2]) if kind == "strain_gauge" else (kind, place)
+            stated = ProbeSettings(measure=cast(Any, maps.physical.measure))
+            probe = make_probe(maps.physical.covariance, kind, 1, place, stated, maps.physical.rectified)
+        except InputError:
+            return ""
+        assert isinstance(probe, Mean)
+        if isinstance(probe, Area) and strain and maps.since is None and not maps.rigid_removed:
+            part = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), self.moved[:, None, probe.nodes], strict=True)))
+            for one in probe.histories(part):
+                if one.name == f"{probe.name}_{name}" and one.std is not None:
+                    return f" mean: {self._told(float(one.values[0]), float(one.std[0]))}"
+        value, std = self.mean_of(probe)
+        most = " at most" if kind != "point" and name not in ("u", "v") and np.isfinite(std) else ""
+        return f"{' mean' if kind != 'point' else ''}: {self.field.text(value, std)}{most}"
+
+    def _told(self, value: float, std: float) -> str:
+        return self.field.text(value, std) if self.measured == self.field.name else self.field.text(std)
+
+    def mean_of(self, mean: Mean) -> tuple[float, float]:
+        """Average the field over a place, as a history does, with its standard uncertainty; NaN where it has none.
+
+        That of u and v is exact, from their displacement; the errors of other fields are taken as the same at all
+        nodes, which is the most that they can add up to: gauges overlap.
+        """
+        name, values = self.measured, self.values
+        if self.field.stepped:
+            return float(values.values[mean.nodes[mean.weights.argmax()]]), math.nan
+        exact = name in ("u", "v")
+        read = self.moved["uv".index(name) :: 2] if exact else np.stack([values.values, values.std])
+        of_nodes, stds = read[:, None, mean.nodes]
+        stated = bool(np.isfinite(stds).any())
+        pair = mean.average(of_nodes, stds, np.isfinite(of_nodes + (stds if stated else 0)), alike=not exact)
+        (value,), (std,) = self.maps.physical.units.lengths(*pair) if exact else pair
+        if exact and name != self.field.name:
+            return float(std), math.nan
+        return float(value), float(std) if stated else math.nan

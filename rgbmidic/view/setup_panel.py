@@ -114,10 +114,9 @@ def pictures(inspection: Inspection, shape: tuple[int, int]) -> dict[str, Pictur
     if inspection.reflection_index is not None:
         for name, index in zip(images.names, inspection.reflection_index, strict=True):
             parts[f"reflection index: {name}"] = np.asarray(255 * np.clip(np.nan_to_num(index), 0, 1), dtype=np.uint8)
-    found = {name: np.zeros(shape, dtype=np.uint8) for name in parts}
-    for name, part in parts.items():
-        found[name][top : top + part.shape[0], left : left + part.shape[1]] = part
-    return found
+    height, width = images.values.shape[1:]
+    around = (top, shape[0] - top - height), (left, shape[1] - left - width)
+    return {name: np.pad(part, around) for name, part in parts.items()}
 
 
 def overview(inspection: Inspection, named: Mapping[str, Picture], raw: Picture) -> str:

@@ -17,12 +17,12 @@ from rgbmidic.settings import ChannelSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import BESIDE, UNCERTAINTY, ViewState
 from rgbmidic.view.picture import (
+    FieldInFrame,
     Overlay,
     Picture,
     Pictures,
     palette,
     palette_name,
-    pointer_text,
     range_of_test,
     robust_range,
 )
@@ -162,8 +162,10 @@ class ShownFields:
 
     def text_at(self, x: float, y: float) -> str:
         """Return the values of all fields in view at a place of the image, as HTML."""
-        place = self.displacement, self.nodes, x, y
-        told = dict.fromkeys(
-            pointer_text(self.maps, self.maps.all[name], self.values(name), *place) for name in self.names
-        )
+        told = dict.fromkeys(self.read(name).pointer_text(self.nodes, x, y) for name in self.names)
         return " &nbsp; ".join([f"x {x:.1f}, y {y:.1f} px:", *told])
+
+    def read(self, name: str) -> FieldInFrame:
+        """Read a field in the frame in view, for texts on it."""
+        field, values = self.maps.all[name], self.values(name)
+        return FieldInFrame(maps=self.maps, field=field, values=values, moved=self.displacement, frame=self.view.frame)
