@@ -48,9 +48,9 @@ def demo(
     print_table(title, columns, lines)
     columns = ["plate", "lens and plane", "one scale", "stated", "strain, lens and plane", "one scale", "stated"]
     lines = []
-    for row in plate:
-        micrometres = [f"{1e3 * value:.2f}" for value in (*row.displacement_mm, row.stated_mm)]
-        lines.append([row.motion, *micrometres, *(f"{1e6 * value:.0f}" for value in (*row.strain, row.stated_strain))])
+    for one in plate:
+        micrometres = [f"{1e3 * value:.2f}" for value in (*one.displacement_mm, one.stated_mm)]
+        lines.append([one.motion, *micrometres, *(f"{1e6 * value:.0f}" for value in (*one.strain, one.stated_strain))])
     title = "Displacement error, um, and strain error, 1e-6, against the exact truth (a flat plate tilted by 5 degrees)"
     print_table(title, columns, lines)
     print(f"pictures: {out / 'figures'}   result: {out / 'result'}   {time.perf_counter() - started:.0f} s")

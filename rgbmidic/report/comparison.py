@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from rgbmidic.results.agreement import Fit
+    from rgbmidic.results.comparison import Fit
 
 PAGE, TABLE, SCALE, INDEX = "comparison.html", "comparison.csv", "scale.csv", "comparison.pvd"
 
