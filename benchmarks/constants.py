@@ -38,8 +38,8 @@ VARIED = {
     "statistics": ("freedom", "least_variance", "own"),
 }
 """Constants of each part of the method."""
-QUICK = ("anchor", "even", "grey", "least_variance", "noisy", "sigma", "smoothness", "swinging")
-"""At least one of each part."""
+QUICK = ("even", "grey", "least_variance", "sigma")
+"""One of each part."""
 NOTHING = {"displacement/stated": 1e-3, "stated [%]": 0.01}
 """What is as good as no change: the last iteration of a solve may move the nodes by so much."""
 COARSE = {"smoothness": 10, "anchor": 10, "settled": 100, "voters": 10, "tolerance": 100}

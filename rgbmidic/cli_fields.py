@@ -12,6 +12,7 @@ from typer import Option
 from rgbmidic import cli_parts as parts
 from rgbmidic import command
 from rgbmidic.errors import InputError
+from rgbmidic.extras import optional
 
 app = typer.Typer()
 
@@ -196,7 +197,6 @@ def movie(
     """Write a movie of one field or several side by side, over the reference image or the raw frames."""
     from rgbmidic._kernels.threads import threads
     from rgbmidic.report import Curve, Movie, write_movie
-    from rgbmidic.view.picture import RawPictures
 
     if over not in ("reference", "frame"):
         raise InputError(f"--over is reference or frame, not {over!r}")
@@ -207,7 +207,7 @@ def movie(
         fields=tuple(name.strip() for name in field.split(",")),
         frames=opened.frames(frames),
         limits=command.read_pair(range_, "--range") if range_ else None,
-        images=RawPictures(result=opened.result) if over == "frame" else None,
+        images=optional("rgbmidic.view.picture", "view").RawPictures(result=opened.result) if over == "frame" else None,
         curve=None if curve is None else Curve.read(curve, column, offset),
         colours=colours,
         opacity=opacity,

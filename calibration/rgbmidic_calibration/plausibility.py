@@ -158,7 +158,8 @@ def _agreement_checks(
         )
         yield Check("captures", text, value, limit=0.02)
     detail = np.array([frame.detail for frame in captures])
-    for label, lost in zip(labels, 1 - detail / max(np.median(detail), 1e-12), strict=True):
+    typical = float(np.median(detail))
+    for label, lost in zip(labels, 1 - detail / typical if typical > 0 else 0 * detail, strict=True):
         text = (
             f"{label} is less sharp than the others: out of focus, or moved? The matrix does not suffer, a "
             "registration would"

@@ -236,6 +236,7 @@ class ReferenceUpdate:
             prefilter=prefilter,
             origin=origin,
             registration=self.first.registration,
+            constants=self.first.constants,
         )
         step, rigid = self._step(displacement, solution)
         gaps = np.where(measured[:, None], step, np.nan)

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from rgbmidic.correlation.constants import USUAL, SolverConstants
 from rgbmidic.correlation.nodes import correlation_around, torn_elements
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, follow
@@ -331,7 +332,9 @@ class Start:
     reference_updates: tuple[int, ...] = ()
     best_match: float = 0.0
 
-    def after(self, mesh: Tri3Mesh, displacement: FloatArray, measured: BoolArray) -> Start:
+    def after(
+        self, mesh: Tri3Mesh, displacement: FloatArray, measured: BoolArray, constants: SolverConstants = USUAL
+    ) -> Start:
         """Return the start of the frame after one that started here.
 
         Nodes without data go on with the displacement, turn and strain of the nearest measured one. Where a frame has
@@ -345,6 +348,8 @@ class Start:
             Of that frame, px.
         measured : ndarray, shape (N,)
             Which of them are measured.
+        constants
+            Of the solve.
 
         Returns
         -------
@@ -354,7 +359,7 @@ class Start:
             return self
         known = np.where(measured[:, None], displacement, 0.0)
         gradient = mesh.element_gradient(known)
-        intact = measured[mesh.elements].all(axis=1) & ~torn_elements(mesh, known)
+        intact = measured[mesh.elements].all(axis=1) & ~torn_elements(mesh, known, constants)
         weight = np.where(intact, mesh.areas, 0.0)
         around = mesh.to_nodes(weight)
         nearest = mesh.nearest(measured & (around > 0) if intact.any() else measured)[1]

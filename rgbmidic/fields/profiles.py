@@ -162,7 +162,7 @@ class ProfileLine:
         part = Tri3Mesh(nodes=mesh.nodes[nodes], elements=np.searchsorted(nodes, elements).astype(np.int32))
         self.points, self.positions = points, np.linspace(0, length, len(points))
         self.places = Places.of(part, points)
-        slopes = [sp.eye(len(mesh.nodes), format="csr")[nodes] @ slope for slope in gauges.slopes]
+        slopes = [slope[nodes] for slope in gauges.slopes]
         exx, eyy = (_unit(slope @ covariance.correlation @ slope.T) for slope in slopes)
         self.correlations = {"": covariance.part(nodes), "exx": exx, "eyy": eyy, "strain": (exx + eyy) / 2}
         count = np.bincount(gauges.rows, weights=gauges.fractions, minlength=len(mesh.nodes))

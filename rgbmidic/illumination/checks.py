@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from math import inf
+from math import inf, isnan
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +42,8 @@ class Check:
 
 
 def warning(text: str, value: float = inf, above: float = 0.0) -> Check:
-    """Check that never fails: a warning where the figure exceeds `above`, or in any case."""
-    return Check("", text, value, limit=inf, doubtful=above)
+    """Check that never fails: a warning where the figure exceeds `above`, or in any case; NaN says nothing."""
+    return Check("", text, 0.0 if isnan(value) else value, limit=inf, doubtful=above)
 
 
 def reported(checks: Iterable[Check]) -> list[Check]:

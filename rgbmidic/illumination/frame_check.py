@@ -386,7 +386,7 @@ def _interpolated(samples: _Samples) -> Iterator[Check]:
         f"samples of {samples.names[worst]} are interpolated from those of a colour mosaic: their second differences "
         f"depend {relative[worst]:.2g} times on the axis or the place in a 2 x 2 cell"
     )
-    yield Check("demosaiced", text, float(relative[worst]), 1.5)
+    yield Check("demosaiced", text, float(np.nan_to_num(relative[worst])), 1.5)
 
 
 def _curvature(x: npt.NDArray[np.float32], usable: BoolArray) -> tuple[FloatArray, float] | None:

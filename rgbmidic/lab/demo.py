@@ -28,6 +28,7 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import align
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Plan, Separation, correlate, measure
+from rgbmidic.pipeline.size_figures import rms
 from rgbmidic.results import Result
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ScaleSettings, TestSettings, read_test
@@ -198,8 +199,8 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
             DemoRow(
                 angle_deg=float(angles[index]),
                 rms_px=field_rms(mesh, field, truth[index]),
-                nodal_px=_rms(field - at_nodes(truth[index], mesh.nodes)),
-                predicted_px=_rms(std),
+                nodal_px=rms(field - at_nodes(truth[index], mesh.nodes)),
+                predicted_px=rms(std),
                 single_px=tuple(field_rms(mesh, single, truth[index]) for single in alone),
                 measured=float(np.isfinite(field[:, 0]).mean()),
             )
@@ -295,10 +296,10 @@ def run_plate(test: Path, truth: CameraCalibration) -> list[PlateRow]:
         rows.append(
             PlateRow(
                 motion=name,
-                displacement_mm=(_rms(errors[0]), _rms(errors[1])),
-                strain=(_rms(strains[0]), _rms(strains[1])),
-                stated_mm=_rms(np.stack([fields[0]["u_std"], fields[0]["v_std"]])),
-                stated_strain=_rms(np.stack([fields[0][f"{name}_std"] for name in known])),
+                displacement_mm=(rms(errors[0]), rms(errors[1])),
+                strain=(rms(strains[0]), rms(strains[1])),
+                stated_mm=rms(np.stack([fields[0]["u_std"], fields[0]["v_std"]])),
+                stated_strain=rms(np.stack([fields[0][f"{name}_std"] for name in known])),
             )
         )
     return rows
@@ -313,10 +314,6 @@ def _posed(turns: Sequence[float], place: tuple[float, float, float]) -> CameraC
     turn = np.asarray(cv2.Rodrigues(np.radians(turns))[0])
     homography = np.linalg.inv(matrix @ np.c_[turn[:, :2], place])
     return CameraCalibration(shape=_PLATE_SHAPE, lens=np.array(_LENS), homography=homography / homography[2, 2])
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.nanmean(values**2)))
 
 
 @contextmanager

@@ -13,10 +13,10 @@ from rgbmidic._version import __version__
 from rgbmidic.errors import InputError
 from rgbmidic.lab import plain, write_findings
 from rgbmidic.lab.planning import Outlook, Plan, Proposal
+from rgbmidic.pipeline.size_figures import rms
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS
-from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -181,9 +181,7 @@ def _lamps(plan: Plan) -> list[dict[str, Any]]:
 
 def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
     inside, names = plan.inside, [light.name for light in plan.scene.lights]
-    std, random, feigned = (
-        values[inside & np.isfinite(values)] for values in (outlook.std, outlook.forecast.std, outlook.forecast.bias)
-    )
+    std = outlook.std[inside & np.isfinite(outlook.std)]
     quantiles = np.quantile(std, [0.5, 0.95, 1.0]).tolist() if std.size else [math.nan] * 3
     return {
         "angle_deg": outlook.state.angle_deg,
@@ -195,13 +193,9 @@ def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
         "no_light": plan.fraction(outlook.clean == 0),
         "saturated": plan.fraction(np.asarray(outlook.saturated.any(axis=0))),
         "std_px": dict(zip(("median", "q95", "largest"), quantiles, strict=True)),
-        "random_px": _rms(random),
-        "feigned_by_domes_px": _rms(feigned),
+        "random_px": rms(outlook.forecast.std[inside]),
+        "feigned_by_domes_px": rms(outlook.forecast.bias[inside]),
     }
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
 
 
 def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:

@@ -71,7 +71,7 @@ class Schedule:
     def __init__(self, plan: Plan, sink: Sink, places: Iterable[int] = ()) -> None:
         self._plan, self._sink = plan, sink
         self._ready = list[tuple[int, Start]]()
-        self._wanted = set[int]()
+        self._wanted, self._last = set[int](), 0
         self._waiting: dict[int, list[int]] = {}
         self._first_tries: dict[int, Measured] = {}
         for place in places:
@@ -91,6 +91,7 @@ class Schedule:
             if ancestor in self._wanted:
                 return
             self._wanted.add(ancestor)
+            self._last = max(self._last, ancestor)
             first = ancestor
         if first is not None:
             before = parent(first)
@@ -167,7 +168,7 @@ class Schedule:
         after = following(self._plan, found.record.values, start)
         self._sink.keep(place, found, after)
         self._wanted.discard(place)
-        released = [child for child in children(place, max(self._wanted, default=0) + 1) if child in self._wanted]
+        released = [child for child in children(place, self._last + 1) if child in self._wanted]
         self._ready += [(one, after) for one in (*released, *self._waiting.pop(place, ()))]
 
 
@@ -181,7 +182,8 @@ def following(plan: Plan, kept: Mapping[str, Any], start: Start) -> Start:
     measured = kept["node_status"] == NodeStatus.MEASURED
     if not measured.any():
         return start
-    after = start.after(plan.reference.mesh, np.stack([kept["u"], kept["v"]], axis=1), measured)
+    reference, displacement = plan.reference, np.stack([kept["u"], kept["v"]], axis=1)
+    after = start.after(reference.mesh, displacement, measured, reference.constants)
     updates, best = tuple(kept["reference_updates"].tolist()), float(kept["best_match"])
     return replace(after, reference_updates=updates, best_match=best)
 
@@ -244,8 +246,8 @@ class Cluster:
                 "a Dask cluster needs the packages dask and distributed: install rgbmidic[cluster]"
             ) from None
         # what becomes of the cluster is reported here, without its tracebacks; some loggers have levels of their own
-        loggers = [logging.getLogger(name) for name in list(logging.root.manager.loggerDict)]
-        self._levels = {log: log.level for log in loggers if log.name.partition(".")[0] in ("distributed", "tornado")}
+        names = [name for name in logging.root.manager.loggerDict if name.startswith(("distributed", "tornado"))]
+        self._levels = {log: log.level for log in map(logging.getLogger, names)}
         for log in self._levels:
             log.setLevel(logging.CRITICAL + 1)
         try:

@@ -97,8 +97,8 @@ def measure_sequence(
     Yields
     ------
     Solution
-        One for each state, relative to the reference. A state that cannot be measured is `Status.FAILED` with its
-        reason; the next states are measured.
+        One for each state, relative to the reference. A state that cannot be measured, because of an unexpected error
+        in a given object, too, is `Status.FAILED` with its reason; the next states are measured.
 
     Raises
     ------

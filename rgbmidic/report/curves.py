@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic.report import style
-from rgbmidic.report.figures import spread
+from rgbmidic.report.figures import field_colours, spread
 from rgbmidic.report.summary import NoiseFloor, TimeHistory
 from rgbmidic.results import QUANTITIES, Histories, HistoryColumn, Profile, Wave, uncertain
 from rgbmidic.typing import FloatArray
@@ -182,7 +182,7 @@ def profile_figure(profile: Profile, wave: Wave | None = None, shown: Sequence[i
     factor = 1.0 if profile.times is None else style.time_unit(profile.times)[0]
     position, field = f"position ({profile.units.length})", style.literal(profile.field.label)
     rows = list(shown) or _rows_shown(profile.values)
-    colours = "plasma" if profile.field.kind == "positive" else "viridis"
+    colours = field_colours(profile.field)
     known = style.ordinary_values(profile.values, profile.std)
     low, high = profile.field.ends or style.colour_range(known)
 

@@ -418,8 +418,8 @@ class MapDrawer:
             box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
             axis.text(0.5, 0.5, "nothing measured", transform=axis.transAxes, ha="center", va="center", bbox=box)
             return
-        codes = ListedColormap(style.STATUS_COLOURS[: len(field.codes)])
-        colours = codes if field.codes else field_colours(field)
+        codes = len(field.codes)
+        colours = ListedColormap(style.STATUS_COLOURS[:codes]) if codes else field_colours(field)
         picture = self._raster(values, stepped=field.stepped)
         axis.imshow(picture, extent=self._extent, cmap=colours, norm=norm, interpolation="nearest")
         if bar:

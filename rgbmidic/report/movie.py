@@ -10,6 +10,7 @@ import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -144,7 +145,7 @@ class Movie:
             return self.limits or {}
         return dict.fromkeys(self.fields, self.limits)
 
-    @property
+    @cached_property
     def times(self) -> FloatArray | None:
         """Times (T,) of all frames of the result in s; None where not known."""
         return frame_times(self.maps.result, self.maps.physical.scale)

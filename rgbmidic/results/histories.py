@@ -326,9 +326,8 @@ def with_channels(histories: Histories, stated: ChannelSettings) -> Histories:
             "the clocks of channels and frames are taken as equal: channels.offset, .trigger or .align relates them"
         )
     first, last = channels.times[[0, -1]]
-    if (
-        covered := float(np.nanmax(times) - np.nanmin(times)) / (last - first)
-    ) < 0.01:  # a factor of 1,000 is far below
+    covered = float(np.nanmax(times) - np.nanmin(times)) / (last - first)
+    if covered < 0.01:  # a factor of 1,000 is far below
         remarks.append(
             f"the frames cover {covered:.2%} of the time of the channels: is the unit of {stated.file} right?"
         )

@@ -81,7 +81,7 @@ class Quantity:
             name=f"{self.name}_std",
             source=re.sub(r"^[a-z]+", r"\g<0>_std", self.source),
             meaning=f"standard uncertainty of {self.name}",
-            symbol=f"σ({self.symbol})",
+            symbol=self.symbol and f"σ({self.symbol})",
             group="Uncertainty",
             kind="positive",
         )

@@ -61,7 +61,7 @@ class FilmButton:
         self._process = context.Process(target=_write, args=(send, maps, self._out, names, options), daemon=True)
         self._process.start()
         send.close()
-        self._tell(f"{self._out.name}: starting")
+        self._tell(f"{html.escape(self._out.name)}: starting")
 
     def tell(self) -> None:
         """Show how far the movie is, where its file is, or why there is none."""

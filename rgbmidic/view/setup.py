@@ -192,7 +192,7 @@ class SetupPage:
         """Inspect the frame in view as `rgbmidic inspect` does, in another thread."""
         self.drawing.settle()  # else it drops the inspection
         if (made := self._meshed()) is None:
-            self.parts.message.text = "Draw the region first."
+            self.parts.message.text = "Draw the region and state the size of the elements first."
             return
         self.parts.message.text = "inspecting …"
         index = int(self.parts.frame.value)
@@ -209,8 +209,10 @@ class SetupPage:
         expected = f"median uncertainty to expect {np.median(known):.2g} px" if known.size else "no node is measured"
         lines = [f"<b>{html.escape(found.name)}</b>: {expected}"]
         self.parts.message.text = "<br>".join(lines + [f"• {html.escape(finding.text)}" for finding in found.findings])
-        self.parts.picture.value = _EXPECTED
-        self.show()
+        if self.parts.picture.value == _EXPECTED:
+            self.show()
+        else:  # which shows it
+            self.parts.picture.value = _EXPECTED
 
     def _changed(self) -> Draft:
         """Return the draft with the values of all controls."""

@@ -143,12 +143,13 @@ def test_angles_that_make_no_sense_are_refused_before_any_work(angles, tmp_path,
 
 @pytest.mark.parametrize("script", sorted(Path(run.__file__).parent.glob("*.py")), ids=lambda path: path.name)
 def test_the_study_uses_public_names_only(script):
-    """Names of a package's `__all__` or of a top module: what a laboratory's own script may rely on."""
+    """Names of a package's `__all__`, a top module or the measures: what a laboratory's own script may rely on."""
+    public = {"rgbmidic.errors", "rgbmidic.settings", "rgbmidic.lab.measures"}
     for node in ast.walk(ast.parse(script.read_text(encoding="utf-8"))):
         assert not (isinstance(node, ast.Import) and any(part.name.startswith("rgbmidic") for part in node.names))
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rgbmidic"):
             home = import_module(node.module)
-            assert hasattr(home, "__path__") or node.module in {"rgbmidic.errors", "rgbmidic.settings"}, node.module
+            assert hasattr(home, "__path__") or node.module in public, node.module
             assert {part.name for part in node.names} <= set(getattr(home, "__all__", vars(home))), node.module
 
 
