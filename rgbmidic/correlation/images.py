@@ -114,8 +114,8 @@ class SlidingWindow:
     ----------
     sigma
         Its standard deviation, px: its 800 px, 4 pi times the square, give a variance to 5 % (derived), and it is
-        narrow beside a reflection. Chosen; with half or twice of it in all statistics lights under one differ by 4e-3 px
-        at most, beside a gap by .1 px, their uncertainty by 7 % (benchmarks/constants.py).
+        narrow beside a reflection. Chosen; with half or twice of it in all statistics lights under one differ by 4e-3
+        px at most, beside a gap by .1 px, their uncertainty by 7 % (benchmarks/constants.py).
     step
         Side of the blocks, px: half the standard deviation, to which it adds 1 %.
     """
