@@ -14,6 +14,7 @@ from draws import JITTER, SAMPLERS, other_draws
 from matplotlib.figure import Figure
 from renders import kept_renders, new_renders
 
+from rgbmidic import report
 from rgbmidic.lab.demo import kernels_compiled_meanwhile
 
 THREADS = ("RGBMIDIC_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
@@ -85,9 +86,10 @@ def alarm() -> Iterator[None]:
 
 @pytest.fixture
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures that nobody looks at are drawn with a third of the resolution."""
-    savefig = Figure.savefig
+    """Pictures and movies that nobody looks at are drawn with a third of the resolution."""
+    savefig, movie = Figure.savefig, report.Movie
     monkeypatch.setattr(Figure, "savefig", lambda figure, *to, **how: savefig(figure, *to, **how | {"dpi": 50}))
+    monkeypatch.setattr(report, "Movie", lambda **shown: movie(**shown | {"width": 480}))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

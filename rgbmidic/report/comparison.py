@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from operator import methodcaller
@@ -19,7 +17,7 @@ from rgbmidic.report import style
 from rgbmidic.report.figures import spread
 from rgbmidic.report.page import render
 from rgbmidic.results.comparison import QUANTITIES, WAYS, Comparison, FrameComparison
-from rgbmidic.results.files import write_complete, writing
+from rgbmidic.results.files import write_complete, write_table, writing
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -120,21 +118,11 @@ def write_comparison(
             progress(len(done), len(comparison.frames), "frames")
     sets = "".join(f'<DataSet timestep="{one.time:.12g}" file={quoteattr(_state(one.frame))}/>' for one in done)
     index = f'<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1"><Collection>{sets}</Collection></VTKFile>'
-    texts = {name: _csv(rows) for name, rows in tables.items()}
-    for name, text in {**texts, INDEX: index, PAGE: _page(comparison, done)}.items():
+    for name, rows in tables.items():
+        write_complete(out / name, partial(write_table, head=rows[0], rows=[row.values() for row in rows]))
+    for name, text in {INDEX: index, PAGE: _page(comparison, done)}.items():
         write_complete(out / name, methodcaller("write", text.encode()))
     return done
-
-
-def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Rows of texts, whole numbers and numbers as CSV; NaN is an empty field."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    writer.writerow(rows[0])
-    for row in rows:
-        cells = (f"{value:.9g}" if isinstance(value, float) else value for value in row.values())
-        writer.writerow("" if cell == "nan" else cell for cell in cells)
-    return text.getvalue()
 
 
 def _scale_columns(fit: Fit) -> dict[str, float]:

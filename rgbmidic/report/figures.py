@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from rgbmidic.report import style
 from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Maps, Quantity, Result
+from rgbmidic.results.quantities import FAILED
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ MAPS = {
 """Fields of each kind of map."""
 _COLOURS = {"positive": "plasma", "fraction": "cividis", "angle": "twilight"}
 """Colours of the kinds of fields; all others have viridis."""
-_FAILED = QUANTITIES["status"].codes.index("failed")
 
 
 def shown_frames(result: Result) -> tuple[int, ...]:
@@ -42,7 +42,7 @@ def measured_frames(result: Result) -> tuple[int, ...]:
     """Select those of `shown_frames` that did not fail; all of them where all failed."""
     shown = shown_frames(result)
     ends = zip(shown, result.each("status", shown), strict=True)
-    return tuple(frame for frame, end in ends if end != _FAILED) or shown
+    return tuple(frame for frame, end in ends if end != FAILED) or shown
 
 
 def spread(frames: Sequence[int], most: int) -> tuple[int, ...]:

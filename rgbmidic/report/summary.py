@@ -10,6 +10,7 @@ import numpy as np
 
 from rgbmidic.report.style import time_axis
 from rgbmidic.results import QUANTITIES, Result, speckle_diameter
+from rgbmidic.results.quantities import FAILED
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ def noise_floor(physical: Physical, most: int = 50) -> NoiseFloor | None:
         None where fewer than two frames of the reference are measured.
     """
     result, names = physical.result, ("u", "v", "exx", "eyy", "exy")
-    static = [place for place in result.provenance["references"] if result.status[place] != 2][:most]
+    static = [place for place in result.provenance["references"] if result.status[place] != FAILED][:most]
     if len(static) < 2:
         return None
     fields = np.array([[values[name] for name in names] for values in map(physical.frame, static)], dtype=np.float64)

@@ -29,7 +29,7 @@ from rgbmidic.fields import NodalCovariance, StrainGauges, strain_of_gradient
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh
 from rgbmidic.results.levelling import Levelling, reading
 from rgbmidic.results.physical import frame_times, rectification_of, shared_part
-from rgbmidic.results.quantities import QUANTITIES as STORED
+from rgbmidic.results.quantities import FAILED
 from rgbmidic.results.result import Result
 from rgbmidic.results.simulation import Simulation, places_among
 from rgbmidic.settings import ScaleSettings
@@ -45,7 +45,6 @@ _SAME = 1e-6
 """Distance over the size of an element under which two nodes are one: rounding of a placement (derived)."""
 _RIGID = 1e-6
 """Least squared ratio to the uncertainty, of a node on average, of what is no rigid motion in a simulation (chosen)."""
-_FAILED = STORED["status"].codes.index("failed")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -430,11 +429,11 @@ def _matched(
 ) -> tuple[FloatArray, tuple[int, ...], tuple[int, ...]]:
     """Find the time (T,) of each frame, the frames to compare, and those beyond the simulation's times."""
     for index in asked or ():
-        if result.frame(index).status == _FAILED:
+        if result.frame(index).status == FAILED:
             raise InputError(f"frame {index} of {result.path} is not measured; compare another one (--frames)")
         if index not in result.deformed:
             raise InputError(f"frame {index} of {result.path} is of the reference, against which nothing has moved")
-    known = [index for index in result.deformed if result.finished[index] and result.status[index] != _FAILED]
+    known = [index for index in result.deformed if result.finished[index] and result.status[index] != FAILED]
     frames = list(known if asked is None else asked)
     if not frames:
         raise InputError(f"no deformed frame of {result.path} is measured")

@@ -25,7 +25,7 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.fields.units import column
 from rgbmidic.results.files import check_file, write_complete, write_table, writing
 from rgbmidic.results.physical import Physical
-from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, Quantity
+from rgbmidic.results.quantities import FAILED, FINITE_ELEMENTS, QUANTITIES, SHARED, Quantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray
@@ -33,7 +33,6 @@ from rgbmidic.typing import AnyArray
 if TYPE_CHECKING:
     import h5py
 
-_FAILED = QUANTITIES["status"].codes.index("failed")
 _AXES = "x to the right, y down; (0, 0) is the centre of the image's top-left pixel"
 _AXES_UP = "x to the right, y up: y, v, shears and directions are those of the file's root times -1"
 _TURNED = ("exy", "direction")
@@ -310,7 +309,7 @@ def _write_nodemaps(physical: Physical, folder: Path, *, overwrite: bool) -> Non
             file.unlink()
     x, y = physical.length * physical.mesh.nodes.T
     flat = np.zeros(len(x))
-    for index in np.flatnonzero(result.finished & (result.status != _FAILED)).tolist():
+    for index in np.flatnonzero(result.finished & (result.status != FAILED)).tolist():
         values = physical.frame(index)
         table = [np.arange(len(x)) + 1, x, -y, flat, values["u"], -values["v"], flat]
         table += [100 * values["exx"], 100 * values["eyy"], -values["exy"]]

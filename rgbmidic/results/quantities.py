@@ -343,6 +343,8 @@ _TABLE = (
 
 QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _TABLE}
 """Every quantity by its name, in the order of the documents."""
+FAILED = QUANTITIES["status"].codes.index("failed")
+"""`status` of a frame that could not be measured."""
 
 _CORNERS = "node indices; `(p1 - p0) x (p2 - p0) > 0` in (x, y)"
 _REFERENCE = "reference image of each light, stretched to 8 bit, for pictures"

@@ -27,6 +27,7 @@ from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.report.figures import field_colours, spread
 from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, time_text
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, MapValues, Profile, Quantity, Result
+from rgbmidic.results.quantities import FAILED
 from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.typing import AnyArray, FloatArray
 from rgbmidic.view.constants import VIEWER
@@ -264,7 +265,6 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 T = TypeVar("T")
 _REASONS = ("measured", "no light sees enough texture here", "the images around it do not match", "carried over")
 """What a node's status means, under the pointer."""
-_FAILED = QUANTITIES["status"].codes.index("failed")
 
 
 def range_of_test(maps: Maps, name: str) -> tuple[float, float]:
@@ -381,7 +381,7 @@ def frame_text(maps: Maps, place: int, field: Quantity, values: MapValues, remar
     missing = float(np.mean(read["node_status"] != 0))
     measured = bool(result.finished[place])
     end = QUANTITIES["status"].codes[read["status"]] if measured else "not measured yet"
-    without = f", {missing:.1%} of the nodes not measured" if missing and read["status"] != _FAILED else ""
+    without = f", {missing:.1%} of the nodes not measured" if missing and read["status"] != FAILED else ""
     seconds = math.nan if read["time_ns"] == UNKNOWN_TIME else read["time_ns"] * 1e-9
     lines = [html.escape(frame_title(result, place, seconds)), f"{end}{without}"]
     if read["reason"] and measured:
