@@ -328,7 +328,8 @@ def kernels_compiled_meanwhile() -> Iterator[None]:
         return
     with ExitStack() as stack:
         quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        commands = [[sys.executable, "-m", __name__, part] for part in _SMALL_MEASUREMENTS]
+        # -P: not the package of a clone in whose folder this runs, whose kernels lie elsewhere
+        commands = [[sys.executable, "-P", "-m", __name__, part] for part in _SMALL_MEASUREMENTS]
         others = [stack.enter_context(subprocess.Popen(command, **quiet)) for command in commands]
         try:
             yield

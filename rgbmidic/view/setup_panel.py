@@ -322,7 +322,7 @@ class Run:
             The run.
         """
         output = tempfile.TemporaryFile()  # noqa: SIM115 it lives as long as the run
-        command = [sys.executable, "-m", "rgbmidic.cli", "run", str(test), "--out", str(out), "--no-figures"]
+        command = [sys.executable, "-P", "-m", "rgbmidic.cli", "run", str(test), "--out", str(out), "--no-figures"]
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
         return cls(out=out, process=process, output=output)
 
