@@ -218,11 +218,13 @@ def profile_figure(profile: Profile, wave: Wave | None = None, shown: Sequence[i
 
 
 def _rows_shown(values: FloatArray) -> list[int]:
-    """Choose six rows of a profile (T, P): the first, the last, and four spaced over those between that are busy.
+    """Choose rows of a profile (T, P): all of up to six, else the first, the last, and four of the busy ones between.
 
     Busy is a row whose extreme lies above half of the largest.
     """
     size, last = np.nan_to_num(np.abs(values)).max(axis=1), len(values) - 1
+    if last < 6:
+        return list(range(last + 1))
     busy = np.flatnonzero(size > 0.5 * size.max())
     return sorted({0, last, *spread(busy[(busy > 0) & (busy < last)].tolist(), 4)})
 

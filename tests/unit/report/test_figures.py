@@ -220,6 +220,7 @@ def test_each_frame_has_the_pictures_it_can_have(tmp_path: Path) -> None:
 def test_a_profile_shows_the_first_the_last_and_busy_frames_between() -> None:
     values = np.full((20, 5), np.nan)
     assert curves._rows_shown(values) == [0, 19]
+    assert curves._rows_shown(values[:6]) == [0, 1, 2, 3, 4, 5]
     values[8:12] = 1.0
     assert curves._rows_shown(values) == [0, 8, 9, 10, 11, 19]
     values[:] = 1.0
