@@ -85,9 +85,9 @@ def _spread(taps, parity, channel, index, first, lines):
     for tile in range(first, min(first + lines.shape[1] // TILE, index.size)):
         chosen = taps[index[tile], parity, channel]
         for k in range(lines.shape[0]):
-            source, line = chosen[k], lines[k, (tile - first) * TILE :]
-            for j in range(TILE):
-                line[j] = source[j]
+            even, odd, line = chosen[k, 0], chosen[k, 1], lines[k, (tile - first) * TILE :]
+            for j in range(TILE // 2):
+                line[2 * j], line[2 * j + 1] = even, odd
 
 
 @over_ranges("index")
@@ -105,9 +105,8 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
         Scaled contrast, finite, with pad = size // 2.
     index : (h, w) int32
         Which filters each tile of 32 x 32 px uses.
-    taps : (T, 2, 3, size², 32) float32
-        By row parity, channel and tap; the last axis runs over the columns of the tile, which alternate between two
-        phases.
+    taps : (T, 2, 3, size², 2) float32
+        By row parity, channel, tap and column parity.
     scale, mean : (3, h, W) float32
         Rows of grids, widened to the pixels.
     scale_block, mean_block
@@ -199,64 +198,61 @@ def prediction_taps(
     out : (T, 4, 3, size, size) float64
         Written.
     """
-    size, lights = channels.shape[1], seen.shape[1]
-    reach, count = size - 1, size * size
-    covariance = np.empty((3, 3, 2 * size - 1, 2 * size - 1))
-    matrix, factor = np.empty((count, count)), np.empty((count, count))
-    wanted, lagged = np.empty((3, count)), np.empty((lights, lights))
-    pairs = np.empty((3, 3, lights, lights))
+    lights, size, count = seen.shape[1], np.uint64(channels.shape[1]), np.uint64(channels[0].size)
+    reach, sides, half, one = size - np.uint64(1), np.uint64(fine.shape[0]), size // np.uint64(2), np.uint64(1)
+    covariance, lagged = np.empty((3, 3, fine.shape[0], fine.shape[0])), np.empty(fine.shape)
+    matrix, factor, wanted = np.empty((count, count)), np.empty((count, count)), np.empty((3, count))
+    per_step, last = 1 / step, texture.size - 1.001
     for entry in range(start, stop):
-        d = displacement[entry]
         for c in range(3):
             for e in range(3):
-                for a in range(lights):
-                    for b in range(lights):
-                        shown = common[entry, c] * seen[c, a] * common[entry, e] * seen[e, b]
-                        pairs[c, e, a, b] = shown * alike[entry, a, b]
-        for i in range(2 * size - 1):
-            for j in range(2 * size - 1):
-                for a in range(lights):
-                    for b in range(lights):
-                        x, y = j - reach - d[a, 0] + d[b, 0], i - reach - d[a, 1] + d[b, 1]
-                        place = min((x * x + y * y) / step, texture.size - 1.001)
-                        low = int(place)
-                        lagged[a, b] = texture[low] + (place - low) * (texture[low + 1] - texture[low])
+                constant = common[entry, c] * common[entry, e] * offset
+                apart = own[entry, c] * own[entry, e] * together[entry, c, e]
+                for i in range(sides):
+                    for j in range(sides):
+                        covariance[c, e, i, j] = constant + apart * fine[i, j]
+        for a in range(lights):
+            for b in range(lights):
+                x = displacement[entry, b, 0] - displacement[entry, a, 0] - reach
+                y = displacement[entry, b, 1] - displacement[entry, a, 1] - reach
+                for i in range(sides):
+                    for j in range(sides):
+                        place = min(((x + j) ** 2 + (y + i) ** 2) * per_step, last)
+                        low = np.uint64(place)
+                        lagged[i, j] = texture[low] + (place - low) * (texture[low + one] - texture[low])
                 for c in range(3):
                     for e in range(3):
-                        total = common[entry, c] * common[entry, e] * offset
-                        total += own[entry, c] * own[entry, e] * together[entry, c, e] * fine[i, j]
-                        for a in range(lights):
-                            for b in range(lights):
-                                total += pairs[c, e, a, b] * lagged[a, b]
-                        covariance[c, e, i, j] = total
+                        shown = common[entry, c] * seen[c, a] * common[entry, e] * seen[e, b] * alike[entry, a, b]
+                        for i in range(sides):
+                            for j in range(sides):
+                                covariance[c, e, i, j] += shown * lagged[i, j]
         for phase in range(4):
-            colour = channels[phase].ravel()
             for m in range(count):
-                row, column, c = m // size, m % size, colour[m]
-                for n in range(m + 1):
-                    matrix[m, n] = covariance[c, colour[n], row - n // size + reach, column - n % size + reach]
+                row, column = m // size, m % size
+                c = channels[phase, row, column]
+                for other in range(row + one):
+                    for n in range(size):
+                        e = channels[phase, other, n]
+                        matrix[m, other * size + n] = covariance[c, e, row + reach - other, column + reach - n]
                 matrix[m, m] += noise[entry, c]
                 for e in range(3):
-                    wanted[e, m] = covariance[c, e, row - size // 2 + reach, column - size // 2 + reach]
+                    wanted[e, m] = covariance[c, e, row + reach - half, column + reach - half]
             for q in range(count):  # Cholesky, column by column
                 scale = 1 / np.sqrt(matrix[q, q])
-                column_of = factor[q]
                 for m in range(q, count):
-                    column_of[m] = matrix[m, q] * scale
-                for m in range(q + 1, count):
-                    value, line = column_of[m], matrix[m]
-                    for n in range(q + 1, m + 1):
-                        line[n] -= value * column_of[n]
+                    factor[q, m] = matrix[m, q] * scale
+                for m in range(q + one, count):
+                    for n in range(q + one, m + one):
+                        matrix[m, n] -= factor[q, m] * factor[q, n]
                 for e in range(3):
-                    value = wanted[e, q] * scale
-                    wanted[e, q] = value
-                    for m in range(q + 1, count):
-                        wanted[e, m] -= column_of[m] * value
+                    wanted[e, q] *= scale
+                    for m in range(q + one, count):
+                        wanted[e, m] -= wanted[e, q] * factor[q, m]
             for e in range(3):
                 for back in range(count):
-                    q = count - 1 - back
+                    q = reach * size + reach - back
                     value = wanted[e, q]
-                    for m in range(q + 1, count):
+                    for m in range(q + one, count):
                         value -= factor[q, m] * wanted[e, m]
                     wanted[e, q] = value / factor[q, q]
                     out[entry, phase, e, q // size, q % size] = wanted[e, q]

@@ -148,7 +148,7 @@ class FilterTable:
     ----------
     index : (h, w) int32
         Row of `taps` for each tile.
-    taps : (T, 2, n, size², 32) float32
+    taps : (T, 2, n, size², 2) float32
         As `rgbmidic._kernels.demosaicing.predict` takes them.
     size : int
         Side of the square of samples.
@@ -230,8 +230,9 @@ def prediction_filters(
         channels.astype(np.int64),
         taps,
     )
-    lanes = np.tile(taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2), TILE // 2)
-    return FilterTable(index=index.reshape(tiles).astype(np.int32), taps=lanes.astype(np.float32), size=size)
+    by_parity = taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2)
+    table = np.ascontiguousarray(by_parity, dtype=np.float32)
+    return FilterTable(index=index.reshape(tiles).astype(np.int32), taps=table, size=size)
 
 
 def _correlations(variance: FloatArray, seen: FloatArray) -> FloatArray:

@@ -171,7 +171,9 @@ def saturated_fraction(state: RawState, inside: BoolArray) -> float:
     """Fraction of the raw samples in a region (H, W) that are saturated; 0 for images of the lights."""
     if isinstance(state, IlluminationImages):
         return 0.0
-    return float(np.mean([(frame.values[..., inside] >= frame.white_level).mean() for frame in state]))
+    samples = np.count_nonzero(inside) / inside.size
+    counts = [np.count_nonzero((frame.values >= frame.white_level) & inside) / frame.values.size for frame in state]
+    return float(np.mean(counts) / samples)
 
 
 def shifted_levels(samples: AnyArray, white: float) -> str | None:
