@@ -12,11 +12,11 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from rgbmidic._kernels.correlation import differences, warped_weights
 from rgbmidic._kernels.illumination import unmix
 from rgbmidic._kernels.splines import PAD, bspline_coefficients
 from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.typing import FloatArray
 
 from .tables import table
 
@@ -52,16 +52,17 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     motion = (mesh.nodes - size / 2) @ np.array([[0.01, 0.035], [-0.035, 0.01]])
     owned, count, elements = reference.pixels.local_x.size, size * size, len(mesh.elements)
     difference, weight = np.empty((2, owned), np.float32)
-    values, weights = reference.values[0], reference.pixel_weights[0]
+    values, weights, moments = reference.values[0], reference.pixel_weights[0], np.empty((elements, 6))
     coefficients = np.empty((size + 2 * PAD,) * 2, np.float32)
-    moments: FloatArray = np.empty((elements, 6))
-    compared = values, motion, difference, weight, moments
+    there = (*reference.geometry.parts, motion)
+    warped = deformed.weights[0], deformed.partial[0], values, difference, weights, *there, weight, moments
     channels, known = random.uniform(0, 200, (3, size, size)).astype(np.float32), np.ones((3, size, size), dtype=bool)
     lights, lit = np.empty_like(channels), np.empty_like(known)
     grid, needed = np.tile(np.eye(3, dtype=np.float32) + np.float32(0.1), (2, 2, 1, 1)), np.eye(3, dtype=bool)
     return [
-        ("right-hand side", owned, 20, lambda: reference.right_side(deformed, 0, values, weights, motion)),
-        ("comparison", owned, 20, lambda: reference.warp(deformed, 0, *compared[:2], compared[2:])),
+        ("difference", owned, 12, lambda: differences(deformed.coefficients[0], values, *there, difference)),
+        ("weights and moments", owned, 16, lambda: warped_weights(*warped)),
+        ("right-hand side", owned, 24, lambda: reference.projected(weights, difference, reference.gradient[:, 0])),
         ("Hessian", owned, 20, lambda: reference.blocks(weights, reference.gradient[:, 0])),
         ("spline coefficients", count, 16, lambda: bspline_coefficients(image[0], coefficients)),
         ("unmixing, 3 lights", count, 30, lambda: unmix(channels, known, grid, size, needed, lights, lit)),

@@ -76,20 +76,6 @@ def warp(coefficients, pixels, mesh, displacement):
     return out
 
 
-def element_right_side(coefficients, reference, gradient, weight, pixels, mesh, displacement):
-    """Sums (E, 3, 2) of w (f - g) grad f phi."""
-    out = np.zeros((len(mesh.elements), 3, 2))
-    for e, i in owned(pixels):
-        x, y = moved(pixels, mesh, displacement, e, i)
-        if not inside(pixels.shape, x, y):
-            continue
-        residual = float(reference[i]) - spline(coefficients, x, y)[0]
-        for a, phi in enumerate(shape_functions(pixels, e, i)):
-            for c in range(2):
-                out[e, a, c] += float(weight[i]) * residual * float(gradient[c][i]) * phi
-    return out
-
-
 def element_hessian(gradient, weight, pixels):
     """Sums (E, 3, 3, 3) of w (gx gx, gx gy, gy gy) phi_a phi_b."""
     out = np.zeros((len(pixels.offsets) - 1, 3, 3, 3))

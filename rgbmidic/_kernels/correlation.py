@@ -21,7 +21,8 @@ _ZERO = np.float32(0.0)
 _LEVEL = np.float32(1e-7)
 """Drift (px per pixel) under which a run stays between two rows: 100 pixels then drift by what float32 resolves."""
 BLOCK = 8
-"""Side (px) of the blocks for each of which `warp` knows whether all weights are 1: eight bytes, compared in one go."""
+"""Side (px) of the blocks for each of which `warped_weights` knows whether all weights are 1: eight bytes, compared at
+once."""
 _LANES = 8
 """Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
@@ -109,16 +110,14 @@ def _element_motion(displacement, elements, barycentric, origin, e):
 
 @over_ranges("elements")
 @compiled(fastmath=FAST)
-def element_right_side(
-    start, stop, coefficients, reference, gradient_x, gradient_y, weight, runs, run_offsets, origin, elements,
-    barycentric, displacement, out,
-):  # fmt: skip
-    """Right-hand side of one light, element by element.
+def differences(
+    start, stop, coefficients, reference, runs, run_offsets, origin, elements, barycentric, displacement, out
+):
+    """Differences ``f - g(x + u)`` of one light at the owned pixels, 0 outside the deformed image.
 
-    `coefficients` of the deformed image; `reference`, `gradient_x`, `gradient_y`, `weight` (P,) float32 per owned
-    pixel; `runs` (R, 4) int32, `run_offsets` (E + 1,) and `origin` (E, 2) as in `rgbmidic.mesh.PixelMap`; `barycentric`
-    (E, 3, 3) float64 with the shape function ``b[0] + b[1] x + b[2] y`` of the local position; `displacement` (N, 2)
-    float64. `out` (E, 3, 2) receives ``sum w (f - g(x + u)) grad f phi``; pixels that have left the image do not count.
+    `coefficients` of the deformed image; `reference` and `out` (P,) float32; `runs` (R, 4) int32, `run_offsets`
+    (E + 1,) and `origin` (E, 2) as in `rgbmidic.mesh.PixelMap`; `barycentric` (E, 3, 3) float64 with the shape function
+    ``b[0] + b[1] x + b[2] y`` of the local position; `displacement` (N, 2) float64.
     """
     height, width = coefficients.shape[0] - 2 * PAD, coefficients.shape[1] - 2 * PAD
     flat, across = coefficients.ravel(), np.uint64(coefficients.shape[1])
@@ -126,7 +125,6 @@ def element_right_side(
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
         low_x, low_y = np.float32(-base_x), np.float32(-base_y)
         high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
-        sx = sxx = sxy = sy = syx = syy = _ZERO
         for run in range(run_offsets[e], run_offsets[e + 1]):
             slot, left = np.int64(runs[run, 0]), np.int64(runs[run, 1])
             x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
@@ -134,42 +132,24 @@ def element_right_side(
                 px = ux + fxx * x + fxy * y
                 py = uy + fyx * x + fyy * y
                 if not (px >= low_x and py >= low_y and px <= high_x and py <= high_y):
+                    out[slot] = _ZERO
                     slot, left, x = slot + 1, left - 1, x + _ONE
                     continue
                 cx, cy = np.floor(px), np.floor(py)
                 column, row = base_x + np.int64(cx), base_y + np.int64(cy)
                 tx, ty = px - cx, py - cy
                 n = _span(left, tx, ty, fxx, fyx, column, width)
-                # whole vectors, the rest of the last one without weight, where memory goes on so far
+                # whole vectors, of which the last one may be too long, where memory goes on so far
                 filled = (n + _LANES - 1) // _LANES * _LANES
                 if slot + filled > reference.size or column + filled + 3 >= width + 2 * PAD:
                     filled = n
                 i0, first = np.uint64(slot), np.uint64(row + PAD - 1) * across + np.uint64(column + PAD - 1)
-                pull_x = pull_y = turn_x = turn_y = _ZERO
                 for i in range(np.uint32(filled)):
                     t = np.float32(np.int32(i))
-                    own = np.int32(i) < np.int32(n)
                     g = _spline(flat, first, across, i, tx + (fxx - _ONE) * t, ty + fyx * t)
-                    difference = reference[i0 + i] - g if own else _ZERO
-                    w = weight[i0 + i] if own else _ZERO
-                    pull = w * difference
-                    along = pull * gradient_x[i0 + i]
-                    down = pull * gradient_y[i0 + i]
-                    pull_x += along
-                    pull_y += down
-                    turn_x += along * t
-                    turn_y += down * t
-                sx += pull_x
-                sy += pull_y
-                sxx += pull_x * x + turn_x
-                syx += pull_y * x + turn_y
-                sxy += pull_x * y
-                syy += pull_y * y
+                    if np.int32(i) < np.int32(n):
+                        out[i0 + i] = reference[i0 + i] - g
                 slot, left, x = slot + n, left - n, x + np.float32(n)
-        for a in range(3):
-            b0, b1, b2 = barycentric[e, a, 0], barycentric[e, a, 1], barycentric[e, a, 2]
-            out[e, a, 0] = b0 * sx + b1 * sxx + b2 * sxy
-            out[e, a, 1] = b0 * sy + b1 * syx + b2 * syy
 
 
 @over_ranges("out")
@@ -277,57 +257,35 @@ def element_block_products(
 
 @over_ranges("elements")
 @compiled(fastmath=FAST)
-def warp(
-    start, stop, coefficients, deformed_weight, partial, reference, reference_weight, runs, run_offsets, origin,
-    elements, barycentric, displacement, difference, weight, moments,
+def warped_weights(
+    start, stop, deformed_weight, partial, reference, difference, reference_weight, runs, run_offsets, origin,
+    elements, barycentric, displacement, weight, moments,
 ):  # fmt: skip
-    """Warp the deformed image and weights of one light and compare them with the reference at the owned pixels.
+    """Warp the weights of one light to the owned pixels, and sum the grey levels of both states with them.
 
-    `difference` (P,) float32 receives ``f - g(x + u)``, 0 outside the image; `weight` (P,) float32 the
-    `reference_weight` (P,) times the `deformed_weight` (H, W) at the displaced position (bilinear), 0 outside and
-    beside excluded pixels. `partial` (h + 1, w + 1) int32 counts where that is other than 1: how many such blocks of
-    `BLOCK` px lie above and to the left. `moments` (E, 6) receives the sums of w, w f, w g, w f f, w f g, w g g.
+    `weight` (P,) float32 receives the `reference_weight` (P,) times the `deformed_weight` (H, W) at the displaced
+    position (bilinear), 0 outside and beside excluded pixels. `partial` (h + 1, w + 1) int32 counts where that is other
+    than 1: how many such blocks of `BLOCK` px lie above and to the left. `moments` (E, 6) receives the sums of w, w f,
+    w g, w f f, w f g, w g g, where g is f, the `reference` (P,), less the `difference` (P,).
     """
     height, width = deformed_weight.shape
-    flat, across = coefficients.ravel(), np.uint64(coefficients.shape[1])
     for e in range(start, stop):
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
         low_x, low_y = np.float32(-base_x), np.float32(-base_y)
         high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
         left_x = top_y = np.float32(np.inf)
         right_x = bottom_y = -np.float32(np.inf)
-        for run in range(run_offsets[e], run_offsets[e + 1]):
-            slot, left = np.int64(runs[run, 0]), np.int64(runs[run, 1])
-            x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
-            while left > 0:
-                px = ux + fxx * x + fxy * y
-                py = uy + fyx * x + fyy * y
-                left_x, right_x = min(left_x, px), max(right_x, px)
-                top_y, bottom_y = min(top_y, py), max(bottom_y, py)
-                if not (px >= low_x and py >= low_y and px <= high_x and py <= high_y):
-                    difference[slot] = _ZERO
-                    slot, left, x = slot + 1, left - 1, x + _ONE
-                    continue
-                cx, cy = np.floor(px), np.floor(py)
-                column, row = base_x + np.int64(cx), base_y + np.int64(cy)
-                tx, ty = px - cx, py - cy
-                n = _span(left, tx, ty, fxx, fyx, column, width)
-                filled = (n + _LANES - 1) // _LANES * _LANES  # as in `element_right_side`
-                if slot + filled > reference.size or column + filled + 3 >= width + 2 * PAD:
-                    filled = n
-                i0, first = np.uint64(slot), np.uint64(row + PAD - 1) * across + np.uint64(column + PAD - 1)
-                for i in range(np.uint32(filled)):
-                    t = np.float32(np.int32(i))
-                    g = _spline(flat, first, across, i, tx + (fxx - _ONE) * t, ty + fyx * t)
-                    if np.int32(i) < np.int32(n):
-                        difference[i0 + i] = reference[i0 + i] - g
-                right_x = max(right_x, px + fxx * np.float32(n))
-                top_y, bottom_y = min(top_y, py + fyx * np.float32(n)), max(bottom_y, py + fyx * np.float32(n))
-                slot, left, x = slot + n, left - n, x + np.float32(n)
         if run_offsets[e] == run_offsets[e + 1]:
             moments[e] = 0.0
             continue
         begin, end = runs[run_offsets[e], 0], runs[run_offsets[e + 1] - 1, 0] + runs[run_offsets[e + 1] - 1, 1]
+        for run in range(run_offsets[e], run_offsets[e + 1]):
+            first, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
+            for x in (first, first + np.float32(runs[run, 1])):  # its first pixel, and the one behind its last
+                px = ux + fxx * x + fxy * y
+                py = uy + fyx * x + fyy * y
+                left_x, right_x = min(left_x, px), max(right_x, px)
+                top_y, bottom_y = min(top_y, py), max(bottom_y, py)
         inside = left_x >= low_x and top_y >= low_y and right_x <= high_x and bottom_y <= high_y
         if inside and not _any_partial(partial, base_x + left_x, base_y + top_y, base_x + right_x, base_y + bottom_y):
             for i in range(np.uint64(begin), np.uint64(end)):

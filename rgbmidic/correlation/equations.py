@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rgbmidic._kernels.correlation import differences
 from rgbmidic.correlation.assembly import RigidMotions
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.reference import Deformed, Reference
@@ -332,14 +333,15 @@ def _right_sides(
     reference, assembly = problem.reference, problem.reference.assembly
     bend = assembly.smoothness @ estimate.displacement.ravel()
     held = -equations.smoothness * equations.turned_back(bend[:, None]).ravel()
-    total, rigid = held.copy(), []
+    total, rigid, difference = held.copy(), [], np.empty_like(values[0])
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
-        weight = equations.weights[light]
-        if known is None:
-            parts = reference.right_side(problem.deformed, light, values[light], weight, displacement)
+        if known is not None:
+            difference = known[light]
         else:
-            parts = reference.projected(weight, known[light], reference.gradient[:, light])
-        vector = assembly.vector(parts)
+            there = (*reference.geometry.parts, reference.motion(problem.deformed, light, displacement))
+            differences(problem.deformed.coefficients[light], values[light], *there, difference)
+        gradient = reference.gradient[:, light]
+        vector = assembly.vector(reference.projected(equations.weights[light], difference, gradient))
         total += vector
         if light:
             rigid.append(equations.functions.T @ vector)

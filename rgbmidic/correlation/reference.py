@@ -9,7 +9,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.correlation import BLOCK, element_hessian, element_right_side, element_sums, element_vector, warp
+from rgbmidic._kernels.correlation import (
+    BLOCK,
+    differences,
+    element_hessian,
+    element_sums,
+    element_vector,
+    warped_weights,
+)
 from rgbmidic._kernels.patches import interpolate_nodal
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
@@ -382,67 +389,8 @@ class Reference:
         """
         return [self.blocks(*light) for light in zip(weights, self.gradient.swapaxes(0, 1), strict=True)]
 
-    def warp(
-        self,
-        deformed: Deformed,
-        light: int,
-        values: FloatImage,
-        displacement: FloatArray,
-        out: tuple[FloatImage, FloatImage, FloatArray],
-    ) -> None:
-        """Warp a light's deformed image by a nodal displacement (N, 2) and compare it with reference grey levels.
-
-        Parameters
-        ----------
-        deformed, light
-            The deformed state and the number of the light.
-        values : ndarray, shape (P,), float32
-            Reference grey levels.
-        displacement : ndarray, shape (N, 2)
-            px.
-        out : tuple of ndarray, shape (P,), (P,), (E, 6)
-            Receive the light's difference, weight and moments as in `Residual`; the weight is the reference's times the
-            deformed image's.
-        """
-        images = (
-            deformed.coefficients[light],
-            deformed.weights[light],
-            deformed.partial[light],
-            values,
-            self.pixel_weights[light],
-        )
-        warp(*images, *self.geometry.parts, self.motion(deformed, light, displacement), *out)
-
-    def right_side(
-        self, deformed: Deformed, light: int, values: FloatImage, weight: FloatImage, displacement: FloatArray
-    ) -> FloatArray:
-        """Sum a light's right-hand side over each element, (E, 3, 2), for reference grey levels `values` (P,).
-
-        Parameters
-        ----------
-        deformed
-            The deformed images.
-        light
-            Index of the light.
-        values : ndarray, shape (P,)
-            Grey levels of the reference.
-        weight : ndarray, shape (P,)
-            Weight of every owned pixel.
-        displacement : ndarray, shape (N, 2)
-            Nodal displacement in px.
-
-        Returns
-        -------
-        ndarray, shape (E, 3, 2)
-            By element, corner and axis.
-        """
-        parts, motion = np.empty((len(self.mesh.elements), 3, 2)), self.motion(deformed, light, displacement)
-        images = deformed.coefficients[light], values, *self.gradient[:, light], weight
-        element_right_side(*images, *self.geometry.parts, motion, parts)
-        return parts
-
     def projected(self, weight: FloatImage, difference: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
-        """Sum the same for a difference that is known: ``sum w (f - g) grad f phi``, for fields (P,).
+        """Sum a light's right-hand side over each element: ``sum w (f - g) grad f phi``, for fields (P,).
 
         Parameters
         ----------
@@ -507,12 +455,14 @@ def _where_they_lie(
     x, y = pixels.columns, pixels.rows
     values, weights = (np.empty((len(state.weights), inside.size), dtype=np.float32) for _ in range(2))
     gradient, shift = (np.empty((2, *many, inside.size), dtype=np.float32) for many in (values.shape[:1], ()))
-    unused, moments = np.empty_like(inside), np.empty((len(elements), 6))
+    zero, unused, moments = np.zeros_like(inside), np.empty_like(inside), np.empty((len(elements), 6))
     for light, motion in enumerate(registration.displacement(geometry.mesh.nodes + geometry.origin)):
-        images = state.coefficients[light], state.weights[light], state.partial[light]
-        warp(*images, np.zeros_like(inside), inside, *geometry.parts, motion, values[light], weights[light], moments)
+        there, spline = (*geometry.parts, motion), state.coefficients[light]
+        differences(spline, zero, *there, values[light])
+        images = state.weights[light], state.partial[light], zero, values[light], inside
+        warped_weights(*images, *there, weights[light], moments)
         interpolate_nodal(motion, elements, *pixels.positions, shift)
-        sample_with_gradient(images[0], x + shift[0], y + shift[1], unused, *gradient[:, light])
+        sample_with_gradient(spline, x + shift[0], y + shift[1], unused, *gradient[:, light])
     return np.negative(values, out=values), weights, gradient
 
 

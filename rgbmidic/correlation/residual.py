@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rgbmidic._kernels.correlation import element_squares
+from rgbmidic._kernels.correlation import differences, element_squares, warped_weights
 from rgbmidic._kernels.patches import interpolate_nodal, subtract_quadratic
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.mesh import Tri3Mesh
@@ -69,8 +69,10 @@ class Residual:
         difference, weights = np.empty_like(values), np.empty_like(values)
         moments = np.empty((len(values), len(reference.mesh.elements), 6))
         for light, displacement in enumerate(displacements):
-            out = difference[light], weights[light], moments[light]
-            reference.warp(deformed, light, values[light], displacement, out)
+            there = (*reference.geometry.parts, reference.motion(deformed, light, displacement))
+            differences(deformed.coefficients[light], values[light], *there, difference[light])
+            images = deformed.weights[light], deformed.partial[light], values[light], difference[light]
+            warped_weights(*images, reference.pixel_weights[light], *there, weights[light], moments[light])
         return cls(reference=reference, values=values, weights=weights, difference=difference, moments=moments)
 
     @property

@@ -109,31 +109,25 @@ def test_gradients_at_the_owned_pixels_equal_the_naive_twin(outlined):
 
 @pytest.mark.parametrize("outlined", [False, True])
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_right_side_equals_the_naive_twin(motion, outlined):
+def test_differences_equal_the_naive_twin(motion, outlined):
     case = scene(3, motion, outlined=outlined)
-    out = np.full((len(case.mesh.elements), 3, 2), 7.0)
-    kernels.element_right_side(case.coefficients, case.reference, *case.gradient, case.weight, *moved(case), out)
-    expected = naive.element_right_side(
-        case.coefficients, case.reference, case.gradient, case.weight, case.pixels, case.mesh, case.displacement
-    )
-    close(out, expected, scale=1e5)
+    out = np.full(case.reference.size, 7, dtype=np.float32)
+    kernels.differences(case.coefficients, case.reference, *moved(case), out)
+    expected = np.nan_to_num(case.reference - naive.warp(case.coefficients, case.pixels, case.mesh, case.displacement))
+    np.testing.assert_allclose(out, expected, atol=0.02)
     assert (out == 0).all() == (motion == "far outside")
 
 
-def test_an_invalid_coefficient_reaches_the_right_side_of_its_element_only():
+def test_an_invalid_coefficient_reaches_the_pixels_around_it_only():
     case = scene(4, "none")
-    clean, dirty = (np.empty((len(case.mesh.elements), 3, 2)) for _ in range(2))
-    common = (case.reference, *case.gradient, np.ones_like(case.weight), *moved(case))
-    kernels.element_right_side(case.coefficients, *common, clean)
+    clean, dirty = np.empty((2, case.reference.size), dtype=np.float32)
+    kernels.differences(case.coefficients, case.reference, *moved(case), clean)
     case.coefficients[15 + PAD, 18 + PAD] = np.nan
-    kernels.element_right_side(case.coefficients, *common, dirty)
-    touched = naive.element_right_side(
-        case.coefficients, case.reference, case.gradient, np.ones_like(case.weight), case.pixels, case.mesh,
-        case.displacement,
-    )  # fmt: skip
-    np.testing.assert_array_equal(np.isnan(dirty), np.isnan(touched))
-    assert np.isnan(dirty).any()
-    np.testing.assert_array_equal(dirty[~np.isnan(dirty)], clean[~np.isnan(dirty)])
+    kernels.differences(case.coefficients, case.reference, *moved(case), dirty)
+    touched = np.isnan(naive.warp(case.coefficients, case.pixels, case.mesh, case.displacement))
+    np.testing.assert_array_equal(np.isnan(dirty), touched)
+    assert touched.any()
+    np.testing.assert_array_equal(dirty[~touched], clean[~touched])
 
 
 @pytest.mark.parametrize("outlined", [False, True])
@@ -178,11 +172,12 @@ def test_what_is_brought_back_equals_the_naive_twins(motion):
 
 
 def compared(case, given, weight):
-    """What `warp` writes for a deformed weight (H, W) and a reference weight (P,)."""
+    """Difference, weight and moments for a deformed weight (H, W) and a reference weight (P,)."""
     difference, found = np.full((2, case.pixels.rows.size), 7, dtype=np.float32)
     moments = np.full((len(case.mesh.elements), 6), 7.0)
-    images = case.coefficients, given, _partial_blocks(given), case.reference, weight
-    kernels.warp(*images, *moved(case), difference, found, moments)
+    kernels.differences(case.coefficients, case.reference, *moved(case), difference)
+    images = given, _partial_blocks(given), case.reference, difference, weight
+    kernels.warped_weights(*images, *moved(case), found, moments)
     return difference, found, moments
 
 
@@ -241,9 +236,8 @@ def all_outputs():
     """What every parallel kernel writes."""
     case = scene(11, "over the edge", shape=(151, 173))
     elements, count = len(case.mesh.elements), case.reference.size
-    right, hessian, vector = np.empty((elements, 3, 2)), np.empty((elements, 3, 3, 3)), np.empty((elements, 3, 2))
+    hessian, vector = np.empty((elements, 3, 3, 3)), np.empty((elements, 3, 2))
     squares, sums, fields = np.empty((2, elements, 3)), np.empty((2, elements, 2)), np.empty((2, count), np.float32)
-    kernels.element_right_side(case.coefficients, case.reference, *case.gradient, case.weight, *moved(case), right)
     kernels.element_hessian(*case.gradient, case.weight, *case.on_map, case.pixels.barycentric, hessian)
     difference, weights, moments = compared(case, case.image, case.weight)
     kernels.element_squares(case.gradient, case.gradient**2, case.pixels.offsets, squares)
@@ -252,7 +246,7 @@ def all_outputs():
     patches.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
     curved = less_curved(case, case.displacement, case.random.normal(size=(len(case.mesh.nodes), 2, 3)))
     blocks = block_products(case, np.ones(case.pixels.grid(7), dtype=np.float32), 7, 2)
-    found = right, hessian, difference, weights, moments, squares, sums, vector, fields, curved, blocks
+    found = hessian, difference, weights, moments, squares, sums, vector, fields, curved, blocks
     return [case.coefficients, *found]
 
 
