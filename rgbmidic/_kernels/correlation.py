@@ -23,6 +23,7 @@ _LEVEL = np.float32(1e-7)
 BLOCK = 8
 """Side (px) of the blocks for each of which `warped_weights` knows whether all weights are 1: eight bytes, compared at
 once."""
+_NEVER = np.float32(1e9)
 _LANES = 8
 """Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
@@ -60,24 +61,15 @@ def _spline(coefficients, first, width, i, tx, ty):
 
 
 @helper(forceinline=True)
-def _steady(fraction, drift, most):
-    """Return how many of the next `most` pixels lie between the same two rows, or move on by one column each.
+def _crossing(drift):
+    """Fraction at which the next pixels reach another row, and its change in pixels per unit of fraction.
 
-    The `fraction` changes by `drift` from pixel to pixel.
+    The fraction changes by `drift` from pixel to pixel. Of ``(crossing - fraction) * pace`` pixels all lie between the
+    same two rows, or move on by one column each.
     """
-    if drift > _LEVEL:
-        return np.int64(min((_ONE - fraction) / drift, most)) + 1
-    if drift < -_LEVEL:
-        return np.int64(min(-fraction / drift, most)) + 1
-    return np.int64(most)
-
-
-@helper(forceinline=True)
-def _span(left, tx, ty, fxx, fyx, column, width):
-    """How many of `left` pixels lie side by side in the deformed image, too."""
-    most = np.float32(left)
-    side_by_side = min(_steady(tx, fxx - _ONE, most), _steady(ty, fyx, most))
-    return max(min(left, side_by_side, width - 1 - column), 1)
+    if abs(drift) <= _LEVEL:
+        return _NEVER, _ONE
+    return _ONE if drift > _ZERO else _ZERO, _ONE / drift
 
 
 @helper(forceinline=True)
@@ -125,6 +117,7 @@ def differences(
         base_x, base_y, ux, uy, fxx, fxy, fyx, fyy = _element_motion(displacement, elements, barycentric, origin, e)
         low_x, low_y = np.float32(-base_x), np.float32(-base_y)
         high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
+        (end_x, pace_x), (end_y, pace_y) = _crossing(fxx - _ONE), _crossing(fyx)
         for run in range(run_offsets[e], run_offsets[e + 1]):
             slot, left = np.int64(runs[run, 0]), np.int64(runs[run, 1])
             x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
@@ -138,7 +131,8 @@ def differences(
                 cx, cy = np.floor(px), np.floor(py)
                 column, row = base_x + np.int64(cx), base_y + np.int64(cy)
                 tx, ty = px - cx, py - cy
-                n = _span(left, tx, ty, fxx, fyx, column, width)
+                side_by_side = min((end_x - tx) * pace_x, (end_y - ty) * pace_y, np.float32(left - 1))
+                n = max(min(np.int64(side_by_side) + 1, width - 1 - column), 1)
                 # whole vectors, of which the last one may be too long, where memory goes on so far
                 filled = (n + _LANES - 1) // _LANES * _LANES
                 if slot + filled > reference.size or column + filled + 3 >= width + 2 * PAD:

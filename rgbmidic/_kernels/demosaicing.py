@@ -199,7 +199,8 @@ def prediction_taps(
         Written.
     """
     lights, size, count = seen.shape[1], np.uint64(channels.shape[1]), np.uint64(channels[0].size)
-    reach, sides, half, one = size - np.uint64(1), np.uint64(fine.shape[0]), size // np.uint64(2), np.uint64(1)
+    one, sides = np.uint64(1), np.uint64(fine.shape[0])
+    reach, half = size - one, size // np.uint64(2)
     covariance, lagged = np.empty((3, 3, fine.shape[0], fine.shape[0])), np.empty(fine.shape)
     matrix, factor, wanted = np.empty((count, count)), np.empty((count, count)), np.empty((3, count))
     per_step, last = 1 / step, texture.size - 1.001
@@ -250,12 +251,12 @@ def prediction_taps(
                         wanted[e, m] -= wanted[e, q] * factor[q, m]
             for e in range(3):
                 for back in range(count):
-                    q = reach * size + reach - back
-                    value = wanted[e, q]
-                    for m in range(q + one, count):
-                        value -= factor[q, m] * wanted[e, m]
-                    wanted[e, q] = value / factor[q, q]
-                    out[entry, phase, e, q // size, q % size] = wanted[e, q]
+                    p = count - one - back
+                    value = wanted[e, p]
+                    for m in range(p + one, count):
+                        value -= factor[p, m] * wanted[e, m]
+                    wanted[e, p] = value / factor[p, p]
+                    out[entry, phase, e, p // size, p % size] = wanted[e, p]
 
 
 @over_ranges("sums", axis=2)
