@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
 
 import numpy as np
 
@@ -365,8 +365,64 @@ FINITE_ELEMENTS = ("node_number", "element_number", "node_mm")
 """Those of them that only a mesh of ``mesh.file`` has."""
 
 
+T_co = TypeVar("T_co", covariant=True)
+
+
+class _Holder(Protocol[T_co]):
+    def _quantity(self, name: str, /) -> T_co: ...
+
+
+class _Attribute:
+    """A quantity of the table as an attribute of what holds it."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, holder: _Holder[T_co], owner: type | None = None) -> T_co:
+        if holder is None:  # asked of the class, by documentation
+            raise AttributeError(self._name)
+        return holder._quantity(self._name)
+
+
+class Quantities:
+    """Quantities with one shape in all frames as attributes: of all frames in a result, of one in a record."""
+
+    __slots__ = ()
+    number = _Attribute()
+    time_ns = _Attribute()
+    status = _Attribute()
+    unread = _Attribute()
+    tries = _Attribute()
+    iterations = _Attribute()
+    checksum = _Attribute()
+    node_status = _Attribute()
+    u = _Attribute()
+    v = _Attribute()
+    u_std = _Attribute()
+    v_std = _Attribute()
+    exx = _Attribute()
+    eyy = _Attribute()
+    exy = _Attribute()
+    exx_std = _Attribute()
+    eyy_std = _Attribute()
+    exy_std = _Attribute()
+    u_mesh_error = _Attribute()
+    v_mesh_error = _Attribute()
+    exx_mesh_error = _Attribute()
+    eyy_mesh_error = _Attribute()
+    exy_mesh_error = _Attribute()
+    match = _Attribute()
+    best_match = _Attribute()
+    misfit = _Attribute()
+    light_fraction = _Attribute()
+    residual = _Attribute()
+    weight_fraction = _Attribute()
+    brightness = _Attribute()
+    seconds = _Attribute()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameRecord:
+class FrameRecord(Quantities):
     """The result of one frame; every quantity of `rgbmidic.results.QUANTITIES` is an attribute, such as ``record.u``.
 
     Attributes
@@ -384,6 +440,14 @@ class FrameRecord:
 
     values: Mapping[str, Any]
     sizes: Mapping[str, int]
+    reason = _Attribute()
+    history = _Attribute()
+    inputs = _Attribute()
+    machine = _Attribute()
+    reference_updates = _Attribute()
+    rigid = _Attribute()
+    weights_thumbnail = _Attribute()
+    reflection_thumbnail = _Attribute()
 
     def __post_init__(self) -> None:
         """Check names and shapes, and take over the types of the table."""
@@ -461,8 +525,5 @@ class FrameRecord:
         about = f"<rgbmidic frame {self.values['number']}, {end}{told}; {self.sizes['node']} nodes>"
         return f"{about}\nquantities: {', '.join(QUANTITIES)}"
 
-    def __getattr__(self, name: str) -> Any:
-        """Return a quantity of the table."""
-        if name in QUANTITIES:
-            return self.values[name]
-        raise AttributeError(f"a frame record has no quantity {name!r}")
+    def _quantity(self, name: str, /) -> Any:
+        return self.values[name]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.extras import optional
 from rgbmidic.results.provenance import fingerprint, read_provenance
-from rgbmidic.results.quantities import QUANTITIES, FrameRecord
+from rgbmidic.results.quantities import QUANTITIES, FrameRecord, Quantities
 from rgbmidic.results.records import FrameTable
 from rgbmidic.results.store import check_complete, listed, load_frames, load_result, read_reference
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Result:
+class Result(Quantities):
     """The result of a test, for post-processing.
 
     `Result.open` opens a result folder, also during a run, and reads only the mesh and which frames there are. The
@@ -276,16 +276,9 @@ class Result:
         dataset: xr.Dataset = optional("rgbmidic.results.dataset", "xarray").to_dataset(self, scale)
         return dataset
 
-    def __getattr__(self, name: str) -> AnyArray:
-        """Read a stackable quantity of the table, and keep it."""
-        if name not in QUANTITIES or not (QUANTITIES[name].stackable or QUANTITIES[name].estimated):
-            raise AttributeError(f"a result has no attribute {name!r}")
+    def _quantity(self, name: str, /) -> AnyArray:
         stacked = self.__dict__[name] = self.stack(name)
         return stacked
-
-    def __dir__(self) -> list[str]:
-        """List the attributes, quantities included."""
-        return [*super().__dir__(), *(name for name, one in QUANTITIES.items() if one.stackable or one.estimated)]
 
     @property
     def strain(self) -> FloatArray:

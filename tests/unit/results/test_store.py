@@ -19,6 +19,7 @@ from rgbmidic._version import __version__
 from rgbmidic.correlation import NodeStatus, Solution, Status
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, FrameRecord, Result, ResultStore
+from rgbmidic.results.quantities import Quantities
 from rgbmidic.settings import CalibrationSettings, FrameSettings, RegionSettings, TestSettings
 
 
@@ -227,6 +228,12 @@ def test_the_deformed_frames_are_those_that_are_no_reference(tmp_path: Path) -> 
     result = make_result(tmp_path / "untold", frames=3)
     assert result.deformed == (1, 2)
     assert [u[0] for u in result.each("u", result.deformed)] == pytest.approx(result.u[1:, 0].tolist(), nan_ok=True)
+
+
+def test_result_and_record_have_the_attributes_that_the_table_declares() -> None:
+    stacked = {name for name, one in QUANTITIES.items() if one.stackable or one.estimated}
+    assert {name for name in vars(Quantities) if name[0] != "_"} == stacked
+    assert {name for one in FrameRecord.__mro__ for name in vars(one)} >= QUANTITIES.keys()
 
 
 def test_only_what_stacks_is_an_attribute(tmp_path: Path) -> None:
