@@ -102,7 +102,7 @@ def inspection_document(inspection: Inspection) -> dict[str, Any]:
         "std_from_noise_px": Spread.of(expected.noise),
         "std_from_mosaic_px": Spread.of(expected.mosaic),
         "nodes_not_measured": inspection.unmeasured,
-        "warnings": inspection.findings,
+        "warnings": [{"code": found.name, "text": found.text} for found in inspection.findings],
     }
     return plain(document)  # type: ignore[no-any-return]
 
@@ -196,7 +196,7 @@ def _write_summary(axis: Axes, inspection: Inspection) -> None:
         lines.append("noise not calibrated, estimated")
     if not inspection.crosstalk_known:
         lines.append("crosstalk unknown: channels for lights")
-    codes = list(dict.fromkeys(finding.code for finding in inspection.findings))
+    codes = list(dict.fromkeys(finding.name for finding in inspection.findings))
     lines += ["", "warnings: " + (", ".join(codes) if codes else "none")]
     text = "\n".join(fill(line, 36, subsequent_indent="  ") if line.strip() == line else line for line in lines)
     axis.text(0.02, 0.98, text, transform=axis.transAxes, va="top", fontsize=8, linespacing=1.5, parse_math=False)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rgbmidic.illumination.checks import Check
+from rgbmidic.illumination.checks import Check, reported
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import COLOURED, TextureModel
@@ -102,22 +102,6 @@ class LightSummary:
     alone: Spread
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """A warning.
-
-    Attributes
-    ----------
-    code : str
-        For programs, such as ``"fine speckle"``.
-    text : str
-        Its meaning and remedy.
-    """
-
-    code: str
-    text: str
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inspection:
     """Results of the inspection of one frame before a test.
@@ -190,9 +174,9 @@ class Inspection:
         return float(np.isnan(self.prediction.std).mean())
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> tuple[Check, ...]:
         """The warnings, the gravest first."""
-        return (*_of_set_up(self), *_of_exposure(self), *_of_speckle(self), *_of_region(self))
+        return tuple(reported([*_of_set_up(self), *_of_exposure(self), *_of_speckle(self), *_of_region(self)]))
 
     @property
     def speckle_px(self) -> float:
@@ -201,87 +185,87 @@ class Inspection:
         return float(np.median(sizes)) if sizes else float("nan")
 
 
-def _of_set_up(inspection: Inspection) -> Iterator[Finding]:
+def _of_set_up(inspection: Inspection) -> Iterator[Check]:
     for found in inspection.contradictions:
-        yield Finding(f"not calibrated: {found.name}", found.text)
-    if inspection.greens > CONSTANTS.greens:
-        difference = f"{inspection.greens:.0%}"
-        yield Finding(
-            "pattern", f"the two greens of the pattern differ by {difference}: check cfa, they are one colour"
-        )
+        yield Check(f"not calibrated: {found.name}", found.text)
+    differ = f"the two greens of the pattern differ by {inspection.greens:.0%}: check cfa, they are one colour"
+    yield Check("pattern", differ, inspection.greens, CONSTANTS.greens)
     if not inspection.crosstalk_known:
-        yield Finding(
+        yield Check(
             "crosstalk unknown",
             "no crosstalk calibration: the camera's channels stand for the lights, and a reflection of one light "
             "shows in the others too; rgbmidic-calibrate crosstalk",
         )
     if not inspection.noise_known:
-        yield Finding(
+        yield Check(
             "noise unknown",
             "no noise calibration: noise and the uncertainty from it are estimated from the frame, up to a few "
             "times too high for speckle under 4 px and in reflections; rgbmidic-calibrate noise",
         )
     for light in inspection.lights:
-        if light.negative > CONSTANTS.negative:
-            yield Finding(
-                "negative light",
-                f"light {light.name} is negative on {light.negative:.0%} of the region: crosstalk, pattern or "
-                "black level are not those of this frame",
-            )
+        yield Check(
+            "negative light",
+            f"light {light.name} is negative on {light.negative:.0%} of the region: crosstalk, pattern or "
+            "black level are not those of this frame",
+            light.negative,
+            CONSTANTS.negative,
+        )
 
 
-def _of_exposure(inspection: Inspection) -> Iterator[Finding]:
+def _of_exposure(inspection: Inspection) -> Iterator[Check]:
     for channel in inspection.channels:
-        if channel.saturated > CONSTANTS.saturated:
-            yield Finding(
-                "saturated",
-                f"channel {channel.name}: {channel.saturated:.1%} of the samples are saturated and will not be "
-                "measured; less exposure, or another place of the lamp",
-            )
-        if channel.high < CONSTANTS.dark:
-            yield Finding(
-                "dark",
-                f"channel {channel.name} is dark: 95 % of its samples are below {channel.high:.1%} of the full "
-                "scale; more light or exposure",
-            )
+        yield Check(
+            "saturated",
+            f"channel {channel.name}: {channel.saturated:.1%} of the samples are saturated and will not be "
+            "measured; less exposure, or another place of the lamp",
+            channel.saturated,
+            CONSTANTS.saturated,
+        )
+        yield Check(
+            "dark",
+            f"channel {channel.name} is dark: 95 % of its samples are below {channel.high:.1%} of the full "
+            "scale; more light or exposure",
+            max(CONSTANTS.dark - channel.high, 0.0),
+        )
 
 
-def _of_speckle(inspection: Inspection) -> Iterator[Finding]:
+def _of_speckle(inspection: Inspection) -> Iterator[Check]:
     texture, size = inspection.texture, inspection.speckle_px
     if texture is not None and (texture.specific > 0.5 or texture.correlation < COLOURED):
-        yield Finding(
+        yield Check(
             "coloured",
             f"the colours do not show one texture (agreement {texture.correlation:.2f}): a coloured specimen, or "
             "speckle far too fine; each colour has only its own lattice, so speckles need 6 px and more",
         )
-    elif texture is not None and texture.correlation < CONSTANTS.too_fine:
-        yield Finding(
+    elif texture is not None:
+        yield Check(
             "fine speckle",
             f"the speckle is too fine for the colour lattice: neighbouring colours agree to {texture.correlation:.2f}, "
             f"{CONSTANTS.too_fine} is needed (speckles of about 2.0 px); displacements will be pulled towards whole "
             "pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer lens",
+            max(CONSTANTS.too_fine - texture.correlation, 0.0),
         )
     if np.isnan(size):
-        yield Finding("no texture", "no speckle is seen: its autocorrelation has no width")
+        yield Check("no texture", "no speckle is seen: its autocorrelation has no width")
     elif inspection.element_size < SPECKLES * size:
-        yield Finding(
+        yield Check(
             "coarse speckle",
             f"speckles of {size:.1f} px are coarse for elements of {inspection.element_size:g} px: at least "
             f"{SPECKLES:g} per side, so element_size = {np.ceil(SPECKLES * size):.0f} or finer speckle",
         )
 
 
-def _of_region(inspection: Inspection) -> Iterator[Finding]:
+def _of_region(inspection: Inspection) -> Iterator[Check]:
     hidden, dark = (float(where[inspection.region].mean()) for where in (inspection.hidden, inspection.background))
-    if hidden > CONSTANTS.hidden:
-        what, why = "the light does not show", "it reflects or saturates there"
-        if len(inspection.lights) > 1:
-            what, why = "no light shows", "all lights reflect or saturate there"
-        reasons = []
-        if dark > CONSTANTS.hidden:
-            reasons.append(f"it holds dark background ({dark:.1%}), draw it inside the specimen")
-        if hidden - dark > CONSTANTS.hidden or not reasons:
-            reasons.append(f"{why}, or there is no paint")
-        yield Finding("hidden", f"{what} the texture on {hidden:.1%} of the region: {'; '.join(reasons)}")
-    if inspection.unmeasured > 0:
-        yield Finding("not measured", f"{inspection.unmeasured:.1%} of the nodes will not be measured")
+    what, why = "the light does not show", "it reflects or saturates there"
+    if len(inspection.lights) > 1:
+        what, why = "no light shows", "all lights reflect or saturate there"
+    reasons = []
+    if dark > CONSTANTS.hidden:
+        reasons.append(f"it holds dark background ({dark:.1%}), draw it inside the specimen")
+    if hidden - dark > CONSTANTS.hidden or not reasons:
+        reasons.append(f"{why}, or there is no paint")
+    text = f"{what} the texture on {hidden:.1%} of the region: {'; '.join(reasons)}"
+    yield Check("hidden", text, hidden, CONSTANTS.hidden)
+    lost = f"{inspection.unmeasured:.1%} of the nodes will not be measured"
+    yield Check("not measured", lost, inspection.unmeasured)

@@ -84,7 +84,7 @@ def glaring() -> Inspection:
 
 
 def codes(seen: Inspection) -> set[str]:
-    return {finding.code for finding in seen.findings}
+    return {finding.name for finding in seen.findings}
 
 
 def test_a_good_frame_has_no_warnings_and_its_figures_are_those_it_was_made_with():
@@ -297,7 +297,7 @@ def test_edges_of_a_specimen_before_a_dark_background_hide_no_texture(real_data,
     inside = seen.region
     assert (seen.hidden != empty)[inside].mean() < 0.01
     np.testing.assert_array_equal(seen.background[inside], seen.hidden[inside])
-    text = next((finding.text for finding in seen.findings if finding.code == "hidden"), None)
+    text = next((finding.text for finding in seen.findings if finding.name == "hidden"), None)
     if empty[inside].any():
         assert "draw it inside the specimen" in text
         assert "reflects" not in text
@@ -328,7 +328,7 @@ def test_three_lights_before_a_dark_background_and_with_a_dim_part():
     assert seen.background[:, 50:].mean() < 0.01
     assert seen.hidden[120:, 120:].mean() < 0.02
     assert seen.hidden[55:65, 115:125].all()
-    text = next(finding.text for finding in seen.findings if finding.code == "hidden")
+    text = next(finding.text for finding in seen.findings if finding.name == "hidden")
     assert "draw it inside the specimen" in text
     assert "reflect" in text
     assert np.isnan(seen.prediction.std[seen.mesh.nodes[:, 0] < 20]).all()
