@@ -16,6 +16,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.text import Described, rounded, uncertain
 from rgbmidic.typing import BoolArray, FloatArray
 
 NO_MATCH = "the images do not match anywhere in the region"
@@ -43,7 +44,7 @@ class NodeStatus(IntEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Solution:
+class Solution(Described):
     """Displacement field of one frame.
 
     Attributes
@@ -114,8 +115,9 @@ class Solution:
             lines.insert(1, f"reason: {self.reason}")
         for name, values, std in zip("uv", self.displacement.T, self.displacement_std.T, strict=True):
             if (known := values[np.isfinite(values)]).size:
-                spread = np.median(std[np.isfinite(std)]) if np.isfinite(std).any() else np.nan
-                lines.append(f"{name}:      {known.min():.4g} to {known.max():.4g} px ± {spread:.2g} px (median)")
+                spread = float(np.median(std[np.isfinite(std)])) if np.isfinite(std).any() else np.nan
+                least, most = rounded(known.min(), spread), uncertain(known.max(), spread, "px")
+                lines.append(f"{name}:      {least} to {most} (median)")
         return "\n".join(lines)
 
     @classmethod

@@ -18,7 +18,8 @@ from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.probes import Area, Mean, make_probe
 from rgbmidic.fields.profiles import ProfileLine
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, shortest_gauge, strain_of, strain_of_gradient
-from rgbmidic.fields.units import Units, rounded, uncertain
+from rgbmidic.fields.units import Units
+from rgbmidic.text import rounded, uncertain
 
 __all__ = [
     "MEASURES",

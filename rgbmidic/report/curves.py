@@ -12,7 +12,8 @@ import numpy as np
 from rgbmidic.report import style
 from rgbmidic.report.figures import field_colours, spread
 from rgbmidic.report.summary import NoiseFloor, TimeHistory
-from rgbmidic.results import QUANTITIES, Histories, HistoryColumn, Profile, Wave, uncertain
+from rgbmidic.results import QUANTITIES, Histories, HistoryColumn, Profile, Wave
+from rgbmidic.text import uncertain
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:

@@ -18,11 +18,12 @@ from rgbmidic.report.gallery import REPORT
 from rgbmidic.report.page import render
 from rgbmidic.report.style import PAGE_DPI, time_text
 from rgbmidic.report.summary import TimeHistory, noise_floor, speckle_size
-from rgbmidic.results import QUANTITIES, Maps, Result, channels_of, probes_of, rounded, uncertain
+from rgbmidic.results import QUANTITIES, Maps, Result, channels_of, probes_of
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
+from rgbmidic.text import rounded, uncertain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

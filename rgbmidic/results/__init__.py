@@ -1,6 +1,5 @@
 """What is kept of a test: one record per frame, the folder that holds them, and other programs' formats."""
 
-from rgbmidic.fields import rounded, uncertain
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.results.channels import Channels
@@ -39,11 +38,9 @@ __all__ = [
     "placement_of",
     "probes_of",
     "read_profile",
-    "rounded",
     "scale_of",
     "shared_part",
     "speckle_diameter",
-    "uncertain",
     "write_histories",
     "write_profile",
 ]

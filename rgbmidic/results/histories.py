@@ -22,12 +22,13 @@ from rgbmidic.fields.nodal import NodalCovariance, RigidMotion
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.probes import make_probe
 from rgbmidic.fields.strain import EQUIVALENT
-from rgbmidic.fields.units import Units, rounded
+from rgbmidic.fields.units import Units
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.physical import MOVED, frame_times, rectification_of, reference_frames, shared_part
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
+from rgbmidic.text import rounded
 from rgbmidic.typing import FloatArray, IntArray
 
 HistoryColumn = History

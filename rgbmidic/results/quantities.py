@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields.units import Units, rounded, uncertain
+from rgbmidic.fields.units import Units
+from rgbmidic.text import Described, rounded, uncertain
 from rgbmidic.timing import STAGES
 
 if TYPE_CHECKING:
@@ -422,7 +423,7 @@ class Quantities:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameRecord(Quantities):
+class FrameRecord(Quantities, Described):
     """The result of one frame; every quantity of `rgbmidic.results.QUANTITIES` is an attribute, such as ``record.u``.
 
     Attributes

@@ -14,9 +14,9 @@ from bokeh.document import Document
 from bokeh.events import DocumentReady, Tap
 
 from rgbmidic.errors import RgbmidicError
-from rgbmidic.fields import uncertain
 from rgbmidic.report.style import embedded
 from rgbmidic.results import Result, channels_of, probes_of
+from rgbmidic.text import uncertain
 from rgbmidic.view.address import BESIDE, OVER, SCALE, UNCERTAINTY, Mark, Steps, ViewState
 from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.constants import VIEWER

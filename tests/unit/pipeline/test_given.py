@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -67,4 +68,10 @@ def test_results_show_what_they_are_and_frames_count_from_the_end(tmp_path: Path
     solution = correlate(images[0], images[1])
     assert repr(solution).startswith("<rgbmidic.Solution converged, ")
     assert len(repr(solution).splitlines()) < 8
+    for one in (result, result.frame(0), solution):
+        title, *lines = repr(one).splitlines()
+        table = one._repr_html_()
+        assert html.escape(title) in table
+        assert table.count("<tr>") == len(lines)
+        assert all(html.escape(line.partition(":")[2]) in table for line in lines)
     assert isinstance(Result.open(tmp_path / "out"), Result)

@@ -1,0 +1,69 @@
+"""Numbers and objects as text: value and standard uncertainty to the same place, and tables for notebooks."""
+
+from __future__ import annotations
+
+import math
+from html import escape
+
+_PLAIN = range(-3, 9)
+"""Decimals of a number that is written without a power of ten: from whole thousands to the eighth decimal."""
+
+
+def rounded(value: float, std: float) -> str:
+    """Write a number to the place of the second digit of its standard uncertainty (GUM, 7.2.6); it may be its own.
+
+    Parameters
+    ----------
+    value
+        The number.
+    std
+        Its standard uncertainty; not finite or 0 where there is none: four digits of the value are written.
+
+    Returns
+    -------
+    str
+        A dash for a value that is not finite.
+    """
+    if not math.isfinite(value):
+        return "-"
+    if not (math.isfinite(std) and std > 0):
+        return f"{value:.4g}"
+    decimals = 1 - int(f"{std:.1e}".partition("e")[2])  # of the uncertainty as it is rounded: 0.0996 is 0.10
+    if decimals in _PLAIN:
+        value = round(value, decimals) + 0.0  # no "-0.00"
+        return f"{value:.{max(decimals, 0)}f}"
+    digits = int(f"{value:.1e}".partition("e")[2]) + decimals if value else 0
+    return f"{value:.{max(digits, 0)}e}"
+
+
+def uncertain(value: float, std: float, unit: str = "") -> str:
+    """Write a number with its standard uncertainty and unit, such as ``"0.1433 ± 0.0022 mm"``.
+
+    Parameters
+    ----------
+    value, std
+        As of `rounded`; a value without uncertainty is written alone.
+    unit
+        Empty for none.
+
+    Returns
+    -------
+    str
+    """
+    if not math.isfinite(value):
+        return "-"
+    known = math.isfinite(std) and std > 0
+    return " ".join(filter(None, [rounded(value, std), f"± {rounded(std, std)}" if known else "", unit]))
+
+
+class Described:
+    """An object that shows itself in a few lines: a title, then ``name: value``; notebooks make a table of them."""
+
+    __slots__ = ()
+
+    def _repr_html_(self) -> str:
+        title, *lines = repr(self).splitlines()
+        parts = (line.partition(":") for line in lines)
+        cell = '<td style="text-align: left">'
+        rows = "".join(f"<tr>{cell}{escape(name)}</td>{cell}{escape(value)}</td></tr>" for name, _, value in parts)
+        return f"<div><code>{escape(title)}</code><table>{rows}</table></div>"
