@@ -91,6 +91,7 @@ def history(
     out: Annotated[
         Path | None, Option(help="CSV file to write; a picture gets the same name. Else printed only.")
     ] = None,
+    px: parts.Pixels = False,
     overwrite: parts.Overwrite = False,
 ) -> None:
     """Displacement, strain and rates over time at points, over areas and along gauges: table, picture and CSV file.
@@ -112,7 +113,7 @@ def history(
     histories = read_histories(
         result,
         replace(kept, **(probes | added)),
-        scale=opened.scale,
+        scale=opened.scale_in(px=px),
         channels=replace(channels_of(result) if settings is None else settings.channels, **channels),
     )
     if out is not None:

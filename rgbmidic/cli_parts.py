@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +22,7 @@ messages = Console(stderr=True)
 
 Draw = Annotated[bool, Option("--figures/--no-figures", help="Write pictures into DIR/figures.")]
 Measure = Annotated[str | None, Option(help="green-lagrange, hencky, biot or engineering.")]
+Pixels = Annotated[bool, Option("--px", help="Lengths in px, though the scale is known.")]
 Out = Annotated[Path, Option(help="Output folder; created if it does not exist.")]
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
 Test = Annotated[Path, Argument(metavar="TEST.toml", help="Settings of the test.")]
@@ -40,11 +41,18 @@ class Opened:
         """The scale of these settings; None: that of the result."""
         return None if self.settings is None else self.settings.scale
 
+    def scale_in(self, *, px: bool) -> ScaleSettings | None:
+        """The same, with lengths in px though the scale may be known."""
+        from rgbmidic.results.physical import scale_of
+
+        return replace(self.scale or scale_of(self.result), unit="px") if px else self.scale
+
     def maps(self, derived: Mapping[str, Any]) -> Maps:
         """The fields of the result, as the options of `derived_options` derive them."""
         from rgbmidic.results import Maps
 
-        return Maps.of(self.result, self.scale, **derived)
+        choices = dict(derived)
+        return Maps.of(self.result, self.scale_in(px=choices.pop("px")), **choices)
 
     def frames(self, text: str) -> list[int] | None:
         """The measured ones of the frames that ``--frames`` states; None where it states none."""
@@ -83,8 +91,9 @@ _DERIVED: dict[str, Any] = {
     "since": Annotated[int | None, Option(metavar="N", help="Show the fields relative to frame N.")],
     "rigid_removed": Annotated[bool, Option("--remove-rigid", help="Remove the rigid motion.")],
     "window": Annotated[int | None, Option(help="Frames that a rate is taken over, 4 or more.")],
+    "px": Pixels,
 }
-derived_options = command.gather("derived", _DERIVED, dict, rigid_removed=False)
+derived_options = command.gather("derived", _DERIVED, dict, rigid_removed=False, px=False)
 """Decorator of a command whose parameter `derived` states how fields are derived, as `rgbmidic.results.Maps.of`."""
 
 

@@ -40,7 +40,7 @@ def figures(
         names = [name.strip() for name in fields.split(",")]
         files = write_maps(opened.maps(derived), names, folder, chosen, hatched=hatch)
     elif hatch or settings or any(option not in (None, False) for option in derived.values()):
-        raise InputError("--gauge, --measure, --since, --remove-rigid, --window, --hatch and --test need a --field")
+        raise InputError("--gauge, --measure, --since, --remove-rigid, --window, --px, --hatch, --test need a --field")
     else:
         files = write_figures(opened.result, folder, chosen, processes=threads())
     for file in files:

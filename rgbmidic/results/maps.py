@@ -81,7 +81,7 @@ class Maps:
         Whether shift and rotation of the field as a whole are removed from the displacement, and from the gradient of
         the engineering strain; other strains do not depend on it.
     window
-        Frames that a parabola takes in for rates, as ``probes.window``.
+        Frames that a rate is taken over, as ``probes.window``.
     """
 
     result: Result

@@ -93,13 +93,16 @@ def rectification_of(result: Result, scale: ScaleSettings | None = None) -> Rect
     InputError
         The camera holds no plane.
     """
-    if scale is None:
-        stated, camera = scale_of(result), _kept_camera(result)
-    else:
-        stated, camera = scale, None if scale.camera is None else CameraCalibration.read(scale.camera)
+    stated, camera = scale_of(result) if scale is None else scale, None
+    if stated.unit == "px":
+        stated = replace(stated, mm_per_pixel=None, mm_per_pixel_std=0.0, camera=None)
+    elif scale is None:
+        camera = _kept_camera(result)
+    elif scale.camera is not None:
+        camera = CameraCalibration.read(scale.camera)
     if camera is not None:
         camera.check(result.frame_shape or camera.shape)
-    elif stated.mm_per_pixel is None and (placed := placement_of(result)) is not None:
+    elif stated.unit == "mm" and stated.mm_per_pixel is None and (placed := placement_of(result)) is not None:
         stated = replace(stated, mm_per_pixel=placed.mm_per_pixel, mm_per_pixel_std=placed.mm_per_pixel_std)
     return Rectification.of(Tri3Mesh(nodes=result.nodes, elements=result.elements), stated, camera)
 

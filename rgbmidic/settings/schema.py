@@ -49,6 +49,8 @@ class ScaleSettings(Checked):
         Instead of `mm_per_pixel`: file with lens and plane, which ``rgbmidic-calibrate camera`` writes.
     frame_rate
         Frames per second, for files that do not state when their frames were taken.
+    unit
+        Unit of lengths: ``"mm"`` where the scale is known, or ``"px"`` of the image though it is.
     """
 
     section = "scale"
@@ -57,6 +59,7 @@ class ScaleSettings(Checked):
     mm_per_pixel_std: float = bounded(0.0, at_least=0)
     camera: Path | None = None
     frame_rate: float | None = bounded(None, above=0)
+    unit: Literal["mm", "px"] = "mm"
 
     def _problems(self) -> Iterator[str]:
         if self.camera is not None and self.mm_per_pixel is not None:

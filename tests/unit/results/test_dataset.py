@@ -48,6 +48,7 @@ def test_every_stackable_quantity_is_there_in_its_unit(result: Result) -> None:
 
 
 def test_coordinates_are_in_px_mm_and_s_where_these_are_known(result: Result, tmp_path: Path) -> None:
+    assert result.to_xarray(ScaleSettings(mm_per_pixel=0.02, unit="px")).identical(result.to_xarray())
     plain, scaled = result.to_xarray(), result.to_xarray(ScaleSettings(mm_per_pixel=0.02, mm_per_pixel_std=0.001))
     assert (plain.x.units, plain.u.units) == ("px", "px")
     assert "mm_per_pixel" not in plain.attrs

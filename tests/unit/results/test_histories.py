@@ -413,6 +413,10 @@ def test_the_command_takes_the_test_s_probes_and_its_own_and_writes_table_and_pi
     assert command(result.path, "--test", tmp_path / "test.toml", "--out", out, "--overwrite") == 0
     header = out.read_text().splitlines()[0].split(",")
     assert header[4:] == ["gauge_1_extension_mm", "gauge_1_extension_mm_std", "gauge_1_strain", "gauge_1_strain_std"]
+    table = np.genfromtxt(out, delimiter=",", names=True)
+    assert command(result.path, "--test", tmp_path / "test.toml", "--px", "--out", out, "--overwrite") == 0
+    in_px = np.genfromtxt(out, delimiter=",", names=True)
+    np.testing.assert_allclose(2 * in_px["gauge_1_extension_px"], table["gauge_1_extension_mm"])
 
 
 def test_the_command_scale_gives_lines_for_the_settings(capsys: pytest.CaptureFixture[str]) -> None:
