@@ -45,7 +45,9 @@ def medians_figure(
             for name, colour, line in zip(names, ("blue", "vermillion", "green"), style.LINES, strict=False):
                 look: dict[str, Any] = {"color": style.OKABE_ITO[colour], "linestyle": line}
                 low, median, high = history.quantiles[name].T
-                axis.plot(times, median, linewidth=1.2, label=name, marker=marker, markersize=2.5, **look)
+                axis.plot(
+                    times, median, linewidth=1.2, label=history.symbols[name], marker=marker, markersize=2.5, **look
+                )
                 if band:
                     axis.fill_between(times, low, high, color=look["color"], alpha=0.18, linewidth=0)
                 if floor is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rgbmidic.report.style import time_axis
-from rgbmidic.results import QUANTITIES, Result, speckle_diameter
+from rgbmidic.results import QUANTITIES, Maps, Result, speckle_diameter
 from rgbmidic.results.quantities import FAILED
 from rgbmidic.typing import FloatArray
 
@@ -35,6 +35,8 @@ class TimeHistory:
         Times, or numbers of the frames where no time is known, and the label of the axis.
     timed : bool
         Whether the times are known.
+    symbols : dict
+        Symbol of each quantity.
     quantiles : dict
         Of each quantity the 5 %, 50 % and 95 % quantile over the nodes, shape (F, 3); NaN where nothing is measured.
     fractions : ndarray, shape (F, S)
@@ -52,6 +54,9 @@ class TimeHistory:
         self.frames, self.timed, times = tuple(frames), physical.units.timed, physical.times[list(frames)]
         read = ("u", "v", "u_std", "v_std", "exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std", "misfit")
         self.axis = time_axis(times if self.timed else None, physical.result.number[list(frames)])
+        self.symbols = {
+            name: entry.symbol for name, entry in Maps(result=physical.result, physical=physical).all.items()
+        }
         self.quantiles = {name: np.full((len(times), 3), np.nan) for name in read}
         self.fractions = np.empty((len(times), len(QUANTITIES["node_status"].codes)))
         self.fastest, before = 0.0, np.array(np.nan)

@@ -52,7 +52,7 @@ class Claim:
             file = folder / f"in_use.{secrets.token_hex(8)}.json"
             if not (other := next(_others(file, frames), None)):
                 holder = {"process": os.getpid(), "host": socket.gethostname()}
-                part = file.with_suffix(".part")
+                part = file.with_name(f"{file.name}.{holder['host']}.{holder['process']}.part")
                 with writing(file):  # whole at once; it need not outlive the machine
                     part.write_text(json.dumps(holder | {"first": frames.start, "stop": frames.stop}), encoding="utf-8")
                     part.replace(file)

@@ -62,8 +62,9 @@ def test_every_key_of_the_test_file_is_documented_with_its_default():
 def test_every_choice_of_a_key_is_named():
     text = (DOCS / "reference/test-file.md").read_text(encoding="utf-8")
     for section, kind in section_kinds().items():
+        rows = text.split(f"\n## [{section}]")[1].split("\n## ")[0].splitlines()
         for key, hint in get_type_hints(kind).items():
-            row = next(line for line in text.splitlines() if line.startswith(f"| `{key}` |"))
+            row = next(line for line in rows if line.startswith(f"| `{key}` |"))
             for choice in (c for part in (hint, *get_args(hint)) for c in get_args(part) if isinstance(c, str)):
                 assert choice in row, f"{section}.{key}: {choice}"
 

@@ -165,7 +165,7 @@ def test_it_says_what_is_stated_and_what_is_not(tmp_path: Path) -> None:
         f"side {stated.mesh.element_size:.4g} px ({0.05 * stated.mesh.element_size:.3g} mm)"
     )
     assert page.rows["image filter"].startswith("[1 2 1]")
-    assert page.rows["u_std"].startswith("mm | ")
+    assert page.rows["σ(u)"].startswith("mm | ")
     assert "by number or time: 2" in page.words
     assert "no image scale" not in page.words
     methods = page.words[page.words.index("The surface was patterned") :]
