@@ -16,6 +16,7 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise
+from rgbmidic.text import uncertain
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
 from rgbmidic_calibration.design import Design
 from rgbmidic_calibration.noise import NoiseEstimate
@@ -78,7 +79,7 @@ def verdict(result: Verdict) -> None:
     """Print every figure with its limit, and the verdict."""
     table = _table("Check of the calibration", ("figure", "value", "limit", ""))
     for item in result.items:
-        figure = f"{item.value:+.3f}" + (f" ± {item.std:.3f}" if item.std else "") + f" {item.unit}"
+        figure = uncertain(item.value, item.std, item.unit)
         word = "[green]passed[/]" if item.passed else "[bold red]failed[/]"
         table.add_row(escape(item.name), figure, f"{item.limit:g} {item.unit}", word)
     sums = (
@@ -172,8 +173,7 @@ def _registration(result: Registration) -> Table:
     for index, name in enumerate(result.lights[1:], start=1):
         values = result.parameters[index] * factors
         std = None if result.covariance is None else np.sqrt(np.diag(result.covariance[index])) * factors
-        cells = [f"{value:.4f}" + ("" if std is None else f" ± {std[term]:.4f}") for term, value in enumerate(values)]
-        table.add_row(escape(name), *cells)
+        table.add_row(escape(name), *map(uncertain, values, np.zeros_like(values) if std is None else std))
     return table
 
 
@@ -182,13 +182,12 @@ def _matrix(result: Crosstalk) -> tuple[Table, str]:
     heads = ("channel", *result.lights)
     table, std = _table("Crosstalk: camera channels = A . lights (± standard uncertainty)", heads), result.std
     for row, values in enumerate(result.matrix):
-        more = [""] * len(values) if std is None else [f" ± {value:.5f}" for value in std[row]]
-        cells = ["1" if value == 1 else f"{value:.5f}{error}" for value, error in zip(values, more, strict=True)]
+        cells = map(uncertain, values, np.where(values == 1, 0, 0 if std is None else std[row]))
         table.add_row(CHANNELS[row] if len(result.matrix) == 3 else str(row + 1), *cells)
     table.add_section()
     table.add_row("noise amplification", *(f"{value:.2f}" for value in result.noise_amplification))
-    field = "the same everywhere" if result.field is None else f"varies over the field (degree {result.field.order})"
-    words = f"condition number {result.condition_number:.2f}; A is {field}"
+    field = "is the same everywhere" if result.field is None else f"varies over the field (degree {result.field.order})"
+    words = f"condition number {result.condition_number:.2f}; A {field}"
     if (leakage := result.leakage_std) is not None:
         words += f"; its uncertainty leaves at most {100 * leakage.max():.3f} % of one light in another (1 sigma)"
     return table, words
@@ -198,19 +197,18 @@ def _noise(result: CameraNoise) -> tuple[Table, str]:
     """The figures of every plane, and the number of defects."""
     table = _table("Camera noise (EMVA 1288; ± standard uncertainty)", ("", *result.planes))
     rows = (
-        ("gain 1/K, e-/DN", result.gain, 3),
-        ("dark noise, DN", result.read_noise, 3),
-        ("dark noise, e-", result.dark_noise, 2),
-        ("black level, DN", result.black_level, 2),
-        ("saturation, DN", result.saturation, 0),
-        ("full well, e-", result.full_well, 0),
-        ("linearity LE, %", result.linearity_error, 3),
-        ("DSNU, DN", result.dsnu, 3),
-        ("PRNU, %", result.prnu, 3),
+        ("gain 1/K, e-/DN", result.gain),
+        ("dark noise, DN", result.read_noise),
+        ("dark noise, e-", result.dark_noise),
+        ("black level, DN", result.black_level),
+        ("saturation, DN", result.saturation),
+        ("full well, e-", result.full_well),
+        ("linearity LE, %", result.linearity_error),
+        ("DSNU, DN", result.dsnu),
+        ("PRNU, %", result.prnu),
     )
-    for name, quantity, digits in rows:
-        pairs = zip(quantity.value, quantity.std, strict=True)
-        table.add_row(name, *(f"{v:.{digits}f} ± {s:.{digits}f}" if np.isfinite(v) else "-" for v, s in pairs))
+    for name, quantity in rows:
+        table.add_row(name, *map(uncertain, quantity.value, quantity.std))
     table.add_row("dynamic range, dB", *(f"{value:.1f}" for value in result.dynamic_range))
     counts = [f"{sum(kind == name for *_, kind in result.defects)} {name}" for name in ("hot", "dead")]
     return table, f"pixels to distrust: {', '.join(counts)}"

@@ -23,6 +23,7 @@ from rgbmidic.fields.units import Units
 from rgbmidic.illumination.calibration import read_document, write_document
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import ScaleSettings
+from rgbmidic.text import uncertain
 from rgbmidic.typing import FloatArray
 
 LENS_PARAMETERS = ("f", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -325,8 +326,8 @@ class CameraCalibration:
         str
         """
         (scale, scale_std), (tilt, tilt_std) = self.scale(self.centre), self.tilt_deg
-        known = f"tilt {tilt:.3f} ± {tilt_std:.2g} degrees" if np.isfinite(tilt) else "tilt not known without a lens"
-        return f"{scale:.6g} ± {scale_std:.2g} mm per px in the middle of the frame, {known}"
+        known = f"tilt {uncertain(tilt, tilt_std, 'degrees')}" if np.isfinite(tilt) else "tilt not known without a lens"
+        return f"{uncertain(scale, scale_std, 'mm per px')} in the middle of the frame, {known}"
 
     def jacobian_std(self, points: FloatArray) -> FloatArray:
         """Standard uncertainty (N,) that the calibration leaves in a displacement of one px at points (N, 2), mm.

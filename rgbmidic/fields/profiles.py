@@ -26,6 +26,7 @@ from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.strain import StrainGauges
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.quadratic_fit import quadratic_fit
+from rgbmidic.text import uncertain
 from rgbmidic.typing import BoolArray, FloatArray
 
 ARRIVALS = ("front", "peak")
@@ -523,9 +524,10 @@ def fit_front(
     spread = spread * max(chi_square / freedom, 1)
     start_std, slope_std = np.sqrt(np.diag(spread))
     if not abs(slope) > _CONSTANTS.travels * slope_std:
+        differ = uncertain(*(part * np.ptp(positions[used]) for part in (slope, slope_std)))
         raise InputError(
-            f"no front travels along the line: the arrival times differ by {slope * np.ptp(positions[used]):.3g} ± "
-            f"{slope_std * np.ptp(positions[used]):.2g} between its ends (chi-square {chi_square:.3g} of {freedom}); "
+            f"no front travels along the line: the arrival times differ by {differ} between its ends "
+            f"(chi-square {chi_square:.3g} of {freedom}); "
             f"a speed needs {_CONSTANTS.travels:g} standard uncertainties"
         )
     chosen = np.zeros(len(positions), dtype=bool)

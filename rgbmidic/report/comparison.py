@@ -18,6 +18,7 @@ from rgbmidic.report.figures import spread
 from rgbmidic.report.page import render
 from rgbmidic.results.comparison import QUANTITIES, WAYS, Comparison, FrameComparison
 from rgbmidic.results.files import write_complete, write_table, writing
+from rgbmidic.text import uncertain
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -249,7 +250,7 @@ def scale_text(comparison: Comparison, done: Sequence[FrameComparison]) -> str:
     scale, std = comparison.best_scale([made.fit for made in done])
     if not np.isfinite(scale):
         return "no scale is found: the simulation is a rigid motion in all frames, or too few of its nodes have data"
-    text = f"{scale:.4f} ± {std:.2g} times the simulation fits the measurement best, with any shift and rotation: "
+    text = f"{uncertain(scale, std)} times the simulation fits the measurement best, with any shift and rotation: "
     away, rest = abs(scale - 1) / std if std else np.inf, float(np.median([made.fit.chi_square for made in done]))
     if away <= 2:
         text += "1 is within two standard uncertainties"

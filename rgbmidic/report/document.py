@@ -23,7 +23,6 @@ from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
-from rgbmidic.text import rounded, uncertain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,8 +127,6 @@ def write_report(
         curves=curves,
         figures=figures,
         isfinite=np.isfinite,
-        uncertain=uncertain,
-        rounded=rounded,
         result=result,
         physical=physical,
         stated=asdict(setup),

@@ -8,6 +8,7 @@ from typing import Any
 
 from rgbmidic.errors import legible
 from rgbmidic.report import style
+from rgbmidic.text import rounded, uncertain
 
 _TEMPLATES = Path(__file__).with_name("templates")
 
@@ -16,7 +17,8 @@ def render(template: str, folder: Path = _TEMPLATES, **values: Any) -> str:
     """Fill a template in.
 
     It has three filters beside those of jinja2: ``code`` writes words between backquotes as code, ``gaps`` writes a
-    paragraph on one line and marks words between brackets, ``embedded`` makes the address of a picture of a figure.
+    paragraph on one line and marks words between brackets, ``embedded`` makes the address of a picture of a figure; and
+    `rgbmidic.text.rounded` and `uncertain`.
 
     Parameters
     ----------
@@ -47,4 +49,5 @@ def render(template: str, folder: Path = _TEMPLATES, **values: Any) -> str:
         "gaps": lambda text: Markup(re.sub(r"(\[[^\]]*\])", r"<mark>\1</mark>", " ".join(escape(text).split()))),
         "embedded": style.embedded,
     }
+    environment.globals |= {"rounded": rounded, "uncertain": uncertain}
     return legible(environment.get_template(template).render(values))

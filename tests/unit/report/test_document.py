@@ -155,7 +155,7 @@ def test_it_says_what_is_stated_and_what_is_not(tmp_path: Path) -> None:
     assert page.rows["loading"] == "three-point bending"
     assert page.rows["camera"] == "not stated (setup.camera)"
     assert page.rows["image"] == "120 x 80 px; field of view 6 x 4 mm"
-    assert page.rows["image scale"].startswith("0.05 mm per px ± 0.001")
+    assert page.rows["image scale"].startswith("0.0500 ± 0.0010 mm per px")
     assert page.rows["frame rate"].startswith("50000 frames per second")
     assert page.rows["exposure"] == "1.5 µs"
     assert page.rows["virtual strain gauge"] == f"{3 * MESH.size:.4g} px ({0.15 * MESH.size:.3g} mm), at every node"
@@ -193,7 +193,7 @@ def test_calibration_exposure_and_stress_are_in_the_report(tmp_path: Path, monke
     monkeypatch.setattr(curves, "history_figure", lambda *given: seen.append(given))
     write_report(result, tmp_path / "a.html")
     page = Reader(tmp_path / "a.html")
-    assert page.rows["channel 2"] == "0.20000 ± 0.0002 | 1.00000 | 0.30000 ± 0.0002"
+    assert page.rows["channel 2"] == "0.20000 ± 0.00020 | 1 | 0.30000 ± 0.00020"
     assert page.rows[LIGHTS[0]] == "30.1% | 2.00%"
     assert page.rows["noise model"] == "gain 0.5, read_noise 3"
     assert page.rows["crosstalk measured"] == "today, from 2 files"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import html
 import re
 from pathlib import Path
@@ -9,7 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from results import NODES, make_result, smooth_record
+from textures import rigid_pair
 
+import rgbmidic
+import rgbmidic_calibration
+from rgbmidic import correlate
 from rgbmidic.fields.units import column
 from rgbmidic.report import history_figure, profile_figure, write_report
 from rgbmidic.report.curves import history_panels
@@ -20,14 +25,17 @@ from rgbmidic.results import (
     Maps,
     Result,
     export_result,
+    history_rows,
     read_profile,
     write_histories,
     write_profile,
 )
 from rgbmidic.results.histories import read_histories
 from rgbmidic.settings import ProbeSettings, ScaleSettings
+from rgbmidic.text import rounded
 
 FIELDS = ("u", "exx", "e1", "direction", "equivalent", "u_velocity")
+STATED = re.compile(r"(\S+) ± (\d\S*?)(?=[\s<,;)]|$)")
 SCALES = (None, ScaleSettings(mm_per_pixel=0.05), ScaleSettings(mm_per_pixel=0.05, unit="px"))
 
 
@@ -92,3 +100,22 @@ def test_histories_have_one_name_and_one_unit_in_picture_table_and_page(result: 
     for name in ("u", "v", "exx", "eyy", "exy"):
         field = Maps.of(result).field(f"{name}_std")
         assert f"<tr><td>{field.symbol}</td><td>{field.unit or 1}</td>" in page
+    printed = " ".join(cell for row in history_rows(histories)[1] for cell in row)
+    stated = (
+        STATED.findall(page)
+        + STATED.findall(printed)
+        + STATED.findall(repr(correlate(*rigid_pair((80, 80), (0.3, 0.2)))))
+    )
+    assert len(stated) >= 4
+    for value, std in stated:
+        assert std == rounded(float(std), float(std))
+        assert value == rounded(float(value), float(std))
+
+
+def test_no_number_with_an_uncertainty_is_written_but_by_one_function() -> None:
+    package = Path(rgbmidic.__file__).parent
+    for file in [*package.rglob("*.py"), *Path(rgbmidic_calibration.__file__).parent.rglob("*.py")]:
+        texts = (one for one in ast.walk(ast.parse(file.read_text())) if isinstance(one, ast.JoinedStr))
+        found = [one.lineno for one in texts if "±" in ast.unparse(one)]
+        assert len(found) == (file.name == "text.py"), file
+    assert not [file for file in package.rglob("*.html") if "±" in file.read_text()]
