@@ -167,7 +167,7 @@ def _sections(result: Calibration) -> list[str]:
 
 def _registration(result: Registration) -> Table:
     """The parameters of every light with their uncertainties."""
-    heads = ("light", "x, px", "y, px", "rotation, mrad", "scale, 1e-3", "radial, 1e-3")
+    heads = ("light", "x (px)", "y (px)", "rotation (mrad)", "scale (1e-3)", "radial (1e-3)")
     table = _table(f"Registration against {escape(result.lights[0])}", heads)
     factors = np.array([1, 1, 1e3, 1e3, 1e3])
     for index, name in enumerate(result.lights[1:], start=1):

@@ -85,7 +85,7 @@ def _draw_field(axes: Axes, crosstalk: Crosstalk) -> None:
     image = axes.imshow(values[..., row, column], extent=(0, width, height, 0), cmap="viridis")
     axes.figure.colorbar(image, ax=axes, shrink=0.8)
     title = f"{CHANNELS[row]} seen of {literal(crosstalk.lights[column])}"
-    axes.set(xlabel="x, px", ylabel="y, px", title=title)
+    axes.set(xlabel="x (px)", ylabel="y (px)", title=title)
 
 
 def _draw_noise(axes: Axes, noise: CameraNoise) -> None:
@@ -95,7 +95,7 @@ def _draw_noise(axes: Axes, noise: CameraNoise) -> None:
         std = np.sqrt(noise.read_noise.value[index] ** 2 + level / noise.gain.value[index])
         colour = COLOURS["RGB".find(plane[0])] if plane[0] in "RGB" else "k"
         axes.loglog(level, std, color=colour, ls="--" if plane == "G2" else "-", label=plane)
-    axes.set(xlabel="grey level above black, DN", ylabel="noise of one sample, DN", title="camera noise")
+    axes.set(xlabel="grey level above black (DN)", ylabel="noise of one sample (DN)", title="camera noise")
     axes.legend()
     axes.grid(alpha=0.3)
 
@@ -110,7 +110,7 @@ def _draw_registration(axes: Axes, registration: Registration) -> None:
         look: dict[str, Any] = {"color": COLOURS[index % len(COLOURS)], "label": literal(name)}
         axes.quiver(*points.T, *moved[index].T, angles="xy", scale_units="xy", scale=10 * largest / radius, **look)
     title = f"seen elsewhere than by {literal(registration.lights[0])}, up to {largest:.2f} px"
-    axes.set(xlabel="x, px", ylabel="y, px", title=title)
+    axes.set(xlabel="x (px)", ylabel="y (px)", title=title)
     axes.set(xlim=(-0.1 * x, 2.1 * x), ylim=(2.1 * y, -0.1 * y), aspect="equal")
     axes.legend(fontsize="small")
 
@@ -125,7 +125,7 @@ def draw_design(result: Design, camera: Sensitivities, lamps: Mapping[str, Lamp]
             power = lamps[name].power(camera.wavelengths)
             colour = COLOURS[column.argmax()]
             axes.fill_between(camera.wavelengths, power / power.max(), alpha=0.25, label=literal(name), color=colour)
-        axes.set(xlabel="wavelength, nm", ylabel="relative")
+        axes.set(xlabel="wavelength (nm)", ylabel="relative")
         axes.legend(fontsize="small")
 
     _save([spectra, lambda axes: _draw_matrix(axes, result.crosstalk)], path)
@@ -144,7 +144,7 @@ def draw_camera(estimate: CameraEstimate, path: Path) -> None:
     y, x = np.mgrid[0 : rows - 1 : 24j, 0 : columns - 1 : 24j]
     grid = np.stack([x.ravel(), y.ravel()], axis=1)
     whole: dict[str, Any] = {"xlim": (-0.5, columns - 0.5), "ylim": (rows - 0.5, -0.5), "aspect": "equal"}
-    whole |= {"xlabel": "x, px", "ylabel": "y, px"}
+    whole |= {"xlabel": "x (px)", "ylabel": "y (px)"}
 
     def residuals(axes: Axes) -> None:
         unit = float(f"{max(1e-6, *(np.abs(residual).max() for _, residual in estimate.residuals)):.0e}")
@@ -155,14 +155,15 @@ def draw_camera(estimate: CameraEstimate, path: Path) -> None:
     def distortion(axes: Axes) -> None:
         if camera.lens is not None:
             shift = np.linalg.norm(distorted(camera.lens, grid) - grid, axis=1).reshape(x.shape)
-            axes.clabel(axes.contour(x, y, shift, cmap="viridis"), fmt="%.2f")
-        axes.set(title="distortion, px" if camera.lens is not None else "no lens calibrated", **whole)
+            axes.figure.colorbar(axes.contourf(x, y, shift, 12, cmap="viridis"), ax=axes, shrink=0.8)
+        axes.set(title="distortion (px)" if camera.lens is not None else "no lens calibrated", **whole)
 
     def scale(axes: Axes) -> None:
         known = camera.homography is not None
         if known:
             local = np.sqrt(np.linalg.det(camera.jacobian(grid))).reshape(x.shape)
-            axes.clabel(axes.contour(x, y, 100 * (local / local.mean() - 1), cmap="viridis"), fmt="%.3f")
-        axes.set(title="scale on the plane, % of its mean" if known else "no plane calibrated", **whole)
+            filled = axes.contourf(x, y, 100 * (local / local.mean() - 1), 12, cmap="viridis")
+            axes.figure.colorbar(filled, ax=axes, shrink=0.8)
+        axes.set(title="scale on the plane (% of its mean)" if known else "no plane calibrated", **whole)
 
     _save([*([residuals] if estimate.residuals else []), distortion, scale], path)  # a file has no residuals

@@ -61,7 +61,7 @@ def zone_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
         fractions += [state[key] for key in ("all_reflect", "one_light", "no_light", "saturated")]
         rows.append([label, f"{state['largest_motion_px']:.1f}", *(f"{fraction:.1%}" for fraction in fractions)])
     names = [light.name for light in plan.scene.lights]
-    return ["state", "motion, px", *names, "all", "one", "none", "clipped"], rows
+    return ["state", "motion (px)", *names, "all", "one", "none", "clipped"], rows
 
 
 def uncertainty_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:

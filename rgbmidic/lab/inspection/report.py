@@ -45,7 +45,7 @@ def channel_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
         noise = f"{channel.noise_dn:.1f}" if inspection.noise_known else f"~ {channel.noise_dn:.0f}"
         fractions = [f"{value:.1%}" for value in (channel.mean, channel.low, channel.high, channel.saturated)]
         rows.append([channel.name, *fractions, _text(channel.speckle_px, 1), noise])
-    return ["channel", "mean", "5 %", "95 %", "saturated", "speckle, px", "noise, DN"], rows
+    return ["channel", "mean", "5 %", "95 %", "saturated", "speckle (px)", "noise (DN)"], rows
 
 
 def light_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
