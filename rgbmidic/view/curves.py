@@ -7,7 +7,7 @@ import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bokeh.models as bk
 import numpy as np
@@ -15,6 +15,7 @@ import numpy.typing as npt
 from bokeh.document import Document
 
 from rgbmidic.errors import ResultError, RgbmidicError
+from rgbmidic.report import history_figure
 from rgbmidic.report.style import OKABE_ITO, time_axis, time_unit
 from rgbmidic.results import Channels, Histories, HistoryColumn, Result, probes_of
 from rgbmidic.results.histories import frames_alone, history_csv, read_histories, with_channels
@@ -26,6 +27,9 @@ from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.models import ResultControls
 from rgbmidic.view.picture import Background, warning
 from rgbmidic.view.shown import ShownFields
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def probes(marks: Sequence[Mark], gauge: float, stated: ProbeSettings, measure: Any = None) -> ProbeSettings:
@@ -359,6 +363,13 @@ class CurvePanel:
         self.plot.xaxis.axis_label, self.plot.yaxis[0].axis_label = (axis, chosen) if there else (None, None)
         self.plot.legend.visible = there
         self._draw_beside(self.channels)
+
+    def figure(self) -> Figure | None:
+        """Draw the chosen curve of all probes for print; None where there is none."""
+        chosen = self._parts.curve.value
+        if self.reading or self.histories is None or chosen not in (found := groups(self.histories, self._colours)):
+            return None
+        return history_figure(self.histories, [(chosen, found[chosen])])
 
     def _draw_beside(self, channels: Channels | None) -> None:
         """Draw the channel beside the curves as it was recorded, around the frames or, off them, all of it."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bokeh.models as bk
 import numpy as np
@@ -15,6 +15,7 @@ import numpy.typing as npt
 from bokeh.document import Document
 
 from rgbmidic.errors import ResultError
+from rgbmidic.report import profile_figure
 from rgbmidic.report.style import time_axis
 from rgbmidic.results import HistoryColumn, Maps, MapValues
 from rgbmidic.results.profiles import Profile
@@ -26,6 +27,9 @@ from rgbmidic.view.curves import NOW, band
 from rgbmidic.view.models import labelled
 from rgbmidic.view.picture import Background, warning
 from rgbmidic.view.shown import ShownFields
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _IMAGE = "image x y dw dh"
 
@@ -222,6 +226,16 @@ class LinePanel:
         self._bands.data = dict(zip(("xs", "ys"), band(profile.positions, curve), strict=True))
         at = self._clock[0][frame]
         self.now.location, self.profile.title.text = float(at) if np.isfinite(at) else None, f"Profile in frame {frame}"
+
+    def figure(self) -> Figure | None:
+        """Draw the frames that are read, and the profile of the one in view, for print; None where there are none."""
+        reading, frame = self._reading, self._shown.view.frame
+        there = [] if reading is None else np.flatnonzero(reading.read & reading.maps.result.finished).tolist()
+        if reading is None or not there:
+            return None
+        profile = Profile(reading.maps, reading.profile.field.name, self._asked[1], there)
+        profile.values[:], profile.std[:] = reading.profile.values[there], reading.profile.std[there]
+        return profile_figure(profile, shown=[there.index(frame)] if frame in there else ())
 
     def frame(self, x: float) -> int:
         """Return the index of the frame at a place of the time axis."""

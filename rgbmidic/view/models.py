@@ -159,14 +159,13 @@ class ResultControls(Controls):
         self.section.js_on_change("active", script("turnTo", group=self.section, sections=shown))
         return column(self.description, self.section, *shown, self.theme, **flat)
 
-    def wire(self, state: SharedState, tools: Sequence[Any], now: bk.Span, curves: Sequence[Any]) -> None:
-        """Let the browser itself act; `now` marks the frame that is shown, `curves` are plots."""
+    def wire(self, state: SharedState, tools: Sequence[Any], now: bk.Span) -> None:
+        """Let the browser itself act; `now` marks the frame that is shown."""
         self.ask(state)
         for name in ("shown", "query"):
             state.js_on_change(name, script("shown", state=state, now=now))
         state.js_on_change("csv", script("keepCsv", state=state))
-        state.js_on_change("png", script("keepMap", state=state))
-        self.png.js_on_click(script("keepPng", plots=list(curves)))
+        state.js_on_change("png", script("keepPng", state=state))
         groups = (self.mode, tools[:-1], self.scale), (self.scale, [tools[0], tools[-1]], self.mode)
         for group, own, other in groups:
             group.js_on_change("active", script("choose", group=group, tools=list(own), other=other))

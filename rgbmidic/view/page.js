@@ -73,19 +73,11 @@ const rgbmidic = {
     state.csv = "";
   },
 
-  keepMap({state}) {
+  keepPng({state}) {
     if (!state.png) return;
-    const name = (new URLSearchParams(state.query).get("field") || "u") + "_" + String(state.shown).padStart(6, "0") + ".png";
-    fetch(state.png).then((answer) => answer.blob()).then((blob) => rgbmidic.keep(blob, name));
+    const [name, source] = state.png.split(" ");
+    fetch(source).then((answer) => answer.blob()).then((blob) => rgbmidic.keep(blob, name));
     state.png = "";
-  },
-
-  // Of plots that take each other's place those that are there: one that is hidden has no size.
-  keepPng({plots}) {
-    for (const plot of plots.filter((one) => one.visible)) {
-      const name = plot.name.replace("curves_plot", "history").replace("_plot", "") + ".png";
-      Bokeh.index.get_one(plot).export("png").to_blob().then((blob) => rgbmidic.keep(blob, name));
-    }
   },
 };
 window.rgbmidic = rgbmidic;

@@ -6,7 +6,7 @@ import html
 import time
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bokeh.models as bk
 import numpy as np
@@ -28,6 +28,9 @@ from rgbmidic.view.models import ResultControls, SharedState, script
 from rgbmidic.view.picture import every, frame_text, guarded, warning
 from rgbmidic.view.sections import ChannelControls, FileButtons, ProbeNames
 from rgbmidic.view.shown import ShownFields
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class ResultPage:
@@ -64,8 +67,7 @@ class ResultPage:
         panels = [self.line.choice, self.curves.plot, *self.line.parts]
         self.panel = bk.Column(children=panels, sizing_mode="stretch_both")
         self._begin()
-        plots = self.curves.plot, self.line.wave, self.line.profile
-        p.wire(self.state, self.maps.canvas.tools, self.timeline.now, plots)
+        p.wire(self.state, self.maps.canvas.tools, self.timeline.now)
         self._listen()
 
     @property
@@ -144,7 +146,8 @@ class ResultPage:
             (p.redo, lambda: self.show(marks=self.steps.go(back=False))),
         ):  # fmt: skip
             button.on_click(partial(guarded, act, lambda text: p.written.update(text=warning(text))))
-        p.print.on_click(partial(guarded, self._print, self.complain))
+        for button, act in ((p.print, self._print), (p.png, self._print_curves)):
+            button.on_click(partial(guarded, act, self.complain))
         p.drag.js_on_change("active", script("hold", toggle=p.drag, pan=self.curves.pan))
         p.movie.on_change("active", lambda attr, old, new: guarded(self.film.press, self.film.stop))
         self.line.choice.on_change("active", lambda attr, old, new: self._choose_line(self.line.names[new]))
@@ -256,9 +259,24 @@ class ResultPage:
             self.state.csv = as_csv(self.curves.histories)
 
     def _print(self) -> None:
-        """Send the maps in view as a picture for print, as a data URL."""
-        figure = self.maps.figure()
-        self.state.png = embedded(figure, dpi=round(VIEWER.print_columns / figure.get_figwidth()))
+        """Send the maps in view as a picture for print."""
+        self._send(f"{self.view.field}_{self.view.frame:06}", self.maps.figure())
+
+    def _print_curves(self) -> None:
+        """Send the curves in view, over the time or along a line, as a picture for print."""
+        if self.line.wave.visible:
+            name, figure = "profile", self.line.figure()
+        else:
+            name, figure = "history", self.curves.figure()
+        if figure is None:
+            self.parts.message.text = "There is no curve yet, or its frames are still being read."
+        else:
+            self._send(name, figure)
+
+    def _send(self, name: str, figure: Figure) -> None:
+        """Send a picture, light whatever the page is, as a file name and a data URL."""
+        source = embedded(figure, dpi=round(VIEWER.print_columns / figure.get_figwidth()))
+        self.state.png = f"{name}.png {source}"
 
     def _jump(self, event: Any) -> None:
         """Go to the frame that was clicked in the time line or among the curves."""

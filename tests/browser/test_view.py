@@ -526,13 +526,16 @@ def test_the_picture_that_is_saved_is_of_the_plot_that_is_there(driver, wave):
         page.until("model('wave').data.image.length && !model('told_of_line').visible")
         driver.execute_script("window.kept = []; rgbmidic.keep = (blob, name) => window.kept.push([name, blob.size])")
         page.driver.execute_script(*click("Save PNG"))
-        page.until("window.kept.length === 2")
+        page.until("window.kept.length === 1")
         page.driver.execute_script(*click("Save PNG for print"))
+        page.until("window.kept.length === 2")
+        page.driver.execute_script(*click("over time"))
+        page.until("model('curves_plot').visible && model('curve').value")
+        page.driver.execute_script(*click("Save PNG"))
         page.until("window.kept.length === 3")
-        assert page.run("window.kept.pop()[0]") == "exx_000005.png"
         kept = dict(page.run("window.kept"))
-        assert kept.keys() == {"wave.png", "profile.png"}
-        assert min(kept.values()) > 3000, "an empty picture has 300 x 150 px"
+        assert list(kept) == ["profile.png", "exx_000005.png", "history.png"]
+        assert min(kept.values()) > 20_000
 
 
 def test_a_movie_of_what_is_in_view_is_written_beside_the_others(driver, wave, tmp_path, monkeypatch):
