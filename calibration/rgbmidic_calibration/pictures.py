@@ -142,7 +142,7 @@ def draw_camera(estimate: CameraEstimate, path: Path) -> None:
     camera = estimate.camera
     rows, columns = camera.shape
     y, x = np.mgrid[0 : rows - 1 : 24j, 0 : columns - 1 : 24j]
-    grid = np.stack([x.ravel(), y.ravel()], axis=1)
+    grid = np.stack([x.ravel(), y.ravel()], axis=1)  # what is drawn there is rounded: noise of 1e-14 would be contoured
     whole: dict[str, Any] = {"xlim": (-0.5, columns - 0.5), "ylim": (rows - 0.5, -0.5), "aspect": "equal"}
     whole |= {"xlabel": "x (px)", "ylabel": "y (px)"}
 
@@ -155,14 +155,14 @@ def draw_camera(estimate: CameraEstimate, path: Path) -> None:
     def distortion(axes: Axes) -> None:
         if camera.lens is not None:
             shift = np.linalg.norm(distorted(camera.lens, grid) - grid, axis=1).reshape(x.shape)
-            axes.figure.colorbar(axes.contourf(x, y, shift, 12, cmap="viridis"), ax=axes, shrink=0.8)
+            axes.figure.colorbar(axes.contourf(x, y, shift.round(6), 12, cmap="viridis"), ax=axes, shrink=0.8)
         axes.set(title="distortion (px)" if camera.lens is not None else "no lens calibrated", **whole)
 
     def scale(axes: Axes) -> None:
         known = camera.homography is not None
         if known:
             local = np.sqrt(np.linalg.det(camera.jacobian(grid))).reshape(x.shape)
-            filled = axes.contourf(x, y, 100 * (local / local.mean() - 1), 12, cmap="viridis")
+            filled = axes.contourf(x, y, (100 * (local / local.mean() - 1)).round(6), 12, cmap="viridis")
             axes.figure.colorbar(filled, ax=axes, shrink=0.8)
         axes.set(title="scale on the plane (% of its mean)" if known else "no plane calibrated", **whole)
 
