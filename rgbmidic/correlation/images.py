@@ -43,7 +43,7 @@ def as_light_stack(images: npt.ArrayLike, name: str) -> FloatImage:
         Another number of axes, not real numbers, or under 8 px in height or width.
     """
     stack = unmasked(images)
-    if stack.ndim not in (2, 3) or stack.dtype.kind not in "buif":
+    if stack.ndim not in (2, 3) or stack.dtype.kind not in "uif":
         raise InputError(f"{name} must be a real image (H, W) or (k, H, W), not {stack.dtype} of shape {stack.shape}")
     stack = np.atleast_3d(stack) if stack.ndim == 3 else stack[None]
     if stack.shape[0] == 0 or min(stack.shape[1:]) < 8:

@@ -266,20 +266,26 @@ def corrected_values(residual: Residual, kind: Literal["auto", "none", "global",
         return np.stack([_gain_of_means(reference, *light) for light in sums])
     lights = zip(reference.values, residual.warped, residual.weights, strict=True)
     if kind == "global":
-        return np.stack([_one_gain(f, g, weight.astype(np.float64)) for f, g, weight in lights])
+        return np.stack([_one_gain(f, g, weight.astype(np.float64))[0] for f, g, weight in lights])
     return np.stack([_gain_field(reference, f, g, weight) for f, g, weight in lights])
 
 
-def _one_gain(f: FloatImage, g: FloatImage, weight: FloatArray) -> FloatImage:
-    """Correct f (P,) by one gain and offset."""
+_CORRELATED = 0.3
+"""Correlation of both states from which a light has a gain: a lamp that is off shows noise, whose contrast over the
+speckle's is none. Two states of one speckle have .9 and more; of 50 speckles chance makes .3 in 1 of 60 cases."""
+
+
+def _one_gain(f: FloatImage, g: FloatImage, weight: FloatArray) -> tuple[FloatImage, bool]:
+    """Correct f (P,) by one offset and, where f and g show the same, one gain; and whether they do."""
     total = weight.sum()
     if not total:
-        return f
+        return f, False
     mean_f, mean_g = (weight * f).sum() / total, (weight * g).sum() / total
     # both images carry the same noise: the ratio of the deviations is not attenuated by it
     spread_f, spread_g = (float((weight * (i - m) ** 2).sum()) for i, m in ((f, mean_f), (g, mean_g)))
-    gain = np.sqrt(spread_f / spread_g) if spread_f > 0 and spread_g > 0 else 1.0
-    return np.asarray((f - mean_f) / gain + mean_g, dtype=np.float32)
+    alike = float((weight * (f - mean_f) * (g - mean_g)).sum()) > _CORRELATED * np.sqrt(spread_f * spread_g)
+    gain = np.sqrt(spread_f / spread_g) if alike else 1.0
+    return np.asarray((f - mean_f) / gain + mean_g, dtype=np.float32), alike
 
 
 def _gain_of_means(reference: Reference, f: FloatImage, weight: FloatImage, sum_g: FloatArray) -> FloatImage:
@@ -294,8 +300,9 @@ def _gain_of_means(reference: Reference, f: FloatImage, weight: FloatImage, sum_
 
 def _gain_field(reference: Reference, f: FloatImage, g: FloatImage, weight: FloatImage) -> FloatImage:
     """Correct f (P,) by a gain and an offset that are linear in every element."""
-    if not weight.any():
-        return f
+    corrected, alike = _one_gain(f, g, weight.astype(np.float64))
+    if not alike:
+        return corrected
     assembly = reference.assembly
     scale = float(np.sqrt((weight * g * g).sum() / weight.sum())) or 1.0
     g = g / np.float32(scale)

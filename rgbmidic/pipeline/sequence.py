@@ -158,7 +158,7 @@ class _Latest:
         if not self.light_images or hasattr(state, "values"):
             return state
         images = unmasked(state)
-        if images.dtype.kind not in "buif":
+        if images.dtype.kind not in "uif":
             raise FrameError(f"a state must be an array of real numbers or IlluminationImages, not {images.dtype}")
         return images.astype(np.float32)
 

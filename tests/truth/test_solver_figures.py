@@ -352,6 +352,21 @@ def test_rigid_motions_need_a_first_light_that_sees():
     assert "first light" in found.reason
 
 
+@pytest.mark.parametrize("level", [0.0, 5.0])
+@pytest.mark.parametrize("brightness", ["global", "local"])
+def test_a_light_that_is_off_leaves_the_others_their_displacement(level, brightness):
+    """Its noise is not taken for speckle of little contrast: the error is as stated."""
+    errors, image, random = [], reference_image(), np.random.default_rng(0)
+    for _ in range(4):
+        first, second = np.stack([[image, image], [image, np.full_like(image, level)]]) + random.normal(
+            0, 2, (2, 2, *image.shape)
+        )
+        found = correlate(first, second, region=REGION, brightness=brightness, statistics=True)
+        assert found.measured.all()
+        errors.append(found.displacement / found.displacement_std)
+    assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.25
+
+
 @pytest.mark.parametrize("unit", [1e-12, 1e12])
 @pytest.mark.parametrize("brightness", ["none", "local"])
 def test_uncertainty_does_not_depend_on_the_unit_of_the_grey_levels(unit, brightness):

@@ -88,6 +88,7 @@ def test_the_largest_number_of_iterations_is_kept_and_told():
         ({"deformed": np.ones((90, 99))}, r"one shape.*90, 100.*90, 99"),
         ({"reference": np.ones(100)}, "reference must be a real image"),
         ({"reference": np.ones((90, 100), complex)}, "reference must be a real image"),
+        ({"reference": np.ones((90, 100), bool)}, "reference must be a real image .*, not bool"),
         ({"reference": np.ones((7, 100)), "deformed": np.ones((7, 100))}, "at least 8 x 8 px"),
         ({"reference": np.ones((0, 90, 100)), "deformed": np.ones((0, 90, 100))}, "at least one image"),
         ({"weights": np.ones((90, 99))}, "weights must have shape"),
