@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +12,7 @@ from rgbmidic.errors import ResultError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["check_folder", "plain", "write_findings"]
+__all__ = ["check_folder", "write_findings"]
 
 
 def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
@@ -41,27 +39,6 @@ def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
         raise ResultError(
             f"{out / taken[0]} is already there; choose another folder, or overwrite it (overwrite=True, --overwrite)"
         )
-
-
-def plain(value: Any) -> Any:
-    """Return a value as JSON holds it: dataclasses as objects, None for a number that is not known.
-
-    Parameters
-    ----------
-    value
-        A number, a text, a dataclass, or a mapping or sequence of such.
-
-    Returns
-    -------
-    object
-    """
-    if is_dataclass(value) and not isinstance(value, type):
-        value = asdict(value)
-    if isinstance(value, Mapping):
-        return {key: plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_findings(out: Path, contents: Mapping[str, Mapping[str, Any] | str | Figure], *, overwrite: bool) -> None:

@@ -22,10 +22,11 @@ from scipy.sparse.linalg import splu
 from rgbmidic._version import __version__
 from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
 from rgbmidic.fields import NodalCovariance, StrainGauges
-from rgbmidic.lab import plain, write_findings
+from rgbmidic.lab import write_findings
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.size_figures import ResolutionStudy
 from rgbmidic.pipeline.suitability import SPECKLES
+from rgbmidic.settings.conversion import plain
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:

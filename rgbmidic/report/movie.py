@@ -325,21 +325,10 @@ class _Canvas:
 
     def _resampled(self, image: AnyArray, origin: tuple[int, int] = (0, 0)) -> npt.NDArray[np.uint8]:
         """Resample an image, which begins at `origin`, in the first panel; all have its size."""
-        import cv2
-
         rows, columns, _ = self._boxes[0]
         (step, left), (_, top) = self._steps()
-        factor = max(1, int(step))
-        small: AnyArray = np.asarray(image, dtype=np.uint8)
-        if factor > 1:  # reduced by a whole factor first, against moiré
-            height, width = (size // factor * factor for size in small.shape)
-            size = (width // factor, height // factor)
-            small = cv2.resize(small[:height, :width], size, interpolation=cv2.INTER_AREA)
-        shift = (factor - 1) / 2
-        to_image = np.array([[step, 0, left - origin[0] - shift], [0, step, top - origin[1] - shift]]) / factor
-        shape = (columns.stop - columns.start, rows.stop - rows.start)
-        flags, around = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, float(self._movie.constants.around)
-        return np.asarray(cv2.warpAffine(small, to_image, shape, flags=flags, borderValue=around), np.uint8)
+        size, first = (rows.stop - rows.start, columns.stop - columns.start), (left - origin[0], top - origin[1])
+        return style.resampled(image, (step, step), first, size, self._movie.constants.around)
 
     def _steps(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return px of the image to a pixel of the panel, and the place of the first pixel, along x and y."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.results.files import writing
@@ -227,6 +228,33 @@ def freeze_axes(figure: Figure, dpi: int) -> None:
         for image in axis.images:
             image.remove()
     figure.add_artist(Picture()).set_zorder(-1)
+
+
+def resampled(
+    image: AnyArray,
+    step: tuple[float, float],
+    first: tuple[float, float],
+    size: tuple[int, int],
+    around: int,
+    *,
+    nearest: bool = False,
+) -> npt.NDArray[np.uint8]:
+    """Resample an image on `size` (rows, columns) pixels, `step` (x, y) px apart from the place `first` (x, y) on.
+
+    It is reduced by a whole factor first, against moiré; beyond it lies the grey level `around`.
+    """
+    import cv2
+
+    factor = max(1, int(min(step)))
+    small: AnyArray = np.asarray(image, dtype=np.uint8)
+    if factor > 1:
+        height, width = (side // factor * factor for side in small.shape)
+        reduced = (width // factor, height // factor)
+        small = cv2.resize(small[:height, :width], reduced, interpolation=cv2.INTER_AREA)
+    shift, (across, down), (x, y) = (factor - 1) / 2, step, first
+    to_image = np.array([[across, 0, x - shift], [0, down, y - shift]], dtype=np.float64) / factor
+    flags = (cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(small, to_image, size[::-1], flags=flags, borderValue=float(around)), np.uint8)
 
 
 def save_figure(figure: Figure, path: Path | str, *, dpi: int = DPI) -> None:

@@ -248,12 +248,12 @@ def _quoted(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Value as TOML and JSON hold it: a dataclass as a dict, an array or a tuple as a list, NaN as None.
+    """Value as TOML and JSON hold it: a dataclass as a dict, an array or a tuple as a list, what is not finite as None.
 
     Parameters
     ----------
     value
-        A dataclass, an array, a tuple, a path, a number or a text.
+        A dataclass, a mapping, an array, a list or a tuple, a path, a number or a text.
 
     Returns
     -------
@@ -261,10 +261,12 @@ def plain(value: Any) -> Any:
     """
     if is_dataclass(value):
         return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: plain(part) for key, part in value.items()}
     value = _python(value)
     if isinstance(value, tuple):
         return [plain(entry) for entry in value]
-    if isinstance(value, float) and math.isnan(value):
+    if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
 

@@ -25,7 +25,7 @@ from rgbmidic.fields import Area, Mean, Nodal, make_probe
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.report.figures import field_colours, spread
-from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, time_text
+from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, resampled, time_text
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, MapValues, Profile, Quantity, Result
 from rgbmidic.results.quantities import FAILED
 from rgbmidic.settings import ProbeSettings, TestSettings
@@ -145,7 +145,8 @@ def paint(window: Window, picture: AnyArray, over: Overlay | None = None, around
     ndarray, shape (rows, columns), uint32
         Red, green, blue, 255, the lowest byte first; the first row is the top.
     """
-    grey = _resampled(window, picture, around)
+    first = (window.left + window.steps[0] / 2, window.top + window.steps[1] / 2)
+    grey = resampled(picture, window.steps, first, window.size, around, nearest=min(window.steps) <= 0.5)
     if over is None:
         return grey * np.uint32(0x010101) | np.uint32(0xFF000000)
     out = np.empty(grey.shape, dtype=np.uint32)
@@ -158,26 +159,6 @@ def paint(window: Window, picture: AnyArray, over: Overlay | None = None, around
         paint_field(below, grey, x, y, over.elements, over.beyond, -reach, reach, _packed(_SIDES, 0), 0, False)
         out[lines & (below == _packed(_SIDES, 0)[0])] = 0xFF000000
     return out
-
-
-def _resampled(window: Window, picture: AnyArray, around: int) -> npt.NDArray[np.uint8]:
-    """Resample the image in the window, reduced by whole factors first, against moiré."""
-    across, down = window.steps
-    factor = max(1, int(min(across, down)))
-    small = picture
-    if factor > 1:
-        rows, columns = (size // factor * factor for size in picture.shape)
-        small = cv2.resize(picture[:rows, :columns], (columns // factor, rows // factor), interpolation=cv2.INTER_AREA)
-    x, y = window.left + across / 2, window.top + down / 2
-    shift = (factor - 1) / 2
-    to_image = np.array(
-        [[across / factor, 0, (x - shift) / factor], [0, down / factor, (y - shift) / factor]], dtype=np.float64
-    )
-    rows, columns = window.size
-    smooth = cv2.INTER_LINEAR if min(across, down) > 0.5 else cv2.INTER_NEAREST
-    flags = smooth | cv2.WARP_INVERSE_MAP
-    out = cv2.warpAffine(small, to_image, (columns, rows), flags=flags, borderValue=float(around))
-    return np.asarray(out, dtype=np.uint8)
 
 
 @cache

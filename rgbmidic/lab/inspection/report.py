@@ -12,9 +12,10 @@ import numpy as np
 
 from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
-from rgbmidic.lab import plain, write_findings
+from rgbmidic.lab import write_findings
 from rgbmidic.lab.inspection import Inspection, Spread
 from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal, shade, show_image
+from rgbmidic.settings.conversion import plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
