@@ -92,7 +92,7 @@ def test_a_quantity_of_the_table_is_kept_read_and_exported_by_its_entry_alone(
     with ResultStore.create(tmp_path / "out", origin) as store:
         store.write_frame(0, FrameRecord.of(nodes=3, lights=1, depth=depth))
     result = Result.open(tmp_path / "out")
-    np.testing.assert_array_equal(result.depth, [depth])
+    np.testing.assert_array_equal(result.stack("depth"), [depth])
     for to in ("npz", "csv", "hdf5"):
         export_result(result, to, tmp_path / to)
     np.testing.assert_array_equal(np.load(tmp_path / "npz")["depth"], [depth])
