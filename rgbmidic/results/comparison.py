@@ -203,7 +203,7 @@ class Comparison:
         self.simulated_mesh = Tri3Mesh(nodes=simulation.mesh.points, elements=simulation.mesh.elements)
         self.levelling = Levelling(self.mesh, self.simulated_mesh)
         self.covariance = NodalCovariance.from_mesh(self.mesh)
-        units = placement if placement.camera is None else rectification_of(result, scale).units
+        units = placement if placement.camera is None else rectification_of(result, scale, "mm").units
         self.relative_std = units.mm_per_pixel_std / units.mm_per_pixel if units.mm_per_pixel else 0.0
         image = Tri3Mesh(nodes=result.nodes, elements=result.elements)
         self._blocks = image.areas.sum() / max(USUAL.block, USUAL.of_element * image.size) ** 2

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 
@@ -76,7 +76,9 @@ def channels_of(result: Result) -> ChannelSettings:
     return read_section(ChannelSettings, "channels", result.provenance.get("settings", {}).get("channels", {}))
 
 
-def rectification_of(result: Result, scale: ScaleSettings | None = None) -> Rectification:
+def rectification_of(
+    result: Result, scale: ScaleSettings | None = None, unit: Literal["mm", "px"] | None = None
+) -> Rectification:
     """Return the change from px of the image to rectified px, and the scale.
 
     Parameters
@@ -85,6 +87,8 @@ def rectification_of(result: Result, scale: ScaleSettings | None = None) -> Rect
         The result; its provenance holds the camera that its ``[scale]`` names.
     scale
         It replaces the ``[scale]`` that was kept with the result; None: that one.
+    unit
+        Unit of lengths; None: the scale's.
 
     Raises
     ------
@@ -94,6 +98,7 @@ def rectification_of(result: Result, scale: ScaleSettings | None = None) -> Rect
         The camera holds no plane.
     """
     stated, camera = scale_of(result) if scale is None else scale, None
+    stated = replace(stated, unit=unit or stated.unit)
     if stated.unit == "px":
         stated = replace(stated, mm_per_pixel=None, mm_per_pixel_std=0.0, camera=None)
     elif scale is None:

@@ -239,7 +239,7 @@ def place(result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence
             f"where the simulation's mesh lies on the image of {result.path} is not known: state two points or more, "
             "--points X_MM,Y_MM:X_PX,Y_PX each"
         )
-    found = Placement.fit(known, rectification_of(result, scale).camera, where=where)
+    found = Placement.fit(known, rectification_of(result, scale, "mm").camera, where=where)
     stated = (scale or scale_of(result)).mm_per_pixel  # half a pixel at each end of 100 px is .7 % of it
     if found.mm_per_pixel is not None and stated is not None and abs(found.mm_per_pixel / stated - 1) > 0.01:
         text = "%s state %.6g mm per px, scale.mm_per_pixel %.6g: the former is taken"

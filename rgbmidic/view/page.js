@@ -75,8 +75,8 @@ const rgbmidic = {
 
   keepPng({state}) {
     if (!state.png) return;
-    const [name, source] = state.png.split(" ");
-    fetch(source).then((answer) => answer.blob()).then((blob) => rgbmidic.keep(blob, name));
+    const end = state.png.indexOf(" "), name = state.png.slice(end + 1);  // which may have spaces itself
+    fetch(state.png.slice(0, end)).then((answer) => answer.blob()).then((blob) => rgbmidic.keep(blob, name));
     state.png = "";
   },
 };

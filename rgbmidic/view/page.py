@@ -274,9 +274,9 @@ class ResultPage:
             self._send(name, figure)
 
     def _send(self, name: str, figure: Figure) -> None:
-        """Send a picture, light whatever the page is, as a file name and a data URL."""
+        """Send a picture, light whatever the page is, as a data URL, a space and the file name."""
         source = embedded(figure, dpi=round(VIEWER.print_columns / figure.get_figwidth()))
-        self.state.png = f"{name}.png {source}"
+        self.state.png = f"{source} {name}.png"
 
     def _jump(self, event: Any) -> None:
         """Go to the frame that was clicked in the time line or among the curves."""

@@ -692,7 +692,9 @@ def test_a_picture_for_print_is_light_wide_and_says_what_it_shows(probed):
     assert sum("point 1" in text.get_text() for text in figure.axes[0].texts) == 1
     assert figure.get_facecolor()[:3] == (1, 1, 1)
     page._print()
-    png = base64.b64decode(page.state.png.removeprefix("exx_000003.png data:image/png;base64,"))
+    source, _, name = page.state.png.partition(" ")
+    assert name == "exx_000003.png"
+    png = base64.b64decode(source.removeprefix("data:image/png;base64,"))
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape[1] == pytest.approx(2000, abs=5)
     assert (picture[:5] == 255).mean() > 0.9
