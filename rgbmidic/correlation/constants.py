@@ -98,6 +98,10 @@ class SolverConstants:
     named
         Least part of a light in a motion that the images do not show, by which the light is named: the parts of the
         lights add up to 1 (derived), so that one of up to ten is named at least.
+    lit
+        Correlation of both states from which a light has a gain: a lamp that is off shows noise, whose contrast over
+        the speckle's is none. Two states of one speckle have .9 and more; of 50 speckles chance makes .3 in 1 of 60
+        cases (derived).
     least_gain
         Least gain of the local correction: a light that has lost 95 % of its contrast is not amplified any further.
     gain_smoothness
@@ -164,6 +168,7 @@ class SolverConstants:
     shared: float = 0.85
     shown: float = 0.5
     named: float = 0.1
+    lit: float = 0.3
     least_gain: float = 0.05
     gain_smoothness: float = 1e-3
     block: int = 13
