@@ -18,7 +18,6 @@ from itertools import product
 import cv2
 import numpy as np
 from scipy.linalg import pinv
-from scipy.signal import convolve2d, correlate2d
 
 from rgbmidic._kernels.demosaicing import displacement_sums
 from rgbmidic.frames.data import cfa_channels
@@ -202,8 +201,9 @@ def _filters(texture: TextureModel, noise: tuple[float, ...], cfa: str) -> tuple
         """Covariance of a filter's output at a phase with another's at lags up to `REACH` rows and columns."""
         a, b = (taps[phases[n]][m].reshape(SIZE, SIZE) for n, m in ((first, one), (second, other)))
         level = np.take(noise, colours[first]).reshape(SIZE, SIZE)
-        white = np.pad(correlate2d(b, a * level), REACH - SIZE + 1)[::-1, ::-1]
-        return np.asarray(convolve2d(around, correlate2d(b, a)[::-1, ::-1], mode="valid") + white)
+        b = np.pad(b, SIZE - 1)
+        white = np.pad(_correlated(b, a * level), REACH - SIZE + 1)[::-1, ::-1]
+        return _correlated(around, _correlated(b, a)) + white
 
     total, alone = np.zeros((3, 3)), np.zeros(3)
     parity = np.arange(-REACH, REACH + 1) % 2
@@ -220,3 +220,8 @@ def _filters(texture: TextureModel, noise: tuple[float, ...], cfa: str) -> tuple
     # 256 columns at a time: what a core's fastest cache holds of their filters
     lanes: FloatImage = np.tile(taps.transpose(0, 2, 3, 1), 128).astype(np.float32)
     return lanes, moved / unit[:, None], total / np.sqrt(alone[:, None] * alone)
+
+
+def _correlated(image: FloatArray, kernel: FloatArray) -> FloatArray:
+    """Correlation of a kernel with an image where it lies within."""
+    return np.asarray(np.einsum("ijkl,kl", np.lib.stride_tricks.sliding_window_view(image, kernel.shape), kernel))

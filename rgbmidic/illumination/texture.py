@@ -13,7 +13,6 @@ from functools import cached_property, lru_cache
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import nnls
 
 from rgbmidic.errors import InputError
 from rgbmidic.typing import FloatArray
@@ -208,6 +207,8 @@ def _mixture(
         small_offset = np.append(np.zeros(len(widths)), 0.05)
         system = np.vstack([system, 1e3 * sum_to_one, 1e3 * fine, small_offset])
         wanted = np.concatenate([np.zeros(r.size), [1e3, 0.0, 0.0]])
+    from scipy.optimize import nnls  # half a second to import
+
     solution = nnls(system, wanted)[0]
     total = solution[:-1].sum() - solution[-1]
     if not total > 0.1 * solution[:-1].sum():

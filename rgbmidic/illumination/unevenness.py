@@ -37,8 +37,6 @@ def unevenness(
     -------
     float
     """
-    from scipy.signal import savgol_coeffs, savgol_filter  # a second to import
-
     if samples.size < 1000:
         return float("nan")
     count = np.bincount(samples // step).astype(np.float64)
@@ -51,8 +49,9 @@ def unevenness(
         known &= noise.variance(step * np.arange(count.size) - black) >= (SMOOTHED * step) ** 2
     if known.sum() < 30:
         return float("nan")
-    kept = 1 - savgol_coeffs(WINDOW, 2)[WINDOW // 2]  # of the variance of counting, by the residual of the parabola
-    square = (count - savgol_filter(count, WINDOW, 2, mode="constant"))[known] ** 2 / kept
+    middle = np.linalg.pinv(np.vander(np.arange(WINDOW) - WINDOW // 2, 3))[-1]  # of the parabola through a window
+    kept = 1 - middle[WINDOW // 2]  # of the variance of counting, by the residual of the parabola
+    square = (count - np.convolve(count, middle, mode="same"))[known] ** 2 / kept
     chance = SIGNIFICANCE * np.sqrt(2 * known.sum())
     if (square / around[known]).sum() - known.sum() < chance:
         return 0.0

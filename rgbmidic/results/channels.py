@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from rgbmidic.errors import InputError
 from rgbmidic.settings import regular
@@ -186,6 +185,8 @@ class Channels:
         InputError
             There is no such channel, too little of the history is known, or the two do not correlate.
         """
+        from scipy.optimize import minimize_scalar  # half a second to import
+
         signal, there = self.named(name), np.isfinite(values) & np.isfinite(times)
         at, wanted = times[there], values[there]
         if len(at) < _FEWEST or not np.ptp(wanted) > 0:
