@@ -99,14 +99,15 @@ def history(
     Positions are in px on the reference; an option of a position may be given several times.
     """
     from rgbmidic.report import history_figure, save_figure
-    from rgbmidic.results import channels_of, history_rows, probes_of, write_histories
+    from rgbmidic.results import history_rows, write_histories
     from rgbmidic.results.files import check_file
     from rgbmidic.results.histories import read_histories
+    from rgbmidic.settings import ChannelSettings, ProbeSettings
 
     for file in (out, command.picture_beside(out)) if out else ():
         check_file(file, overwrite=overwrite)
     result, settings = opened.result, opened.settings
-    kept = probes_of(result) if settings is None else settings.probes
+    kept = result.section(ProbeSettings) if settings is None else settings.probes
     if (asked := sorted(_TIP.keys() & probes.keys())) and not (probes.get("tips") or kept.tips):
         raise InputError(f"--{asked[0].replace('_', '-')} is of a crack's tip, and none is stated: --tip X,Y:R0,R1")
     added = {key: (*getattr(kept, key), *probes[key]) for key in _PLACES}
@@ -114,7 +115,7 @@ def history(
         result,
         replace(kept, **(probes | added)),
         scale=opened.scale_in(px=px),
-        channels=replace(channels_of(result) if settings is None else settings.channels, **channels),
+        channels=replace(result.section(ChannelSettings) if settings is None else settings.channels, **channels),
     )
     if out is not None:
         write_histories(histories, out, overwrite=overwrite)

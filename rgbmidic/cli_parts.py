@@ -43,9 +43,9 @@ class Opened:
 
     def scale_in(self, *, px: bool) -> ScaleSettings | None:
         """The same, with lengths in px though the scale may be known."""
-        from rgbmidic.results.physical import scale_of
+        from rgbmidic.settings import ScaleSettings
 
-        return replace(self.scale or scale_of(self.result), unit="px") if px else self.scale
+        return replace(self.scale or self.result.section(ScaleSettings), unit="px") if px else self.scale
 
     def maps(self, derived: Mapping[str, Any]) -> Maps:
         """The fields of the result, as the options of `derived_options` derive them."""

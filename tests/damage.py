@@ -17,7 +17,7 @@ import numpy as np
 from results import make_origin, random_record
 
 from rgbmidic.errors import ResultError
-from rgbmidic.results import FrameRecord, Result, ResultStore, probes_of, scale_of
+from rgbmidic.results import FrameRecord, Result, ResultStore
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, SolverSettings, TestSettings
 
 FRAMES = 6
@@ -172,7 +172,9 @@ def _resumed(copy: Path, truth: Result) -> bool:
 
 def _check_shared(result: Result, truth: Result) -> None:
     assert (result.names, result.lights) == (truth.names, truth.lights)
-    assert (scale_of(result), probes_of(result)) == (scale_of(truth), probes_of(truth))
+    assert [result.section(kind) for kind in (ScaleSettings, ProbeSettings)] == [
+        truth.section(kind) for kind in (ScaleSettings, ProbeSettings)
+    ]
     np.testing.assert_array_equal(result.nodes, truth.nodes)
     np.testing.assert_array_equal(result.elements, truth.elements)
     if result.reference is not None:  # pictures; a result may be without

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rgbmidic.fields import History
 from rgbmidic.report import style
 from rgbmidic.report.figures import field_colours, spread
 from rgbmidic.report.summary import NoiseFloor, TimeHistory
-from rgbmidic.results import QUANTITIES, Histories, HistoryColumn, Profile, Wave
+from rgbmidic.results import QUANTITIES, Histories, Profile, Wave
 from rgbmidic.text import uncertain
 from rgbmidic.typing import FloatArray
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-Panel = tuple[str, Sequence[HistoryColumn]]
+Panel = tuple[str, Sequence[History]]
 """Label of a panel and the quantities that it shows over the time; without a label: one over the other."""
 _KIND = re.compile(
     "(?:^|_)(velocity|acceleration|strain_rate|rate|strain|extension|opening|sliding|direction|stress)(_before|_after)?$"
@@ -81,7 +82,7 @@ def history_panels(histories: Histories) -> list[Panel]:
 
     Where a stress is known, a last panel has it and the strain.
     """
-    panels: dict[str, list[HistoryColumn]] = {}
+    panels: dict[str, list[History]] = {}
     for quantity in histories.quantities:
         kind = quantity.name  # of a channel that is not a probe's
         if quantity.std is not None or quantity.name == "stress":
@@ -136,7 +137,7 @@ def history_figure(histories: Histories, panels: Sequence[Panel] = (), *, most: 
     return style.draw_figure(draw, count=len(panels), aspect=0.45, beside=style.LEGEND, tallest=tallest)
 
 
-def _draw_quantities(axis: Axes, times: FloatArray, quantities: Sequence[HistoryColumn]) -> None:
+def _draw_quantities(axis: Axes, times: FloatArray, quantities: Sequence[History]) -> None:
     """Draw quantities over the times (T,), with bands of two standard uncertainties; their values set the limits."""
     colours: dict[str, Any] = {}
     step = -(-len(quantities) // 14)  # more names of 7 points are higher than a panel: a crack has a quantity a node

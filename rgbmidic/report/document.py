@@ -18,11 +18,11 @@ from rgbmidic.report.gallery import REPORT
 from rgbmidic.report.page import render
 from rgbmidic.report.style import PAGE_DPI, time_text
 from rgbmidic.report.summary import TimeHistory, noise_floor, speckle_size
-from rgbmidic.results import QUANTITIES, Maps, Result, channels_of, probes_of
+from rgbmidic.results import QUANTITIES, Maps, Result
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.physical import Physical
-from rgbmidic.settings import ProbeSettings, SetupSettings, TestSettings, read_section
+from rgbmidic.settings import ChannelSettings, ProbeSettings, SetupSettings, TestSettings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,10 +105,9 @@ def write_report(
             f"a report is a page, .html or .htm, not {out.name}; for a PDF open the page in a browser and print it"
         )
     check_file(out, overwrite=overwrite)
-    kept = result.provenance.get("settings", {}).get("setup", {})
-    setup = read_section(SetupSettings, "setup", kept) if settings is None else settings.setup
-    probes = probes_of(result) if settings is None else settings.probes
-    channels = channels_of(result) if settings is None else settings.channels
+    setup = result.section(SetupSettings) if settings is None else settings.setup
+    probes = result.section(ProbeSettings) if settings is None else settings.probes
+    channels = result.section(ChannelSettings) if settings is None else settings.channels
     physical = Physical.of(result, None if settings is None else settings.scale)
     for frame in frames or ():
         result.frame(frame)  # an error of one is raised before the long work

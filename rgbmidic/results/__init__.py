@@ -4,9 +4,9 @@ from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
-from rgbmidic.results.histories import Histories, HistoryColumn, history_rows, write_histories
+from rgbmidic.results.histories import Histories, history_rows, write_histories
 from rgbmidic.results.maps import Maps, MapValues
-from rgbmidic.results.physical import channels_of, frame_times, placement_of, probes_of, scale_of, shared_part
+from rgbmidic.results.physical import frame_times, placement_of, shared_part
 from rgbmidic.results.profiles import Profile, Wave, read_profile, write_profile
 from rgbmidic.results.provenance import Origin
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, Quantity
@@ -21,7 +21,6 @@ __all__ = [
     "Channels",
     "FrameRecord",
     "Histories",
-    "HistoryColumn",
     "MapValues",
     "Maps",
     "Origin",
@@ -30,15 +29,12 @@ __all__ = [
     "Result",
     "ResultStore",
     "Wave",
-    "channels_of",
     "export_result",
     "finish_result",
     "frame_times",
     "history_rows",
     "placement_of",
-    "probes_of",
     "read_profile",
-    "scale_of",
     "shared_part",
     "speckle_diameter",
     "write_histories",

@@ -31,9 +31,6 @@ from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.text import rounded
 from rgbmidic.typing import FloatArray, IntArray
 
-HistoryColumn = History
-"""A column of `Histories`: one quantity over the frames in the reader's unit."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Histories:
@@ -62,12 +59,12 @@ class Histories:
     status: IntArray
     times: FloatArray | None
     units: Units
-    quantities: tuple[HistoryColumn, ...] = ()
+    quantities: tuple[History, ...] = ()
     stress_strain: tuple[str, str] | None = None
     remarks: tuple[str, ...] = ()
     channels: Channels | None = None
 
-    def __getitem__(self, name: str) -> HistoryColumn:
+    def __getitem__(self, name: str) -> History:
         """Return the quantity of a name, or of a column name with unit."""
         for quantity in self.quantities:
             if name in (quantity.name, quantity.column):
@@ -259,14 +256,14 @@ def _read(
     return nodal, histories, speed
 
 
-def _in_units(history: History, units: Units, rate: Callable[..., Rates] | None) -> Iterator[HistoryColumn]:
+def _in_units(history: History, units: Units, rate: Callable[..., Rates] | None) -> Iterator[History]:
     """Convert a history to the reader's units; add its rates, if asked for, at kinks those of both sides."""
     length = history.unit == "px"
     unit = units.length if length else history.unit
 
-    def entry(name: str, unit: str, values: FloatArray, std: FloatArray) -> HistoryColumn:
+    def entry(name: str, unit: str, values: FloatArray, std: FloatArray) -> History:
         values, std = units.lengths(values, std) if length else (values, std)
-        return HistoryColumn(name=name, unit=unit, values=values, std=std)
+        return History(name=name, unit=unit, values=values, std=std)
 
     if history.std is None:
         yield history
@@ -339,14 +336,14 @@ def with_channels(histories: Histories, stated: ChannelSettings) -> Histories:
         raise InputError(
             f"channels of {stated.file} have the names of columns of the history, rename: {', '.join(both)}"
         )
-    beside = [HistoryColumn(name=name, unit="", values=values, std=None) for name, values in read.items()]
+    beside = [History(name=name, unit="", values=values, std=None) for name, values in read.items()]
     for name, values in read.items():
         if missing := int(np.isnan(values).sum()):
             remarks.append(f"the channel {name} has no value in {missing} of {len(histories.frames)} frames")
     pair = None
     if stated.area is not None:
         name, newtons = channels.force(stated.force)
-        beside.append(HistoryColumn(name="stress", unit="MPa", values=read[name] * newtons / stated.area, std=None))
+        beside.append(History(name="stress", unit="MPa", values=read[name] * newtons / stated.area, std=None))
         strain = next((one.name for one in histories.quantities if one.name.endswith(("_strain", "_e1"))), None)
         pair = (strain, "stress") if strain else None
     return replace(

@@ -21,7 +21,7 @@ from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, st
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.derived import COMPONENTS, DERIVED, FINER, STRAINS, UV, WITH_ERROR, map_quantities
-from rgbmidic.results.physical import MOVED, Physical, frame_times, named, reference_frames, scale_of, shared_part
+from rgbmidic.results.physical import MOVED, Physical, frame_times, named, reference_frames, shared_part
 from rgbmidic.results.quantities import UNKNOWN_TIME, Quantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
@@ -425,7 +425,7 @@ class Maps:
     def _units(self) -> Units:
         """Units with that of time, for which one frame is read: `_clock` reads all."""
         first = next(iter(self.result.each("time_ns", self._there[:1])), UNKNOWN_TIME)
-        scale = self.physical.scale or scale_of(self.result)
+        scale = self.physical.scale or self.result.section(ScaleSettings)
         rate = scale.frame_rate or self.result.provenance.get("frame_rate")
         return replace(self.physical.units, timed=bool(rate) or first != UNKNOWN_TIME)
 

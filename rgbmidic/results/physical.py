@@ -22,58 +22,13 @@ from rgbmidic.mesh import Placement, Tri3Mesh
 from rgbmidic.results.derived import ELEMENT_STRAIN, STRAIN
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, Quantity
 from rgbmidic.results.result import Result
-from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings, read_section
+from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
 
 MOVED = ("u", "v", "u_std", "v_std")
 """Displacement and its standard uncertainty, in the order in which functions take them."""
-
-
-def scale_of(result: Result) -> ScaleSettings:
-    """Return the ``[scale]`` that a result was measured with.
-
-    Parameters
-    ----------
-    result
-        The result.
-
-    Returns
-    -------
-    ScaleSettings
-    """
-    return read_section(ScaleSettings, "scale", result.provenance.get("settings", {}).get("scale", {}))
-
-
-def probes_of(result: Result) -> ProbeSettings:
-    """Return the ``[probes]`` that a result was measured with.
-
-    Parameters
-    ----------
-    result
-        The result.
-
-    Returns
-    -------
-    ProbeSettings
-    """
-    return read_section(ProbeSettings, "probes", result.provenance.get("settings", {}).get("probes", {}))
-
-
-def channels_of(result: Result) -> ChannelSettings:
-    """Return the ``[channels]`` that a result was measured with.
-
-    Parameters
-    ----------
-    result
-        The result.
-
-    Returns
-    -------
-    ChannelSettings
-    """
-    return read_section(ChannelSettings, "channels", result.provenance.get("settings", {}).get("channels", {}))
 
 
 def rectification_of(
@@ -97,7 +52,7 @@ def rectification_of(
     InputError
         The camera holds no plane.
     """
-    stated, camera = scale_of(result) if scale is None else scale, None
+    stated, camera = result.section(ScaleSettings) if scale is None else scale, None
     stated = replace(stated, unit=unit or stated.unit)
     if stated.unit == "px":
         stated = replace(stated, mm_per_pixel=None, mm_per_pixel_std=0.0, camera=None)
@@ -114,7 +69,11 @@ def rectification_of(
 
 def _kept_camera(result: Result) -> CameraCalibration | None:
     document = result.provenance.get("camera")
-    return None if document is None else CameraCalibration.from_document(document, str(scale_of(result).camera))
+    return (
+        None
+        if document is None
+        else CameraCalibration.from_document(document, str(result.section(ScaleSettings).camera))
+    )
 
 
 def placement_of(result: Result) -> Placement | None:
@@ -151,7 +110,7 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     ndarray, shape (T,), or None
         In seconds, NaN for frames that are not measured yet; None where no time is known.
     """
-    scale = scale_of(result) if scale is None else scale
+    scale = result.section(ScaleSettings) if scale is None else scale
     there = result.finished
     stamps, numbers = result.time_ns[there], result.number[there]
     if (stamps == UNKNOWN_TIME).any():

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,8 @@ from rgbmidic.results.provenance import fingerprint, read_provenance
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord, Quantities
 from rgbmidic.results.records import FrameTable
 from rgbmidic.results.store import check_complete, listed, load_frames, load_result, read_reference
+from rgbmidic.settings.conversion import read_section
+from rgbmidic.settings.schema import section_kinds
 from rgbmidic.text import Described
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from rgbmidic.settings import ScaleSettings
+
+S = TypeVar("S")
 
 logger = logging.getLogger(__name__)
 
@@ -166,6 +170,21 @@ class Result(Quantities, Described):
         """Indices of the frames that are no reference."""
         references = set(self.provenance["references"])
         return tuple(index for index in range(len(self)) if index not in references)
+
+    def section(self, kind: type[S]) -> S:
+        """Return a section of the settings that the result was measured with; its defaults where none were kept.
+
+        Parameters
+        ----------
+        kind
+            Class of the section, such as `rgbmidic.settings.ScaleSettings`.
+
+        Returns
+        -------
+        object of `kind`
+        """
+        name = next(name for name, known in section_kinds().items() if known is kind)
+        return read_section(kind, name, self.provenance.get("settings", {}).get(name, {}))
 
     def setting(self, section: str, key: str, default: Any = None) -> Any:
         """Return a setting of the run, as TEST.toml names it; `default` where it was not kept.

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import FiniteElementMesh, Placement, read_mesh
-from rgbmidic.results.physical import placement_of, rectification_of, scale_of
+from rgbmidic.results.physical import placement_of, rectification_of
 from rgbmidic.results.result import Result
 from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, regular
 from rgbmidic.typing import FloatArray, IntArray
@@ -240,7 +240,7 @@ def place(result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence
             "--points X_MM,Y_MM:X_PX,Y_PX each"
         )
     found = Placement.fit(known, rectification_of(result, scale, "mm").camera, where=where)
-    stated = (scale or scale_of(result)).mm_per_pixel  # half a pixel at each end of 100 px is .7 % of it
+    stated = (scale or result.section(ScaleSettings)).mm_per_pixel  # half a pixel at each end of 100 px is .7 % of it
     if found.mm_per_pixel is not None and stated is not None and abs(found.mm_per_pixel / stated - 1) > 0.01:
         text = "%s state %.6g mm per px, scale.mm_per_pixel %.6g: the former is taken"
         logger.warning(text, where, found.mm_per_pixel, stated)

@@ -15,9 +15,10 @@ import numpy.typing as npt
 from bokeh.document import Document
 
 from rgbmidic.errors import ResultError, RgbmidicError
+from rgbmidic.fields import History
 from rgbmidic.report import history_figure
 from rgbmidic.report.style import OKABE_ITO, time_axis, time_unit
-from rgbmidic.results import Channels, Histories, HistoryColumn, Result, probes_of
+from rgbmidic.results import Channels, Histories, Result
 from rgbmidic.results.histories import frames_alone, history_csv, read_histories, with_channels
 from rgbmidic.settings import ProbeSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
@@ -74,13 +75,13 @@ def read(
     result: Result, marks: Sequence[Mark], gauge: float, measure: str | None = None, scale: ScaleSettings | None = None
 ) -> Histories | None:
     """Read the probes that marks make off a result, as `read_histories`; None where they make none."""
-    made = probes(marks, gauge, probes_of(result), measure)
+    made = probes(marks, gauge, result.section(ProbeSettings), measure)
     return read_histories(result, made, scale=scale) if made.places else None
 
 
-def groups(histories: Histories, names: Iterable[str]) -> dict[str, list[HistoryColumn]]:
+def groups(histories: Histories, names: Iterable[str]) -> dict[str, list[History]]:
     """Group the same quantity of the probes of some names, by its name and unit; channels are alone."""
-    found: dict[str, list[HistoryColumn]] = {}
+    found: dict[str, list[History]] = {}
     for quantity in histories.quantities:
         if quantity.name.endswith(("_before", "_after")):  # single frames, no curve
             continue
@@ -89,7 +90,7 @@ def groups(histories: Histories, names: Iterable[str]) -> dict[str, list[History
     return found
 
 
-def band(x: FloatArray, quantity: HistoryColumn) -> tuple[list[FloatArray], list[FloatArray]]:
+def band(x: FloatArray, quantity: History) -> tuple[list[FloatArray], list[FloatArray]]:
     """Outline two standard uncertainties on both sides, for each stretch of frames without a gap: their x and y."""
     if quantity.std is None:
         return [], []
@@ -110,7 +111,7 @@ def as_csv(histories: Histories) -> str:
     return file.getvalue().decode("utf-8")
 
 
-def _probe(quantity: HistoryColumn, names: Iterable[str]) -> str:
+def _probe(quantity: History, names: Iterable[str]) -> str:
     """Return the name of the probe, of some names, that a quantity is of; empty: it is a channel."""
     return max((name for name in names if quantity.name.startswith(f"{name}_")), key=len, default="")
 
@@ -332,7 +333,7 @@ class CurvePanel:
         self._offer()
         self.point(self._shown.view.frame)
 
-    def _combine(self) -> dict[str, list[HistoryColumn]]:
+    def _combine(self) -> dict[str, list[History]]:
         """Add the channels as they are stated to the probes; what is wrong with them is reported. Return the groups."""
         stated, view, text = self._shown.channels, self._shown.view, ""
         self.histories, self.channels, self._drawn = self._probed, None, (stated, view.along, view.beside)
@@ -414,7 +415,7 @@ class CurvePanel:
         return int(self.histories.frames[np.nanargmin(np.abs(self._x[0] - x))])
 
     @property
-    def _over(self) -> HistoryColumn | None:
+    def _over(self) -> History | None:
         """The quantity along x; None: the time."""
         quantities = () if self.histories is None else self.histories.quantities
         return next((one for one in quantities if one.name == self._shown.view.along), None)

@@ -15,9 +15,10 @@ import numpy.typing as npt
 from bokeh.document import Document
 
 from rgbmidic.errors import ResultError
+from rgbmidic.fields import History
 from rgbmidic.report import profile_figure
 from rgbmidic.report.style import time_axis
-from rgbmidic.results import HistoryColumn, Maps, MapValues
+from rgbmidic.results import Maps, MapValues
 from rgbmidic.results.profiles import Profile
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.view.address import probe_marks, probe_place
@@ -222,7 +223,7 @@ class LinePanel:
         profile = self._reading.profile
         along, std = profile.line.read(values.values, values.std, profile.kind)
         self._line.data = {"x": profile.positions, "y": along}
-        curve = HistoryColumn(name=profile.field.name, unit=profile.field.unit, values=along, std=std)
+        curve = History(name=profile.field.name, unit=profile.field.unit, values=along, std=std)
         self._bands.data = dict(zip(("xs", "ys"), band(profile.positions, curve), strict=True))
         at = self._clock[0][frame]
         self.now.location, self.profile.title.text = float(at) if np.isfinite(at) else None, f"Profile in frame {frame}"

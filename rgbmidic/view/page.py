@@ -15,7 +15,8 @@ from bokeh.events import DocumentReady, Tap
 
 from rgbmidic.errors import RgbmidicError
 from rgbmidic.report.style import embedded
-from rgbmidic.results import Result, channels_of, probes_of
+from rgbmidic.results import Result
+from rgbmidic.settings import ChannelSettings, ProbeSettings
 from rgbmidic.text import uncertain
 from rgbmidic.view.address import BESIDE, OVER, SCALE, UNCERTAINTY, Mark, Steps, ViewState
 from rgbmidic.view.canvas import Canvas
@@ -50,8 +51,8 @@ class ResultPage:
 
     def __init__(self, document: Document, result: Result, view: ViewState, progress: Progress) -> None:
         self.document, self.progress = document, progress
-        self.shown = ShownFields(result, view.with_channels(channels_of(result)))
-        self.shown.view = view = with_probes(self.shown.view, probes_of(result), self.shown.gauge)
+        self.shown = ShownFields(result, view.with_channels(result.section(ChannelSettings)))
+        self.shown.view = view = with_probes(self.shown.view, result.section(ProbeSettings), self.shown.gauge)
         self._told = False
         self._pointer: tuple[float, float] | None = None
         self._grown = 0

@@ -11,7 +11,6 @@ from typing import Any
 from bokeh.events import Pan, PanEnd, PanStart
 
 from rgbmidic.errors import InputError
-from rgbmidic.results import probes_of
 from rgbmidic.settings import PROBE_NAME, ProbeSettings, read_section
 from rgbmidic.view.address import SCALE, Mark, ViewState, probe_marks
 from rgbmidic.view.curves import CurvePanel, marks_of, probes
@@ -129,7 +128,7 @@ class FileButtons:
         """Write the chosen sections into a TEST.toml, which must be confirmed where it exists."""
         p, shown = self._parts, self._shown
         draft = Draft.of_result(shown.result, Path(p.file.value))
-        made = probes(shown.view.marks, shown.gauge, probes_of(shown.result), shown.measure)
+        made = probes(shown.view.marks, shown.gauge, shown.result.section(ProbeSettings), shown.measure)
         ready: dict[str, Callable[[], dict[str, Any]]] = {
             "probes": lambda: probe_section(draft, made),
             "channels": lambda: channel_section(draft, shown.channels),

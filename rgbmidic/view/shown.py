@@ -12,7 +12,6 @@ import numpy as np
 from rgbmidic.fields import MEASURES
 from rgbmidic.fields.strain import shortest_gauge
 from rgbmidic.results import Maps, MapValues, Profile, Result
-from rgbmidic.results.physical import scale_of
 from rgbmidic.settings import ChannelSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import BESIDE, UNCERTAINTY, ViewState
@@ -74,7 +73,7 @@ class ShownFields:
 
     def rescale(self) -> bool:
         """Take the scale of the view; returns whether it is another one."""
-        scale = self.view.scale_settings(self.base, scale_of(self.result))
+        scale = self.view.scale_settings(self.base, self.result.section(ScaleSettings))
         if scale == self.scale:
             return False
         self.maps, self.scale = Maps.of(self.result, scale), scale

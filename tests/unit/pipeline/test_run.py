@@ -30,9 +30,9 @@ from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.pipeline import Plan, engine, frame, measure, run
 from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import ProcessState
-from rgbmidic.results import Maps, Result, finish_result, scale_of
+from rgbmidic.results import Maps, Result, finish_result
 from rgbmidic.results.physical import Physical
-from rgbmidic.settings import TestSettings
+from rgbmidic.settings import ScaleSettings, TestSettings
 
 COUNT, SHAPE = 36, (72, 80)
 in_order = partial(measure, workers=1)
@@ -383,7 +383,7 @@ def test_how_a_result_is_read_is_stated_anew_by_going_on_with_it(movie: Path, wh
     (out / "provenance.json").write_text(text)
     scaled = TestSettings.from_mapping({**settings(movie).to_mapping(), "scale": {"mm_per_pixel": 0.02}}, movie)
     result = measure(scaled, out, resume=True)
-    assert (scale_of(whole).mm_per_pixel, scale_of(result).mm_per_pixel) == (None, 0.02)
+    assert (whole.section(ScaleSettings).mm_per_pixel, result.section(ScaleSettings).mm_per_pixel) == (None, 0.02)
     assert result.provenance["finished"] == whole.provenance["finished"]
     same(result, whole)
     camera = CameraCalibration(shape=SHAPE[-2:], homography=np.diag([0.02, 0.02, 1]))

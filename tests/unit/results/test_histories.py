@@ -17,7 +17,7 @@ from results import MESH, NODES, make_origin, make_result
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import ConfigurationError, InputError
-from rgbmidic.fields import Units
+from rgbmidic.fields import History, Units
 from rgbmidic.fields.history import rate_words
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.report import history_figure
@@ -30,10 +30,9 @@ from rgbmidic.results import (
     Origin,
     Result,
     ResultStore,
-    probes_of,
     write_histories,
 )
-from rgbmidic.results.histories import HistoryColumn, history_csv, read_histories, with_channels
+from rgbmidic.results.histories import history_csv, read_histories, with_channels
 from rgbmidic.settings import (
     ChannelSettings,
     FrameSettings,
@@ -264,7 +263,7 @@ def test_a_channel_file_that_is_none_is_one_line(tmp_path: Path, text: str, word
         Channels.read(tmp_path / "c.csv")
 
 
-def histories_of(times: np.ndarray, *quantities: HistoryColumn) -> Histories:
+def histories_of(times: np.ndarray, *quantities: History) -> Histories:
     """Histories of frames that are all there."""
     numbers = np.arange(len(times))
     return Histories(
@@ -281,7 +280,7 @@ def histories_of(times: np.ndarray, *quantities: HistoryColumn) -> Histories:
 
 def test_a_channel_does_not_take_the_place_of_a_measured_column(tmp_path: Path) -> None:
     times = np.arange(4.0)
-    gauge = HistoryColumn(name="gauge_1_strain", unit="", values=np.full(4, 1e-3), std=np.full(4, 1e-5))
+    gauge = History(name="gauge_1_strain", unit="", values=np.full(4, 1e-3), std=np.full(4, 1e-5))
     for name in ("gauge_1_strain", "frame", "status"):
         (tmp_path / "c.csv").write_text(f"time_s,{name}\n" + "".join(f"{t},{t}\n" for t in times))
         with pytest.raises(InputError, match=f"have the names of columns of the history, rename: {name}"):
@@ -290,7 +289,7 @@ def test_a_channel_does_not_take_the_place_of_a_measured_column(tmp_path: Path) 
 
 def test_doubts_about_the_clock_of_a_channel_file_are_stated(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     times = np.arange(4.0)
-    gauge = HistoryColumn(name="gauge_1_strain", unit="", values=np.zeros(4), std=np.zeros(4))
+    gauge = History(name="gauge_1_strain", unit="", values=np.zeros(4), std=np.zeros(4))
     (tmp_path / "c.csv").write_text("time_s,a\n" + "".join(f"{1000 * t},{t}\n" for t in times))
     found = with_channels(histories_of(times, gauge), ChannelSettings(file=tmp_path / "c.csv"))
     assert any("the clocks of channels and frames are taken as equal" in remark for remark in found.remarks)
@@ -397,7 +396,7 @@ def test_a_probe_that_no_frame_measures_and_a_result_without_probes_are_refused(
 def test_the_command_takes_the_test_s_probes_and_its_own_and_writes_table_and_picture(
     result: Result, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert probes_of(result) == ProbeSettings(points=(PLACE,))
+    assert result.section(ProbeSettings) == ProbeSettings(points=(PLACE,))
     out = tmp_path / "h.csv"
     assert command(result.path, "--point", "60,40", "--gauge", "20,15:90,60", "--window", 5, "--out", out) == 0
     printed = capsys.readouterr()
@@ -542,7 +541,7 @@ def test_what_is_cut_off_a_probe_is_stated(result: Result) -> None:
 
 
 def test_of_many_channels_the_first_are_drawn(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    columns = [HistoryColumn(name=f"c{i}", unit=f"u{i}", values=np.arange(4.0), std=None) for i in range(40)]
+    columns = [History(name=f"c{i}", unit=f"u{i}", values=np.arange(4.0), std=None) for i in range(40)]
     assert len(history_figure(histories_of(np.arange(4.0), *columns)).axes) == 24
     assert "the picture shows 24 of 40 kinds" in caplog.text
 

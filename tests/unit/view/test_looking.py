@@ -430,9 +430,9 @@ def test_curves_are_grouped_by_what_they_tell_and_saved_as_the_command_does(tmp_
 
 
 def test_the_band_is_open_where_a_frame_is_missing():
-    from rgbmidic.results import HistoryColumn
+    from rgbmidic.fields import History
 
-    told = HistoryColumn(name="a", unit="", values=np.array([1.0, 2, np.nan, 4, 5, 6]), std=np.full(6, 0.5))
+    told = History(name="a", unit="", values=np.array([1.0, 2, np.nan, 4, 5, 6]), std=np.full(6, 0.5))
     xs, ys = curves.band(np.arange(6.0), told)
     assert [list(x) for x in xs] == [[0, 1, 1, 0], [3, 4, 5, 5, 4, 3]]
     assert list(ys[0]) == [0, 1, 3, 2]
