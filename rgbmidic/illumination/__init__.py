@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rgbmidic.illumination.crosstalk import unmix
-    from rgbmidic.illumination.images import REFLECTING, IlluminationImages
+    from rgbmidic.illumination.images import IlluminationImages
     from rgbmidic.illumination.linear import linearise
     from rgbmidic.illumination.separation import demosaic, separate
 
-__all__ = ["REFLECTING", "IlluminationImages", "demosaic", "linearise", "separate", "unmix"]
+__all__ = ["IlluminationImages", "demosaic", "linearise", "separate", "unmix"]
 
 _HOMES = {
-    "REFLECTING": "images",
     "IlluminationImages": "images",
     "demosaic": "separation",
     "linearise": "linear",

@@ -4,7 +4,7 @@ Fixed linear filters (Malvar, He, Cutler 2004) and normalisation assume that the
 coloured lights that holds where the paint is mat and breaks where one light reflects.
 
 The reflection-aware method measures, block by block, how much of each channel's contrast is common and how much
-channel-specific (`rgbmidic.illumination.colour_factors`), and predicts every channel at every pixel from the samples
+channel-specific (`rgbmidic.illumination.mosaic_statistics`), and predicts every channel at every pixel from the samples
 around with exactly that trust (simple kriging). A channel in a reflection no longer leaks into the others, its sparkle
 is kept, the coarse lattices of red and blue are filled from what the others see; a coloured specimen, whose channels
 have nothing in common, is reconstructed channel by channel.
@@ -32,22 +32,24 @@ from rgbmidic._kernels.demosaicing import TILE, fill_unknown, predict, predictio
 from rgbmidic._kernels.illumination import PAD, malvar, pad_mosaic
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
-from rgbmidic.illumination.colour_factors import (
+from rgbmidic.illumination.crosstalk import Crosstalk, needed
+from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
+from rgbmidic.illumination.mosaic_statistics import (
     BLOCK,
     MEAN_BLOCK,
     ColourFactors,
+    LightDisplacement,
     Moments,
     colour_factors,
     enlarged,
     gather_moments,
     learn_texture,
+    light_displacement,
     local_means,
     scaled,
+    seen_lights,
     widened,
 )
-from rgbmidic.illumination.crosstalk import Crosstalk, needed
-from rgbmidic.illumination.displacement import LightDisplacement, light_displacement, seen_lights
-from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -62,18 +64,6 @@ class Demosaicer(Protocol):
 
     def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
         """Demosaic a linearised frame."""
-
-
-def check_mosaic(mosaic: LinearMosaic) -> None:
-    """Raise `InputError` unless `mosaic` has at least one full 2x2 cell and consistent arrays."""
-    if not isinstance(mosaic, LinearMosaic):
-        raise InputError(f"demosaicing takes a LinearMosaic, not {type(mosaic).__name__}")
-    if mosaic.values.ndim != 2 or min(mosaic.values.shape) < 2:
-        raise InputError(f"a mosaic has at least 2 rows and 2 columns; given is shape {mosaic.values.shape}")
-    if mosaic.saturated.shape != mosaic.values.shape:
-        raise InputError(
-            f"the saturation mask has shape {mosaic.saturated.shape}, the mosaic has {mosaic.values.shape}"
-        )
 
 
 def red_position(cfa: str) -> tuple[int, int]:
@@ -96,10 +86,9 @@ class MalvarDemosaicer:
 
     def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
         """Demosaic; see `Demosaicer`."""
-        check_mosaic(mosaic)
         values = np.empty((3, *mosaic.values.shape), dtype=np.float32)
         padded = np.empty([side + 2 * PAD for side in mosaic.values.shape], dtype=np.float32)
-        pad_mosaic(np.ascontiguousarray(mosaic.values, dtype=np.float32), np.asarray(mosaic.saturated, bool), padded)
+        pad_mosaic(mosaic.values, mosaic.saturated, padded)
         malvar(padded, *red_position(mosaic.cfa), values)
         return LinearChannels(values=values, valid=np.isfinite(values), full_scale=mosaic.full_scale)
 
@@ -114,9 +103,7 @@ class NormalisedMosaic:
 
     def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
         """Return channels that show one image; see `Demosaicer`."""
-        check_mosaic(mosaic)
-        saturated = np.asarray(mosaic.saturated, bool)
-        values = np.where(saturated, np.float32(np.nan), mosaic.values).astype(np.float32)
+        values = np.where(mosaic.saturated, np.float32(np.nan), mosaic.values)
         level = enlarged(local_means(values, red_position(mosaic.cfa)), MEAN_BLOCK, values.shape)
         own = np.take_along_axis(level, sampled_channels(mosaic.cfa, values.shape)[None], axis=0)[0]
         out = level * np.divide(values, own, out=np.full_like(values, np.nan), where=own > 0)
@@ -331,17 +318,14 @@ class ReflectionAwareDemosaicer:
         InputError
             The frame is smaller than 64 x 64 px.
         """
-        check_mosaic(mosaic)
         if min(mosaic.values.shape) < SMALLEST_FRAME:
             raise InputError(
                 f"reflection-aware demosaicing needs at least {SMALLEST_FRAME} x {SMALLEST_FRAME} px to know the "
                 f'speckle; the frame has {mosaic.values.shape[1]} x {mosaic.values.shape[0]}: use method "malvar"'
             )
-        saturated = np.asarray(mosaic.saturated, dtype=bool)
-        values = np.ascontiguousarray(mosaic.values, dtype=np.float32)
-        damaged = bool(saturated.any())
+        values, damaged = mosaic.values, bool(mosaic.saturated.any())
         if damaged:
-            values = np.where(saturated, np.float32(np.nan), values)
+            values = np.where(mosaic.saturated, np.float32(np.nan), values)
         moments = gather_moments(values, red_position(mosaic.cfa), mosaic.noise)
         texture = learn_texture(moments) if self.texture is None else self.texture
         matrix = np.eye(3) if self.crosstalk is None else self.crosstalk.matrix
@@ -362,7 +346,7 @@ class ReflectionAwareDemosaicer:
         out, unknown = _predict(moments, factors, table, mixing, damaged=damaged)
         valid = np.ones(out.shape, dtype=bool)
         if damaged:
-            known = _validity(saturated, unknown, mosaic.cfa)
+            known = _validity(mosaic.saturated, unknown, mosaic.cfa)
             valid = np.stack([known[matters].all(axis=0) for matters in needed(mixing)])
         channels = LinearChannels(values=out, valid=valid, full_scale=mosaic.full_scale)
         return Reconstruction(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import CalibrationError
+from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.settings import bounded
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
@@ -60,6 +60,16 @@ class LinearMosaic:
     cfa: str
     full_scale: float
     noise: NoiseModel | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values and convert them to their types."""
+        values, saturated = np.ascontiguousarray(self.values, dtype=np.float32), np.asarray(self.saturated, dtype=bool)
+        if values.ndim != 2 or min(values.shape) < 2:
+            raise InputError(f"a mosaic has at least 2 rows and 2 columns; given is shape {values.shape}")
+        if saturated.shape != values.shape:
+            raise InputError(f"the saturation mask has shape {saturated.shape}, the mosaic has {values.shape}")
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "saturated", saturated)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

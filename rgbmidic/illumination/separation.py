@@ -28,7 +28,6 @@ from rgbmidic.illumination.demosaicing import (
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.typing import FloatArray
 
 DEFAULT_METHOD = "reflection-aware"
 _BY_CHANNEL: dict[str, Demosaicer] = {"malvar": MalvarDemosaicer(), "normalised": NormalisedMosaic()}
@@ -79,22 +78,14 @@ def separate(
     if isinstance(linear, LinearChannels):
         return unmix(linear, crosstalk)
     method = _chosen(method, linear)
-    _check_channels(crosstalk)
+    if crosstalk.matrix.shape[0] != 3:
+        rows = crosstalk.matrix.shape[0]
+        raise InputError(f"a Bayer mosaic has 3 camera channels; the crosstalk matrix has {rows} rows")
     if method != DEFAULT_METHOD:
         return unmix(_BY_CHANNEL[method](linear), crosstalk)
-    demosaicer = ReflectionAwareDemosaicer(crosstalk=crosstalk, texture=texture)
-    if crosstalk.field is not None:
-        return reconstructed_lights(demosaicer.reconstruct(linear), crosstalk)
-    model = demosaicer.reconstruct(linear, crosstalk.unmixing)
-    return IlluminationImages(
-        values=model.channels.values,
-        valid=model.channels.valid,
-        names=crosstalk.lights,
-        full_scale=linear.full_scale,
-        reflection=_reflection(model, crosstalk),
-        displacement=model.displacement,
-        texture=model.texture,
-    )
+    mixing = crosstalk.unmixing if crosstalk.field is None else None
+    model = ReflectionAwareDemosaicer(crosstalk=crosstalk, texture=texture).reconstruct(linear, mixing)
+    return reconstructed_lights(model, crosstalk, unmixed=mixing is not None)
 
 
 def demosaic(
@@ -126,20 +117,31 @@ def demosaic(
         Unknown method, or a frame too small for it.
     """
     linear = linearise(mosaic) if isinstance(mosaic, Mosaic) else mosaic
-    assert isinstance(linear, LinearMosaic)
+    if not isinstance(linear, LinearMosaic):
+        raise InputError(f"demosaicing takes a LinearMosaic, not {type(linear).__name__}")
     if (chosen := _chosen(method, linear)) != DEFAULT_METHOD:
         return _BY_CHANNEL[chosen](linear)
     return ReflectionAwareDemosaicer(crosstalk=crosstalk, texture=texture)(linear)
 
 
-def reconstructed_lights(reconstruction: Reconstruction, crosstalk: Crosstalk) -> IlluminationImages:
-    """The lights of a frame, and their reflection index, from what the reflection-aware method made of its channels."""
-    images = unmix(reconstruction.channels, crosstalk)
-    return replace(
-        images,
-        reflection=_reflection(reconstruction, crosstalk),
-        displacement=reconstruction.displacement,
-        texture=reconstruction.texture,
+def reconstructed_lights(model: Reconstruction, crosstalk: Crosstalk, *, unmixed: bool = False) -> IlluminationImages:
+    """The lights of a frame, and their reflection index, from what the reflection-aware method made of its channels.
+
+    The channels are unmixed, unless what the method gives are the lights already. The index, on the blocks' grid, is
+    how much less contrast a light has than the best one.
+    """
+    height, width = model.factors.slope.shape[1:]
+    level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in model.mean])
+    slope, light = (np.tensordot(crosstalk.unmixing, seen, axes=1) for seen in (model.factors.slope, level))
+    contrast = np.divide(slope, light, out=np.zeros_like(slope), where=light > 1e-3 * light.max())
+    best = contrast.max(axis=0)
+    relative = np.divide(contrast, best, out=np.ones_like(contrast), where=best > 0)
+    found = {"reflection": 1 - np.clip(relative, 0, 1), "displacement": model.displacement, "texture": model.texture}
+    channels = model.channels
+    if not unmixed:
+        return replace(unmix(channels, crosstalk), **found)
+    return IlluminationImages(
+        values=channels.values, valid=channels.valid, names=crosstalk.lights, full_scale=channels.full_scale, **found
     )
 
 
@@ -150,25 +152,6 @@ def _chosen(method: str, mosaic: LinearMosaic) -> str:
     if method not in DEMOSAICERS:
         raise InputError(f"unknown demosaicing method {method!r}; allowed are auto, {', '.join(DEMOSAICERS)}")
     return method
-
-
-def _check_channels(crosstalk: Crosstalk) -> None:
-    if crosstalk.matrix.shape[0] != 3:
-        raise InputError(
-            f"a Bayer mosaic has 3 camera channels; the crosstalk matrix has {crosstalk.matrix.shape[0]} rows"
-        )
-
-
-def _reflection(model: Reconstruction, crosstalk: Crosstalk) -> FloatArray:
-    """Index (k, h, w) on the blocks' grid: how much less contrast a light has than the best one."""
-    height, width = model.factors.slope.shape[1:]
-    level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in model.mean])
-    unmixing = crosstalk.unmixing
-    slope, light = (np.tensordot(unmixing, channels, axes=1) for channels in (model.factors.slope, level))
-    contrast = np.divide(slope, light, out=np.zeros_like(slope), where=light > 1e-3 * light.max())
-    best = contrast.max(axis=0)
-    relative = np.divide(contrast, best, out=np.ones_like(contrast), where=best > 0)
-    return np.asarray(1 - np.clip(relative, 0, 1))
 
 
 RawState = tuple[Mosaic | ChannelFrame, ...] | IlluminationImages
@@ -245,8 +228,11 @@ class Separation:
             images = IlluminationImages.in_succession([one for one in linear if isinstance(one, LinearChannels)], names)
         elif len(linear) > 1:
             raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
+        elif known.crosstalk is None:
+            what = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
+            raise ConfigurationError(f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk")
         else:
-            images = separate(linear[0], self._crosstalk(), self.demosaic, texture=self.texture)
+            images = separate(linear[0], known.crosstalk, self.demosaic, texture=self.texture)
         return replace(images, registration=known.registration)
 
     def within(self, window: Window) -> Separation:
@@ -276,12 +262,6 @@ class Separation:
         Separation
         """
         return replace(self, texture=images.texture)
-
-    def _crosstalk(self) -> Crosstalk:
-        if self.calibration is None or self.calibration.crosstalk is None:
-            what = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
-            raise ConfigurationError(f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk")
-        return self.calibration.crosstalk
 
 
 def light_images(separation: LightSeparation, state: RawState, window: Window) -> IlluminationImages:

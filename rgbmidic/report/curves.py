@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic.fields import History
 from rgbmidic.report import style
 from rgbmidic.report.figures import field_colours, spread
 from rgbmidic.report.summary import NoiseFloor, TimeHistory
-from rgbmidic.results import QUANTITIES, Histories, Profile, Wave
+from rgbmidic.results import QUANTITIES, Histories, History, Profile, Wave
 from rgbmidic.text import uncertain
 from rgbmidic.typing import FloatArray
 

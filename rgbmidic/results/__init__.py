@@ -1,5 +1,6 @@
 """What is kept of a test: one record per frame, the folder that holds them, and other programs' formats."""
 
+from rgbmidic.fields import History
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.results.channels import Channels
@@ -21,6 +22,7 @@ __all__ = [
     "Channels",
     "FrameRecord",
     "Histories",
+    "History",
     "MapValues",
     "Maps",
     "Origin",

@@ -9,8 +9,12 @@ CORE = ("frames", "mesh", "illumination", "weights", "correlation", "fields", "r
 TOOLS = ("typer", "rich", "bokeh", "matplotlib", *(f"rgbmidic.{room}" for room in ("scene", "lab", "report", "view")))
 
 
-def test_the_core_is_imported_without_the_tools() -> None:
+SLOW = ("scipy.signal", "scipy.stats", "scipy.optimize", "numba")
+"""Packages that would double the time until a command begins."""
+
+
+def test_the_core_is_imported_without_tools_and_slow_packages() -> None:
     rooms = ", ".join(f"rgbmidic.{room}" for room in CORE)
-    code = f"import sys, {rooms}\nprint(*sorted(set({TOOLS!r}) & set(sys.modules)))"
+    code = f"import sys, {rooms}\nprint(*sorted(set({TOOLS + SLOW!r}) & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not done.stdout.split()
