@@ -290,8 +290,8 @@ def _write_nodemaps(physical: Physical, folder: Path, *, overwrite: bool) -> Non
     result = physical.result
     if physical.units.mm_per_pixel is None:
         raise InputError(
-            f"nodemaps for CrackPy are in mm, and no scale of {result.path} is known: state mm_per_pixel or camera in "
-            "[scale] of a TEST.toml and give it as --test"
+            f"nodemaps for CrackPy are in mm, and lengths of {result.path} are in px: state mm_per_pixel or camera in "
+            '[scale] of a TEST.toml, without unit = "px", and give it as --test'
         )
     stem = result.path.resolve().name
     if folder.exists() and not folder.is_dir():
