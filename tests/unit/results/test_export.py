@@ -148,7 +148,7 @@ def test_nodemaps_are_those_that_crackpy_reads(result: Result, tmp_path: Path) -
 
 def test_nodemaps_have_a_folder_and_millimetres_of_their_own(result: Result, tmp_path: Path) -> None:
     scale, out = ScaleSettings(mm_per_pixel=0.05), tmp_path / "a" / "nodemaps"
-    with pytest.raises(InputError, match=r"are in mm, and no scale .* mm_per_pixel or camera"):
+    with pytest.raises(InputError, match=r"are in mm, and lengths of .* are in px: .* mm_per_pixel or camera"):
         export_result(result, "crackpy", out)
     assert not out.parent.exists()
     (tmp_path / "file").write_text("mine")
