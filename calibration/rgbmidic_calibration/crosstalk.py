@@ -24,8 +24,8 @@ import numpy as np
 from scipy.special import fdtri
 
 from rgbmidic.errors import CalibrationError
+from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products
-from rgbmidic.illumination.frame_check import Check, warning
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic_calibration.captures import BlockMeans, block_centres
 from rgbmidic_calibration.plausibility import CHECKS, capture_checks, judged

@@ -17,7 +17,7 @@ from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.fields.plane import CameraCalibration
 from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.frame_check import unevenness
+from rgbmidic.illumination.unevenness import unevenness
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.camera import LIMITS, covered, estimate_lens, estimate_plane

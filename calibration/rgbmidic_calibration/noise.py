@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.illumination.frame_check import Check, reported, warning
+from rgbmidic.illumination.checks import Check, reported, warning
 from rgbmidic.illumination.linear import CameraNoise, Quantity
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile_means

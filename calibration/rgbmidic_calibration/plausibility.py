@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.illumination.frame_check import Check, refused, reported, warning
+from rgbmidic.illumination.checks import Check, refused, reported, warning
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.captures import BlockMeans
 

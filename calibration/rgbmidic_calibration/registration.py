@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from rgbmidic.correlation.solution import NodeStatus, Solution
 from rgbmidic.errors import CalibrationError, RgbmidicError
-from rgbmidic.illumination.frame_check import Check, reported, warning
+from rgbmidic.illumination.checks import Check, reported, warning
 from rgbmidic.illumination.images import PARAMETERS, Registration, frame_geometry, registration_basis
 from rgbmidic.pipeline import correlate
 from rgbmidic.settings import ELEMENT_SIZE

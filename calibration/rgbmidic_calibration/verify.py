@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.checks import Check
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.frame_check import Check
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
 from rgbmidic.typing import FloatArray

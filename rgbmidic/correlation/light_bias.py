@@ -3,9 +3,9 @@
 A light's residual at the solution, projected on its gradient in a window, is its own displacement from the solution.
 Noise makes some thousandths of a pixel of it; more is a reflection that does not follow the surface, or follows it with
 the droplets' flanks. The solution is the mean of the lights by their precision, so it holds some of each light's bias.
-Where lights agree with each other (`rgbmidic.illumination.mosaic_statistics.agreement`) the others' part is taken off
-the solution. What is left of the disagreement is its uncertainty, as of the weighted mean of measurements whose biases
-are independent; of two lights that disagree nobody knows which is right, and half their distance is uncertain.
+Where lights agree with each other (`rgbmidic.illumination.displacement.agreement`) the others' part is taken off the
+solution. What is left of the disagreement is its uncertainty, as of the weighted mean of measurements whose biases are
+independent; of two lights that disagree nobody knows which is right, and half their distance is uncertain.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from rgbmidic._kernels.weights import scores
 from rgbmidic.correlation.residual import Residual
-from rgbmidic.illumination.mosaic_statistics import agreement
+from rgbmidic.illumination.displacement import agreement
 from rgbmidic.typing import FloatArray, FloatImage
 
 

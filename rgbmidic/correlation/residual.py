@@ -266,20 +266,20 @@ def corrected_values(residual: Residual, kind: Literal["auto", "none", "global",
         return np.stack([_gain_of_means(reference, *light) for light in sums])
     lights = zip(reference.values, residual.warped, residual.weights, strict=True)
     if kind == "global":
-        least = reference.constants.lit
-        return np.stack([_one_gain(f, g, weight.astype(np.float64), least)[0] for f, g, weight in lights])
-    return np.stack([_gain_field(reference, f, g, weight) for f, g, weight in lights])
+        return np.stack([_one_gain(reference, *light)[0] for light in lights])
+    return np.stack([_gain_field(reference, *light) for light in lights])
 
 
-def _one_gain(f: FloatImage, g: FloatImage, weight: FloatArray, least: float) -> tuple[FloatImage, bool]:
-    """Correct f (P,) by one offset and, where f and g correlate by `least`, one gain; and whether they do."""
+def _one_gain(reference: Reference, f: FloatImage, g: FloatImage, weight: FloatImage) -> tuple[FloatImage, bool]:
+    """Correct f (P,) by one offset and, where f and g show the same, one gain; and whether they do."""
+    weight = weight.astype(np.float64)
     total = weight.sum()
     if not total:
         return f, False
     mean_f, mean_g = (weight * f).sum() / total, (weight * g).sum() / total
     # both images carry the same noise: the ratio of the deviations is not attenuated by it
     spread_f, spread_g = (float((weight * (i - m) ** 2).sum()) for i, m in ((f, mean_f), (g, mean_g)))
-    alike = float((weight * (f - mean_f) * (g - mean_g)).sum()) > least * np.sqrt(spread_f * spread_g)
+    alike = float((weight * (f - mean_f) * (g - mean_g)).sum()) > reference.constants.lit * np.sqrt(spread_f * spread_g)
     gain = np.sqrt(spread_f / spread_g) if alike else 1.0
     return np.asarray((f - mean_f) / gain + mean_g, dtype=np.float32), alike
 
@@ -288,7 +288,8 @@ def _gain_of_means(reference: Reference, f: FloatImage, weight: FloatImage, sum_
     """Correct f (P,) by the ratio of the weighted sums around each node, of which `sum_g` (E,) is that of g."""
     mesh = reference.mesh
     around_f, around_g = mesh.to_nodes(reference.sums(weight[None], f)[0, :, 1]), mesh.to_nodes(sum_g)
-    ratio = np.divide(around_g, around_f, out=np.ones_like(around_f), where=around_f > 0)  # <= 0 of a light that is off
+    # of a light that is off it may be negative; the least gain bounds it
+    ratio = np.divide(around_g, around_f, out=np.ones_like(around_f), where=around_f > 0)
     fields = np.empty((2, f.size), dtype=np.float32)
     interpolate_nodal(np.stack([ratio, ratio], axis=1), mesh.elements, *reference.pixels.positions, fields)
     return np.asarray(f * np.maximum(fields[0], np.float32(reference.constants.least_gain)))
@@ -296,7 +297,7 @@ def _gain_of_means(reference: Reference, f: FloatImage, weight: FloatImage, sum_
 
 def _gain_field(reference: Reference, f: FloatImage, g: FloatImage, weight: FloatImage) -> FloatImage:
     """Correct f (P,) by a gain and an offset that are linear in every element."""
-    corrected, alike = _one_gain(f, g, weight.astype(np.float64), reference.constants.lit)
+    corrected, alike = _one_gain(reference, f, g, weight)
     if not alike:
         return corrected
     assembly = reference.assembly

@@ -1,6 +1,6 @@
 """Raw frames and where they come from: readers, the series of a test's frames, writers."""
 
-from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, cfa_channels
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window, cfa_channels
 from rgbmidic.frames.formats import FrameFormat, known_formats, open_source, read_frame
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.frames.series import FrameSeries, list_frames, open_series
@@ -14,6 +14,7 @@ __all__ = [
     "FrameSource",
     "Mosaic",
     "Movie",
+    "Recording",
     "StoredFrame",
     "Window",
     "cfa_channels",

@@ -4,7 +4,7 @@ Fixed linear filters (Malvar, He, Cutler 2004) and normalisation assume that the
 coloured lights that holds where the paint is mat and breaks where one light reflects.
 
 The reflection-aware method measures, block by block, how much of each channel's contrast is common and how much
-channel-specific (`rgbmidic.illumination.mosaic_statistics`), and predicts every channel at every pixel from the samples
+channel-specific (`rgbmidic.illumination.colour_factors`), and predicts every channel at every pixel from the samples
 around with exactly that trust (simple kriging). A channel in a reflection no longer leaks into the others, its sparkle
 is kept, the coarse lattices of red and blue are filled from what the others see; a coloured specimen, whose channels
 have nothing in common, is reconstructed channel by channel.
@@ -32,24 +32,22 @@ from rgbmidic._kernels.demosaicing import TILE, fill_unknown, predict, predictio
 from rgbmidic._kernels.illumination import PAD, malvar, pad_mosaic
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
-from rgbmidic.illumination.crosstalk import Crosstalk, needed
-from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
-from rgbmidic.illumination.mosaic_statistics import (
+from rgbmidic.illumination.colour_factors import (
     BLOCK,
     MEAN_BLOCK,
     ColourFactors,
-    LightDisplacement,
     Moments,
     colour_factors,
     enlarged,
     gather_moments,
     learn_texture,
-    light_displacement,
     local_means,
     scaled,
-    seen_lights,
     widened,
 )
+from rgbmidic.illumination.crosstalk import Crosstalk, needed
+from rgbmidic.illumination.displacement import LightDisplacement, light_displacement, seen_lights
+from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 

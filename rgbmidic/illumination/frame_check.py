@@ -1,6 +1,4 @@
-"""Checks: a figure, its limits and the sentence that it gives rise to; those of a raw frame against its calibration.
-
-Whether the frame is of the camera and the lights that were calibrated is seen from that frame alone.
+"""Checks that a raw frame is of the camera and the lights that were calibrated, from that frame alone.
 
 Every check is one-sided: what a frame does not show, as noise under texture, passes. The constants are measured:
 docs/how-to/inspect.md shows which manipulations are found and that good frames pass.
@@ -8,10 +6,9 @@ docs/how-to/inspect.md shows which manipulations are found and that good frames 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
-from math import inf, isnan
 from typing import Any, get_args
 
 import cv2
@@ -22,115 +19,17 @@ from scipy.special import erf
 from rgbmidic.errors import ConfigurationError, FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.checks import Check, refused, reported
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
+from rgbmidic.illumination.unevenness import SIGNIFICANCE, unevenness
 from rgbmidic.settings import FrameCheck
 from rgbmidic.typing import BoolArray, FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    """A figure against its limits; its size counts, not its sign.
-
-    Attributes
-    ----------
-    name : str
-        By which a user accepts that it fails (`--allow`, `calibration.accept`); in a verdict, what the figure is.
-    text : str
-        What was found, what was expected, and what the cause may be.
-    value : float
-        The figure; infinite where the sentence is all there is.
-    limit : float
-        Largest size that passes.
-    doubtful : float
-        Size up to which nothing is reported; between it and `limit` the sentence is a warning.
-    std, unit : float, str
-        Standard uncertainty and unit of the figure.
-    """
-
-    name: str
-    text: str
-    value: float = inf
-    limit: float = 0.0
-    doubtful: float = inf
-    std: float = 0.0
-    unit: str = ""
-
-    @property
-    def passed(self) -> bool:
-        """The figure keeps its limit; one that is not a number does not."""
-        return bool(abs(self.value) <= self.limit)
-
-
-def warning(text: str, value: float = inf, above: float = 0.0) -> Check:
-    """Check that never fails: a warning where the figure exceeds `above`, or in any case; NaN says nothing."""
-    return Check("", text, 0.0 if isnan(value) else value, limit=inf, doubtful=above)
-
-
-def reported(checks: Iterable[Check]) -> list[Check]:
-    """Those that fail or are doubtful."""
-    return [check for check in checks if not check.passed or abs(check.value) > check.doubtful]
-
-
-def refused(checks: Iterable[Check], accepted: Collection[str]) -> list[Check]:
-    """Those that fail and whose names are not accepted."""
-    return [check for check in checks if not check.passed and check.name not in accepted]
-
 
 Frame = Mosaic | ChannelFrame
 
 BLOCK = 16
 """Side of blocks in px, twice that for the greens."""
-
-SIGNIFICANCE = 6.0
-"""Standard errors beyond which a departure is not chance: 24 planes and levels are looked at."""
-WINDOW = 9
-"""Grey levels over which the histogram is smooth (a parabola) where noise has a standard deviation of `SMOOTHED`."""
-SMOOTHED = 2.0
-
-
-def unevenness(
-    samples: npt.NDArray[np.uint16], noise: NoiseModel | None = None, black: float = 0.0, step: int = 1
-) -> float:
-    """Return the relative variance of the histogram of raw samples about its smooth course, less that of counting.
-
-    It is 0 where the histogram is smooth over `WINDOW` levels as noise makes it, .05 where every 21st level is missing,
-    about 2 where every other one is; NaN where too few samples, or too little noise, leave it open.
-
-    Parameters
-    ----------
-    samples
-        Of one colour plane, none saturated.
-    noise
-        Calibrated noise: only levels at which it smooths the histogram are looked at; None: all.
-    black
-        Their black level.
-    step
-        What all samples of the frame are multiples of.
-
-    Returns
-    -------
-    float
-    """
-    if samples.size < 1000:
-        return float("nan")
-    count = np.bincount(samples // step).astype(np.float64)
-    if count.size < 30:
-        return float("nan")
-    count[: np.flatnonzero(count)[0] + 1] = 0  # what is clipped at the bottom
-    around = np.convolve(count, np.full(WINDOW, 1 / WINDOW), mode="same")
-    known = around >= 8
-    if noise is not None:
-        known &= noise.variance(step * np.arange(count.size) - black) >= (SMOOTHED * step) ** 2
-    if known.sum() < 30:
-        return float("nan")
-    middle = np.linalg.pinv(np.vander(np.arange(WINDOW) - WINDOW // 2, 3))[-1]  # of the parabola through a window
-    kept = 1 - middle[WINDOW // 2]  # of the variance of counting, by the residual of the parabola
-    square = (count - np.convolve(count, middle, mode="same"))[known] ** 2 / kept
-    chance = SIGNIFICANCE * np.sqrt(2 * known.sum())
-    if (square / around[known]).sum() - known.sum() < chance:
-        return 0.0
-    return float((square.sum() - around[known].sum()) / (around[known] ** 2).sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,7 +211,7 @@ def _noise(samples: _Samples, repeat: _Samples | None, step: int) -> Iterator[Ch
     if len(samples.names) > 1:
         flatness = square.sum(axis=0) - square
     else:  # around each place of the only plane, of differences that share no sample with its own
-        flatness = np.full_like(square, inf)
+        flatness = np.full_like(square, np.inf)
         flatness[:, 2:-2, 2:-2] = (
             square[:, :-4, 2:-2] + square[:, 4:, 2:-2] + square[:, 2:-2, :-4] + square[:, 2:-2, 4:]
         )
@@ -331,7 +230,7 @@ def _noise(samples: _Samples, repeat: _Samples | None, step: int) -> Iterator[Ch
     shared = 1.5  # variance of the count over that of independent differences: neighbours share two samples of four
     beyond = (count - expected) / (SIGNIFICANCE * np.sqrt(shared * np.maximum(chance, 1e-9)))
     ratio = np.divide(count, expected, out=np.ones_like(count), where=(beyond > 1) | ((beyond < -1) & bool(repeat)))
-    for excess, limit, motion in ((ratio, 1.25, ""), (1 / ratio, inf, ", motion between the two frames")):
+    for excess, limit, motion in ((ratio, 1.25, ""), (1 / ratio, np.inf, ", motion between the two frames")):
         at = np.unravel_index(excess.argmax(), excess.shape)
         if excess[at] <= 1:
             continue

@@ -27,7 +27,7 @@ from rgbmidic.settings import LOCAL_MEAN
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:  # reading a result takes no kernels
-    from rgbmidic.illumination.mosaic_statistics import LightDisplacement
+    from rgbmidic.illumination.displacement import LightDisplacement
 
 PARAMETERS = ("shift_x", "shift_y", "rotation", "scale", "radial")
 """Parameters of a light: px, px, rad (x towards y), relative magnification, relative magnification more at radius R."""
@@ -273,7 +273,7 @@ class IlluminationImages:
             0 where a light's contrast is that of the light with the most contrast there, towards 1 in its reflection;
             None where the separation does not give it.
         """
-        from rgbmidic.illumination.mosaic_statistics import BLOCK, enlarged  # reading a result takes no kernels
+        from rgbmidic.illumination.colour_factors import BLOCK, enlarged  # reading a result takes no kernels
 
         if self.reflection is None:
             return None

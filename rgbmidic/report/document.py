@@ -18,11 +18,11 @@ from rgbmidic.report.gallery import REPORT
 from rgbmidic.report.page import render
 from rgbmidic.report.style import PAGE_DPI, time_text
 from rgbmidic.report.summary import TimeHistory, noise_floor, speckle_size
-from rgbmidic.results import QUANTITIES, Maps, Result
+from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, Result
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.physical import Physical
-from rgbmidic.settings import ChannelSettings, ProbeSettings, SetupSettings, TestSettings
+from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings, SetupSettings, TestSettings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,7 +138,7 @@ def write_report(
         histories=read_histories(result, probes, scale=physical.scale, channels=channels) if probes.places else None,
         lines=_lines(maps.maps, probes, constants),
         when=partial(_when, physical),
-        rate=kept.get("frame_rate") or result.setting("scale", "frame_rate"),
+        rate=_frame_rate(physical),
         exposure=None if exposure is None else f"{exposure / 1000:g} µs",
         blur=1e-9 * (exposure or 0) * history.fastest if physical.units.timed else 0,
         speckle=None if speckle is None else physical.in_units(speckle),
@@ -147,6 +147,15 @@ def write_report(
         troubled=list(zip((result.names[index] for index in odd), result.each("reason", odd), strict=True)),
     )
     write_complete(out, lambda file: file.write(text.encode()))
+
+
+def _frame_rate(physical: Physical) -> tuple[float | None, str]:
+    """Frame rate that `frame_times` follows, and where it is from; None where the frames have times of their own."""
+    result = physical.result
+    recorded = result.provenance.get("frame_rate"), "by the camera's file"
+    stated = (physical.scale or result.section(ScaleSettings)).frame_rate, "as stated"
+    stamped = (result.time_ns[result.finished] != UNKNOWN_TIME).all()
+    return next((rate for rate in ([recorded] if stamped else [stated, recorded]) if rate[0]), (None, ""))
 
 
 def _lines(maps: Maps, probes: ProbeSettings, constants: ReportConstants) -> Iterator[dict[str, Any]]:

@@ -24,7 +24,7 @@ from rgbmidic.results.derived import COMPONENTS, DERIVED, FINER, STRAINS, UV, WI
 from rgbmidic.results.physical import MOVED, Physical, frame_times, named, reference_frames, shared_part
 from rgbmidic.results.quantities import UNKNOWN_TIME, Quantity
 from rgbmidic.results.result import Result
-from rgbmidic.settings import ScaleSettings
+from rgbmidic.settings import MeshSettings, ProbeSettings, ScaleSettings
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 WINDOW = 9
@@ -150,7 +150,7 @@ class Maps:
         if since is not None and self.result.finished[since] and np.isnan(self.result.frame(since).u).all():
             reason = self.result.frame(since).reason or "no node"
             raise InputError(f"nothing is known since frame {since}, in which nothing is measured: {reason}")
-        window = window or int(self.result.setting("probes", "window", 0)) or WINDOW
+        window = window or self.result.section(ProbeSettings).window or WINDOW
         rate_frames(window, FEWEST)
         physical, measure = self.physical, measure or MEASURES[0]
         if (gauge, measure) != (physical.gauge, physical.measure):
@@ -166,8 +166,8 @@ class Maps:
     @cached_property
     def all(self) -> dict[str, Quantity]:
         """Every field by its name, displacements first; each that has an uncertainty is followed by it further down."""
-        error = bool(self.result.setting("mesh", "error"))
-        return map_quantities(self._units, self.result.lights, with_error=error)
+        error = self.result.section(MeshSettings).error
+        return map_quantities(self._units, self.result.lights, with_error=bool(error))
 
     def field(self, name: str) -> Quantity:
         """Return a field by its name.

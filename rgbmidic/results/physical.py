@@ -69,11 +69,9 @@ def rectification_of(
 
 def _kept_camera(result: Result) -> CameraCalibration | None:
     document = result.provenance.get("camera")
-    return (
-        None
-        if document is None
-        else CameraCalibration.from_document(document, str(result.section(ScaleSettings).camera))
-    )
+    if document is None:
+        return None
+    return CameraCalibration.from_document(document, str(result.section(ScaleSettings).camera))
 
 
 def placement_of(result: Result) -> Placement | None:

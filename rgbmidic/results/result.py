@@ -18,7 +18,7 @@ from rgbmidic.results.provenance import fingerprint, read_provenance
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord, Quantities
 from rgbmidic.results.records import FrameTable
 from rgbmidic.results.store import check_complete, listed, load_frames, load_result, read_reference
-from rgbmidic.settings.conversion import read_section
+from rgbmidic.settings import read_section
 from rgbmidic.settings.schema import section_kinds
 from rgbmidic.text import Described
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
@@ -182,8 +182,18 @@ class Result(Quantities, Described):
         Returns
         -------
         object of `kind`
+
+        Raises
+        ------
+        InputError
+            There is no section of this class.
+        ConfigurationError
+            None was kept, and one of its keys has no default.
         """
-        name = next(name for name, known in section_kinds().items() if known is kind)
+        names = {known: name for name, known in section_kinds().items()}
+        if kind not in names:
+            raise InputError(f"{kind!r} is no section of a TEST.toml; these are {', '.join(k.__name__ for k in names)}")
+        name = names[kind]
         return read_section(kind, name, self.provenance.get("settings", {}).get(name, {}))
 
     def setting(self, section: str, key: str, default: Any = None) -> Any:

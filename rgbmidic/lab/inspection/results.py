@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rgbmidic.illumination.frame_check import Check, reported
+from rgbmidic.illumination.checks import Check, reported
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import COLOURED, TextureModel

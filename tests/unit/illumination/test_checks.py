@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from rgbmidic.illumination.frame_check import Check, refused, reported, warning
+from rgbmidic.illumination.checks import Check, refused, reported, warning
 
 
 @pytest.mark.parametrize("sign", [-1, 1])

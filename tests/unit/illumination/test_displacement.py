@@ -6,7 +6,7 @@ import pytest
 from scipy.ndimage import shift
 
 from rgbmidic._kernels.demosaicing import displacement_sums
-from rgbmidic.illumination.mosaic_statistics import agreement
+from rgbmidic.illumination.displacement import agreement
 from rgbmidic.illumination.separation import separate
 
 SHAPE = (192, 192)

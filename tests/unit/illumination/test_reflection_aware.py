@@ -6,6 +6,7 @@ import pytest
 from naive_demosaic import site_channels
 
 from rgbmidic.errors import InputError
+from rgbmidic.illumination.colour_factors import colour_factors, gather_moments, learn_texture
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.demosaicing import (
     DISSIMILAR,
@@ -15,7 +16,6 @@ from rgbmidic.illumination.demosaicing import (
     ReflectionAwareDemosaicer,
     prediction_filters,
 )
-from rgbmidic.illumination.mosaic_statistics import colour_factors, gather_moments, learn_texture
 from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.scene.camera import MEASURED_CROSSTALK

@@ -6,8 +6,8 @@ import pytest
 
 from rgbmidic._kernels import demosaicing as kriging
 from rgbmidic._kernels import texture
+from rgbmidic.illumination.colour_factors import colour_moments, of_mosaic, widened
 from rgbmidic.illumination.demosaicing import red_position
-from rgbmidic.illumination.mosaic_statistics import colour_moments, of_mosaic, widened
 from rgbmidic.settings import BAYER_PATTERNS
 
 SHAPES = [(16, 24), (19, 21), (33, 18), (9, 531)]

@@ -20,7 +20,7 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.report import curves, document, remove_pictures, style, summary, write_batch_page, write_report
-from rgbmidic.results import FrameRecord, Maps, Result, ResultStore, read_profile
+from rgbmidic.results import UNKNOWN_TIME, FrameRecord, Maps, Result, ResultStore, read_profile
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import (
     ChannelSettings,
@@ -174,6 +174,22 @@ def test_it_says_what_is_stated_and_what_is_not(tmp_path: Path) -> None:
     assert "exposure 1.5 µs" in methods
     assert f"triangles of {stated.mesh.element_size:.4g} px ({0.05 * stated.mesh.element_size:.3g} mm)" in methods
     assert "noise floor is [noise floor of static frames]" in methods
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_frame_rate_is_the_one_that_the_times_follow(tmp_path: Path) -> None:
+    """As `frame_times`: time stamps first, then what is stated, then what the camera's file holds."""
+    kept = {"notes": {"frame_rate": 1000.0}, "settings": settings(scale=ScaleSettings(frame_rate=500.0))}
+    for name, clock, wanted in (
+        ("stamped", 1_000_000, "1000 frames per second (by the cam"),
+        ("a", 0, "500 frames per s"),
+    ):
+        times = [clock * index if clock else UNKNOWN_TIME for index in range(3)]
+        result = make(tmp_path / name, [still(index, 0.01, time_ns=time) for index, time in enumerate(times)], **kept)
+        write_report(result, tmp_path / f"{name}.html")
+        assert Reader(tmp_path / f"{name}.html").rows["frame rate"].startswith(wanted)
+    write_report(result, tmp_path / "b.html", settings=settings(scale=ScaleSettings(frame_rate=250.0)))
+    assert Reader(tmp_path / "b.html").rows["frame rate"] == "250 frames per second (as stated)"
 
 
 @pytest.mark.usefixtures("undrawn")

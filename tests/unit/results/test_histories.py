@@ -397,6 +397,8 @@ def test_the_command_takes_the_test_s_probes_and_its_own_and_writes_table_and_pi
     result: Result, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert result.section(ProbeSettings) == ProbeSettings(points=(PLACE,))
+    with pytest.raises(InputError, match=r"is no section of a TEST.toml; these are FrameSettings, "):
+        result.section(TestSettings)
     out = tmp_path / "h.csv"
     assert command(result.path, "--point", "60,40", "--gauge", "20,15:90,60", "--window", 5, "--out", out) == 0
     printed = capsys.readouterr()

@@ -1,34 +1,21 @@
-"""Statistics of a single mosaic, block by block: the colours' slopes and variances, the displacement of the lights.
+"""Slope of each colour on the common texture, and its channel-specific variance, block by block, from a single mosaic.
 
 A sample of camera channel c is ``m_c = mean_c + alpha_c a + e_c``. alpha_c, the slope on the common texture a, is
 smooth; e_c is the channel-specific component, the erratic part of a reflection and camera noise. Low-passed to the
 band that all colours resolve, two channels have the moment ``alpha_c alpha_c'`` in common and nothing else, so three
 channels give three slopes (``alpha_1^2 = M_12 M_13 / M_23``, a one-factor analysis), free of the bias that noise gives
 a regression; what a channel's own moment has beyond that is the variance of e_c.
-
-Where paint reflects, glints sit on the flanks of raised droplets: the light that is reflected shows the common texture
-displaced by some tenths of a pixel, and the displacement slides as the surface turns. Its variance hardly shows that.
-Each sample minus its best prediction from the samples of the other colours around it is regressed on the gradient
-predicted likewise; the crosstalk turns the channels' displacements into those of the lights.
-
-Which of several lights shows the texture where it is, is a question of agreement (`agreement`): a light counts by its
-precision and by the precision of the others that show it at the same place.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import product
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import pinv
 
 from rgbmidic._kernels import texture as kernels
-from rgbmidic._kernels.demosaicing import displacement_sums
-from rgbmidic.frames.data import cfa_channels
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import LAGS, WHITE_ENERGY, BandEnergy, TextureModel, fit_texture
 from rgbmidic.typing import FloatArray, FloatImage
@@ -196,27 +183,28 @@ def colour_moments(sums: FloatImage, red: tuple[int, int]) -> FloatImage:
     return np.stack([*own, both[0], of[frozenset((r, b))], both[1], of[frozenset((g, h))]])
 
 
+def blurred(grid: FloatImage, sigma: float) -> FloatImage:
+    """Blur a grid of blocks (h, w) by a Gaussian window of `sigma` blocks."""
+    return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_REFLECT))
+
+
 def _smooth(sums: FloatImage, counts: FloatImage, sigma: float) -> FloatImage:
     """Average sums over `counts` entries, (n, h, w) or (1, h, w), in a Gaussian window of `sigma` blocks.
 
     Where no entries are, it is the overall mean.
     """
 
-    def blurred(grid: FloatImage) -> FloatImage:
-        return grid if (grid == grid[0, 0]).all() else _blurred(grid, sigma)
+    def smooth(grid: FloatImage) -> FloatImage:
+        return grid if (grid == grid[0, 0]).all() else blurred(grid, sigma)
 
-    weights = np.broadcast_to([blurred(number) for number in counts], sums.shape)
+    weights = np.broadcast_to([smooth(number) for number in counts], sums.shape)
     out, enough = np.empty_like(sums), weights > 1e-3 * np.maximum(counts.max(axis=(1, 2), keepdims=True), 1)
     for total, weight, known, target in zip(sums, weights, enough, out, strict=True):
-        np.divide(blurred(total), weight, out=target, where=known)
+        np.divide(smooth(total), weight, out=target, where=known)
     if not enough.all():
         overall = sums.sum(axis=(1, 2)) / np.maximum(counts.sum(axis=(1, 2)), 1)
         np.copyto(out, overall[:, None, None], where=~enough)
     return out
-
-
-def _blurred(grid: FloatImage, sigma: float) -> FloatImage:
-    return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_REFLECT))
 
 
 def learn_texture(moments: Moments, *, samples: int = 80_000) -> TextureModel:
@@ -290,198 +278,3 @@ def colour_factors(
     lights = np.maximum(np.tensordot(to_lights, variance * square, axes=1), 0)
     variance = np.maximum(variance, np.tensordot(crosstalk**2, lights, axes=1) / square) + LEAST
     return ColourFactors(slope=np.sqrt(square), specific=variance, noise=moments.noise / square)
-
-
-SIZE, REACH = 5, 8
-"""Side of the square of samples of a prediction, px; rows and columns over which predictions are correlated."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LightDisplacement:
-    """Displacement of the lights' textures from their mean.
-
-    Attributes
-    ----------
-    values : ndarray, shape (k, 2, h, w)
-        In x and y (px), on a grid of blocks of 8 px.
-    std : ndarray, shape (k, h, w)
-        Standard uncertainty in each direction, px.
-    """
-
-    values: FloatArray
-    std: FloatArray
-
-    @property
-    def significant(self) -> FloatArray:
-        """The displacement shrunk towards 0 by what chance explains of it (James and Stein 1961), (k, 2, h, w)."""
-        most = 1.25  # standard deviations that chance may make in each direction
-        chance = 2 * most**2 * (self.std**2).sum(axis=0)
-        gain = 1 - chance / np.maximum((self.values**2).sum(axis=(0, 1)), 1e-12)
-        return np.asarray(self.values * np.maximum(gain, 0))
-
-
-def agreement(
-    displacement: FloatArray,
-    variance: FloatArray,
-    precision: FloatArray,
-    *,
-    harmless: float = 0.03,
-    alone: float = 0.1,
-) -> tuple[FloatArray, FloatArray]:
-    """How far lights are to be believed about a place, and how far those that are agree with another one.
-
-    Parameters
-    ----------
-    displacement : ndarray, shape (k, 2, h, w)
-        Where each light shows the texture, px.
-    variance : ndarray, shape (k, h, w)
-        Of chance in each direction, px².
-    precision : ndarray, shape (k, h, w)
-        Of each light's displacement; in any unit.
-    harmless
-        Distance (px) of two lights at which each counts half for the other. Half and twice of it change the error of
-        raised droplets by 2 % at most (benchmarks/reflections.py).
-    alone
-        What a light with which no other agrees counts: the square of it is its weight against lights that agree.
-
-    Returns
-    -------
-    tuple of ndarray, shape (k, h, w) and (h, w)
-        Weights of the lights, their sum 1; the weighted mean, 0 to 1, of how far each agrees with its nearest.
-    """
-    believed = precision / np.maximum(precision.sum(axis=0), 1e-30)
-    alike, nearest = np.zeros_like(believed), np.zeros_like(believed)
-    lights = range(len(believed))
-    for light in lights:
-        for other in lights:
-            if other != light:
-                apart = ((displacement[light] - displacement[other]) ** 2).sum(axis=0)
-                beyond = np.maximum(apart - 2 * (variance[light] + variance[other]), 0)
-                near = 1 / (1 + beyond / harmless**2)
-                alike[light] += believed[other] * near
-                nearest[light] = np.maximum(nearest[light], near)
-        alike[light] /= np.maximum(1 - believed[light], 1e-6)
-    weights = believed * (alone + alike) ** 2
-    weights /= np.maximum(weights.sum(axis=0), 1e-30)
-    return weights, (weights * nearest).sum(axis=0)
-
-
-def light_displacement(
-    moments: Moments,
-    factors: ColourFactors,
-    texture: TextureModel,
-    matrix: FloatArray,
-    cfa: str,
-    *,
-    window: float = 20.0,
-) -> LightDisplacement:
-    """Displacement of the lights' textures against each other.
-
-    Parameters
-    ----------
-    moments, factors, texture
-        Of the mosaic.
-    matrix : ndarray, shape (3, k)
-        Crosstalk.
-    cfa
-        Bayer pattern.
-    window
-        Standard deviation (px) of the window in which a displacement is taken: glints change their place over some
-        50 px.
-
-    Returns
-    -------
-    LightDisplacement
-    """
-    slope = np.median(factors.slope, axis=(1, 2))
-    octave = np.round(np.log2(np.maximum(np.median(factors.noise, axis=(1, 2)), 2.0**-20)))
-    taps, response, chance = _filters(texture, tuple((2.0**octave).tolist()), cfa)
-    padded = scaled(moments, (1 / factors.slope).astype(np.float32), pad=SIZE // 2)
-    sums = np.empty((3, 5, *(-(-side // BLOCK) for side in moments.contrast.shape)), dtype=np.float32)
-    displacement_sums(padded, taps, BLOCK, *moments.red, sums)
-    around = np.array([[_blurred(grid, window / BLOCK) for grid in one] for one in sums.swapaxes(0, 1)], np.float64)
-    square = around[2] + 1e-12
-    shift = around[:2].swapaxes(0, 1) / square[:, None]
-    back = pinv(response @ seen_lights(matrix, slope), rtol=0.05)
-    back -= back.mean(axis=0)
-    # standard deviation of as many independent products: a window holds so many blocks
-    alone = np.sqrt(around[3] / (square * np.maximum(around[4], 1e-6) * (4 * np.pi * (window / BLOCK) ** 2)))
-    values = np.tensordot(back, shift, axes=1)
-    variance = np.maximum(np.einsum("lc,ld,cd,cyx,dyx->lyx", back, back, chance, alone, alone), 1e-12)
-    return LightDisplacement(values=values, std=np.sqrt(variance))
-
-
-def seen_lights(matrix: FloatArray, slope: FloatArray) -> FloatArray:
-    """Fraction (3, k, ...) of each light in the slope (3, ...) of each channel on the common texture."""
-    lights = np.tensordot(np.linalg.pinv(matrix), slope, axes=1)
-    lights = np.maximum(lights, 0.02 * lights.max())
-    parts = matrix.reshape(*matrix.shape, *(1,) * (slope.ndim - 1)) * lights
-    return np.asarray(parts / parts.sum(axis=1, keepdims=True))
-
-
-@lru_cache(maxsize=64)
-def _filters(texture: TextureModel, noise: tuple[float, ...], cfa: str) -> tuple[FloatImage, FloatArray, FloatArray]:
-    """Filters of residual and gradient from the samples of the other colours, and what they make of a displacement.
-
-    Returns
-    -------
-    tuple
-        Taps as `rgbmidic._kernels.demosaicing.displacement_sums` takes them; (3, 3): displacement found for each
-        channel (row) per displacement of each channel's texture; (3, 3): covariance of two channels' sums of residual
-        times gradient over the root of the variances of as many independent products (Isserlis' theorem).
-    """
-    cell, offset, middle = cfa_channels(cfa), np.arange(SIZE) - SIZE // 2, SIZE**2 // 2
-    places = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)  # x, y
-    apart = places[:, None] - places
-    # over the texture's variance: that of an unknown constant under it, that by which the other colours' prediction may
-    # be wrong; the distance (px) over which the derivative of the autocorrelation is taken
-    constant, wrong, step = 10.0, 0.02, 0.25
-    covariance = texture(np.linalg.norm(apart, axis=-1)) + constant
-    ends = [[texture(np.linalg.norm(apart + s * step * e, axis=-1)) for s in (1, -1)] for e in np.eye(2)]
-    derivative = [(after - before) / (2 * step) for after, before in ends]  # of the texture at a, with that at b
-    taps = np.zeros((2, 2, 3, SIZE**2))
-    moved, unit = np.zeros((3, 3)), np.zeros(3)
-    phases = list(np.ndindex(2, 2))
-    colours = [cell[np.ix_((offset + p) % 2, (offset + q) % 2)].ravel() for p, q in phases]
-    for phase, channel in zip(phases, colours, strict=True):
-        own, others = channel[middle], channel != channel[middle]
-        system = covariance[np.ix_(others, others)] + np.diag(np.take(noise, channel[others]) + wrong)
-        wanted = np.stack([covariance[middle, others], *(one[middle, others] for one in derivative)], axis=1)
-        taps[phase][:, others] = np.linalg.solve(system, wanted).T
-        taps[phase][0] *= -1
-        taps[phase][0, middle] = 1
-        residual, *gradients = taps[phase]
-        for one, gradient in zip(derivative, gradients, strict=True):
-            unit[own] += gradient @ covariance @ gradient
-            moved[own] -= np.bincount(channel, residual * (one @ gradient), minlength=3)
-    lag = np.arange(-REACH - SIZE + 1, REACH + SIZE)
-    around = texture(np.hypot(lag[:, None], lag))
-
-    def moment(first: int, one: int, second: int, other: int) -> FloatArray:
-        """Covariance of a filter's output at a phase with another's at lags up to `REACH` rows and columns."""
-        a, b = (taps[phases[n]][m].reshape(SIZE, SIZE) for n, m in ((first, one), (second, other)))
-        level = np.take(noise, colours[first]).reshape(SIZE, SIZE)
-        b = np.pad(b, SIZE - 1)
-        white = np.pad(_correlated(b, a * level), REACH - SIZE + 1)[::-1, ::-1]
-        return _correlated(around, _correlated(b, a)) + white
-
-    total, alone = np.zeros((3, 3)), np.zeros(3)
-    parity = np.arange(-REACH, REACH + 1) % 2
-    for first, second in product(range(4), repeat=2):
-        own, other = colours[first][middle], colours[second][middle]
-        (p, q), (r, s) = phases[first], phases[second]
-        met = np.outer(parity == (r - p) % 2, parity == (s - q) % 2)
-        for axis in (1, 2):
-            square = moment(first, 0, second, 0) * moment(first, axis, second, axis)
-            cross = moment(first, 0, second, axis) * moment(first, axis, second, 0)
-            total[own, other] += (square + cross)[met].sum()
-            if first == second:
-                alone[own] += square[REACH, REACH]
-    # 256 columns at a time: what a core's fastest cache holds of their filters
-    lanes: FloatImage = np.tile(taps.transpose(0, 2, 3, 1), 128).astype(np.float32)
-    return lanes, moved / unit[:, None], total / np.sqrt(alone[:, None] * alone)
-
-
-def _correlated(image: FloatArray, kernel: FloatArray) -> FloatArray:
-    """Correlation of a kernel with an image where it lies within."""
-    return np.asarray(np.einsum("ijkl,kl", np.lib.stride_tricks.sliding_window_view(image, kernel.shape), kernel))
