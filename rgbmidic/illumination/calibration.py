@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -322,6 +323,9 @@ def write_document(path: Path | str, document: Mapping[str, Any]) -> None:
         temporary.replace(path)
     except OSError as error:
         raise CalibrationError(f"{path} cannot be written: {error.strerror or error}") from None
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
 
 
 def _read(kind: type[_Section], document: dict[str, Any], name: str) -> _Section | None:

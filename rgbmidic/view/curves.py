@@ -411,7 +411,7 @@ class CurvePanel:
     def frame(self, x: float) -> int:
         """Return the index of the frame at a place of the axis."""
         if self.histories is None or not np.isfinite(self._x[0]).any():
-            return 0
+            return self._shown.view.frame
         return int(self.histories.frames[np.nanargmin(np.abs(self._x[0] - x))])
 
     @property

@@ -198,7 +198,11 @@ class RegionDrawing:
         """Draw the lines."""
         self._coming = False
         outline, holes = rings(self.marks)
-        masks = [(ring, _COLOURS[(at + 2) % 7]) for at, own in enumerate(masks_of(self.marks).values()) for ring in own]
+        masks = [
+            (ring, _COLOURS[2 + at % (len(_COLOURS) - 2)])
+            for at, own in enumerate(masks_of(self.marks).values())
+            for ring in own
+        ]
         closed = [[*ring, *ring[:1]] for ring in (outline, *holes, *(ring for ring, _ in masks))]
         self._rings.data = {
             "xs": [[x for x, _ in ring] for ring in closed],

@@ -126,3 +126,10 @@ def test_cut_off_file_is_refused(files, tmp_path):
         Calibration.read(tmp_path / "cut.json")
     with pytest.raises(CalibrationError, match="not found"):
         Calibration.read(tmp_path / "absent.json")
+
+
+def test_a_calibration_that_cannot_be_written_leaves_nothing(files, tmp_path):
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(CalibrationError, match="taken cannot be written"):
+        merge_files(files).write(tmp_path / "taken")
+    assert not list(tmp_path.glob("*.part"))
