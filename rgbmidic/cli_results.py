@@ -34,15 +34,15 @@ def figures(
     from rgbmidic.report import write_figures, write_maps
 
     chosen, folder, settings = command.read_frames(frames), out or opened.result.path / "figures", opened.settings
+    if derived["measure"] is None and settings is not None:
+        derived["measure"] = settings.probes.measure
+    maps = opened.maps(derived)
     if fields:
-        if derived["measure"] is None and settings is not None:
-            derived["measure"] = settings.probes.measure
-        names = [name.strip() for name in fields.split(",")]
-        files = write_maps(opened.maps(derived), names, folder, chosen, hatched=hatch)
-    elif hatch or settings or any(option not in (None, False) for option in derived.values()):
-        raise InputError("--gauge, --measure, --since, --remove-rigid, --window, --px, --hatch, --test need a --field")
+        files = write_maps(maps, [name.strip() for name in fields.split(",")], folder, chosen, hatched=hatch)
+    elif hatch:
+        raise InputError("--hatch needs a --field")
     else:
-        files = write_figures(opened.result, folder, chosen, processes=threads())
+        files = write_figures(maps, folder, chosen, processes=threads())
     for file in files:
         print(file)
 

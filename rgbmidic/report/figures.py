@@ -122,8 +122,7 @@ def mask_figure(result: Result, frame: int) -> Figure | None:
     InputError, ResultError
         As `map_figure`.
     """
-    excluded = 1 - result.frame(frame).weights_thumbnail / 255
-    return _shaded(result, frame, excluded, excluded, "{:.1%} excluded") if excluded.any() else None
+    return MapDrawer(Maps.of(result)).masks(frame)
 
 
 def reflection_figure(result: Result, frame: int) -> Figure | None:
@@ -146,8 +145,7 @@ def reflection_figure(result: Result, frame: int) -> Figure | None:
     InputError, ResultError
         As `map_figure`.
     """
-    index = result.frame(frame).reflection_thumbnail / 255
-    return _shaded(result, frame, index, index > REFLECTING, "reflects on {:.1%}") if index.size else None
+    return MapDrawer(Maps.of(result)).reflections(frame)
 
 
 def brightness_figure(result: Result) -> Figure:
@@ -315,6 +313,16 @@ class MapDrawer:
         """Draw the fraction of each light in what determines the nodes of a frame, as `fraction_figure` does."""
         return self.fields(frame, [f"fraction of {light}" for light in self.result.lights])
 
+    def masks(self, frame: int) -> Figure | None:
+        """Draw what the weights of a frame exclude of each light, as `mask_figure` does."""
+        excluded = 1 - self.result.frame(frame).weights_thumbnail / 255
+        return self._shaded(frame, excluded, excluded, "{:.1%} excluded") if excluded.any() else None
+
+    def reflections(self, frame: int) -> Figure | None:
+        """Draw the reflection index of each light in a frame, as `reflection_figure` does."""
+        index = self.result.frame(frame).reflection_thumbnail / 255
+        return self._shaded(frame, index, index > REFLECTING, "reflects on {:.1%}") if index.size else None
+
     def strip(self, name: str, frames: Sequence[int], label: str) -> Figure:
         """Draw small maps of one field in several frames, side by side, in the same colours.
 
@@ -376,6 +384,34 @@ class MapDrawer:
                         axis.contourf(*self._places, doubtful, levels=[-np.inf, 0], hatches=["////"], colors="none")
         return figure
 
+    def _shaded(self, frame: int, cover: FloatArray, counted: AnyArray, words: str) -> Figure | None:
+        """Show the reference of each light around the mesh, shaded by a reduced picture (k, h, w) of one frame.
+
+        The `words` state the mean of what is `counted` (k, h, w) over the part that is shown. None where no reference
+        was kept.
+        """
+        result = self.result
+        if (reference := result.reference) is None:
+            return None
+        record = result.frame(frame)
+        step, origin = -(-reference.shape[1] // cover.shape[1]), result.reference_origin
+        moved = result.nodes + np.stack([record.u, record.v], axis=1)
+        x, y = picture_limits(result, np.concatenate([result.nodes, moved[np.isfinite(moved).all(axis=1)]]))
+        columns, rows = (
+            slice(int((low - first + 0.5) // step), math.ceil((high - first + 0.5) / step))
+            for (low, high), first in zip((x, y), origin, strict=True)
+        )
+
+        def draw(axes: list[Axes]) -> None:
+            for axis, image, light, part, share in zip(axes, reference, result.lights, cover, counted, strict=True):
+                style.show_image(axis, image, origin)
+                style.shade(axis, part, step, origin, style.LIGHT_COLOURS.get(light))
+                axis.set_title(style.literal(f"{light}: {words.format(share[rows, columns].mean())}"))
+                style.finish_picture(axis, x, y, first=axis is axes[0], unit=self._unit, factor=self._factor)
+
+        title = f"{_frame_title(result, frame, record)}, over the reference image"
+        return style.draw_figure(draw, count=len(cover), aspect=np.ptp(y) / np.ptp(x), beside=style.GAP, title=title)
+
     def _panels(self, count: int) -> Figure:
         """Draw what is the same in all figures of `count` maps: axes and reference image."""
         result, (x, y) = self.result, picture_limits(self.result, self.result.nodes)
@@ -431,34 +467,6 @@ class MapDrawer:
 def field_colours(field: Quantity) -> str:
     """Return the name of matplotlib's colours of a field."""
     return _COLOURS.get(field.kind, "viridis")
-
-
-def _shaded(result: Result, frame: int, cover: FloatArray, counted: AnyArray, words: str) -> Figure | None:
-    """Show the reference of each light around the mesh, shaded by a reduced picture (k, h, w) of one frame.
-
-    The `words` state the mean of what is `counted` (k, h, w) over the part that is shown. None where no reference was
-    kept.
-    """
-    if (reference := result.reference) is None:
-        return None
-    record = result.frame(frame)
-    step, origin = -(-reference.shape[1] // cover.shape[1]), result.reference_origin
-    moved = result.nodes + np.stack([record.u, record.v], axis=1)
-    x, y = picture_limits(result, np.concatenate([result.nodes, moved[np.isfinite(moved).all(axis=1)]]))
-    columns, rows = (
-        slice(int((low - first + 0.5) // step), math.ceil((high - first + 0.5) / step))
-        for (low, high), first in zip((x, y), origin, strict=True)
-    )
-
-    def draw(axes: list[Axes]) -> None:
-        for axis, image, light, part, share in zip(axes, reference, result.lights, cover, counted, strict=True):
-            style.show_image(axis, image, origin)
-            style.shade(axis, part, step, origin, style.LIGHT_COLOURS.get(light))
-            axis.set_title(style.literal(f"{light}: {words.format(share[rows, columns].mean())}"))
-            style.finish_picture(axis, x, y, first=axis is axes[0])
-
-    title = f"{_frame_title(result, frame, record)}, over the reference image"
-    return style.draw_figure(draw, count=len(cover), aspect=np.ptp(y) / np.ptp(x), beside=style.GAP, title=title)
 
 
 def picture_limits(result: Result, points: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:

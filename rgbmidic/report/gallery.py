@@ -7,7 +7,6 @@ import re
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,9 +30,9 @@ _OF_TEST: Mapping[str, Callable[[Result], Figure]] = {
 _OF_FRAME: Mapping[str, Callable[[figures.MapDrawer, int], Figure | None]] = {
     **{kind: partial(figures.MapDrawer.fields, names=names) for kind, names in figures.MAPS.items()},
     "fractions": lambda maps, frame: maps.fractions(frame) if len(maps.result.lights) > 1 else None,
-    "masks": lambda maps, frame: figures.mask_figure(maps.result, frame),
-    "discretisation": lambda maps, frame: maps.discretisation(frame),
-    "reflections": lambda maps, frame: figures.reflection_figure(maps.result, frame),
+    "masks": figures.MapDrawer.masks,
+    "discretisation": figures.MapDrawer.discretisation,
+    "reflections": figures.MapDrawer.reflections,
 }
 _NAMES = re.compile(rf"({'|'.join(_OF_TEST)}|({'|'.join(_OF_FRAME)}|map_.+)_[0-9]{{6,}})\.png")
 _Picture = tuple[str, int | None]
@@ -41,14 +40,14 @@ _Picture = tuple[str, int | None]
 
 
 def write_figures(
-    result: Result, folder: Path | str, frames: Sequence[int] | None = None, *, processes: int = 1, few: int = 20
+    shown: Result | Maps, folder: Path | str, frames: Sequence[int] | None = None, *, processes: int = 1, few: int = 20
 ) -> tuple[Path, ...]:
     """Write figures of convergence, residual and brightness, and of some frames maps, masks and reflections.
 
     Parameters
     ----------
-    result
-        The result.
+    shown
+        The result, or its fields as `Maps.of` derives them.
     folder
         Where the pictures go; made where it does not exist. Pictures of the same names are replaced.
     frames
@@ -72,7 +71,8 @@ def write_figures(
     ResultError
         The result is damaged, the folder cannot be written, or a process that draws is ended.
     """
-    folder = Path(folder)
+    folder, maps = Path(folder), shown if isinstance(shown, Maps) else Maps.of(shown)
+    result = maps.result
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     frames = _shown(result) if frames is None else frames
@@ -84,9 +84,8 @@ def write_figures(
     # Ctrl-C reaches all processes: the others end silently, this one reports it
     ended = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     with ProcessPoolExecutor(parts, multiprocessing.get_context("spawn"), initializer=ended) as pool:
-        bare = replace(result)  # without the quantities that were read, which each process reads for itself
-        others = [pool.submit(_draw, bare, folder, pictures[part::parts]) for part in range(1, parts)]
-        drawn = {*_draw(result, folder, pictures[::parts])}
+        others = [pool.submit(_draw, maps, folder, pictures[part::parts]) for part in range(1, parts)]
+        drawn = {*_draw(maps, folder, pictures[::parts])}
         try:
             drawn.update(*(other.result() for other in others))
         except BrokenExecutor:
@@ -142,11 +141,11 @@ def _shown(result: Result) -> tuple[int, ...]:
     return figures.spread(figures.measured_frames(result), 3)
 
 
-def _draw(result: Result, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
+def _draw(shown: Maps, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
     """Write pictures one after the other, so that only one is in memory; return the files of those that exist."""
-    files, maps = [], figures.MapDrawer(Maps.of(result), DPI)
+    files, maps = [], figures.MapDrawer(shown, DPI)
     for kind, frame in pictures:
-        figure = _OF_TEST[kind](result) if frame is None else _OF_FRAME[kind](maps, frame)
+        figure = _OF_TEST[kind](shown.result) if frame is None else _OF_FRAME[kind](maps, frame)
         if figure is not None:
             files.append(_file(folder, kind, frame))
             save_figure(figure, files[-1])

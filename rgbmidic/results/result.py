@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -143,6 +143,10 @@ class Result(Quantities, Described):
         if self.table.damaged.any():
             table = table.without_damaged(ended="finished" in provenance)
         return replace(self, table=table, provenance=provenance)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what was read, which each process reads for itself."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
     def __repr__(self) -> str:
         """Return what the result is of, in a few lines; values are not read."""

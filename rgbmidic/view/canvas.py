@@ -94,7 +94,7 @@ class Canvas:
         self.colours = bk.LinearColorMapper(palette=["#000000"], low=0, high=1, name=names[1])
         numbers = bk.BasicTickFormatter(power_limit_low=-6)  # else each number has a power of ten of its own
         look = {"width": 14, "major_label_text_font_size": "12px", "formatter": numbers}
-        self.bar = bk.ColorBar(color_mapper=self.colours, visible=False, **look)
+        self.bar = bk.ColorBar(color_mapper=self.colours, visible=False, ticker=bk.BasicTicker(), **look)
         self.plot.add_layout(self.bar, "right")
         self.marks = bk.ColumnDataSource(columns("x y kind name 0"), name=names[2])
         self._states, self.set = {0: list[Mark]()}, list[Mark]()
@@ -138,9 +138,9 @@ class Canvas:
         self.plot.title.text, self.bar.visible = title, True
         names = dict(enumerate(codes))
         if self.bar.major_label_overrides != names:
-            ticker = bk.FixedTicker(ticks=list(names)) if codes else "auto"
             size = "10px" if codes else "12px"  # the plot keeps its size
-            self.bar.update(major_label_overrides=names, ticker=ticker, major_label_text_font_size=size)
+            self.bar.update(major_label_overrides=names, major_label_text_font_size=size)
+            self.bar.ticker.min_interval = int(bool(codes))  # the page does not see another ticker
         self.colours.update(low=ends[0], high=ends[1])
         if self.colours.palette != list(colours):  # which takes as long to check as a frame to paint
             self.colours.palette = list(colours)

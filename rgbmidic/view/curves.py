@@ -208,7 +208,7 @@ class TimeLine:
         self._faults = bk.ColumnDataSource(columns("x colour"), name="faults")
         ranges = {"x_range": bk.Range1d(-0.5, max(frames - 0.5, 0.5)), "y_range": bk.Range1d(0, 105)}
         self.plot = plain_plot(x_axis_label="frame", y_axis_label="nodes (%)", min_border=2, **ranges)
-        self.plot.yaxis.ticker = [0, 50, 100]
+        self.plot.yaxis.ticker, self.plot.xaxis.ticker = [0, 50, 100], bk.BasicTicker(min_interval=1)
         self.plot.yaxis.axis_label_text_font_size = "10px"
         self.plot.varea("x", 0, "y", source=self._fractions, fill_color="#6baed6", fill_alpha=0.6)
         self.plot.segment("x", 0, "x", 100, source=self._faults, line_color="colour", line_width=2)

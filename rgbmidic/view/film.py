@@ -6,7 +6,6 @@ import html
 import multiprocessing
 import signal
 import sys
-from dataclasses import replace
 from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
@@ -44,17 +43,16 @@ class FilmButton:
             return
         shown, view, names = self._shown, self._shown.view, self._shown.names
         limited = {"test": names, "hand": names[:1]}.get(view.range, [])
-        result = replace(shown.maps.result)  # without what was read
+        maps = shown.maps
         options = {
             "limits": {name: shown.ends(name) for name in limited},
             "opacity": view.opacity,
             "colours": (view.palette if len(names) == 1 else "") or None,
-            "images": RawPictures(result=result) if view.over == "deformed" else None,
+            "images": RawPictures(result=maps.result) if view.over == "deformed" else None,
         }
-        maps = replace(shown.maps, result=result, physical=replace(shown.maps.physical, result=result))
         ending = ".mp4" if find_spec("imageio_ffmpeg") else ".gif"
         name = f"movie_{'_'.join(names)}".replace(" ", "_")
-        files = (result.path / f"{name}{f'_{number}' if number > 1 else ''}{ending}" for number in count(1))
+        files = (maps.result.path / f"{name}{f'_{number}' if number > 1 else ''}{ending}" for number in count(1))
         self._out = next(file for file in files if not file.exists())
         context = multiprocessing.get_context("spawn")
         self._reports, send = context.Pipe(duplex=False)
