@@ -138,7 +138,7 @@ def history_figure(histories: Histories, panels: Sequence[Panel] = (), *, most: 
 
 def _draw_quantities(axis: Axes, times: FloatArray, quantities: Sequence[History]) -> None:
     """Draw quantities over the times (T,), with bands of two standard uncertainties; their values set the limits."""
-    colours: dict[str, Any] = {}
+    colours, drawn = dict[str, Any](), list[FloatArray]()
     step = -(-len(quantities) // 14)  # more names of 7 points are higher than a panel: a crack has a quantity a node
     for number, quantity in enumerate(quantities):
         values, std = quantity.values, quantity.std
@@ -153,9 +153,10 @@ def _draw_quantities(axis: Axes, times: FloatArray, quantities: Sequence[History
             values = np.where(2 * std < 45, values, np.nan)  # degrees, from which it may be any
         (line,) = axis.plot(times, values, linewidth=1, **look)
         colours[quantity.name] = line.get_color()
+        drawn.append(values[np.isfinite(values)])
         if std is not None:
             axis.fill_between(times, values - 2 * std, values + 2 * std, color=line.get_color(), alpha=0.2, linewidth=0)
-    known = np.concatenate([quantity.values[np.isfinite(quantity.values)] for quantity in quantities])
+    known = np.concatenate(drawn)
     if known.size and np.ptp(known) > 0:
         axis.set_ylim(known.min() - 0.1 * np.ptp(known), known.max() + 0.1 * np.ptp(known))
 

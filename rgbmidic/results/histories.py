@@ -92,8 +92,9 @@ def history_rows(histories: Histories) -> tuple[list[str], list[list[str]]]:
         known = quantity.values[places]
         std = np.full(len(known), np.nan) if quantity.std is None else quantity.std[places]
         ends = (known.argmin(), known.argmax(), len(known) - 1) if known.size else ()
-        texts = [rounded(known[end], std[end]) for end in ends] or ["-"] * 3
         typical = float(np.median(std[np.isfinite(std)])) if np.isfinite(std).any() else math.nan
+        place = np.fmax(std, typical)  # a reference frame is known to rounding only: that is not the test's uncertainty
+        texts = [rounded(known[end], place[end]) for end in ends] or ["-"] * 3
         rows.append([quantity.name, quantity.unit, *texts, rounded(typical, typical), f"{known.size}"])
     return ["quantity", "unit", "smallest", "largest", "last", "uncertainty", "frames"], rows
 

@@ -78,10 +78,12 @@ class LabelLayer:
         canvas.plot.scatter("x", "y", source=self._points, line_color="#15181c", fill_color="colour", **look)
         canvas.plot.text("x", "y", "text", source=self._points, **LETTERS)
 
-    def show(self, points: Sequence[tuple[float, float, str, str]] = ()) -> None:
-        """Show points with their texts and colours."""
+    def show(
+        self, points: Sequence[tuple[float, float, str, str]] = (), others: Sequence[tuple[float, float, str]] = ()
+    ) -> None:
+        """Show points with their texts and colours, the texts clear of `others` that `beside` has placed."""
         if points or len(self._points.data["x"]):
-            placed = beside([(x, y, text) for x, y, text, _ in points], self._canvas.window)
+            placed = beside([*others, *(one[:3] for one in points)], self._canvas.window)[len(others) :]
             self._points.data = columns(_LABEL, [(*one, *place) for one, place in zip(points, placed, strict=True)])
 
 
@@ -223,7 +225,7 @@ class MarkLayer:
 
     @property
     def drawn(self) -> list[tuple[Any, ...]]:
-        """Line (xs, ys), colour, place (x, y) and text of each probe."""
+        """Line (xs, ys), colour, and place (x, y) and text of each probe."""
         return list(zip(*(self._joined.data[name] for name in _PROBE.split()[:6]), strict=True))
 
     def taken(self, nodes: FloatArray, reference: FloatArray) -> tuple[Mark, ...] | None:

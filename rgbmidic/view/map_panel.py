@@ -177,14 +177,6 @@ class MapPanel:
             arrows, longer = arrow_lines(window, nodes, moved, view.longer)
             title = f"{title}: {longer:.3g}"
         self._arrows.show(arrows)
-        ends = extremes(field, values) if view.extremes else ()
-        names = zip(("smallest", "largest"), ("#56b4e9", "#e69f00"), ends, strict=False)
-        self._ends.show(
-            [
-                (*nodes[node].tolist(), f"{name} {field.text(values.values[node], values.std[node])}", colour)
-                for name, colour, node in names
-            ]
-        )
         missing = np.flatnonzero(values.status) if view.blank else ()
         colours = palette("codes")
         self._blank.show([(*shown.result.nodes[node].tolist(), "", colours[values.status[node]]) for node in missing])
@@ -193,4 +185,13 @@ class MapPanel:
         texts = {name: read.probe_text(marks[0].kind, probe_place(marks, gauge)) for name, marks in probes}
         texts[SCALE] = f": {view.distance:g} mm" if view.distance else ""
         self.marks.place(view.marks, shown.result.nodes, nodes, texts, gauge)
+        ends = extremes(field, values) if view.extremes else ()
+        names = zip(("smallest", "largest"), ("#56b4e9", "#e69f00"), ends, strict=False)
+        self._ends.show(
+            [
+                (*nodes[node].tolist(), f"{name} {field.text(values.values[node], values.std[node])}", colour)
+                for name, colour, node in names
+            ],
+            others=[(x, y, text) for *_, x, y, text in self.marks.drawn],
+        )
         return title

@@ -432,33 +432,43 @@ class FieldInFrame:
     def probe_text(self, kind: str, place: tuple[float, ...]) -> str:
         """Return what a probe of a kind measures of the field, with its uncertainty, as its history has it.
 
-        A probe whose history does not have the field shows its value at the centre, or its mean; see `mean_of`.
+        A probe whose history does not have the field shows its value at the centre, or its mean; see `mean_of`. A
+        gauge shows its extension, or over a strain its own.
         """
         maps, name = self.maps, self.measured
-        strain = maps.all.get(name, self.field).group == "Strain"
-        if kind == "gauge" or (self.field.stepped and kind in ("line", "region", "circle")):
+        group = maps.all.get(name, self.field).group
+        strain = group == "Strain"
+        if self.field.stepped and kind in ("line", "region", "circle"):
             return ""
         try:
             if kind == "strain_gauge" and strain:
                 read = maps.strain_at(self.frame, *place)
-                return f": {self._told(float(read[name][0]), float(read[f'{name}_std'][0]))}"
+                return f": {self._told(float(read[name][0]), float(read[f'{name}_std'][0]), self.field.unit)}"
             kind, place = ("point", place[:2]) if kind == "strain_gauge" else (kind, place)
             stated = ProbeSettings(measure=cast(Any, maps.physical.measure))
             probe = make_probe(maps.physical.covariance, kind, 1, place, stated, maps.physical.rectified)
         except InputError:
             return ""
-        assert isinstance(probe, Mean)
-        if isinstance(probe, Area) and strain and maps.since is None and not maps.rigid_removed:
+        of_gauge = {"Displacement": "extension", "Strain": "strain"}.get(group) if kind == "gauge" else None
+        wanted = of_gauge or (name if isinstance(probe, Area) and strain else None)
+        if wanted and maps.since is None and not maps.rigid_removed:
             part = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), self.moved[:, None, probe.nodes], strict=True)))
             for one in probe.histories(part):
-                if one.name == f"{probe.name}_{name}" and one.std is not None:
-                    return f" mean: {self._told(float(one.values[0]), float(one.std[0]))}"
+                if one.name == f"{probe.name}_{wanted}" and one.std is not None:
+                    (value,), (std,), unit = one.values, one.std, one.unit
+                    if unit == "px":
+                        (value, std), unit = maps.physical.units.lengths(value, std), maps.physical.units.length
+                    return f" {of_gauge or 'mean'}: {self._told(float(value), float(std), unit)}"
+        if not isinstance(probe, Mean):
+            return ""
         value, std = self.mean_of(probe)
         most = " at most" if kind != "point" and name not in ("u", "v") and np.isfinite(std) else ""
         return f"{' mean' if kind != 'point' else ''}: {self.field.text(value, std)}{most}"
 
-    def _told(self, value: float, std: float) -> str:
-        return self.field.text(value, std) if self.measured == self.field.name else self.field.text(std)
+    def _told(self, value: float, std: float, unit: str) -> str:
+        """State a value, or where the field is an uncertainty that of the value."""
+        stated = replace(self.field, unit=unit)
+        return stated.text(value, std) if self.measured == self.field.name else stated.text(std)
 
     def mean_of(self, mean: Mean) -> tuple[float, float]:
         """Average the field over a place, as a history does, with its standard uncertainty; NaN where it has none.

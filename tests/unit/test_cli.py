@@ -289,7 +289,7 @@ def test_figures_of_any_field(command: Run, tmp_path: Path) -> None:
         (("--field", "exx", "--measure", "small"), "allowed are green-lagrange"),
         (("--field", "exx", "--since", "5"), "no frame 5"),
         (("--field", "velocity"), "rates need 4 measured frames or more; there are 2"),
-        (("--gauge", "70"), "need a --field"),
+        (("--hatch",), "--hatch needs a --field"),
     ):
         status, _, error = command("figures", result.path, "--out", tmp_path / "none", *options)
         assert status == 2

@@ -20,7 +20,7 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.report import curves, figures, gallery, remove_pictures, save_figure, style, write_figures, write_maps
 from rgbmidic.results import QUANTITIES, FrameRecord, Maps, Origin, Result, ResultStore
-from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings
+from rgbmidic.settings import FrameSettings, RegionSettings, ScaleSettings, TestSettings
 from rgbmidic.typing import AnyArray
 from rgbmidic.view.picture import Pictures
 
@@ -407,6 +407,18 @@ def test_mask_shades_what_is_excluded(tmp_path: Path) -> None:
     told = float(figure.axes[0].get_title().removeprefix("red: ").removesuffix("% excluded"))
     assert told == pytest.approx(100 * share, abs=2)
     assert figure.axes[1].get_title() == "green: 0.0% excluded"
+
+
+def test_pictures_of_a_frame_have_one_unit_and_the_options_of_the_maps(tmp_path: Path) -> None:
+    notes = {"settings": {"scale": {"mm_per_pixel": 0.5}}}
+    dark = {"weights_thumbnail": np.zeros((3, 40, 60)), "reflection_thumbnail": np.full((3, 40, 60), 255)}
+    result = _one_frame(tmp_path / "out", np.stack([IMAGE] * 3), notes, u=X / 100, v=Y / 200, **dark)
+    for unit, maps in (("mm", Maps.of(result)), ("px", Maps.of(result, ScaleSettings(unit="px"), gauge=70))):
+        drawer = figures.MapDrawer(maps)
+        drawn = drawer.fields(0, ["u"]), drawer.masks(0), drawer.reflections(0)
+        assert {figure.axes[0].get_xlabel() for figure in drawn} == {f"x ({unit})"}
+    assert "gauge of 70 px" in drawer.fields(0, figures.MAPS["strain"]).texts[0].get_text()
+    assert any(file.name == "masks_000000.png" for file in write_figures(maps, tmp_path / "figures"))
 
 
 def test_weights_that_exclude_nothing_have_no_picture(tmp_path: Path) -> None:

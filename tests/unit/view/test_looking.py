@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from bokeh.document import Document
 from bokeh.events import MouseMove
+from bokeh.plotting import figure
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from results import LIGHTS, MESH, NODES, corrupt, make_origin, make_result, random_record, smooth_record
@@ -22,13 +23,14 @@ from results import LIGHTS, MESH, NODES, corrupt, make_origin, make_result, rand
 from rgbmidic import CameraCalibration
 from rgbmidic.fields import MEASURES
 from rgbmidic.report.style import time_axis
-from rgbmidic.results import FrameRecord, Maps, MapValues, Result, ResultStore
+from rgbmidic.results import QUANTITIES, FrameRecord, Maps, MapValues, Result, ResultStore
 from rgbmidic.results.histories import read_histories, write_histories
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, TestSettings
+from rgbmidic.text import rounded, uncertain
 from rgbmidic.view import curves
 from rgbmidic.view.address import CLOCKS, MARKS, PALETTES, UNCERTAINTY, Mark, Steps, ViewState, probe_marks
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
-from rgbmidic.view.layers import arrow_lines, beside, contour_lines
+from rgbmidic.view.layers import LabelLayer, arrow_lines, beside, contour_lines
 from rgbmidic.view.models import ResultControls
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import (
@@ -271,7 +273,7 @@ def spread_of(text):
 
 
 PLACES = {"point": (52.0, 41.0), "region": (30.0, 20.0, 60.0, 60.0), "line": (20.0, 20.0, 90.0, 55.0)}
-PLACES |= {"circle": (60.0, 40.0, 17.0), "strain_gauge": (52.0, 41.0, 60.0)}
+PLACES |= {"circle": (60.0, 40.0, 17.0), "strain_gauge": (52.0, 41.0, 60.0), "gauge": (25.0, 30.0, 85.0, 50.0)}
 
 
 @pytest.mark.parametrize("measure", MEASURES[:2])
@@ -292,6 +294,11 @@ def test_the_label_of_a_probe_is_its_history_in_that_frame_and_the_pointer_state
             value, std = history(kind, name)
             assert label(maps, name, kind, *PLACES[kind]) == f"{mean}: {maps.all[name].text(value, std)}"
             assert label(maps, f"{name}_std", kind, *PLACES[kind]) == f"{mean}: {maps.all[f'{name}_std'].text(std)}"
+    for name, of_gauge, unit in (("u", "extension", " mm"), ("exx", "strain", "")):
+        value, std = history("gauge", of_gauge)
+        assert label(maps, name, "gauge", *PLACES["gauge"]) == f" {of_gauge}: {uncertain(value, std)}{unit}"
+        assert label(maps, f"{name}_std", "gauge", *PLACES["gauge"]) == f" {of_gauge}: {rounded(std, std)}{unit}"
+    assert label(maps, "misfit", "gauge", *PLACES["gauge"]) == ""
     for name in ("exx", "eyy", "exy", "e1", "e2", "equivalent"):
         for kind in ("region", "circle"):
             assert label(maps, name, kind, *PLACES[kind]) == f" mean: {maps.all[name].text(*history(kind, name))}"
@@ -707,6 +714,16 @@ def test_there_is_no_colour_bar_before_there_are_colours(probed):
     assert page.maps.canvas.bar.visible
 
 
+def test_a_bar_of_codes_has_their_names_only(probed):
+    page = ResultPage(Document(), probed, ViewState(field="node_status"), Progress(4))
+    bar = page.maps.canvas.bar
+    ticker = bar.ticker  # the page keeps the one that it was opened with
+    page.show()
+    assert bar.ticker is ticker
+    assert ticker.min_interval == 1
+    assert bar.major_label_overrides == dict(enumerate(QUANTITIES["node_status"].codes))
+
+
 def test_a_page_whose_browser_has_gone_is_not_watched():
     def document(connections):
         session = None if connections is None else SimpleNamespace(connection_count=connections)
@@ -724,3 +741,6 @@ def test_texts_end_in_the_window_and_do_not_lie_on_each_other():
     near = sorted(lows[at] for at in (0, 2, 3))
     assert min(np.diff(near)) >= 20
     assert lows[1] == 50
+    layer = LabelLayer(SimpleNamespace(window=window, plot=figure()), "extremes")
+    layer.show([(11, 51, "smallest", "black")], others=texts)
+    assert 51 + layer._points.data["down"][0] >= max(near) + 20
