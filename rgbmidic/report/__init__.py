@@ -2,15 +2,7 @@
 
 from rgbmidic.report.curves import history_figure, profile_figure, wave_text
 from rgbmidic.report.document import write_batch_page, write_report
-from rgbmidic.report.figures import (
-    brightness_figure,
-    convergence_figure,
-    fraction_figure,
-    map_figure,
-    mask_figure,
-    reflection_figure,
-    residual_figure,
-)
+from rgbmidic.report.figures import MAPS, MapDrawer, brightness_figure, convergence_figure, residual_figure
 from rgbmidic.report.gallery import REPORT, remove_pictures, write_figures, write_maps
 from rgbmidic.report.movie import Movie, write_movie
 from rgbmidic.report.movie_curve import Curve
@@ -18,19 +10,17 @@ from rgbmidic.report.page import render
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
 
 __all__ = [
+    "MAPS",
     "REPORT",
     "STYLE",
     "Curve",
+    "MapDrawer",
     "Movie",
     "brightness_figure",
     "convergence_figure",
     "finish_plot",
-    "fraction_figure",
     "history_figure",
-    "map_figure",
-    "mask_figure",
     "profile_figure",
-    "reflection_figure",
     "remove_pictures",
     "render",
     "residual_figure",

@@ -50,104 +50,6 @@ def spread(frames: Sequence[int], most: int) -> tuple[int, ...]:
     return tuple(sorted({frames[int(i)] for i in np.linspace(len(frames) - 1, 0, min(most, len(frames))).round()}))
 
 
-def map_figure(result: Result, frame: int, kind: str) -> Figure:
-    """Draw maps of nodal fields of one frame over the reference image; blank where not measured.
-
-    They are those of `Maps.of(result)`: in mm where the scale is known, the strain over the shortest virtual gauge.
-
-    Parameters
-    ----------
-    result
-        The result.
-    frame
-        Index of the frame.
-    kind
-        One of `MAPS`.
-
-    Returns
-    -------
-    Figure
-        The figure, one panel per field.
-
-    Raises
-    ------
-    InputError
-        There is no such frame.
-    ResultError
-        The frame is damaged.
-    """
-    return MapDrawer(Maps.of(result)).fields(frame, MAPS[kind])
-
-
-def fraction_figure(result: Result, frame: int) -> Figure:
-    """Draw maps of the fraction of each light in what determines the nodes of one frame.
-
-    Parameters
-    ----------
-    result
-        The result.
-    frame
-        Index of the frame.
-
-    Returns
-    -------
-    Figure
-        The figure, one panel per light.
-
-    Raises
-    ------
-    InputError, ResultError
-        As `map_figure`.
-    """
-    return MapDrawer(Maps.of(result)).fractions(frame)
-
-
-def mask_figure(result: Result, frame: int) -> Figure | None:
-    """Draw what the weights of one frame exclude of each light before the solve.
-
-    Parameters
-    ----------
-    result
-        The result.
-    frame
-        Index of the frame.
-
-    Returns
-    -------
-    Figure or None
-        The figure, one panel per light; None where they exclude nothing, or no reference image was kept.
-
-    Raises
-    ------
-    InputError, ResultError
-        As `map_figure`.
-    """
-    return MapDrawer(Maps.of(result)).masks(frame)
-
-
-def reflection_figure(result: Result, frame: int) -> Figure | None:
-    """Draw the reflection index of each light in one frame.
-
-    Parameters
-    ----------
-    result
-        The result.
-    frame
-        Index of the frame.
-
-    Returns
-    -------
-    Figure or None
-        The figure, one panel per light; None where the separation did not estimate it, or no reference image was kept.
-
-    Raises
-    ------
-    InputError, ResultError
-        As `map_figure`.
-    """
-    return MapDrawer(Maps.of(result)).reflections(frame)
-
-
 def brightness_figure(result: Result) -> Figure:
     """Draw gain and offset of every light against the reference over the deformed frames.
 
@@ -270,7 +172,25 @@ class MapDrawer:
         self._element: npt.NDArray[np.int32] = np.asarray(closed.get_trifinder()(*self._places), dtype=np.int32)
 
     def discretisation(self, frame: int) -> Figure | None:
-        """Draw both errors together, and where a finer mesh is needed; None for a frame without the second one."""
+        """Draw noise and discretisation error together, and where a finer mesh is needed.
+
+        Parameters
+        ----------
+        frame
+            Index of the frame.
+
+        Returns
+        -------
+        Figure or None
+            The figure; None for a frame without discretisation error.
+
+        Raises
+        ------
+        InputError
+            There is no such frame.
+        ResultError
+            The frame is damaged.
+        """
         names = ("u_total", "v_total", "finer_mesh")
         if "finer_mesh" not in self.maps.all or not np.isfinite(self.maps.read("u_total", frame).values).any():
             return None
@@ -310,16 +230,71 @@ class MapDrawer:
         return self._draw(frame, panels, "; ".join(filter(None, how)), hatched=hatched)
 
     def fractions(self, frame: int) -> Figure:
-        """Draw the fraction of each light in what determines the nodes of a frame, as `fraction_figure` does."""
+        """Draw maps of the fraction of each light in what determines the nodes of a frame.
+
+        Parameters
+        ----------
+        frame
+            Index of the frame.
+
+        Returns
+        -------
+        Figure
+            The figure, one panel per light.
+
+        Raises
+        ------
+        InputError
+            There is no such frame.
+        ResultError
+            The frame is damaged.
+        """
         return self.fields(frame, [f"fraction of {light}" for light in self.result.lights])
 
     def masks(self, frame: int) -> Figure | None:
-        """Draw what the weights of a frame exclude of each light, as `mask_figure` does."""
+        """Draw what the weights of a frame exclude of each light before the solve.
+
+        Parameters
+        ----------
+        frame
+            Index of the frame.
+
+        Returns
+        -------
+        Figure or None
+            The figure, one panel per light; None where they exclude nothing, or no reference image was kept.
+
+        Raises
+        ------
+        InputError
+            There is no such frame.
+        ResultError
+            The frame is damaged.
+        """
         excluded = 1 - self.result.frame(frame).weights_thumbnail / 255
         return self._shaded(frame, excluded, excluded, "{:.1%} excluded") if excluded.any() else None
 
     def reflections(self, frame: int) -> Figure | None:
-        """Draw the reflection index of each light in a frame, as `reflection_figure` does."""
+        """Draw the reflection index of each light in a frame.
+
+        Parameters
+        ----------
+        frame
+            Index of the frame.
+
+        Returns
+        -------
+        Figure or None
+            The figure, one panel per light; None where the separation did not estimate it, or no reference image
+            was kept.
+
+        Raises
+        ------
+        InputError
+            There is no such frame.
+        ResultError
+            The frame is damaged.
+        """
         index = self.result.frame(frame).reflection_thumbnail / 255
         return self._shaded(frame, index, index > REFLECTING, "reflects on {:.1%}") if index.size else None
 

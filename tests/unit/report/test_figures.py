@@ -39,6 +39,11 @@ def _one_frame(
     return Result.open(path)
 
 
+def _maps(result: Result, frame: int, kind: str) -> Any:
+    """Maps of a kind in a frame."""
+    return figures.MapDrawer(Maps.of(result)).fields(frame, figures.MAPS[kind])
+
+
 def _places(picture: Any) -> tuple[AnyArray, AnyArray]:
     """x and y of the columns and rows of a map."""
     rows, columns = picture.get_array().shape[:2]
@@ -50,7 +55,7 @@ def _places(picture: Any) -> tuple[AnyArray, AnyArray]:
 @pytest.mark.parametrize("reference", [None, np.stack([IMAGE] * 3)])
 def test_map_has_the_right_value_at_every_place(tmp_path: Path, reference: AnyArray | None) -> None:
     result = _one_frame(tmp_path / "out", reference, u=X / 10, v=1 - Y / 20)
-    figure = figures.map_figure(result, 0, "displacement")
+    figure = _maps(result, 0, "displacement")
     for axis, field in zip(figure.axes[:2], (lambda x, y: x / 10, lambda x, y: 1 - y / 20), strict=True):
         picture = axis.images[-1]
         np.testing.assert_allclose(picture.get_array(), field(*np.meshgrid(*_places(picture))), atol=1e-9)
@@ -68,7 +73,7 @@ def test_a_map_of_a_mesh_with_a_crack_has_the_values_of_both_sides(tmp_path: Pat
         zero = np.zeros(len(mesh.nodes))
         jump = np.where(left, np.where(above, -1.0, 1.0), 0.0)
         store.write_frame(0, FrameRecord.of(nodes=len(mesh.nodes), lights=1, u=zero, v=jump, u_std=zero, v_std=zero))
-    picture = figures.map_figure(Result.open(tmp_path / "out"), 0, "displacement").axes[1].images[-1]
+    picture = _maps(Result.open(tmp_path / "out"), 0, "displacement").axes[1].images[-1]
     x, y = _places(picture)
     shown = picture.get_array()
     assert not np.ma.getmaskarray(np.ma.masked_invalid(shown)).any()
@@ -93,7 +98,7 @@ def test_a_reference_that_shows_a_part_of_the_frame_lies_where_it_belongs(tmp_pa
     assert whole.shape == (80, 120)
     np.testing.assert_array_equal(whole[4:, 8:], result.reference[0])
     assert (whole[:4] == whole[0, 0]).all()
-    image, shade = figures.reflection_figure(result, 0).axes[0].images
+    image, shade = figures.MapDrawer(Maps.of(result)).reflections(0).axes[0].images
     assert image.get_extent() == [7.5, 119.5, 79.5, 3.5]
     places, rows = _places(shade)
     seen = shade.get_array()[..., 3] > 0
@@ -106,7 +111,7 @@ def test_axes_that_are_drawn_once_look_as_if_drawn_for_each_map(tmp_path: Path) 
     maps = figures.MapDrawer(Maps.of(result), 60)
     before = _pixels(maps.fields(1, figures.MAPS["displacement"]))
     frozen = _pixels(maps.fields(2, figures.MAPS["displacement"]))
-    anew = _pixels(figures.map_figure(result, 2, "displacement"))
+    anew = _pixels(_maps(result, 2, "displacement"))
     changed = (np.abs(before - anew) > 30).mean()
     assert (np.abs(frozen - anew) > 30).mean() < 0.01 < 0.1 < changed
     assert maps.fields(2, figures.MAPS["uncertainty"]) is maps.fields(1, figures.MAPS["displacement"])
@@ -123,7 +128,7 @@ def test_every_map_shows_its_quantities_around_the_mesh(tmp_path: Path, kind: st
     ramp = np.linspace(1, 2, NODES)
     given = {"u": 0.01 * X**2 / 60, "v": 0.02 * Y, "u_std": ramp, "v_std": 2 * ramp, "misfit": ramp}
     result = _one_frame(tmp_path / "out", np.ones((3, 500, 700)), **given)
-    figure, maps = figures.map_figure(result, 0, kind), Maps.of(result)
+    figure, maps = _maps(result, 0, kind), Maps.of(result)
     for axis, name in zip(figure.axes, figures.MAPS[kind], strict=False):
         assert axis.get_title() == maps.field(name).label
         picture, values = axis.images[-1].get_array(), maps.read(name, 0).values
@@ -158,7 +163,7 @@ def test_a_derived_field_has_its_uncertainty_beside_it_and_hatches_where_it_may_
 
 def test_blank_where_not_measured(tmp_path: Path) -> None:
     result = _one_frame(tmp_path / "out", u=np.where(X > 60, np.nan, X), v=X)
-    picture = figures.map_figure(result, 0, "displacement").axes[0].images[-1]
+    picture = _maps(result, 0, "displacement").axes[0].images[-1]
     hidden, (x, _) = np.ma.getmaskarray(picture.get_array()), _places(picture)
     # an element is blank as soon as one of its nodes is: from the last measured column of nodes on
     assert hidden[:, x > 60.01].all()
@@ -175,7 +180,7 @@ def test_outliers_at_the_edge_do_not_turn_the_bulk_of_an_uncertainty_black(tmp_p
     """A third of the nodes 30 times as uncertain: the others still spread over a good part of the colours."""
     edge = np.isin(X, [X.min(), X.max()])
     std = np.where(edge, 0.1, 0.003) * np.exp(np.random.default_rng(0).normal(0, 0.2, NODES))
-    figure = figures.map_figure(_one_frame(tmp_path / "out", u_std=std, v_std=std), 0, "uncertainty")
+    figure = _maps(_one_frame(tmp_path / "out", u_std=std, v_std=std), 0, "uncertainty")
     colours = np.asarray(figure.axes[0].images[-1].norm(std))
     assert np.ptp(np.percentile(colours[~edge], [5, 95])) > 0.15
     assert (colours[edge] >= 1).all()
@@ -186,7 +191,7 @@ def test_doubtful_nodes_do_not_rule_the_colours(tmp_path: Path) -> None:
     edge = X < 30
     u = np.where(edge, 0.05 * np.random.default_rng(0).normal(size=NODES), 0.002 * (X > 60))
     result = _one_frame(tmp_path / "out", u=u, v=u, u_std=np.where(edge, 0.05, 1e-4), v_std=np.full(NODES, 1.0))
-    norm = figures.map_figure(result, 0, "displacement").axes[0].images[-1].norm
+    norm = _maps(result, 0, "displacement").axes[0].images[-1].norm
     assert (norm.vmin, norm.vmax) == (0, 0.002)
 
 
@@ -262,12 +267,12 @@ def test_displacements_are_in_mm_where_the_scale_is_known(tmp_path: Path) -> Non
     settings = TestSettings.from_mapping({**SETTINGS, "scale": scale})
     record = FrameRecord.of(nodes=NODES, lights=len(LIGHTS), u=X, v=Y, u_std=X / 100, v_std=Y / 100, exx=X)
     result = make_result(tmp_path / "out", frames=1, record=lambda index: record, settings=settings)
-    u, v, *_ = figures.map_figure(result, 0, "displacement").axes
+    u, v, *_ = _maps(result, 0, "displacement").axes
     assert (u.get_title(), v.get_title()) == ("u (mm)", "v (mm)")
     assert np.ptp(u.images[-1].get_array()) == pytest.approx(0.05 * np.ptp(X), rel=0.01)
-    std = figures.map_figure(result, 0, "uncertainty").axes[0].images[-1].get_array()
+    std = _maps(result, 0, "uncertainty").axes[0].images[-1].get_array()
     assert std.max() == pytest.approx(np.hypot(0.05 * 0.01, 0.001) * X.max(), rel=0.01)
-    assert figures.map_figure(result, 0, "strain").axes[0].get_title() == "εxx"
+    assert _maps(result, 0, "strain").axes[0].get_title() == "εxx"
     assert (u.get_xlabel(), u.get_ylabel()) == ("x (mm)", "y (mm)")
     numbers = [float(label.get_text()) for label in u.get_xticklabels()]
     assert all(0 < number < 0.05 * 120 for number in numbers[1:-1])
@@ -287,7 +292,7 @@ def test_run_xarray_and_maps_have_one_strain_and_say_which(tmp_path: Path) -> No
     """The picture of `run`, the Dataset and the maps: the same numbers, and the title has measure and gauge."""
     stretch = {"u": 0.1 * (X - 60), "v": 0 * Y, "u_std": np.full(NODES, 0.01), "v_std": np.full(NODES, 0.01)}
     result = _one_frame(tmp_path / "out", **stretch)
-    figure, maps = figures.map_figure(result, 0, "strain"), Maps.of(result)
+    figure, maps = _maps(result, 0, "strain"), Maps.of(result)
     expected = 0.1 + 0.1**2 / 2
     assert np.nanmean(figure.axes[0].images[-1].get_array()) == pytest.approx(expected, rel=1e-3)
     assert maps.how("exx") in figure.texts[0].get_text()
@@ -313,7 +318,7 @@ def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
     for figure, names in (
         (figures.convergence_figure(result), NASTY[1:5]),
         (figures.residual_figure(result), NASTY[:3]),
-        (figures.fraction_figure(result, 0), NASTY[:3]),
+        (figures.MapDrawer(Maps.of(result)).fractions(0), NASTY[:3]),
     ):
         figure.savefig(io.BytesIO(), format="png", dpi=30)
         texts = [text for text in figure.findobj(match=Text) if "mathdefault" not in text.get_text()]
@@ -354,7 +359,7 @@ def test_numbers_under_a_narrow_map_do_not_touch(tmp_path: Path) -> None:
     origin = make_origin(1, nodes=tall.nodes, elements=tall.elements)
     with ResultStore.create(tmp_path / "out", origin) as store:
         store.write_frame(0, FrameRecord.of(nodes=len(tall.nodes), lights=len(LIGHTS), exx=tall.nodes[:, 0]))
-    _numbers(figures.map_figure(Result.open(tmp_path / "out"), 0, "strain"))
+    _numbers(_maps(Result.open(tmp_path / "out"), 0, "strain"))
 
 
 def _numbers(figure: Any) -> list[float]:
@@ -393,14 +398,14 @@ def test_mask_shades_what_is_excluded(tmp_path: Path) -> None:
     weights[0, :20] = 0
     still = {"u": 0 * X, "v": 0 * X, "reflection_thumbnail": 255 - weights}
     result = _one_frame(tmp_path / "out", np.stack([IMAGE] * 3), weights_thumbnail=weights, **still)
-    for figure in (figures.mask_figure(result, 0), figures.reflection_figure(result, 0)):
+    for figure in (figures.MapDrawer(Maps.of(result)).masks(0), figures.MapDrawer(Maps.of(result)).reflections(0)):
         assert figure is not None
         shade = figure.axes[0].images[-1]
         alpha = shade.get_array()[..., 3]
         assert alpha[:20].min() > 0.5
         assert alpha[20:].max() == 0
         assert shade.get_extent() == [-0.5, 119.5, 79.5, -0.5]
-    figure = figures.mask_figure(result, 0)
+    figure = figures.MapDrawer(Maps.of(result)).masks(0)
     assert figure is not None
     top, bottom = sorted(figure.axes[0].get_ylim())
     share = (40 - top) / (bottom - top)
@@ -424,14 +429,14 @@ def test_pictures_of_a_frame_have_one_unit_and_the_options_of_the_maps(tmp_path:
 def test_weights_that_exclude_nothing_have_no_picture(tmp_path: Path) -> None:
     weights = np.full((3, 40, 60), 255)
     result = _one_frame(tmp_path / "out", np.stack([IMAGE] * 3), weights_thumbnail=weights)
-    assert figures.mask_figure(result, 0) is None
-    assert figures.reflection_figure(result, 0) is None
+    assert figures.MapDrawer(Maps.of(result)).masks(0) is None
+    assert figures.MapDrawer(Maps.of(result)).reflections(0) is None
 
 
 def test_impossible_frame_and_file(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out")
     with pytest.raises(InputError, match="no frame 2"):
-        figures.map_figure(result, 2, "displacement")
+        _maps(result, 2, "displacement")
     with pytest.raises(InputError, match="no frame 7"):
         write_figures(result, tmp_path / "figures", [0, 7])
     assert not list((tmp_path / "figures").iterdir())
