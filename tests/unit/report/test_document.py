@@ -106,7 +106,7 @@ def still(index: int, noise: float, **values: Any) -> FrameRecord:
 
 def test_the_page_is_whole_and_needs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(style, "embedded", partial(style.embedded, dpi=40))  # coarse: for the time
-    for name in ("brightness", "convergence", "map", "residual", "fraction"):  # have tests of their own
+    for name in ("brightness", "convergence", "residual"):  # have tests of their own
         monkeypatch.setattr(document.figures, f"{name}_figure", lambda *_: Figure(facecolor="red"))
     image = np.random.default_rng(0).normal(1000, 100, (3, 80, 120))
     probes = ProbeSettings(points=((60.0, 40.0),))
