@@ -30,6 +30,7 @@ from rgbmidic.results import (
     Origin,
     Result,
     ResultStore,
+    history_rows,
     write_histories,
 )
 from rgbmidic.results.histories import history_csv, read_histories, with_channels
@@ -558,3 +559,22 @@ def test_without_a_file_the_table_is_printed_and_nothing_written(
     assert "point_1_u" in out
     assert "table:" not in out
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_extremes_are_not_stated_finer_than_the_test_is_known():
+    """A reference frame compared with itself is known to rounding; beside frames known to 1e-4 that means nothing."""
+    std = np.array([1.6e-9, 1.1e-4, 1.2e-4])
+    quantity = History(name="point_1_u", unit="mm", values=np.array([2.35e-9, 3e-4, 0.01944]), std=std)
+    assert history_rows(histories_of(np.arange(float(len(quantity.values))), quantity))[1] == [
+        ["point_1_u", "mm", "0.00000", "0.01944", "0.01944", "0.00011", "3"]
+    ]
+    wide = replace(quantity, values=quantity.values[::-1], std=np.array([1.1e-4, 1.2e-4, 0.02]))
+    assert history_rows(histories_of(np.arange(3.0), wide))[1][0][2:5] == ["0.000", "0.01944", "0.000"]
+
+
+def test_a_direction_that_is_not_drawn_sets_no_limits():
+    values, std = np.array([-80.0, 67.0, 68.0, 72.0]), np.array([30.0, 0.4, 0.3, 0.1])
+    quantity = History(name="region_1_direction", unit="deg", values=values, std=std)
+    low, high = history_figure(histories_of(np.arange(float(len(quantity.values))), quantity)).axes[0].get_ylim()
+    assert 60 < low < 67
+    assert 72 < high < 80
