@@ -87,7 +87,7 @@ class ChannelControls:
         quantities = [] if curves.histories is None else [one.name for one in curves.histories.quantities]
         read = [name for name in quantities if name not in names]
         for entry, first, known in (
-            ("trigger", "choose", names), ("align", "choose", names), ("force", "the only one in N or kN", names),
+            ("trigger", "choose", names), ("align", "choose", names), ("force", "the one in N or kN", names),
             ("beside", "none", names), ("align_to", "choose", read), ("along", "time", quantities),
         ):  # fmt: skip
             stated = getattr(view, entry)
