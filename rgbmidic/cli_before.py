@@ -27,7 +27,7 @@ def demo(
     from rgbmidic._kernels.threads import threads
     from rgbmidic.lab.demo import run_demo, run_plate, write_plate
     from rgbmidic.report import write_figures
-    from rgbmidic.results import Result
+    from rgbmidic.results import Maps, Result
 
     started = time.perf_counter()
     with progress_of("demo") as progress:
@@ -38,7 +38,7 @@ def demo(
     note(f"6 of 7: measurement on it: rgbmidic run {out / 'test' / 'plate.toml'}, with [scale] camera = camera.json")
     plate = run_plate(out / "test", truth)
     note(f"7 of 7: pictures of the result in {out / 'figures'}")
-    write_figures(Result.open(out / "result"), out / "figures", (len(rows),), processes=threads())
+    write_figures(Maps.of(Result.open(out / "result")), out / "figures", (len(rows),), processes=threads())
     columns = ["angle", "three lights", "red alone", "green alone", "blue alone", "at nodes", "stated u_std"]
     lines = []
     for row in rows:

@@ -148,10 +148,11 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
     """
     from rgbmidic._kernels.threads import threads
     from rgbmidic.report import remove_pictures, write_figures
+    from rgbmidic.results import Maps
 
     remove_pictures(result.path)
     if draw:
-        write_figures(result, result.path / "figures", processes=processes or threads())
+        write_figures(Maps.of(result), result.path / "figures", processes=processes or threads())
     _print_summary(result, time.perf_counter() - started)
     failed = [index for index in result.deformed if result.status[index] != 0]
     if unread := int(result.unread.sum()):

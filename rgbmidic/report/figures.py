@@ -186,10 +186,8 @@ class MapDrawer:
 
         Raises
         ------
-        InputError
-            There is no such frame.
-        ResultError
-            The frame is damaged.
+        InputError, ResultError
+            As `fields`.
         """
         names = ("u_total", "v_total", "finer_mesh")
         if "finer_mesh" not in self.maps.all or not np.isfinite(self.maps.read("u_total", frame).values).any():
@@ -244,10 +242,8 @@ class MapDrawer:
 
         Raises
         ------
-        InputError
-            There is no such frame.
-        ResultError
-            The frame is damaged.
+        InputError, ResultError
+            As `fields`.
         """
         return self.fields(frame, [f"fraction of {light}" for light in self.result.lights])
 
@@ -266,10 +262,8 @@ class MapDrawer:
 
         Raises
         ------
-        InputError
-            There is no such frame.
-        ResultError
-            The frame is damaged.
+        InputError, ResultError
+            As `fields`.
         """
         excluded = 1 - self.result.frame(frame).weights_thumbnail / 255
         return self._shaded(frame, excluded, excluded, "{:.1%} excluded") if excluded.any() else None
@@ -290,10 +284,8 @@ class MapDrawer:
 
         Raises
         ------
-        InputError
-            There is no such frame.
-        ResultError
-            The frame is damaged.
+        InputError, ResultError
+            As `fields`.
         """
         index = self.result.frame(frame).reflection_thumbnail / 255
         return self._shaded(frame, index, index > REFLECTING, "reflects on {:.1%}") if index.size else None

@@ -40,14 +40,14 @@ _Picture = tuple[str, int | None]
 
 
 def write_figures(
-    shown: Result | Maps, folder: Path | str, frames: Sequence[int] | None = None, *, processes: int = 1, few: int = 20
+    maps: Maps, folder: Path | str, frames: Sequence[int] | None = None, *, processes: int = 1, few: int = 20
 ) -> tuple[Path, ...]:
     """Write figures of convergence, residual and brightness, and of some frames maps, masks and reflections.
 
     Parameters
     ----------
-    shown
-        The result, or its fields as `Maps.of` derives them.
+    maps
+        The fields of a result.
     folder
         Where the pictures go; made where it does not exist. Pictures of the same names are replaced.
     frames
@@ -71,8 +71,7 @@ def write_figures(
     ResultError
         The result is damaged, the folder cannot be written, or a process that draws is ended.
     """
-    folder, maps = Path(folder), shown if isinstance(shown, Maps) else Maps.of(shown)
-    result = maps.result
+    folder, result = Path(folder), maps.result
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     frames = _shown(result) if frames is None else frames

@@ -196,7 +196,7 @@ def read_histories(
     common, references = shared_part(result), reference_frames(result)[there]
     rate = partial(rates, clock, window=span, common_fraction=common, references=references) if window else None
     read = [*rigid, *(history for part in by_probe.values() for history in part)]
-    quantities = tuple(quantity for history in read for quantity in _in_units(history, units, rate))
+    quantities = tuple(quantity for history in read for quantity in in_units(history, units, rate))
     remarks = [*_remarks(rectified, speed, result.provenance.get("exposure_ns"), there, by_probe)]
     if any(one.name.endswith("_exx") for one in quantities):
         remarks.append(f"exx, eyy, exy, e1, e2: {probes.measure.title()} strain")
@@ -257,7 +257,7 @@ def _read(
     return nodal, histories, speed
 
 
-def _in_units(history: History, units: Units, rate: Callable[..., Rates] | None) -> Iterator[History]:
+def in_units(history: History, units: Units, rate: Callable[..., Rates] | None) -> Iterator[History]:
     """Convert a history to the reader's units; add its rates, if asked for, at kinks those of both sides."""
     length = history.unit == "px"
     unit = units.length if length else history.unit

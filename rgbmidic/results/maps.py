@@ -7,7 +7,7 @@ accelerations and strain rates are those of `rgbmidic.fields.rates` at every nod
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, Self
 
@@ -23,7 +23,7 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.results.derived import COMPONENTS, DERIVED, FINER, STRAINS, UV, WITH_ERROR, map_quantities
 from rgbmidic.results.physical import MOVED, Physical, frame_times, named, reference_frames, shared_part
 from rgbmidic.results.quantities import UNKNOWN_TIME, Quantity
-from rgbmidic.results.result import Result
+from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import MeshSettings, ProbeSettings, ScaleSettings
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
@@ -62,7 +62,7 @@ class MapValues:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Maps:
+class Maps(Portable):
     """The nodal fields of a result.
 
     Attributes
@@ -158,10 +158,6 @@ class Maps:
             strain_of_gradient(np.zeros((1, 2, 2)), np.zeros((1, 4, 4)), measure)
             _ = gauge is not None and physical.gauges
         return replace(self, physical=physical, since=since, rigid_removed=rigid_removed, window=window)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out what was read, which each process reads for itself."""
-        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
     @cached_property
     def all(self) -> dict[str, Quantity]:

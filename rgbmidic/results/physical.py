@@ -21,7 +21,7 @@ from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Placement, Tri3Mesh
 from rgbmidic.results.derived import ELEMENT_STRAIN, STRAIN
 from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, Quantity
-from rgbmidic.results.result import Result
+from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
@@ -171,7 +171,7 @@ def shared_part(result: Result) -> float:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Physical:
+class Physical(Portable):
     """A result with its units.
 
     Attributes

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -33,8 +33,18 @@ S = TypeVar("S")
 logger = logging.getLogger(__name__)
 
 
+class Portable:
+    """A dataclass that goes to another process without what it has read or made, which that reads for itself."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields alone."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Result(Quantities, Described):
+class Result(Portable, Quantities, Described):
     """The result of a test, for post-processing.
 
     `Result.open` opens a result folder, also during a run, and reads only the mesh and which frames there are. The
@@ -143,10 +153,6 @@ class Result(Quantities, Described):
         if self.table.damaged.any():
             table = table.without_damaged(ended="finished" in provenance)
         return replace(self, table=table, provenance=provenance)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out what was read, which each process reads for itself."""
-        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
     def __repr__(self) -> str:
         """Return what the result is of, in a few lines; values are not read."""

@@ -27,6 +27,7 @@ from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.report.figures import field_colours, spread
 from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, resampled, time_text
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, MapValues, Profile, Quantity, Result
+from rgbmidic.results.histories import in_units
 from rgbmidic.results.quantities import FAILED
 from rgbmidic.settings import ProbeSettings, TestSettings
 from rgbmidic.typing import AnyArray, FloatArray
@@ -453,12 +454,10 @@ class FieldInFrame:
         wanted = of_gauge or (name if isinstance(probe, Area) and strain else None)
         if wanted and maps.since is None and not maps.rigid_removed:
             part = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), self.moved[:, None, probe.nodes], strict=True)))
-            for one in probe.histories(part):
-                if one.name == f"{probe.name}_{wanted}" and one.std is not None:
-                    (value,), (std,), unit = one.values, one.std, one.unit
-                    if unit == "px":
-                        (value, std), unit = maps.physical.units.lengths(value, std), maps.physical.units.length
-                    return f" {of_gauge or 'mean'}: {self._told(float(value), float(std), unit)}"
+            whole = (one for one in probe.histories(part) if one.name == f"{probe.name}_{wanted}")
+            for one in (read for history in whole for read in in_units(history, maps.physical.units, None)):
+                if one.std is not None:
+                    return f" {of_gauge or 'mean'}: {self._told(float(one.values[0]), float(one.std[0]), one.unit)}"
         if not isinstance(probe, Mean):
             return ""
         value, std = self.mean_of(probe)

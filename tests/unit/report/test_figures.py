@@ -205,7 +205,7 @@ def test_all_figures_can_be_written_by_two_processes(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=12, reference=np.stack([IMAGE] * 3))
     told_once = {"convergence", "residual", "brightness"}
     with_pictures = {*EVERY_FRAME, "masks", "reflections"}
-    files = write_figures(result, tmp_path / "figures", [4], processes=2, few=5)
+    files = write_figures(Maps.of(result), tmp_path / "figures", [4], processes=2, few=5)
     assert {file.stem for file in files} == told_once | {f"{name}_000004" for name in with_pictures}
     assert all(file.stat().st_size > 5000 for file in files)
 
@@ -213,7 +213,7 @@ def test_all_figures_can_be_written_by_two_processes(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("unsaved")
 def test_each_frame_has_the_pictures_it_can_have(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=12, reference=np.stack([IMAGE] * 3))
-    files = write_figures(result, tmp_path / "figures", [3, 4])
+    files = write_figures(Maps.of(result), tmp_path / "figures", [3, 4])
     assert {file.stem.split("_")[0] for file in files if "000004" in file.stem} == {
         *EVERY_FRAME,
         "masks",
@@ -256,7 +256,9 @@ def test_pictures_are_of_frames_that_were_measured(tmp_path: Path) -> None:
     records = [FrameRecord.of(nodes=NODES, lights=len(LIGHTS), status=0, u=X, v=Y) for _ in range(8)]
     records += [FrameRecord.failed("the fragment has left", nodes=NODES, lights=len(LIGHTS)) for _ in range(2)]
     result = make_result(tmp_path / "out", frames=10, record=records.__getitem__)
-    drawn = {int(file.stem[-6:]) for file in write_figures(result, tmp_path / "figures") if file.stem[-1].isdigit()}
+    drawn = {
+        int(file.stem[-6:]) for file in write_figures(Maps.of(result), tmp_path / "figures") if file.stem[-1].isdigit()
+    }
     assert drawn == {1, 4, 7}
     none = make_result(tmp_path / "none", frames=4, record=lambda index: records[-1])
     assert figures.measured_frames(none) == figures.shown_frames(none)
@@ -379,7 +381,7 @@ def _numbers(figure: Any) -> list[float]:
 @pytest.mark.usefixtures("unsaved")
 def test_pictures_of_an_earlier_run_are_removed_and_no_others(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=3, reference=np.stack([IMAGE] * 3))
-    files = write_figures(result, tmp_path / "figures", [2])
+    files = write_figures(Maps.of(result), tmp_path / "figures", [2])
     mine = tmp_path / "figures" / "my_displacement.png"
     mine.write_bytes(b"kept")
     remove_pictures(tmp_path)
@@ -389,7 +391,7 @@ def test_pictures_of_an_earlier_run_are_removed_and_no_others(tmp_path: Path) ->
 
 
 def test_frame_where_nothing_is_measured_still_has_figures(tmp_path: Path) -> None:
-    for file in write_figures(_one_frame(tmp_path / "out", reason="damaged"), tmp_path / "figures"):
+    for file in write_figures(Maps.of(_one_frame(tmp_path / "out", reason="damaged")), tmp_path / "figures"):
         assert file.stat().st_size > 2000
 
 
@@ -438,7 +440,7 @@ def test_impossible_frame_and_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no frame 2"):
         _maps(result, 2, "displacement")
     with pytest.raises(InputError, match="no frame 7"):
-        write_figures(result, tmp_path / "figures", [0, 7])
+        write_figures(Maps.of(result), tmp_path / "figures", [0, 7])
     assert not list((tmp_path / "figures").iterdir())
     with pytest.raises(ResultError, match="cannot be written"):
         save_figure(figures.residual_figure(result), tmp_path / "none" / "a.png")

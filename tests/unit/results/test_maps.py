@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -193,3 +194,15 @@ def test_nothing_is_known_since_a_frame_that_failed(tmp_path: Path) -> None:
     result = make_result(tmp_path / "r", frames=3, record=record)
     with pytest.raises(InputError, match="nothing is known since frame 1, in which nothing is measured: no texture"):
         Maps.of(result, since=1)
+
+
+def test_what_was_read_does_not_go_to_another_process(tmp_path):
+    maps = Maps.of(make_result(tmp_path / "result", frames=5, record=smooth_record), gauge=60.0)
+    values = maps.read("exx_std", 4).values, maps.read("velocity", 4).values, maps.result.u
+    sent = pickle.loads(pickle.dumps(maps))
+    assert "u" in maps.result.__dict__
+    for one in (sent, sent.physical, sent.result):
+        assert one.__dict__.keys() == one.__dataclass_fields__.keys()
+    there = sent.read("exx_std", 4).values, sent.read("velocity", 4).values, sent.result.u
+    for one, same in zip(values, there, strict=True):
+        np.testing.assert_array_equal(one, same)
