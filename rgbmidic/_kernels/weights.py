@@ -1,4 +1,4 @@
-"""From the lights' residuals to their weights and to the scores of the displacement."""
+"""From the lights' residuals to their weights, and the gradient of the other lights."""
 
 import numpy as np
 
@@ -51,11 +51,10 @@ def gradient_of_others(start, stop, gradient, weights, light, fewest, mean, prod
 
 @over_ranges("fraction", axis=1, grain=BLOCK)
 @compiled(fastmath=FAST)
-def best_mean(start, stop, fraction, weights, difference, mean, used, square):
+def best_mean(start, stop, fraction, weights, difference, mean, used):
     """Turn `fraction` (k, P) into the fractions of the lights in a mean: none below 0 or without weight, their sum 1.
 
-    `mean` (P,) receives that of `difference` (k, P), `square` (P,) its square, and `used` (P,) 1 where a light has a
-    fraction, else 0.
+    `mean` (P,) receives that of `difference` (k, P), and `used` (P,) 1 where a light has a fraction, else 0.
     """
     for first in range(start, stop, BLOCK):
         chunk = slice(first, min(first + BLOCK, stop))
@@ -74,9 +73,6 @@ def best_mean(start, stop, fraction, weights, difference, mean, used, square):
                 result[i] += own[i] * value[i]
         for i in range(np.uint64(total.size)):
             total[i] = _ONE if total[i] > _ZERO else _ZERO
-        squares = square[chunk]
-        for i in range(np.uint64(total.size)):
-            squares[i] = result[i] * result[i]
 
 
 @over_ranges("fraction", axis=1, grain=BLOCK)
@@ -100,28 +96,3 @@ def robust_weights(start, stop, mean, variance, displacing, unit, freedom, fract
             own = fraction[light, chunk]
             for i in range(np.uint64(own.size)):
                 own[i] *= factor[i]
-
-
-@over_ranges("out", axis=1, grain=BLOCK)
-@compiled(fastmath=FAST)
-def scores(start, stop, residual, weights, gradient_x, gradient_y, out):
-    """Sum ``w r gx``, ``w r gy`` and ``w (gx gx + gy gy)`` over the lights.
-
-    ``out`` (4, P) receives the sums of fields (k, P), and 1 where a light has weight, else 0.
-    """
-    for first in range(start, stop, BLOCK):
-        chunk = slice(first, min(first + BLOCK, stop))
-        x, y, information, used = out[0, chunk], out[1, chunk], out[2, chunk], out[3, chunk]
-        out[:, chunk] = 0
-        for light in range(len(weights)):
-            r, w = residual[light, chunk], weights[light, chunk]
-            gx, gy = gradient_x[light, chunk], gradient_y[light, chunk]
-            # loops that write to one place each: a loop over many arrays is not vectorised
-            for i in range(np.uint64(x.size)):
-                x[i] += w[i] * r[i] * gx[i]
-            for i in range(np.uint64(x.size)):
-                y[i] += w[i] * r[i] * gy[i]
-            for i in range(np.uint64(x.size)):
-                information[i] += w[i] * (gx[i] * gx[i] + gy[i] * gy[i])
-            for i in range(np.uint64(x.size)):
-                used[i] = max(used[i], _ONE if w[i] > _ZERO else _ZERO)

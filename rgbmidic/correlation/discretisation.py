@@ -23,7 +23,6 @@ from scipy.sparse.linalg import splu
 
 from rgbmidic._kernels.patches import interpolate_nodal
 from rgbmidic._kernels.threads import one_blas_thread
-from rgbmidic._kernels.weights import scores
 from rgbmidic.correlation.assembly import block_side, rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
 from rgbmidic.correlation.images import apply_prefilter
@@ -193,9 +192,8 @@ def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:
     """Variance of the scores in x and y (N, 2) over the square of their information, per pixel, around each node."""
     pixels, mesh, constants = residual.reference.pixels, residual.reference.mesh, residual.reference.constants
     side = block_side(pixels, mesh.size, constants)
-    sums = np.empty((4, weights.shape[1]), dtype=np.float32)
-    scores(residual.difference, weights, *residual.reference.gradient, sums)
-    x, y, information, count = pixels.block_sums(sums, side).astype(np.float64)
+    fields = residual.difference, weights, *residual.reference.gradient
+    x, y, information, count = residual.reference.score_sums(side, *fields)
     xx, yy, information, count = (
         cv2.GaussianBlur(grid, (0, 0), constants.score_range / side, borderType=cv2.BORDER_CONSTANT)
         for grid in (x * x, y * y, information, count)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.owned_pixels import product_sums
+from rgbmidic._kernels.block_sums import product_sums
 from rgbmidic._kernels.splines import PAD, bspline_coefficients
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import fill_holes
@@ -123,10 +123,6 @@ class SlidingWindow:
     sigma: float = 8.0
     step: int = 4
 
-    def means(self, pixels: PixelMap, fields: FloatImage, weights: FloatImage) -> FloatImage:
-        """Weighted means (n, h, w) of fields (n, P) around each block of the grid, for weights (n, P)."""
-        return self._means(pixels.block_sums(fields * weights, self.step), pixels.block_sums(weights, self.step))
-
     def ratios(self, pixels: PixelMap, fields: FloatImage) -> FloatImage:
         """Sums of fields (n, P) around each block of the grid over that of the last one, (n - 1, h, w)."""
         sums = pixels.block_sums(fields, self.step)
@@ -138,11 +134,11 @@ class SlidingWindow:
         Their weight is the geometric mean of the fields' weights (k, P).
         """
         count = len(fields)
-        sums = np.empty((count, count, 2, *pixels.grid(self.step)), dtype=np.float32)
-        product_sums(fields, weights, pixels.lines, pixels.line_offsets, self.step, sums)
-        means = np.empty((count, count, *sums.shape[3:]), dtype=np.float32)
-        for a in range(count):
-            means[a, : a + 1] = means[: a + 1, a] = self._means(sums[a, : a + 1, 0], sums[a, : a + 1, 1])
+        sums = np.empty((count * (count + 1), *pixels.grid(self.step)), dtype=np.float32)
+        product_sums(fields, weights, *pixels.in_bounds, self.step, sums)
+        means = np.empty((count, count, *sums.shape[1:]), dtype=np.float32)
+        first, second = np.tril_indices(count)
+        means[first, second] = means[second, first] = self._means(sums[::2], sums[1::2])
         return means
 
     def spread(self, pixels: PixelMap, grids: FloatImage) -> FloatImage:

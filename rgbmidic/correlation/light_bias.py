@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from rgbmidic._kernels.weights import scores
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.illumination.displacement import agreement
 from rgbmidic.typing import FloatArray, FloatImage
@@ -47,13 +46,9 @@ class LightBias:
         block, reach = reference.constants.block, reference.constants.bias_range
         if count == 1:
             return cls(values=np.zeros_like(mesh.nodes), std=np.zeros_like(mesh.nodes), reach=reach)
-        sums = np.empty((4, weights.shape[1]), dtype=np.float32)
-        moments = []
         lights = zip(residual.difference, weights, *reference.gradient, strict=True)
-        for light in lights:
-            scores(*(field[None] for field in light), sums)
-            moments.append(pixels.block_sums(sums[:3], block).astype(np.float64))
-        blocks = np.stack(moments)  # (k, 3, h, w)
+        # (k, 3, h, w)
+        blocks = np.stack([reference.score_sums(block, *(field[None] for field in light))[:3] for light in lights])
         sigma = (0, 0, reach / block, reach / block)
         around = gaussian_filter(blocks, sigma, mode="constant", truncate=3)
         half = np.maximum(around[:, 2] / 2, 1e-30)

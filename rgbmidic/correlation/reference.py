@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic._kernels.block_sums import score_sums
 from rgbmidic._kernels.correlation import (
     BLOCK,
     differences,
@@ -428,6 +429,25 @@ class Reference:
         out = np.empty((len(values), len(self.mesh.elements), 2))
         element_sums(values, factor, self.pixels.offsets, out)
         return out
+
+    def score_sums(self, side: int, *fields: FloatImage) -> FloatArray:
+        """Sums over blocks of `side` px of all lights' scores ``w r grad f`` and their information ``w |grad f|^2``.
+
+        Parameters
+        ----------
+        side
+            Side of the blocks in px.
+        *fields : ndarray, shape (k, P)
+            Residual r, weights w, and gradient along x and y.
+
+        Returns
+        -------
+        ndarray, shape (4, rows, columns)
+            Scores in x and y, information, and the number of pixels where a light has weight.
+        """
+        sums = np.empty((4, *self.pixels.grid(side)), dtype=np.float32)
+        score_sums(*fields, *self.pixels.in_bounds, side, sums)
+        return sums.astype(np.float64)
 
 
 def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: str) -> FloatImage:

@@ -14,7 +14,6 @@ from itertools import combinations_with_replacement
 import cv2
 import numpy as np
 
-from rgbmidic._kernels.weights import scores
 from rgbmidic.correlation.assembly import RigidMotions, block_side
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.equations import Equations
@@ -84,9 +83,9 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
     """
     reference = residual.reference
     side, slopes = block_side(reference.pixels, reference.mesh.size, reference.constants), reference.gradient
-    fields = np.empty((4, weights.shape[1]), dtype=np.float32)
-    scores(residual.difference, weights, *slopes, fields)
-    common = np.divide(fields[:2], fields[2], out=np.zeros_like(fields[:2]), where=fields[2] > 0)
+    score = (weights * residual.difference * slopes).sum(axis=1)
+    information = (weights * (slopes**2).sum(axis=0)).sum(axis=0)
+    common = np.divide(score, information, out=np.zeros_like(score), where=information > 0)
     lost = np.asarray(1 / np.sqrt(reference.unfitted) - 1, dtype=np.float32)
     if lost.ndim:
         lost = np.repeat(lost, np.diff(reference.pixels.offsets))
@@ -145,10 +144,8 @@ class BlockScores:
     @classmethod
     def of(cls, reference: Reference, side: int, *fields: FloatImage) -> BlockScores:
         """Scores of all lights together; `fields` are difference, weights, gradient in x and y, (k, P) or (P,)."""
-        pixels, even = reference.pixels, reference.constants.even
-        sums = np.empty((4, pixels.local_x.size), dtype=np.float32)
-        scores(*(np.atleast_2d(field) for field in fields), sums)
-        x, y, information, count = pixels.block_sums(sums, side).astype(np.float64)
+        even = reference.constants.even
+        x, y, information, count = reference.score_sums(side, *(np.atleast_2d(field) for field in fields))
         level = _blur(information, even) / np.maximum(_blur(count, even), 1e-6)
         scale = np.divide(1, np.sqrt(level), out=np.zeros_like(level), where=(level > 0) & (count > 0))
         return cls(x=x * scale, y=y * scale, count=count, side=side, constants=reference.constants)

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic._kernels.block_sums import block_sums
 from rgbmidic._kernels.mesh import claim_pixels
-from rgbmidic._kernels.owned_pixels import block_sums, from_grid, from_image, to_image
+from rgbmidic._kernels.owned_pixels import from_grid, from_image, to_image
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
@@ -122,6 +123,12 @@ class PixelMap:
         return self.local_x, self.local_y, self.offsets, self.barycentric
 
     @property
+    def in_bounds(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Runs, run offsets and the elements' origins in `bounds`, for kernels."""
+        top, left, _, _ = self.bounds
+        return self.runs, self.run_offsets, self.origin - (left, top)
+
+    @property
     def rows(self) -> npt.NDArray[np.int64]:
         """Row of every owned pixel in the image (P,)."""
         return self.of_elements(np.ones(len(self.origin), dtype=bool))[2]
@@ -197,7 +204,7 @@ class PixelMap:
         ndarray, shape (n, rows, columns), float32
         """
         out = np.empty((len(values), *self.grid(side)), dtype=np.float32)
-        block_sums(values, self.lines, self.line_offsets, side, out)
+        block_sums(values, *self.in_bounds, side, out)
         return out
 
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:

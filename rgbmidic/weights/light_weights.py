@@ -399,8 +399,8 @@ class Statistics(ValidPixels):
         floor = np.float32(max(self.least_variance * typical, self.rounding * residual.contrast))
         factor = self.window.spread(pixels, _best_fractions(covariance, floor, self.own))
         mean, used, bend = np.empty((3, factor.shape[1]), dtype=np.float32)
-        best_mean(factor, weights, residual.difference, mean, used, bend)
-        variance, least = self.window.means(pixels, bend[None], used[None]), floor / len(factor)
+        best_mean(factor, weights, residual.difference, mean, used)
+        variance, least = self.window.covariance(pixels, mean[None], used[None])[0], floor / len(factor)
         around = self.window.spread(pixels, np.maximum(variance, least))[0]
         displacing = displacing_fraction(residual.reference, mean, used / around)
         unit = max(np.float32(_typical(variance)), least)

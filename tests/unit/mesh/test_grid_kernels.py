@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from bits import assert_same_on_threads
 
-from rgbmidic._kernels.owned_pixels import product_sums
-from rgbmidic._kernels.weights import gradient_of_others, scores
+from rgbmidic._kernels.block_sums import product_sums, score_sums
+from rgbmidic._kernels.weights import gradient_of_others
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 
@@ -45,23 +45,23 @@ def test_sums_of_products_of_two_fields(pixels):
     random = np.random.default_rng(2)
     a, b = values = random.normal(size=(2, pixels.rows.size)).astype(np.float32)
     v, w = weights = np.maximum(random.normal(size=values.shape), 0).astype(np.float32)
-    out = np.zeros((2, 2, 2, *pixels.grid(4)), dtype=np.float32)
-    product_sums(values, weights, pixels.lines, pixels.line_offsets, 4, out)
+    out = np.full((6, *pixels.grid(4)), 7, dtype=np.float32)
+    product_sums(values, weights, *pixels.in_bounds, 4, out)
     shared = np.sqrt(v * w)
     fields = np.stack([v * a * a, v, shared * a * b, shared, w * b * b, w])
-    wanted = expected_sums(pixels, fields, 4).reshape(3, 2, *pixels.grid(4))
-    np.testing.assert_allclose(np.stack([out[0, 0], out[1, 0], out[1, 1]]), wanted, atol=1e-4)
+    np.testing.assert_allclose(out, expected_sums(pixels, fields, 4), atol=1e-4)
 
 
-def test_scores_of_all_lights_together():
+@pytest.mark.parametrize("side", [4, 13])
+def test_scores_of_all_lights_together(pixels, side):
     random = np.random.default_rng(1)
-    residual, gx, gy = random.normal(size=(3, 3, 5000)).astype(np.float32)
+    residual, gx, gy = random.normal(size=(3, 3, pixels.rows.size)).astype(np.float32)
     weight = np.maximum(random.normal(size=residual.shape), 0).astype(np.float32)
-    out = np.full((4, 5000), 7, dtype=np.float32)
-    scores(residual, weight, gx, gy, out)
-    fields = [weight * residual * gx, weight * residual * gy, weight * (gx**2 + gy**2)]
-    np.testing.assert_allclose(out[:3], np.sum(fields, axis=1), atol=1e-4)
-    np.testing.assert_array_equal(out[3], (weight > 0).any(axis=0))
+    out = np.full((4, *pixels.grid(side)), 7, dtype=np.float32)
+    score_sums(residual, weight, gx, gy, *pixels.in_bounds, side, out)
+    scores = weight * residual * gx, weight * residual * gy, weight * (gx**2 + gy**2)
+    fields = np.stack([*(part.sum(axis=0) for part in scores), (weight > 0).any(axis=0)])
+    np.testing.assert_allclose(out, expected_sums(pixels, fields, side), atol=2e-4)
 
 
 @pytest.mark.parametrize("fewest", [2, 3])
@@ -85,10 +85,10 @@ def test_the_same_bits_on_one_and_three_threads(pixels):
     values = np.random.default_rng(3).uniform(size=(2, pixels.rows.size)).astype(np.float32)
 
     def found():
-        sums, summed = np.zeros((2, 2, 2, *pixels.grid(4)), np.float32), np.zeros((4, 20000), np.float32)
-        product_sums(values, values, pixels.lines, pixels.line_offsets, 4, sums)
+        sums, summed = np.zeros((6, *pixels.grid(4)), np.float32), np.zeros((4, *pixels.grid(4)), np.float32)
+        product_sums(values, values, *pixels.in_bounds, 4, sums)
+        score_sums(values, values, values, values, *pixels.in_bounds, 4, summed)
         many = np.resize(values, (2, 20000))
-        scores(many, many, many, many, summed)
         mean, products = np.zeros((2, 20000), np.float32), np.zeros((4, 20000), np.float32)
         gradient_of_others(np.stack([many, many**2]), many, 1, 1, mean, products)
         blocks = pixels.block_sums(values, 5)
