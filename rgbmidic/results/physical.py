@@ -262,6 +262,11 @@ class Physical(Portable):
         """Unit of the axes of pictures of the image, and that unit over px: mm where each px is as long."""
         return ("px", 1.0) if self.rectified.camera is not None else (self.units.length, self.length)
 
+    def place_text(self, x: float, y: float) -> str:
+        """Write a place of the image (px) as text, in the unit of the axes."""
+        unit, factor = self.axes
+        return f"({x:.0f}, {y:.0f}) px" if unit == "px" else f"({x * factor:.4g}, {y * factor:.4g}) {unit}"
+
     def in_units(self, length: float) -> str:
         """Write a length (px) as text: in px, and in mm where the scale is known."""
         scale = self.units.mm_per_pixel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -84,10 +85,10 @@ class Canvas:
         self.plot = plain_plot(
             x_range=like.plot.x_range if like else bk.Range1d(self.window.left, self.window.right),
             y_range=like.plot.y_range if like else bk.Range1d(self.window.bottom, self.window.top),
-            **{"title": " ", "x_axis_label": "x (px)", "y_axis_label": "y (px)"},
-            **{"min_border_right": VIEWER.bar_width, "toolbar_location": "above"},
+            **{"title": " ", "min_border_right": VIEWER.bar_width, "toolbar_location": "above"},
         )
         self.plot.grid.visible = False
+        self.number("px", 1.0)
         names = ("image", "colours", "marks") if like is None else (None,) * 3
         self._image = bk.ColumnDataSource(columns(_IMAGE), name=names[0])
         self.plot.image_rgba(*_IMAGE.split(), source=self._image)
@@ -127,6 +128,15 @@ class Canvas:
         """Show a picture (rows, columns), uint32, of the window, or of that of the canvas beside it."""
         w = window or self.window
         self._image.data = columns(_IMAGE, [(image, w.left, w.top, w.right - w.left, w.bottom - w.top)])
+
+    def number(self, unit: str, factor: float) -> None:
+        """Number the axes in a unit of which a px has `factor`, at round numbers."""
+        steps = [step / factor for step in (1, 2, 5)]
+        ticks = {"mantissas": sorted(step / 10 ** math.floor(math.log10(step)) for step in steps)}
+        text = bk.CustomJSTickFormatter(args={"factor": factor}, code="return `${+(factor * tick).toPrecision(6)}`")
+        for name, axis in zip("xy", (self.plot.xaxis, self.plot.yaxis), strict=True):
+            if axis.axis_label != (label := f"{name} ({unit})") or axis.formatter.args != text.args:
+                axis.update(axis_label=label, ticker=bk.AdaptiveTicker(**ticks), formatter=text)
 
     def clear(self) -> None:
         """Show neither picture nor colour bar."""

@@ -158,6 +158,7 @@ class MapPanel:
         field, over = self._shown.maps.all[name], self._shown.overlay(name)
         canvas.show(paint(self.canvas.window, picture, over, AROUND[self._dark]), self.canvas.window)
         canvas.colour(over.ends, over.colours, field.label, field.codes)
+        canvas.number(*self._shown.maps.physical.axes)
 
     def _draw_layers(self, nodes: FloatArray) -> str:
         """Draw what lies over the first field: lines, arrows, extremes, nodes without data, marks."""

@@ -375,7 +375,7 @@ def frame_text(maps: Maps, place: int, field: Quantity, values: MapValues, remar
     found = extremes(field, values)
     if found:
         ends = [
-            f"{name} {field.text(values.values[node], values.std[node])} at ({x:.0f}, {y:.0f}) px"
+            f"{name} {field.text(values.values[node], values.std[node])} at {maps.physical.place_text(x, y)}"
             for name, node, (x, y) in zip(("smallest", "largest"), found, result.nodes[[*found]], strict=True)
         ]
         lines.append(html.escape(", ".join(ends)))

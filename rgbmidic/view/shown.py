@@ -162,7 +162,10 @@ class ShownFields:
     def text_at(self, x: float, y: float) -> str:
         """Return the values of all fields in view at a place of the image, as HTML."""
         told = dict.fromkeys(self.read(name).pointer_text(self.nodes, x, y) for name in self.names)
-        return " &nbsp; ".join([f"x {x:.1f}, y {y:.1f} px:", *told])
+        physical, place = self.maps.physical, f"x {x:.1f}, y {y:.1f} px"
+        if physical.axes[0] != "px":
+            place = f"{place}, {physical.place_text(x, y)}"
+        return " &nbsp; ".join([f"{place}:", *told])
 
     def read(self, name: str) -> FieldInFrame:
         """Read a field in the frame in view, for texts on it."""

@@ -204,6 +204,12 @@ def test_two_points_of_a_distance_are_the_scale_of_the_page_and_of_the_file(driv
         page.until("model('plot').title.text === 'u (mm)' && model('curve').value === 'extension (mm)'")
         units = Units.from_points(ends(page, "scale"), 40, length_std=0.1)
         scale = ScaleSettings(mm_per_pixel=units.mm_per_pixel, mm_per_pixel_std=units.mm_per_pixel_std)
+        page.until("model('plot').below[0].axis_label === 'x (mm)'")
+        axis = "Bokeh.index.get_one(model('plot').below[0])"
+        places = page.run(f"Array.from({axis}.tick_coords.major[0])")
+        texts = page.run(f"{axis}.compute_labels({axis}.tick_coords.major[0]).items.map((one) => +one.text)")
+        assert texts == pytest.approx(scale.mm_per_pixel * np.array(places), rel=1e-5, abs=1e-9)
+        assert f"{texts[1] - texts[0]:e}"[0] in "125", "each a round number of mm farther"
         read = read_histories(result, ProbeSettings(gauges=((30, 40, 90, 40),)), scale=scale)
         last = float(read["gauge_1_extension"].values[40])
         page.until(f"Math.abs(model('lines').data.ys[0][40] - {last!r}) < 1e-6")
