@@ -139,7 +139,8 @@ def light_displacement(
     # standard deviation of as many independent products: a window holds so many blocks
     alone = np.sqrt(around[3] / (square * np.maximum(around[4], 1e-6) * (4 * np.pi * (window / BLOCK) ** 2)))
     values = np.tensordot(back, shift, axes=1)
-    variance = np.maximum(np.einsum("lc,ld,cd,cyx,dyx->lyx", back, back, chance, alone, alone), 1e-12)
+    pairs = np.einsum("lc,ld,cd->lcd", back, back, chance)
+    variance = np.maximum(np.tensordot(pairs, alone[:, None] * alone, axes=2), 1e-12)
     return LightDisplacement(values=values, std=np.sqrt(variance))
 
 
