@@ -338,7 +338,7 @@ def viewer(demo: Path) -> None:
 
     marks = "marks=point:140,140;strain_gauge:170,330;line:60,220;line:380,220"
     with chromium() as driver:
-        driver.set_window_size(1280, 860)
+        driver.set_window_size(1280, 940)
         with serving(demo / "result") as address:
             page = Page(driver, f"{address}?field=exx&theme=light&{marks}")
             page.until("model('lines').data.xs.length && model('probes').data.text.length === 3")
