@@ -446,7 +446,7 @@ class Reference:
             Scores in x and y, information, and the number of pixels where a light has weight.
         """
         sums = np.empty((4, *self.pixels.grid(side)), dtype=np.float32)
-        score_sums(*fields, *self.pixels.in_bounds, side, sums)
+        score_sums(*fields, self.pixels.lines, self.pixels.run_offsets, side, sums)
         return sums.astype(np.float64)
 
 

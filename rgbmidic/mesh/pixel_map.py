@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rgbmidic._kernels.block_sums import block_sums
 from rgbmidic._kernels.mesh import claim_pixels
-from rgbmidic._kernels.owned_pixels import from_grid, from_image, to_image
+from rgbmidic._kernels.owned_pixels import from_image, to_image
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
@@ -40,9 +40,7 @@ class PixelMap:
     bounds : tuple of int
         First row, first column, height and width of the smallest rectangle around the owned pixels.
     lines : ndarray, shape (R, 4), int32
-        First slot, number of pixels, row and column in `bounds` of every run, in the order of rows and columns.
-    line_offsets : ndarray, shape (height + 1,), int64
-        Row r of `bounds` has the lines ``line_offsets[r]:line_offsets[r + 1]``.
+        First slot, number of pixels, row and column in `bounds` of every run.
     """
 
     offsets: npt.NDArray[np.int64]
@@ -55,7 +53,6 @@ class PixelMap:
     run_offsets: npt.NDArray[np.int64]
     bounds: tuple[int, int, int, int]
     lines: npt.NDArray[np.int32]
-    line_offsets: npt.NDArray[np.int64]
 
     @classmethod
     def from_mesh(cls, mesh: Tri3Mesh, region: Region) -> PixelMap:
@@ -86,17 +83,13 @@ class PixelMap:
         element, row, column, length = _owned_rows(owner)
         if not element.size:
             raise RegionError("no pixel of the region of interest lies in the mesh")
-        order = np.argsort(element, kind="stable")
-        first = np.empty_like(length)
-        first[order] = np.cumsum(length[order]) - length[order]
         top, left = int(row.min()), int(column.min())
         size = int(row.max()) - top + 1, int((column + length).max()) - left
-        lines = np.stack([first, length, row - top, column - left], axis=1)
         corners = mesh.nodes[mesh.elements]
         origin = np.round(corners.mean(axis=1)).astype(np.int64)
-        from_origin = column - origin[element, 0], row - origin[element, 1]
-        runs = np.take(np.stack([first, length, *from_origin], axis=1).astype(np.int32), order, axis=0)
-        run_offsets = np.searchsorted(element[order], np.arange(len(origin) + 1))
+        first, local = np.cumsum(length) - length, (column - origin[element, 0], row - origin[element, 1])
+        runs = np.stack([first, length, *local], axis=1).astype(np.int32)
+        run_offsets = np.searchsorted(element, np.arange(len(origin) + 1))
         # the position along x of every pixel: its slot less that of the run's first, and that one's position
         local_x = np.arange(length.sum(), dtype=np.int32)
         local_x -= np.repeat(runs[:, 0] - runs[:, 2], runs[:, 1])
@@ -113,20 +106,13 @@ class PixelMap:
             runs=runs,
             run_offsets=run_offsets,
             bounds=(top, left, *size),
-            lines=lines,
-            line_offsets=np.searchsorted(lines[:, 2], np.arange(size[0] + 1)),
+            lines=np.stack([first, length, row - top, column - left], axis=1).astype(np.int32),
         )
 
     @property
     def positions(self) -> tuple[FloatImage, FloatImage, npt.NDArray[np.int64], FloatArray]:
         """Local x and y, offsets and shape functions: where the owned pixels lie, for kernels."""
         return self.local_x, self.local_y, self.offsets, self.barycentric
-
-    @property
-    def in_bounds(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Runs, run offsets and the elements' origins in `bounds`, for kernels."""
-        top, left, _, _ = self.bounds
-        return self.runs, self.run_offsets, self.origin - (left, top)
 
     @property
     def rows(self) -> npt.NDArray[np.int64]:
@@ -204,7 +190,7 @@ class PixelMap:
         ndarray, shape (n, rows, columns), float32
         """
         out = np.empty((len(values), *self.grid(side)), dtype=np.float32)
-        block_sums(values, *self.in_bounds, side, out)
+        block_sums(values, self.lines, self.run_offsets, side, out)
         return out
 
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
@@ -222,7 +208,10 @@ class PixelMap:
         ndarray, shape (n, P), float32
         """
         out = np.empty((len(grids), self.local_x.size), dtype=np.float32)
-        from_grid(self.lines, self.line_offsets, np.ascontiguousarray(grids, dtype=np.float32), side, out)
+        size = grids.shape[2] * side, grids.shape[1] * side
+        for grid, values in zip(grids.astype(np.float32, copy=False), out, strict=True):
+            image = np.asarray(cv2.resize(grid, size, interpolation=cv2.INTER_LINEAR))
+            from_image(self.lines, image[None], 0, 0, values[None])
         return out
 
     def window(self, values: FloatImage) -> FloatImage:
@@ -261,13 +250,13 @@ class PixelMap:
 
 
 def _owned_rows(owner: npt.NDArray[np.int32]) -> tuple[npt.NDArray[np.int32], ...]:
-    """Return owner, row, first column and length of every row of pixels that one element owns, in image order."""
+    """Return owner, row, first column and length of every row of pixels that one element owns, element by element."""
     begins = np.ones(owner.shape, dtype=bool)
     np.not_equal(owner[:, 1:], owner[:, :-1], out=begins[:, 1:])
     start = np.flatnonzero(begins).astype(np.int32)
     length, element = np.diff(start, append=np.int32(owner.size)), owner.ravel()[start]
-    owned = element >= 0
-    return element[owned], *np.divmod(start[owned], np.int32(owner.shape[1])), length[owned]
+    order = np.argsort(element, kind="stable")[int((element < 0).sum()) :]
+    return element[order], *np.divmod(start[order], np.int32(owner.shape[1])), length[order]
 
 
 def _claim_rim(owner: npt.NDArray[np.int32]) -> None:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,7 +24,7 @@ from rgbmidic.typing import BoolArray, FloatArray
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Tri3Mesh:
     """Triangles on the reference image. Its arrays are not writable, because derived quantities are cached.
 
@@ -122,7 +122,7 @@ class Tri3Mesh:
             nodes, elements = outline_mesh(region.mask, element_size, cracks, region.origin)
         return cls(nodes=nodes, elements=elements)
 
-    @property
+    @cached_property
     def copies(self) -> npt.NDArray[np.int32]:
         """Pairs of nodes at one place, on two sides of a crack, shape (C, 2)."""
         return cKDTree(self.nodes).query_pairs(1e-9, output_type="ndarray").astype(np.int32)
@@ -254,9 +254,10 @@ class Tri3Mesh:
 
     def _boundary_edges(self) -> npt.NDArray[np.int32]:
         """Edges (B, 2) that belong to one element only."""
-        edges, count = self._edges()
+        edges, count = self._edges
         return np.asarray(edges[count == 1])
 
+    @cached_property
     def _edges(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.intp]]:
         """Every edge once (M, 2), and the number of elements that share it (M,)."""
         edges = edge_keys(self.elements[:, EDGES].reshape(-1, 2), len(self.nodes))
@@ -281,7 +282,7 @@ class Tri3Mesh:
     @property
     def neighbours(self) -> npt.NDArray[np.int32]:
         """Pairs of nodes joined by an edge, shape (M, 2), each pair once."""
-        return self._edges()[0]
+        return self._edges[0]
 
 
 def _legs(values: FloatArray, elements: npt.NDArray[np.int32]) -> tuple[FloatArray, FloatArray]:
