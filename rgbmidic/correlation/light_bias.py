@@ -47,7 +47,7 @@ class LightBias:
         if count == 1:
             return cls(values=np.zeros_like(mesh.nodes), std=np.zeros_like(mesh.nodes), reach=reach)
         lights = zip(residual.difference, weights, *reference.gradient, strict=True)
-        # (k, 3, h, w)
+        # scores in x and y, and their information, (k, 3, h, w)
         blocks = np.stack([reference.score_sums(block, *(field[None] for field in light))[:3] for light in lights])
         sigma = (0, 0, reach / block, reach / block)
         around = gaussian_filter(blocks, sigma, mode="constant", truncate=3)

@@ -83,8 +83,8 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
     """
     reference = residual.reference
     side, slopes = block_side(reference.pixels, reference.mesh.size, reference.constants), reference.gradient
-    score = (weights * residual.difference * slopes).sum(axis=1)
-    information = (weights * (slopes**2).sum(axis=0)).sum(axis=0)
+    score = np.einsum("kp,kp,akp->ap", weights, residual.difference, slopes)
+    information = np.einsum("kp,akp,akp->p", weights, slopes, slopes)
     common = np.divide(score, information, out=np.zeros_like(score), where=information > 0)
     lost = np.asarray(1 / np.sqrt(reference.unfitted) - 1, dtype=np.float32)
     if lost.ndim:

@@ -125,7 +125,9 @@ class Tri3Mesh:
     @cached_property
     def copies(self) -> npt.NDArray[np.int32]:
         """Pairs of nodes at one place, on two sides of a crack, shape (C, 2)."""
-        return cKDTree(self.nodes).query_pairs(1e-9, output_type="ndarray").astype(np.int32)
+        pairs = cKDTree(self.nodes).query_pairs(1e-9, output_type="ndarray").astype(np.int32)
+        pairs.setflags(write=False)
+        return pairs
 
     @property
     def places(self) -> FloatArray:
@@ -260,9 +262,11 @@ class Tri3Mesh:
     @cached_property
     def _edges(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.intp]]:
         """Every edge once (M, 2), and the number of elements that share it (M,)."""
-        edges = edge_keys(self.elements[:, EDGES].reshape(-1, 2), len(self.nodes))
-        keys, count = np.unique(edges, return_counts=True)
-        return np.stack(np.divmod(keys, len(self.nodes)), axis=1).astype(np.int32), count
+        sides = edge_keys(self.elements[:, EDGES].reshape(-1, 2), len(self.nodes))
+        keys, count = np.unique(sides, return_counts=True)
+        edges = np.stack(np.divmod(keys, len(self.nodes)), axis=1).astype(np.int32)
+        edges.setflags(write=False)
+        return edges, count
 
     @property
     def crack_edges(self) -> npt.NDArray[np.int32]:
