@@ -124,6 +124,7 @@ def over_ranges(
 
 def _share(kernel: Callable[..., None], arguments: tuple[Any, ...], items: int, grain: int, most: int) -> None:
     """Run `kernel` on `most` ranges of about equal length: the first in this thread, the others in the pool."""
+    keep_memory()
     kernel = getattr(kernel, "dispatcher", kernel)  # the first call imports numba, before threads begin
     grains = -(-items // grain)
     parts = min(most, grains)
@@ -155,7 +156,6 @@ def aside(function: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Fu
 @cache
 def _pool(process: int, name: str = "kernels") -> ThreadPoolExecutor:
     """Return the pool of a process: a forked one inherits no threads and makes its own, as many as are needed."""
-    keep_memory()
     return ThreadPoolExecutor(max(_default(), *_chosen, 1), thread_name_prefix=f"rgbmidic-{name}")
 
 

@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from rgbmidic._kernels.threads import keep_memory, set_threads, threads
+from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.correlation import NodeStatus, Solution, Start, Status
 from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError
@@ -199,7 +199,6 @@ class Threads:
     def __init__(self, plan: Plan, count: int) -> None:
         import numba  # noqa: F401  of two threads that import it at once, one may find half of it
 
-        keep_memory()
         self.slots, self._plan, self._running = count, plan, 0
         self._lock, self._before = threading.Lock(), (threads(), cv2.getNumThreads())
         self._executor = ThreadPoolExecutor(count, thread_name_prefix="rgbmidic-frames") if count > 1 else None

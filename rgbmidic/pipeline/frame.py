@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.threads import keep_memory, machine
+from rgbmidic._kernels.threads import machine
 from rgbmidic.correlation import Deformed, Solution, Start, Status, discretisation_error, fill
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import brightness_change
@@ -81,7 +81,6 @@ def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[
             reference_update = next_reference(plan, reference_update, number, solution)
         return reference_update
 
-    keep_memory()
     frames = tuple(number for number, _ in updated)
     return attempt(plan, index, start, lambda: plan.process.reference_update(frames, make)).record
 
