@@ -56,6 +56,8 @@ class InspectionConstants:
         kept: gradients are correlated over a speckle or two.
     too_fine
         Agreement of neighbouring colours below which the speckle is too fine for the colour lattice (docs: inspect).
+    finest
+        Size (px) of speckle whose colours agree so.
     saturated, hidden, negative
         Fractions of samples, of the region that no light shows, and of pixels where a light is negative, from which a
         warning is given; chosen, as the next two.
@@ -82,6 +84,7 @@ class InspectionConstants:
     frequencies: int = 64
     reach: int = 16
     too_fine: float = 0.75
+    finest: float = 2.0
     saturated: float = 0.01
     hidden: float = 0.01
     negative: float = 0.01

@@ -231,18 +231,20 @@ def _of_exposure(inspection: Inspection) -> Iterator[Check]:
 
 def _of_speckle(inspection: Inspection) -> Iterator[Check]:
     texture, size = inspection.texture, inspection.speckle_px
-    if texture is not None and (texture.specific > 0.5 or texture.correlation < COLOURED):
+    least = CONSTANTS.too_fine if size > 2 * CONSTANTS.finest else COLOURED  # coarse speckle is not too fine
+    if texture is not None and (texture.specific > 0.5 or texture.correlation < least):
         yield Check(
             "coloured",
-            f"the colours do not show one texture (agreement {texture.correlation:.2f}): a coloured specimen, or "
-            "speckle far too fine; each colour has only its own lattice, so speckles need 6 px and more",
+            f"the colours do not show one texture (agreement {texture.correlation:.2f}; of what each shows alone, "
+            f"{texture.specific:.0%} is as coarse as the speckle): a coloured specimen, or speckle far too fine; each "
+            "colour has only its own lattice, so speckles need 6 px and more",
         )
     elif texture is not None:
         yield Check(
             "fine speckle",
             f"the speckle is too fine for the colour lattice: neighbouring colours agree to {texture.correlation:.2f}, "
-            f"{CONSTANTS.too_fine} is needed (speckles of about 2.0 px); displacements will be pulled towards whole "
-            "pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer lens",
+            f"{CONSTANTS.too_fine} is needed (speckles of about {CONSTANTS.finest:.1f} px); displacements will be pulled "
+            "towards whole pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer lens",
             max(CONSTANTS.too_fine - texture.correlation, 0.0),
         )
     if np.isnan(size):

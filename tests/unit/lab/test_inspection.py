@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ from rgbmidic.lab.inspection import Inspection, inspect_files, inspect_frame
 from rgbmidic.lab.inspection.channels import Channel, channels_of, noise_estimate, speckle_texture
 from rgbmidic.lab.inspection.prediction import gaussian_field
 from rgbmidic.lab.inspection.report import inspection_document, write_inspection
+from rgbmidic.lab.inspection.results import _of_speckle
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import correlate
 from rgbmidic.scene.forecast import expected_std, node_constant
@@ -282,6 +284,13 @@ def test_troubles_are_told(lights, code):
     seen = inspect_frame(raw(lights()), calibration=CALIBRATION)
     assert code in codes(seen)
     assert all(finding.text for finding in seen.findings)
+
+
+@pytest.mark.parametrize(("size", "code"), [(2.0, "fine speckle"), (26.0, "coloured")])
+def test_coarse_speckle_whose_colours_hardly_agree_is_not_called_too_fine(size, code):
+    texture = SimpleNamespace(specific=0.2, correlation=0.74)
+    seen = SimpleNamespace(texture=texture, speckle_px=size, element_size=100.0)
+    assert [check.name for check in _of_speckle(seen) if not check.passed] == [code]
 
 
 @pytest.mark.parametrize("region", [(26, 250, 285, 800), (60, 450, 280, 640), (100, 250, 280, 450)])
