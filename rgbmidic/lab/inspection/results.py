@@ -243,8 +243,8 @@ def _of_speckle(inspection: Inspection) -> Iterator[Check]:
         yield Check(
             "fine speckle",
             f"the speckle is too fine for the colour lattice: neighbouring colours agree to {texture.correlation:.2f}, "
-            f"{CONSTANTS.too_fine} is needed (speckles of about {CONSTANTS.finest:.1f} px); displacements will be pulled "
-            "towards whole pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer lens",
+            f"{CONSTANTS.too_fine} is needed (speckles of about {CONSTANTS.finest:.1f} px); displacements will be "
+            "pulled towards whole pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer lens",
             max(CONSTANTS.too_fine - texture.correlation, 0.0),
         )
     if np.isnan(size):
