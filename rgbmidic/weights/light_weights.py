@@ -398,7 +398,7 @@ class Statistics(ValidPixels):
             return Precision(factor=np.ones_like(weights), bend=np.ones_like(weights[0]))
         floor = np.float32(max(self.least_variance * typical, self.rounding * residual.contrast))
         factor = self.window.spread(pixels, _best_fractions(covariance, floor, self.own))
-        mean, used, bend = np.empty((3, factor.shape[1]), dtype=np.float32)
+        mean, used, bend = (np.empty_like(factor[0]) for _ in range(3))  # the last one stays
         best_mean(factor, weights, residual.difference, mean, used)
         variance, least = self.window.covariance(pixels, mean[None], used[None])[0], floor / len(factor)
         around = self.window.spread(pixels, np.maximum(variance, least))[0]
