@@ -99,9 +99,9 @@ class Weighting:
 
 
 @stage("weights")
-def first_weighting(problem: Problem, estimate: Estimate) -> Weighting:
-    """Return the weighting of the first pass, at the initial guess."""
-    residual, kind = compare(problem, problem.reference.values, estimate), problem.options.brightness
+def first_weighting(problem: Problem, estimate: Estimate, residual: Residual | None = None) -> Weighting:
+    """Return the weighting of the first pass, at the initial guess, where the `residual` may be known."""
+    residual, kind = residual or compare(problem, problem.reference.values, estimate), problem.options.brightness
     return Weighting(
         residual=residual,
         values=corrected_values(residual, "global" if kind == "local" else kind),
@@ -197,6 +197,7 @@ def solve(
     initial: FloatArray,
     options: SolverSettings,
     method: PrecisionMethod | None,
+    residual: Residual | None = None,
 ) -> Solution:
     """Find the displacement of the reference mesh with which the warped deformed images match the reference ones.
 
@@ -211,6 +212,8 @@ def solve(
     method
         Learns the lights' precision from the residual, such as `rgbmidic.weights.Statistics`; None leaves the weights
         as they are given.
+    residual
+        At the initial guess, if it is known.
 
     Returns
     -------
@@ -238,15 +241,15 @@ def solve(
     )
     try:
         with one_blas_thread():
-            return _conclude(problem, *_passes(problem, Estimate.start(problem, initial)))
+            return _conclude(problem, *_passes(problem, Estimate.start(problem, initial), residual))
     except UnsolvableError as error:
         return Solution.failed(reference.mesh, len(reference.images), str(error), error.history)
 
 
-def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, Weighting]:
+def _passes(problem: Problem, estimate: Estimate, residual: Residual | None) -> tuple[Estimate, Equations, Weighting]:
     """Run passes until the weights have settled."""
     tolerance = problem.options.tolerance
-    estimate, weighting = _begin(problem, estimate)
+    estimate, weighting = _begin(problem, estimate, residual)
     equations: Equations | None = None
     for number in range(problem.constants.passes):
         if equations is not None and not refining(problem, weighting, number) and settled(weighting, equations):
@@ -271,9 +274,9 @@ def _passes(problem: Problem, estimate: Estimate) -> tuple[Estimate, Equations, 
 
 
 @stage("search")
-def _begin(problem: Problem, estimate: Estimate) -> tuple[Estimate, Weighting]:
+def _begin(problem: Problem, estimate: Estimate, residual: Residual | None) -> tuple[Estimate, Weighting]:
     """Bring the initial guess nearer where elements do not match there; what does not match then is left out."""
-    weighting = first_weighting(problem, estimate)
+    weighting = first_weighting(problem, estimate, residual)
     if weighting.matched.all():
         return estimate, weighting
     moved = Estimate.start(problem, brought_nearer(weighting.residual, estimate.displacement))

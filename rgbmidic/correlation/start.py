@@ -41,10 +41,13 @@ class FoundStart:
         px.
     confidence : float
         See `Search.confidence`.
+    residual : Residual or None
+        There, where it was looked at.
     """
 
     displacement: FloatArray
     confidence: float
+    residual: Residual | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,9 +157,15 @@ class Search:
         """
         nodes, offset = reference.mesh.nodes, reference.offset(deformed)
         known = np.zeros_like(nodes) if last is None else last
-        if last is None and (sure := self.confidence(reference, deformed, known, self.still)) >= self.sure:
-            yield FoundStart(displacement=known, confidence=sure)
-            return
+
+        def compared(displacement: FloatArray) -> Residual:
+            return Residual.at(reference, deformed, reference.values, [displacement] * len(reference.images))
+
+        if last is None:
+            residual = compared(known)
+            if (sure := self.confidence(residual, self.still)) >= self.sure:
+                yield FoundStart(displacement=known, confidence=sure, residual=residual)
+                return
         small = float(np.ptp(nodes, axis=0).max()) <= self.small
         slopes = reference.mesh.nodal_gradient(known)
         here = _part_around(nodes, self.context, reference.images.shape[1:])
@@ -176,24 +185,21 @@ class Search:
             nearest = np.asarray(cKDTree(nodes).query(points)[1])
             before = known[nearest] + np.einsum("pij,pj->pi", slopes[nearest], points - nodes[nearest])
             displacement = known + follow(points, motion - before, reference.mesh, float(reduction))
-            found = self.confidence(reference, deformed, displacement)
+            residual = compared(displacement)
+            found = self.confidence(residual)
             if found > best:
                 best = found
-                yield FoundStart(displacement=displacement, confidence=found)
+                yield FoundStart(displacement=displacement, confidence=found, residual=residual)
             if best >= self.sure:
                 return
 
-    def confidence(
-        self, reference: Reference, deformed: Deformed, displacement: FloatArray, least: float | None = None
-    ) -> float:
-        """Fraction of the nodes around which the images correlate by `least` (`agrees`) at a displacement (N, 2).
+    def confidence(self, residual: Residual, least: float | None = None) -> float:
+        """Fraction of the nodes around which the images correlate by `least` (`agrees`), from their residual.
 
         Nodes count that see something in both states, and at least a tenth of those that do in the reference, so that
         a few speckles alone make no start.
         """
-        around = correlation_around(
-            Residual.at(reference, deformed, reference.values, [displacement] * len(reference.images))
-        )
+        reference, around = residual.reference, correlation_around(residual)
         weight = reference.sums(reference.pixel_weights, reference.pixel_weights[0])[..., 0].sum(axis=0)
         seen = reference.mesh.to_nodes(weight) > 0
         with np.errstate(invalid="ignore"):
@@ -404,7 +410,7 @@ def track(
         surest = float(np.fmax(surest, found.confidence))
         if found.confidence < search.needed:
             continue
-        trial = solve(reference, deformed, found.displacement, options, method)
+        trial = solve(reference, deformed, found.displacement, options, method, found.residual)
         if best is None or rank(trial.status, trial.node_status) < rank(best.status, best.node_status):
             best = trial
         acceptable = start.unmeasured + (number + 0.5) * search.loss

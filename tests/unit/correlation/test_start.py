@@ -9,7 +9,11 @@ from textures import Affine, Texture
 
 from rgbmidic import Region, Tri3Mesh
 from rgbmidic.correlation import Deformed, Reference
+from rgbmidic.correlation.residual import Residual
+from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.start import Search, find_start
+from rgbmidic.settings import SolverSettings
+from rgbmidic.weights import Statistics
 
 SHAPE = (260, 320)
 RECTANGLE = (80, 60, 240, 200)
@@ -109,10 +113,21 @@ def test_confidence_is_the_share_that_correlates():
     texture = Texture.random(7)
     reference, deformed = prepared(texture.image(SHAPE), texture.image(SHAPE, Affine(shift=(20.0, 0.0))))
     displacement = np.tile([20.0, 0.0], (len(reference.mesh.nodes), 1))
-    assert Search().confidence(reference, deformed, displacement) == 1
+    assert Search().confidence(Residual.at(reference, deformed, reference.values, [displacement])) == 1
     left = reference.mesh.nodes[:, 0] < 160
     displacement[left] += 12
-    assert Search().confidence(reference, deformed, displacement) == pytest.approx(1 - left.mean(), abs=0.15)
+    partly = Residual.at(reference, deformed, reference.values, [displacement])
+    assert Search().confidence(partly) == pytest.approx(1 - left.mean(), abs=0.15)
+
+
+def test_a_solve_is_the_same_bits_from_a_residual_that_is_known():
+    texture = Texture.random(8)
+    reference, deformed = prepared(texture.image(SHAPE), texture.image(SHAPE, Affine(shift=(0.3, -0.2))))
+    rest = np.zeros_like(reference.mesh.nodes)
+    residual = Residual.at(reference, deformed, reference.values, [rest])
+    alone, known = (solve(reference, deformed, rest, SolverSettings(), Statistics(), one) for one in (None, residual))
+    np.testing.assert_array_equal(known.displacement, alone.displacement)
+    np.testing.assert_array_equal(known.displacement_std, alone.displacement_std)
 
 
 def test_starts_are_surer_and_surer_and_the_same_on_any_threads():
