@@ -99,3 +99,6 @@ def _write(send: Any, maps: Maps, out: Path, fields: list[str], options: dict[st
         send.send((f"written: {html.escape(str(out))}{gif}", True))
     except (RgbmidicError, OSError) as error:
         send.send((warning(f"no {out.name}: {error}"), True))
+    except Exception as error:  # the page says it, whatever it is; its traceback goes to the terminal
+        send.send((warning(f"no {out.name}: unexpected error: {type(error).__name__}: {error}"), True))
+        raise
