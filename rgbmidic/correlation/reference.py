@@ -290,7 +290,7 @@ class Reference:
             values=values,
             gradient=gradient,
             pixel_weights=weighted,
-            texture=gradient.sum(axis=1),
+            texture=gradient[:, 0] if gradient is own else gradient.sum(axis=1),
             channel_specific=own[:, :0] if gradient is own else np.subtract(own, gradient, out=own),
             prefilter=prefilter,
             registration=registration,
