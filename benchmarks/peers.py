@@ -43,7 +43,7 @@ from . import ROOT
 from .tables import table
 
 MARGIN, STEP = 30, 25
-SIZE, ROUNDS = 1024, 3
+SIZE, ROUNDS = 1024, 6
 """Side of the images (px), and timed rounds."""
 CONTENDERS = {"rgbmidic": "rgbmidic", "pyvale": "pyvale", "pyxel-dic": "pyxel", "al-dic": "al_dic"}
 CONTENDERS["al-dic local"] = "al_dic"
