@@ -108,7 +108,7 @@ def explain_first_run() -> None:
 
     if not are_compiled():
         note(
-            "first run on this machine: kernels are compiled for its processor as they are needed, in all some 40 s; "
+            "first run on this machine: kernels are compiled for its processor as they are needed, in all 15 to 40 s; "
             "later runs take them from a cache"
         )
 
