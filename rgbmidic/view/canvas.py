@@ -88,6 +88,7 @@ class Canvas:
             **{"title": " ", "min_border_right": VIEWER.bar_width, "toolbar_location": "above"},
         )
         self.plot.grid.visible = False
+        self._numbered: tuple[str, float] | None = None
         self.number("px", 1.0)
         names = ("image", "colours", "marks") if like is None else (None,) * 3
         self._image = bk.ColumnDataSource(columns(_IMAGE), name=names[0])
@@ -131,12 +132,14 @@ class Canvas:
 
     def number(self, unit: str, factor: float) -> None:
         """Number the axes in a unit of which a px has `factor`, at round numbers."""
+        if self._numbered == (unit, factor):  # as in nearly every frame
+            return
+        self._numbered = unit, factor
         steps = [step / factor for step in (1, 2, 5)]
-        ticks = {"mantissas": sorted(step / 10 ** math.floor(math.log10(step)) for step in steps)}
+        mantissas = sorted(step / 10 ** math.floor(math.log10(step)) for step in steps)
         text = bk.CustomJSTickFormatter(args={"factor": factor}, code="return `${+(factor * tick).toPrecision(6)}`")
-        for name, axis in zip("xy", (self.plot.xaxis, self.plot.yaxis), strict=True):
-            if axis.axis_label != (label := f"{name} ({unit})") or axis.formatter.args != text.args:
-                axis.update(axis_label=label, ticker=bk.AdaptiveTicker(**ticks), formatter=text)
+        for name, (axis,) in zip("xy", (self.plot.xaxis, self.plot.yaxis), strict=True):
+            axis.update(axis_label=f"{name} ({unit})", ticker=bk.AdaptiveTicker(mantissas=mantissas), formatter=text)
 
     def clear(self) -> None:
         """Show neither picture nor colour bar."""
