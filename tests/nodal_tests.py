@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
+from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.fields import NodalCovariance
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
@@ -21,8 +21,8 @@ STD = 0.01
 def dense_correlation(mesh: Tri3Mesh) -> FloatArray:
     """Correlation (N, N) between nodes by dense algebra: the linear fit's, carried through the recovery."""
     everywhere = np.ones(len(mesh.elements), dtype=bool)
-    recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes)), linear_fit_offset(mesh)).value.toarray()
-    covariance = recovery @ np.linalg.inv(mass_matrix(mesh).toarray()) @ recovery.T
+    recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes))).value.toarray()
+    covariance = recovery @ np.linalg.inv(mesh.mass_matrix.toarray()) @ recovery.T
     unit = np.sqrt(np.diag(covariance))
     return covariance / unit / unit[:, None]
 

@@ -23,14 +23,14 @@ from scipy.sparse.linalg import splu
 
 from rgbmidic._kernels.patches import interpolate_nodal
 from rgbmidic._kernels.threads import one_blas_thread
-from rgbmidic.correlation.assembly import block_side, rigid_functions
+from rgbmidic.correlation.assembly import Assembly, block_side, rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
 from rgbmidic.correlation.images import apply_prefilter
-from rgbmidic.correlation.recovery import Recovery, mass_matrix
-from rgbmidic.correlation.reference import Deformed, Reference, ReferenceGeometry
+from rgbmidic.correlation.recovery import Recovery
+from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, corrected_values
 from rgbmidic.correlation.solution import Solution
-from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.mesh.quadratic_fit import quadratic_fit
 from rgbmidic.settings import SMALLEST_HALVED, SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
@@ -271,12 +271,11 @@ class _Halves:
 
     def recovery(self, used: BoolArray, equations: Equations) -> Recovery:
         """Recover the field on the finer mesh, at the nodes of the coarse one."""
-        geometry, information = self.fine.geometry, equations.information(self.fine)
-        return Recovery.over(geometry.material, used, information, geometry.linear_offset, len(self.mesh.nodes))
+        return Recovery.over(self.fine.material, used, equations.information(self.fine), len(self.mesh.nodes))
 
     def straightened(self, residual: Residual, recovery: Recovery, found: FloatArray) -> Residual:
         """Take out what the recovered field (its fit on the finer mesh is `found`) has over that fit."""
-        carried, second = recovery.bend(found, self.fine.geometry.linear_offset)
+        carried, second = recovery.bend(found)
         return residual.without(self.prolonged(carried), self.prolonged(second))
 
     def averaged(self, values: FloatArray) -> FloatArray:
@@ -352,22 +351,22 @@ def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
     """Return a reference on another mesh of the same pixels."""
     old = reference.pixels
     region = Region.from_mask(old.scatter(np.ones(old.local_x.size, dtype=np.float32)) > 0)
-    geometry = ReferenceGeometry.of(mesh, region, reference.origin, None)
+    pixels = PixelMap.from_mesh(mesh, region)
 
     def moved(values: FloatImage) -> FloatImage:
-        out = np.empty((*values.shape[:-1], geometry.pixels.local_x.size), dtype=np.float32)
+        out = np.empty((*values.shape[:-1], pixels.local_x.size), dtype=np.float32)
         for row, place in zip(values.reshape(-1, values.shape[-1]), out.reshape(-1, out.shape[-1]), strict=True):
-            place[:] = geometry.pixels.gather(old.scatter(row))
+            place[:] = pixels.gather(old.scatter(row))
         return out
 
     names = ("values", "gradient", "pixel_weights", "texture", "channel_specific")
     fields: dict[str, Any] = {name: moved(getattr(reference, name)) for name in names}
-    return replace(reference, geometry=geometry, **fields)
+    return replace(reference, mesh=mesh, material=mesh, pixels=pixels, assembly=Assembly.from_mesh(mesh), **fields)
 
 
 def _unsmoothing(mesh: Tri3Mesh) -> Callable[[FloatArray], FloatArray]:
     """See `_Halves.unsmooth`."""
-    mass, edge = mass_matrix(mesh).tocsr(), mesh.on_boundary
+    mass, edge = mesh.mass_matrix.tocsr(), mesh.on_boundary
     lumped = np.asarray(mass.sum(axis=1)).ravel()
     inner, outer = np.flatnonzero(~edge), np.flatnonzero(edge)
     solve = splu(mass[inner][:, inner].tocsc()).solve if inner.size else None
@@ -389,9 +388,8 @@ def _drawn(halves: _Halves, reference: Reference) -> _Draws:
         Equations.build(one, one.pixel_weights, np.zeros((one.assembly.size, 0)), np.zeros_like(one.mesh.nodes))
         for one in (fine, reference)
     )
-    geometry = reference.geometry
-    everywhere, information = np.ones(len(mesh.elements), dtype=bool), coarse.information(reference)
-    recovery = Recovery.over(geometry.material, everywhere, information, geometry.linear_offset)
+    everywhere = np.ones(len(mesh.elements), dtype=bool)
+    recovery = Recovery.over(reference.material, everywhere, coarse.information(reference))
     fine_recovery = halves.recovery(np.repeat(everywhere, len(_CHILDREN)), finer)
     drawn = _scores(finer, random)
     right = np.stack([fine.assembly.vector(one) for one in drawn], axis=1)

@@ -338,7 +338,7 @@ def _right_sides(
         if known is not None:
             difference = known[light]
         else:
-            there = (*reference.geometry.parts, reference.motion(problem.deformed, light, displacement))
+            there = reference.warp(problem.deformed, light, displacement)
             differences(problem.deformed.coefficients[light], values[light], *there, difference)
         gradient = reference.gradient[:, light]
         vector = assembly.vector(reference.projected(equations.weights[light], difference, gradient))

@@ -31,7 +31,6 @@ from rgbmidic.correlation.images import (
     usable_pixels,
     usable_reach,
 )
-from rgbmidic.correlation.recovery import NodeColouring, linear_fit_offset
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -128,63 +127,18 @@ class Deformed:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ReferenceGeometry:
-    """The mesh of a reference and what follows from it; the grey levels of the images have no part in it.
+class Reference:
+    """The reference state: its mesh and its images; everything a frame needs and no frame changes.
 
     Attributes
     ----------
     mesh, pixels, assembly
         TRI3 mesh, pixel map, sparse structure of the normal equations.
     material : Tri3Mesh
-        The mesh on the first frame, where fields are recovered and strains count: `mesh` itself before any reference
-        update.
-    colouring : NodeColouring
-        Of `material`, for the uncertainty: its distances are those where the sides of a crack meet.
-    linear_offset : ndarray, shape (N, 3)
-        What a linear fit makes of fields curved on `material` (`linear_fit_offset`).
+        The mesh on the first frame, where fields are recovered and strains count, and distances are those where the
+        sides of a crack meet: `mesh` itself before any reference update.
     origin : tuple of int
         Column and row of the frame at which the images begin; mesh and pixels count from there.
-    """
-
-    mesh: Tri3Mesh
-    pixels: PixelMap
-    assembly: Assembly
-    material: Tri3Mesh
-    colouring: NodeColouring
-    linear_offset: FloatArray
-    origin: tuple[int, int]
-
-    @classmethod
-    def of(
-        cls, mesh: Tri3Mesh, region: Region, origin: tuple[int, int], first: ReferenceGeometry | None
-    ) -> ReferenceGeometry:
-        """Prepare the geometry of a mesh and its region; `first` is that of the first frame, None for itself."""
-        pixels = aside(PixelMap.from_mesh, mesh, region)
-        return cls(
-            mesh=mesh,
-            assembly=Assembly.from_mesh(mesh),
-            material=mesh if first is None else first.material,
-            colouring=NodeColouring.from_mesh(mesh) if first is None else first.colouring,
-            linear_offset=linear_fit_offset(mesh) if first is None else first.linear_offset,
-            pixels=pixels.result(),
-            origin=origin,
-        )
-
-    @property
-    def parts(self) -> tuple[AnyArray, ...]:
-        """Runs of pixels, elements and shape functions, for the kernels that follow a motion of the nodes."""
-        pixels = self.pixels
-        return pixels.runs, pixels.run_offsets, pixels.origin, self.mesh.elements, pixels.barycentric
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reference:
-    """The reference state: its geometry and its images; everything a frame needs and no frame changes.
-
-    Attributes
-    ----------
-    geometry : ReferenceGeometry
-        Mesh, pixels and what follows from them.
     images, weights : ndarray, shape (k, H, W), float32
         Holes filled and prefiltered; 0 where excluded. In pictures: all lights on the pixels of the first.
     registration : Registration or None
@@ -206,7 +160,11 @@ class Reference:
         Of the solve.
     """
 
-    geometry: ReferenceGeometry
+    mesh: Tri3Mesh
+    pixels: PixelMap
+    assembly: Assembly
+    material: Tri3Mesh
+    origin: tuple[int, int]
     unfitted: float | FloatArray
     images: FloatImage
     weights: FloatImage
@@ -229,7 +187,7 @@ class Reference:
         mesh: Tri3Mesh,
         prefilter: str = "none",
         origin: tuple[int, int] = (0, 0),
-        first: ReferenceGeometry | None = None,
+        material: Tri3Mesh | None = None,
         registration: Registration | None = None,
         constants: SolverConstants = USUAL,
     ) -> Reference:
@@ -249,8 +207,8 @@ class Reference:
             One of `PREFILTERS`.
         origin
             Column and row of the frame at which the images begin.
-        first
-            Geometry of the first frame, where this is a later one; its nodes are those of `mesh`.
+        material
+            Mesh on the first frame, where this is a later one; its nodes are those of `mesh`.
         registration
             Of the lights, where their images do not lie on one grid; the region is then that of the first light.
         constants
@@ -273,18 +231,24 @@ class Reference:
             inside *= usable_pixels(region.mask, prefilter)
         if len(cracks := mesh.crack_edges):  # what lies beyond a crack moves otherwise
             inside *= usable_pixels(~drawn(mesh.nodes[cracks], region.mask.shape), prefilter)
-        geometry = ReferenceGeometry.of(mesh, region, origin, first)
-        pixels, (ready, usable) = geometry.pixels, state.pictures(registration)
+        mapped, assembly, material = aside(PixelMap.from_mesh, mesh, region), Assembly.from_mesh(mesh), material or mesh
+        # what each frame needs of it, found while the pixels are
+        _ = material.linear_fit_offset, material.colouring
+        pixels, (ready, usable) = mapped.result(), state.pictures(registration)
         usable = usable * inside
         if registration is None:
             values, weighted, own = pixels.gather(ready), pixels.gather(usable), _gradient(state.coefficients, pixels)
         else:
-            values, weighted, own = _where_they_lie(state, geometry, pixels.gather(inside), registration)
+            values, weighted, own = _where_they_lie(state, mesh, pixels, pixels.gather(inside), registration)
         del state  # before what needs most memory
         gradient = _common_gradient(own, weighted, pixels, constants.shared)
         return cls(
-            geometry=geometry,
-            unfitted=unfitted_fraction(mesh, pixels, geometry.assembly, gradient, weighted, constants),
+            mesh=mesh,
+            pixels=pixels,
+            assembly=assembly,
+            material=material,
+            origin=origin,
+            unfitted=unfitted_fraction(mesh, pixels, assembly, gradient, weighted, constants),
             images=ready,
             weights=usable,
             values=values,
@@ -296,26 +260,6 @@ class Reference:
             registration=registration,
             constants=constants,
         )
-
-    @property
-    def mesh(self) -> Tri3Mesh:
-        """TRI3 mesh, counted from the first pixel of the images."""
-        return self.geometry.mesh
-
-    @property
-    def pixels(self) -> PixelMap:
-        """Pixel map of the mesh."""
-        return self.geometry.pixels
-
-    @property
-    def assembly(self) -> Assembly:
-        """Sparse structure of the normal equations."""
-        return self.geometry.assembly
-
-    @property
-    def origin(self) -> tuple[int, int]:
-        """Column and row of the frame at which the images begin."""
-        return self.geometry.origin
 
     def offset(self, deformed: Deformed) -> FloatArray:
         """Column and row of these images (2,) at which those of a deformed state begin.
@@ -332,8 +276,8 @@ class Reference:
         """
         return np.subtract(deformed.origin, self.origin).astype(np.float64)
 
-    def motion(self, deformed: Deformed, light: int, displacement: FloatArray) -> FloatArray:
-        """Motion (N, 2) of the nodes from here to where a light's deformed image shows them, for a displacement.
+    def warp(self, deformed: Deformed, light: int, displacement: FloatArray) -> tuple[AnyArray, ...]:
+        """Where a light's deformed image shows the pixels, for a displacement; see `carried`.
 
         A light's registration is part of it, as linear in each element as the displacement, here and in the reference's
         own grey levels: what the elements do not follow of it cancels.
@@ -349,13 +293,12 @@ class Reference:
 
         Returns
         -------
-        ndarray, shape (N, 2)
-            In px.
+        tuple of ndarray
         """
         motion = displacement - self.offset(deformed)
-        if self.registration is None:
-            return motion
-        return np.asarray(motion + self.registration.displacement(self.mesh.nodes + displacement + self.origin, light))
+        if self.registration is not None:
+            motion = motion + self.registration.displacement(self.mesh.nodes + displacement + self.origin, light)
+        return carried(self.mesh, self.pixels, motion)
 
     def blocks(self, weight: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
         """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), for fields (P,).
@@ -450,6 +393,11 @@ class Reference:
         return sums.astype(np.float64)
 
 
+def carried(mesh: Tri3Mesh, pixels: PixelMap, motion: FloatArray) -> tuple[AnyArray, ...]:
+    """Runs of pixels, elements, shape functions and a motion (N, 2) of the nodes, for the kernels that follow it."""
+    return pixels.runs, pixels.run_offsets, pixels.origin, mesh.elements, pixels.barycentric, motion
+
+
 def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: str) -> FloatImage:
     """Return the weight (k, H, W) of each pixel, 0 where it or its neighbourhood is invalid."""
     given = np.ones_like(images) if weights is None else weights
@@ -465,23 +413,22 @@ def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: s
 
 
 def _where_they_lie(
-    state: Deformed, geometry: ReferenceGeometry, inside: FloatImage, registration: Registration
+    state: Deformed, mesh: Tri3Mesh, pixels: PixelMap, inside: FloatImage, registration: Registration
 ) -> tuple[FloatImage, FloatImage, FloatImage]:
     """Grey levels and weights (k, P), gradient (2, k, P) of lights at what the first one shows at the owned pixels.
 
     `inside` (P,) is the weight of these pixels themselves.
     """
-    pixels, elements = geometry.pixels, geometry.mesh.elements
     x, y = pixels.columns, pixels.rows
     values, weights = (np.empty((len(state.weights), inside.size), dtype=np.float32) for _ in range(2))
     gradient, shift = (np.empty((2, *many, inside.size), dtype=np.float32) for many in (values.shape[:1], ()))
-    zero, unused, moments = np.zeros_like(inside), np.empty_like(inside), np.empty((len(elements), 6))
-    for light, motion in enumerate(registration.displacement(geometry.mesh.nodes + geometry.origin)):
-        there, spline = (*geometry.parts, motion), state.coefficients[light]
+    zero, unused, moments = np.zeros_like(inside), np.empty_like(inside), np.empty((len(mesh.elements), 6))
+    for light, motion in enumerate(registration.displacement(mesh.nodes + state.origin)):
+        there, spline = carried(mesh, pixels, motion), state.coefficients[light]
         differences(spline, zero, *there, values[light])
         images = state.weights[light], state.partial[light], zero, values[light], inside
         warped_weights(*images, *there, weights[light], moments)
-        interpolate_nodal(motion, elements, *pixels.positions, shift)
+        interpolate_nodal(motion, mesh.elements, *pixels.positions, shift)
         sample_with_gradient(spline, x + shift[0], y + shift[1], unused, *gradient[:, light])
     return np.negative(values, out=values), weights, gradient
 

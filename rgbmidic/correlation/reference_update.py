@@ -232,7 +232,7 @@ class ReferenceUpdate:
             region,
             weights,
             mesh=moved,
-            first=self.first.geometry,
+            material=self.first.material,
             prefilter=prefilter,
             origin=origin,
             registration=self.first.registration,

@@ -69,7 +69,7 @@ class Residual:
         difference, weights = np.empty_like(values), np.empty_like(values)
         moments = np.empty((len(values), len(reference.mesh.elements), 6))
         for light, displacement in enumerate(displacements):
-            there = (*reference.geometry.parts, reference.motion(deformed, light, displacement))
+            there = reference.warp(deformed, light, displacement)
             differences(deformed.coefficients[light], values[light], *there, difference[light])
             images = deformed.weights[light], deformed.partial[light], values[light], difference[light]
             warped_weights(*images, reference.pixel_weights[light], *there, weights[light], moments[light])
@@ -149,7 +149,7 @@ class Residual:
         Residual
         """
         known, pixels, out = self.reference, self.reference.pixels, np.empty_like(self.difference)
-        deviation = curved_deviation(known.geometry.material, pixels.barycentric, carried, curvature)
+        deviation = curved_deviation(known.material, pixels.barycentric, carried, curvature)
         place = pixels.local_x, pixels.local_y, pixels.offsets
         subtract_quadratic(self.difference, *known.gradient, deviation, *place, out)
         return replace(self, difference=out)

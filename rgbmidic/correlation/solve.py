@@ -327,13 +327,13 @@ def _nothing_left(weighting: Weighting) -> str:
 @stage("conclusion")
 def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weighting: Weighting) -> Solution:
     """Conclude the solve: which nodes count as measured, their values and uncertainty."""
-    options, geometry, mesh = problem.options, problem.reference.geometry, problem.reference.mesh
+    reference, mesh = problem.reference, problem.reference.mesh
     mismatched = np.zeros(len(mesh.nodes), dtype=bool)
     mismatched[mesh.elements[~weighting.matched]] = True
     used = weighting.matched & equations.textured[mesh.elements].all(axis=1)
-    recovery = Recovery.over(geometry.material, used, equations.information(problem.reference), geometry.linear_offset)
+    recovery = Recovery.over(reference.material, used, equations.information(reference))
     fitted = estimate.displacement
-    residual = weighting.residual.without(*recovery.bend(fitted, geometry.linear_offset))
+    residual = weighting.residual.without(*recovery.bend(fitted))
     std = standard_uncertainty(residual, equations, weighting.precision, recovery)
     if weighting.precision is not None:
         bias = LightBias.of(weighting.residual, equations.weights)
@@ -354,7 +354,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     inner = measured & ~mesh.beside(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
     square, total, _ = squares.sum(axis=1).T
     history = estimate.history(measured)
-    converged = bool(history[-1] <= options.tolerance)
+    converged = bool(history[-1] <= problem.options.tolerance)
     return Solution(
         nodes=mesh.nodes,
         elements=mesh.elements,

@@ -236,7 +236,7 @@ def nodal_std(residual: Residual, equations: Equations, recovery: Recovery | Non
         inner = textured & ~reference.mesh.beside(~textured)
         asked = [(one, textured) for one in recovery.displacement_functionals]
         asked += [(one, inner) for one in recovery.strain_functionals]
-    std = functional_std(equations.solve, covariance, reference.geometry.colouring, asked)
+    std = functional_std(equations.solve, covariance, reference.material, asked)
     if equations.rigid is None:
         return std
     rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in asked])

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
+from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.mesh.quadratic_fit import blended, quadratic_fit
@@ -227,11 +227,11 @@ class NodalCovariance:
         -------
         NodalCovariance
         """
-        mass = mass_matrix(mesh)
+        mass = mesh.mass_matrix
         scale = sp.diags(1 / np.sqrt(mass.diagonal()))
         inverse = scale @ _chebyshev_inverse(sp.csr_matrix(scale @ mass @ scale)) @ scale
         everywhere = np.ones(len(mesh.elements), dtype=bool)
-        recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes)), linear_fit_offset(mesh)).value
+        recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes))).value
         whole = sp.csr_matrix(recovery @ inverse @ recovery.T)
         unit = sp.diags(1 / np.sqrt(whole.diagonal()))
         return cls(mesh=mesh, correlation=sp.csr_matrix(unit @ whole @ unit))

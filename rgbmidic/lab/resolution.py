@@ -20,7 +20,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from rgbmidic._version import __version__
-from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
+from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.fields import NodalCovariance, StrainGauges
 from rgbmidic.lab import write_findings
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -57,8 +57,8 @@ def cut_offs(gauges: Sequence[float]) -> tuple[float, float, FloatArray]:
     lengths = np.minimum(np.asarray(gauges, dtype=np.float64), 12.0)
     count = int(np.ceil(max(lengths, default=0.0))) + 14  # half a gauge and the reach of the recovery on either side
     mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, 8 * count, 8 * count), (8 * count + 1,) * 2), 8.0)
-    fitted = splu(mass_matrix(mesh)).solve(_integrals(mesh, 2 * np.pi / (8.0 * periods)))
-    recovery = Recovery.over(mesh, np.ones(len(mesh.elements), bool), np.ones(len(mesh.nodes)), linear_fit_offset(mesh))
+    fitted = splu(mesh.mass_matrix).solve(_integrals(mesh, 2 * np.pi / (8.0 * periods)))
+    recovery = Recovery.over(mesh, np.ones(len(mesh.elements), bool), np.ones(len(mesh.nodes)))
     field = recovery.value @ fitted
     shown = [_cut_off(mesh, periods, field, 3.0), _cut_off(mesh, periods, recovery.slope_x @ fitted, 3.0, slope=True)]
     covariance = NodalCovariance.from_mesh(mesh)

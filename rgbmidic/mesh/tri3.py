@@ -13,8 +13,10 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
+from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from rgbmidic._kernels.mesh import colour_nodes
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.finite_elements import oriented
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, outline_mesh
@@ -287,6 +289,58 @@ class Tri3Mesh:
     def neighbours(self) -> npt.NDArray[np.int32]:
         """Pairs of nodes joined by an edge, shape (M, 2), each pair once."""
         return self._edges[0]
+
+    @cached_property
+    def mass_matrix(self) -> sp.csc_matrix:
+        """Integrals (N, N) of the products of two shape functions, square px: the consistent mass matrix."""
+        mass = np.where(np.eye(3, dtype=bool), 2, 1) * self.areas[:, None, None] / 12
+        rows, columns = np.repeat(self.elements, 3, axis=1).ravel(), np.tile(self.elements, 3).ravel()
+        return sp.csc_matrix((mass.ravel(), (rows, columns)), shape=(len(self.nodes),) * 2)
+
+    @cached_property
+    def linear_fit_offset(self) -> FloatArray:
+        """What the best linear fit has at the nodes beyond a field with second derivative xx, xy or yy of 1, (N, 3).
+
+        In square px. The texture counts alike in all places and directions on average, so the fit is that of the mass
+        matrix M. A field with the second derivative H has ``-1/2 sum phi_a phi_b d^T H d`` over its linear interpolant,
+        d being the edges of an element of area A. The offset solves ``M x = b``, where b sums over the elements around
+        a node ``-A/120 (2 sum d^T H d - d^T H d of the opposite edge)``.
+        """
+        corners = self.nodes[self.elements]
+        edge = np.roll(corners, -1, axis=1) - corners
+        squares = np.stack([edge[..., 0] ** 2, 2 * edge[..., 0] * edge[..., 1], edge[..., 1] ** 2], axis=-1)
+        opposite = np.roll(squares, -1, axis=1)  # edge a joins the corners a and a + 1
+        parts = -(2 * squares.sum(axis=1, keepdims=True) - opposite) * self.areas[:, None, None] / 120
+        sums = [
+            np.bincount(self.elements.ravel(), weights=part.ravel(), minlength=len(self.nodes))
+            for part in np.moveaxis(parts, -1, 0)
+        ]
+        options = {"SymmetricMode": True}
+        factors = splu(self.mass_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        return np.asarray(factors.solve(np.stack(sums, axis=1)))
+
+    @cached_property
+    def colouring(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Colours (N,) of the nodes, those of one at least five edges apart, and the node of each nearest to every one.
+
+        The latter has the shape (C, N) for C colours; it is N where there is none within four edges.
+        """
+        count = len(self.nodes)
+        # nodes at one place count as neighbours: the nearest of a colour is found by distance
+        i, j = np.concatenate([self.neighbours, self.copies, np.repeat(np.arange(count), 2).reshape(-1, 2)]).T
+        ends = np.concatenate([i, j]), np.concatenate([j, i])
+        ring = sp.csr_matrix((np.ones(2 * len(i), dtype=bool), ends), shape=(count, count))
+        near = ring @ ring  # two nodes with one near both are at most four edges apart
+        reach = near @ near
+        colour = np.empty(count, dtype=np.int64)
+        colour_nodes(near.indptr, near.indices, np.zeros((count, np.diff(reach.indptr).max()), dtype=bool), colour)
+        node, other = np.repeat(np.arange(count), np.diff(reach.indptr)), reach.indices
+        place, distance = colour[other] * count + node, sum((axis[node] - axis[other]) ** 2 for axis in self.nodes.T)
+        least = np.full((colour.max() + 1) * count, np.inf)
+        np.minimum.at(least, place, distance)
+        nearest, own = np.full(least.size, count), distance == least[place]
+        nearest[place[own]] = other[own]
+        return colour, nearest.reshape(-1, count)
 
 
 def _legs(values: FloatArray, elements: npt.NDArray[np.int32]) -> tuple[FloatArray, FloatArray]:

@@ -31,7 +31,7 @@ import scipy.sparse as sp
 
 from rgbmidic.correlation.assembly import Assembly
 from rgbmidic.correlation.constants import USUAL
-from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std, linear_fit_offset
+from rgbmidic.correlation.recovery import Recovery, functional_std
 from rgbmidic.illumination.crosstalk import NEGLIGIBLE
 from rgbmidic.illumination.linear import QUANTISATION
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -99,9 +99,9 @@ def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -
     # elements that no light sees must not make the system singular
     solve = assembly.factorise(assembled(np.maximum(information, 1e-3 * USUAL.seen * np.median(density[seen]))))
     used = np.asarray(seen[mesh.elements].all(axis=1))
-    recovery = Recovery.over(mesh, used, density, linear_fit_offset(mesh))
-    along_x, colouring = [(recovery.displacement_functionals[0], seen)], NodeColouring.from_mesh(mesh)
-    std = np.stack([functional_std(solve, assembled(score), colouring, along_x)[:, 0] for score in scores])
+    recovery = Recovery.over(mesh, used, density)
+    along_x = [(recovery.displacement_functionals[0], seen)]
+    std = np.stack([functional_std(solve, assembled(score), mesh, along_x)[:, 0] for score in scores])
     return np.where(seen & (std < USUAL.lost), std, np.nan)
 
 

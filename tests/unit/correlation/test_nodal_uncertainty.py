@@ -12,7 +12,7 @@ from rgbmidic import Region, Tri3Mesh, correlate
 from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.correlation.equations import Equations
-from rgbmidic.correlation.recovery import NodeColouring, Recovery, functional_std
+from rgbmidic.correlation.recovery import Recovery, functional_std
 from rgbmidic.correlation.residual import Residual
 
 NOISE = 3.0
@@ -56,20 +56,20 @@ def test_nodes_of_one_colour_are_five_edges_apart_and_each_knows_the_nearest(sha
     if shape == "rectangle":
         region = Region.from_rectangle((5, 5, 250, 190), x.shape)
     mesh = Tri3Mesh.from_region(region, 13)
-    colouring, (i, j), count = NodeColouring.from_mesh(mesh), mesh.neighbours.T, len(mesh.nodes)
+    (colours, nearest_of), (i, j), count = mesh.colouring, mesh.neighbours.T, len(mesh.nodes)
     edges = dijkstra(coo_matrix((np.ones(i.size), (i, j)), shape=(count, count)), directed=False, unweighted=True)
-    same = colouring.colour[:, None] == colouring.colour
+    same = colours[:, None] == colours
     assert (edges[same] == np.where(np.eye(count)[same] > 0, 0, np.maximum(edges[same], 5))).all()
     # greedy: each node sees all colours before its own
     for node in range(count):
-        around = colouring.colour[(edges[node] < 5) & (np.arange(count) < node)]
-        assert colouring.colour[node] == np.flatnonzero(~np.isin(np.arange(count + 1), around))[0]
+        around = colours[(edges[node] < 5) & (np.arange(count) < node)]
+        assert colours[node] == np.flatnonzero(~np.isin(np.arange(count + 1), around))[0]
     distance = np.hypot(*(mesh.nodes[:, None] - mesh.nodes).T)
-    for colour, nearest in enumerate(colouring.nearest):
-        within = np.where((edges < 5) & (colouring.colour == colour), distance, np.inf).min(axis=1)
+    for colour, nearest in enumerate(nearest_of):
+        within = np.where((edges < 5) & (colours == colour), distance, np.inf).min(axis=1)
         assert ((nearest == count) == np.isinf(within)).all()
         known = np.flatnonzero(nearest < count)
-        assert (colouring.colour[nearest[known]] == colour).all()
+        assert (colours[nearest[known]] == colour).all()
         np.testing.assert_allclose(distance[known, nearest[known]], within[known], rtol=1e-12)
 
 
@@ -85,9 +85,9 @@ def test_elements_of_any_size_state_their_error(size):
 def test_the_smallest_element_beside_a_hole_is_told_by_the_common_way(monkeypatch):
     columns = []
 
-    def counted(solve, covariance, colouring, asked):
-        columns.append(len(asked) * len(colouring.nearest))
-        return functional_std(solve, covariance, colouring, asked)
+    def counted(solve, covariance, mesh, asked):
+        columns.append(len(asked) * len(mesh.colouring[1]))
+        return functional_std(solve, covariance, mesh, asked)
 
     monkeypatch.setattr("rgbmidic.correlation.uncertainty.functional_std", counted)
     image = Texture.random(4, speckle=3).image((96, 96))
@@ -114,9 +114,9 @@ def test_strain_beside_a_hole_has_the_uncertainty_of_its_own_column():
     inner = equations.textured & ~mesh.beside(~equations.textured)
     assert 0 < inner.sum() < equations.textured.sum() < len(mesh.nodes)
     used = equations.textured[mesh.elements].all(axis=1)
-    recovery = Recovery.over(mesh, used, equations.information(reference), reference.geometry.linear_offset)
+    recovery = Recovery.over(mesh, used, equations.information(reference))
     strain, hessian = recovery.strain_functionals, reference.assembly.matrix(equations.blocks)
-    probed = functional_std(equations.solve, hessian, reference.geometry.colouring, [(one, inner) for one in strain])
+    probed = functional_std(equations.solve, hessian, reference.material, [(one, inner) for one in strain])
     for number, functional in enumerate(strain):
         whole = np.zeros((len(mesh.nodes), len(mesh.nodes), 2))
         for axis, matrix in enumerate(functional):

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
+from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.fields import at_pixels
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
@@ -36,8 +36,7 @@ def meshed(kind: str) -> tuple[Tri3Mesh, PixelMap]:
 
 
 def everywhere(mesh):
-    offset = linear_fit_offset(mesh)
-    return Recovery.over(mesh, np.ones(len(mesh.elements), dtype=bool), np.ones(len(mesh.nodes)), offset)
+    return Recovery.over(mesh, np.ones(len(mesh.elements), dtype=bool), np.ones(len(mesh.nodes)))
 
 
 def linear_fit(mesh, field):
@@ -52,7 +51,7 @@ def linear_fit(mesh, field):
     places = np.einsum("qa,ead->eqd", steps, mesh.nodes[mesh.elements])
     parts = np.einsum("q,eq,qa->ea", weights, field(places[..., 0], places[..., 1]), steps) * mesh.areas[:, None]
     load = np.bincount(mesh.elements.ravel(), weights=parts.ravel())
-    return np.linalg.solve(mass_matrix(mesh).toarray(), load)
+    return np.linalg.solve(mesh.mass_matrix.toarray(), load)
 
 
 @pytest.mark.parametrize("kind", MESHES)
@@ -97,7 +96,7 @@ def test_short_waves_have_their_height_at_the_nodes(kind, elements):
 @pytest.mark.parametrize("kind", MESHES)
 def test_inner_nodes_scatter_less_than_those_of_the_linear_fit(kind):
     mesh, _ = meshed(kind)
-    value, covariance = everywhere(mesh).value.toarray(), np.linalg.inv(mass_matrix(mesh).toarray())
+    value, covariance = everywhere(mesh).value.toarray(), np.linalg.inv(mesh.mass_matrix.toarray())
     inner = ~mesh.beside(mesh.on_boundary)
     recovered = np.einsum("ij,ij->i", value @ covariance, value)[inner].mean()
     assert recovered < QUIETER**2 * np.diag(covariance)[inner].mean()
@@ -119,7 +118,7 @@ def test_nothing_passes_over_elements_that_are_not_used():
     mesh, _ = meshed("rectangle")
     centre = mesh.nodes[mesh.elements].mean(axis=1)[:, 0]
     used = np.abs(centre - 100) > SIZE
-    recovery = Recovery.over(mesh, used, np.ones(len(mesh.nodes)), linear_fit_offset(mesh))
+    recovery = Recovery.over(mesh, used, np.ones(len(mesh.nodes)))
     left = mesh.nodes[:, 0] < 100 - SIZE / 2
     field = np.where(left, 0.01 * mesh.nodes[:, 1], 3.0)
     np.testing.assert_allclose((recovery.value @ field)[left], field[left], atol=1e-6)
@@ -132,7 +131,7 @@ def test_a_node_that_is_known_badly_hardly_counts_elsewhere():
     middle = int(np.argmin(np.hypot(*(mesh.nodes - 100).T)))
     information = np.ones(len(mesh.nodes))
     information[middle] = 1e-3
-    recovery = Recovery.over(mesh, mesh.areas > 0, information, linear_fit_offset(mesh))
+    recovery = Recovery.over(mesh, mesh.areas > 0, information)
     others = np.delete(recovery.value.toarray()[:, middle], middle)
     plain = np.delete(everywhere(mesh).value.toarray()[:, middle], middle)
     assert np.abs(others).max() < 0.01 * np.abs(plain).max()

@@ -13,7 +13,7 @@ from results import make_result
 
 from rgbmidic import cli
 from rgbmidic.command import execute
-from rgbmidic.correlation.recovery import Recovery, linear_fit_offset
+from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
 from rgbmidic.report.comparison import scale_text
@@ -124,7 +124,7 @@ def test_a_linear_field_is_levelled_to_itself_and_one_of_the_mesh_to_its_recover
     assert found.T[reached] == pytest.approx((np.c_[MESH.nodes, np.ones(NODES)] @ expected)[reached], abs=1e-6)
     field = random.normal(size=(NODES, 2))
     everywhere = np.ones(len(MESH.elements), dtype=bool)
-    recovery = Recovery.over(MESH, everywhere, np.ones(NODES), linear_fit_offset(MESH))
+    recovery = Recovery.over(MESH, everywhere, np.ones(NODES))
     assert pytest.approx(recovery.displacement(field), abs=1e-9) == Levelling(MESH, MESH)(field).T
 
 
@@ -141,7 +141,7 @@ def test_a_finer_simulation_is_levelled_to_what_least_squares_makes_of_it():
     hats = np.stack([LinearTriInterpolator(coarse, one)(*points.T).filled(0) for one in np.eye(NODES)], axis=1)
     fitted = np.linalg.solve(hats.T @ hats, hats.T @ seen)
     everywhere = np.ones(len(MESH.elements), dtype=bool)
-    recovery = Recovery.over(MESH, everywhere, np.ones(NODES), linear_fit_offset(MESH))
+    recovery = Recovery.over(MESH, everywhere, np.ones(NODES))
     off = Levelling(MESH, fine)(wave).T - recovery.displacement(fitted)
     assert np.sqrt(np.mean(off**2)) < 0.004  # of an amplitude of 1: the quadrature's error
 

@@ -12,7 +12,7 @@ import pytest
 from rgbmidic import correlate
 from rgbmidic._kernels.correlation import element_vector
 from rgbmidic.correlation.images import apply_prefilter
-from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
+from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
 from rgbmidic.fields import at_nodes
 from rgbmidic.illumination.crosstalk import unmix
@@ -44,14 +44,14 @@ def test_the_node_constant_is_the_scatter_of_nodes_recovered_from_fits_to_noise(
     region = Region.from_rectangle((0, 0, 160, 160), shape)
     mesh = Tri3Mesh.from_region(region, size)
     pixels = PixelMap.from_mesh(mesh, region)
-    recovery = Recovery.over(mesh, mesh.areas > 0, np.ones(len(mesh.nodes)), linear_fit_offset(mesh))
+    recovery = Recovery.over(mesh, mesh.areas > 0, np.ones(len(mesh.nodes)))
     noise = np.random.default_rng(0).normal(size=(400, pixels.rows.size)).astype(np.float32)
     parts, loads = np.zeros((len(mesh.elements), 3, 2)), []
     for first, second in noise.reshape(-1, 2, pixels.rows.size):
         geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
         element_vector(*np.ones_like([first, second]), first, second, *geometry, parts)
         loads += [np.bincount(mesh.elements.ravel(), weights=parts[..., c].ravel()) for c in (0, 1)]
-    found = recovery.value @ np.linalg.solve(mass_matrix(mesh).toarray(), np.transpose(loads))
+    found = recovery.value @ np.linalg.solve(mesh.mass_matrix.toarray(), np.transpose(loads))
     inner = (abs(mesh.nodes - 75) < 40).all(axis=1)  # as many nodes with eight triangles as with four
     assert found[inner].var() * size**2 == pytest.approx(node_constant(), rel=0.05)
 
