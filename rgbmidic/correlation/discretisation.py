@@ -26,12 +26,11 @@ from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import Assembly, block_side, rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
 from rgbmidic.correlation.images import apply_prefilter
-from rgbmidic.correlation.recovery import Recovery
+from rgbmidic.correlation.recovery import Recovery, quadratic_fit
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, corrected_values
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.mesh.quadratic_fit import quadratic_fit
 from rgbmidic.settings import SMALLEST_HALVED, SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 

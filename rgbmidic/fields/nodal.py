@@ -21,10 +21,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from rgbmidic.correlation.recovery import Recovery
+from rgbmidic.correlation.recovery import Recovery, blended, quadratic_fit
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.mesh.quadratic_fit import blended, quadratic_fit
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage, IntArray
 
 _LOW, _HIGH = 0.5, 2.0

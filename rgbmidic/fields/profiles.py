@@ -21,11 +21,11 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.special import chdtrc
 
+from rgbmidic.correlation.recovery import quadratic_fit
 from rgbmidic.errors import InputError
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.strain import StrainGauges
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.quadratic_fit import quadratic_fit
 from rgbmidic.text import uncertain
 from rgbmidic.typing import BoolArray, FloatArray
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.correlation import Deformed, Solution, Start, Status, discretisation_error, track
+from rgbmidic.correlation.recovery import quadratic_fit
 from rgbmidic.errors import FrameError
 from rgbmidic.fields import NodalCovariance, Places, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.quadratic_fit import quadratic_fit
 from rgbmidic.pipeline.plan import Choice, Plan
 from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.typing import FloatArray
