@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
@@ -23,6 +22,7 @@ from scipy.linalg import eigh
 from rgbmidic._kernels.correlation import element_block_products, element_hessian
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.elimination import Elimination
+from rgbmidic.correlation.images import window_sums
 from rgbmidic.mesh import PixelMap, Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
@@ -301,9 +301,7 @@ def unfitted_fraction(
     here = [np.zeros((rows, columns)), np.zeros((rows, columns))]
     for grid, values in zip(here, (fitted, whole), strict=True):
         np.add.at(grid, (row, column), values)
-    around = [
-        cv2.GaussianBlur(grid, (0, 0), constants.score_range / side, borderType=cv2.BORDER_CONSTANT) for grid in here
-    ]
+    around = [window_sums(grid, constants.score_range / side) for grid in here]
     centre = mesh.nodes[mesh.elements].mean(axis=1)[:, ::-1] - (top, left)
     row, column = (np.clip(centre, 0, limits) // side).astype(int).T
     known = np.maximum(around[1][row, column], np.finfo(float).tiny)

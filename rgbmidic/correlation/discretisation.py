@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
@@ -25,7 +24,7 @@ from rgbmidic._kernels.patches import interpolate_nodal
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import Assembly, block_side, rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
-from rgbmidic.correlation.images import apply_prefilter
+from rgbmidic.correlation.images import apply_prefilter, at_blocks, window_sums
 from rgbmidic.correlation.recovery import Recovery, quadratic_fit
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, corrected_values
@@ -194,13 +193,10 @@ def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:
     fields = residual.difference, weights, *residual.reference.gradient
     x, y, information, count = residual.reference.score_sums(side, *fields)
     xx, yy, information, count = (
-        cv2.GaussianBlur(grid, (0, 0), constants.score_range / side, borderType=cv2.BORDER_CONSTANT)
-        for grid in (x * x, y * y, information, count)
+        window_sums(grid, constants.score_range / side) for grid in (x * x, y * y, information, count)
     )
     scale = np.divide(count, information**2, out=np.zeros_like(count), where=information > 0)
-    place = mesh.nodes[:, ::-1] - pixels.bounds[:2]
-    row, column = np.clip(np.round(place / side - 0.5).astype(int), 0, np.array(count.shape) - 1).T
-    return np.stack([(xx * scale)[row, column], (yy * scale)[row, column]], axis=1)
+    return at_blocks(pixels, np.stack([xx * scale, yy * scale]), side, mesh.nodes).T
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -106,6 +106,18 @@ def spline_values(coefficients: FloatImage) -> FloatImage:
     return np.stack([cv2.sepFilter2D(one, -1, mean, mean)[PAD:-PAD, PAD:-PAD] for one in coefficients])
 
 
+def window_sums(grid: AnyArray, sigma: float) -> AnyArray:
+    """Sum a grid (h, w) of blocks in a Gaussian window of `sigma` blocks; beyond the grid there is nothing."""
+    return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT))
+
+
+def at_blocks(pixels: PixelMap, grids: AnyArray, side: int, points: FloatArray) -> AnyArray:
+    """Values (n, M) of grids (n, h, w) of blocks of `side` px in the blocks nearest to points (M, 2) in px."""
+    place = (points[:, ::-1] - pixels.bounds[:2]) / side
+    row, column = np.clip(np.round(place - 0.5).astype(int), 0, np.array(grids.shape[1:]) - 1).T
+    return np.asarray(grids[:, row, column])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlidingWindow:
     """Gaussian window for means of fields around the owned pixels, applied on a grid of blocks.
@@ -148,10 +160,7 @@ class SlidingWindow:
     def _means(self, totals: FloatImage, weights: FloatImage) -> FloatImage:
         """Divide sums (n, h, w) by those of their weights (n, h, w) or (1, h, w), both blurred."""
         sigma = self.sigma / self.step
-        means, around = (
-            np.stack([cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT) for grid in grids])
-            for grids in (totals, weights)
-        )
+        means, around = (np.stack([window_sums(grid, sigma) for grid in grids]) for grids in (totals, weights))
         means /= np.maximum(around, np.float32(1e-6), out=around)
         return np.asarray(means, dtype=np.float32)
 

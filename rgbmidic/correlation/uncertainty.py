@@ -11,12 +11,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
-import cv2
 import numpy as np
 
 from rgbmidic.correlation.assembly import RigidMotions, block_side
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.equations import Equations
+from rgbmidic.correlation.images import at_blocks, window_sums
 from rgbmidic.correlation.recovery import Functional, Recovery, displacement_functionals, functional_std
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Precision, Residual
@@ -82,7 +82,8 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
         Numbers of the two lights, and the element blocks (E, 3, 3, 3).
     """
     reference = residual.reference
-    side, slopes = block_side(reference.pixels, reference.mesh.size, reference.constants), reference.gradient
+    mesh, side = reference.mesh, block_side(reference.pixels, reference.mesh.size, reference.constants)
+    slopes, centres = reference.gradient, mesh.nodes[mesh.elements].mean(axis=1)
     score = np.einsum("kp,kp,akp->ap", weights, residual.difference, slopes)
     information = np.einsum("kp,akp,akp->p", weights, slopes, slopes)
     common = np.divide(score, information, out=np.zeros_like(score), where=information > 0)
@@ -101,7 +102,7 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
         (x, y), (other_x, other_y) = roots[a], roots[b]
         scale = np.stack([x * other_x, (x * other_y + y * other_x) / 2, y * other_y], axis=-1)
         if a != b:
-            scale *= _per_element(reference, own[a].correlation(own[b])[None], side)[0, :, None]
+            scale *= at_blocks(reference.pixels, own[a].correlation(own[b])[None], side, centres).T
         yield a, b, texture * scale[:, None, None]
 
 
@@ -111,7 +112,7 @@ def _axis_ratios(reference: Reference, own: BlockScores, texture: FloatArray) ->
     The information is divided by the gradients along x and y in the `texture` (E, 3, 3, 3) around each element.
     """
     mesh = reference.mesh
-    along_x, _, along_y = _per_element(reference, own.products(), own.side)
+    along_x, _, along_y = at_blocks(reference.pixels, own.products(), own.side, mesh.nodes[mesh.elements].mean(axis=1))
     xx, _, yy = texture.sum(axis=(1, 2)).T
     x, y = (mesh.to_nodes(part)[mesh.elements].sum(axis=1) for part in (xx, yy))
     fraction = np.divide(x, x + y, out=np.full_like(x, 0.5), where=x + y > 0)
@@ -146,7 +147,7 @@ class BlockScores:
         """Scores of all lights together; `fields` are difference, weights, gradient in x and y, (k, P) or (P,)."""
         even = reference.constants.even
         x, y, information, count = reference.score_sums(side, *(np.atleast_2d(field) for field in fields))
-        level = _blur(information, even) / np.maximum(_blur(count, even), 1e-6)
+        level = window_sums(information, even) / np.maximum(window_sums(count, even), 1e-6)
         scale = np.divide(1, np.sqrt(level), out=np.zeros_like(level), where=(level > 0) & (count > 0))
         return cls(x=x * scale, y=y * scale, count=count, side=side, constants=reference.constants)
 
@@ -163,7 +164,7 @@ class BlockScores:
 
     def around(self, grid: AnyArray) -> AnyArray:
         """Sums of a grid over the window in which scores are averaged, up to a factor."""
-        return _blur(grid, self.constants.score_range / self.side)
+        return window_sums(grid, self.constants.score_range / self.side)
 
     def products(self) -> FloatArray:
         """Products xx, xy, yy of the scores per pixel, averaged; shape (3, rows, columns).
@@ -192,21 +193,6 @@ class BlockScores:
         )
         scale = np.sqrt(first * second)
         return np.divide(product, scale, out=np.zeros_like(product), where=scale > 0)
-
-
-def _per_element(reference: Reference, grid: FloatArray, side: int) -> FloatArray:
-    """Values (n, E) at the elements' centres of n grids of blocks."""
-    mesh = reference.mesh
-    top, left, _, _ = reference.pixels.bounds
-    place = mesh.nodes[mesh.elements].mean(axis=1) - (left, top)
-    centre = np.round(place / side - 0.5).astype(int)
-    column = np.clip(centre[:, 0], 0, grid.shape[2] - 1)
-    row = np.clip(centre[:, 1], 0, grid.shape[1] - 1)
-    return np.asarray(grid[:, row, column])
-
-
-def _blur(image: AnyArray, sigma: float) -> AnyArray:
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT))
 
 
 def nodal_std(residual: Residual, equations: Equations, recovery: Recovery | None = None) -> FloatArray:
