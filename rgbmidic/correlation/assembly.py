@@ -302,7 +302,7 @@ def unfitted_fraction(
     for grid, values in zip(here, (fitted, whole), strict=True):
         np.add.at(grid, (row, column), values)
     around = [window_sums(grid, constants.score_range / side) for grid in here]
-    centre = mesh.nodes[mesh.elements].mean(axis=1)[:, ::-1] - (top, left)
+    centre = mesh.centres[:, ::-1] - (top, left)
     row, column = (np.clip(centre, 0, limits) // side).astype(int).T
     known = np.maximum(around[1][row, column], np.finfo(float).tiny)
     local = 1 - around[0][row, column] / known

@@ -138,7 +138,7 @@ def matching_elements(
     between = ~matched & (coefficient >= poor)
     typical, textured = 1.0, ff > 0
     if textured.any() and between.any():
-        centre = mesh.nodes[mesh.elements].mean(axis=1)
+        centre = mesh.centres
         ranks = [*range(1, min(constants.around, int(textured.sum())) + 1)]
         nearest = cKDTree(centre[textured]).query(centre[between], k=ranks)[1]
         typical = np.median(coefficient[textured][nearest], axis=1)
@@ -155,7 +155,7 @@ def torn_elements(mesh: Tri3Mesh, displacement: FloatArray, constants: SolverCon
     stretch = np.swapaxes(deformation, 1, 2) @ deformation - np.eye(2)
     torn = np.asarray(np.linalg.norm(stretch, axis=(1, 2)) > constants.torn)
     if torn.any():
-        centre = mesh.nodes[mesh.elements].mean(axis=1)
+        centre = mesh.centres
         around = cKDTree(centre).query(centre[torn], k=[*range(1, min(constants.around, len(centre)) + 1)])[1]
         beyond = stretch[torn] - np.median(stretch[around], axis=1)
         torn[torn] = np.linalg.norm(beyond, axis=(1, 2)) > constants.torn

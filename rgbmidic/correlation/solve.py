@@ -76,22 +76,13 @@ class Weighting:
         """Which lights (k,) see an element that takes part."""
         return np.asarray((self.residual.moments[:, self.matched, 0] > 0).any(axis=1))
 
-    @property
-    def given(self) -> FloatImage:
-        """Pixel weights (k, P) without the precision of the lights."""
-        return self._given(slice(None))
-
-    @property
-    def weights(self) -> FloatImage:
-        """Pixel weights (k, P) of the next pass."""
-        return self.of(slice(None))
-
-    def of(self, pixels: slice) -> FloatImage:
-        """Those of some pixels."""
-        given = self._given(pixels)
+    def weights(self, pixels: slice = slice(None)) -> FloatImage:
+        """Weights (k, P) of pixels in the next pass."""
+        given = self.given(pixels)
         return given if self.precision is None else given * self.precision.factor[:, pixels]
 
-    def _given(self, pixels: slice) -> FloatImage:
+    def given(self, pixels: slice = slice(None)) -> FloatImage:
+        """Weights (k, P) of pixels without the precision of the lights."""
         weights = self.residual.weights[:, pixels]
         if self.matched.all():
             return weights
@@ -180,7 +171,7 @@ def settled(weighting: Weighting, equations: Equations) -> bool:
     """Whether the next pass would have the weights of the last one."""
     constants = weighting.residual.reference.constants
     some = slice(None, None, equations.weights.shape[1] // constants.looked_at + 1)
-    weights = weighting.of(some)
+    weights = weighting.weights(some)
     total = float(weights.sum())
     return total > 0 and float(np.abs(weights - equations.weights[:, some]).sum()) <= constants.settled * total
 
@@ -304,10 +295,10 @@ def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Eq
             "put a light first that sees, or measure without rigid motions",
             estimate,
         )
-    given = None if weighting.precision is None else weighting.given
+    given = None if weighting.precision is None else weighting.given()
     try:
         equations = Equations.build(
-            problem.reference, weighting.weights, problem.functions, estimate.displacement, given
+            problem.reference, weighting.weights(), problem.functions, estimate.displacement, given
         )
     except np.linalg.LinAlgError as error:
         raise UnsolvableError(f"the equations cannot be solved: {error}", estimate) from None

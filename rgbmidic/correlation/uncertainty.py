@@ -82,14 +82,14 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
         Numbers of the two lights, and the element blocks (E, 3, 3, 3).
     """
     reference = residual.reference
-    mesh, side = reference.mesh, block_side(reference.pixels, reference.mesh.size, reference.constants)
-    slopes, centres = reference.gradient, mesh.nodes[mesh.elements].mean(axis=1)
+    mesh, pixels, slopes = reference.mesh, reference.pixels, reference.gradient
+    side = block_side(pixels, mesh.size, reference.constants)
     score = np.einsum("kp,kp,akp->ap", weights, residual.difference, slopes)
     information = np.einsum("kp,akp,akp->p", weights, slopes, slopes)
     common = np.divide(score, information, out=np.zeros_like(score), where=information > 0)
     lost = np.asarray(1 / np.sqrt(reference.unfitted) - 1, dtype=np.float32)
     if lost.ndim:
-        lost = np.repeat(lost, np.diff(reference.pixels.offsets))
+        lost = np.repeat(lost, np.diff(pixels.offsets))
     own, roots = [], []
     for difference, weight, gx, gy in zip(residual.difference, weights, *slopes, strict=True):
         whole = difference + lost * (gx * common[0] + gy * common[1])
@@ -102,7 +102,7 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
         (x, y), (other_x, other_y) = roots[a], roots[b]
         scale = np.stack([x * other_x, (x * other_y + y * other_x) / 2, y * other_y], axis=-1)
         if a != b:
-            scale *= at_blocks(reference.pixels, own[a].correlation(own[b])[None], side, centres).T
+            scale *= at_blocks(pixels, own[a].correlation(own[b])[None], side, mesh.centres).T
         yield a, b, texture * scale[:, None, None]
 
 
@@ -112,7 +112,7 @@ def _axis_ratios(reference: Reference, own: BlockScores, texture: FloatArray) ->
     The information is divided by the gradients along x and y in the `texture` (E, 3, 3, 3) around each element.
     """
     mesh = reference.mesh
-    along_x, _, along_y = at_blocks(reference.pixels, own.products(), own.side, mesh.nodes[mesh.elements].mean(axis=1))
+    along_x, _, along_y = at_blocks(reference.pixels, own.products(), own.side, mesh.centres)
     xx, _, yy = texture.sum(axis=(1, 2)).T
     x, y = (mesh.to_nodes(part)[mesh.elements].sum(axis=1) for part in (xx, yy))
     fraction = np.divide(x, x + y, out=np.full_like(x, 0.5), where=x + y > 0)

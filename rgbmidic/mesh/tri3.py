@@ -124,6 +124,11 @@ class Tri3Mesh:
             nodes, elements = outline_mesh(region.mask, element_size, cracks, region.origin)
         return cls(nodes=nodes, elements=elements)
 
+    @property
+    def centres(self) -> FloatArray:
+        """Centre of each element, shape (E, 2), px."""
+        return np.asarray(self.nodes[self.elements].mean(axis=1))
+
     @cached_property
     def copies(self) -> npt.NDArray[np.int32]:
         """Pairs of nodes at one place, on two sides of a crack, shape (C, 2)."""
@@ -137,7 +142,7 @@ class Tri3Mesh:
 
         They are the nodes; for a node on a side of a crack, the middle of the elements around it.
         """
-        moments = (self.nodes[self.elements].mean(axis=1) * self.areas[:, None]).T
+        moments = (self.centres * self.areas[:, None]).T
         middle = np.stack([self.to_nodes(part) for part in moments], axis=1) / self.to_nodes(self.areas)[:, None]
         places, split = self.nodes.copy(), self.copies.ravel()
         places[split] = middle[split]

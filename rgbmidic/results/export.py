@@ -108,7 +108,7 @@ def _write_shared(out: h5py.File, physical: Physical) -> None:
     }
     for name, (values, unit, meaning) in scales.items():
         _add(out, name, values, (), unit, meaning).make_scale(name)
-    x_element, y_element = physical.length * mesh.nodes[mesh.elements].mean(axis=1).T
+    x_element, y_element = physical.length * mesh.centres.T
     node, element = ("node",), ("element",)
     _add(out, "name", np.array(result.names, dtype=text), ("time",), "1", "name of the frame")
     for name, (unit, values) in physical.places.items():
