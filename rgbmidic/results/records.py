@@ -13,7 +13,7 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -23,12 +23,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rgbmidic.errors import AnotherTestError, ResultError, disk_faults
-from rgbmidic.results.files import npy_array, npy_bytes, write_complete, writing
+from rgbmidic.results.files import npy_array, npy_bytes, write_complete
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.settings import regular
 from rgbmidic.typing import BoolArray, IntArray
 
+FRAMES = "solution"
+"""Folder of the records in that of a result."""
 _NAME = re.compile(r"([0-9]{6}|[1-9][0-9]{6,})\.npz")
 _LOCAL = struct.Struct("<4s5H3I2H")
 """What precedes the name and content of an array; this and the following: PKWARE's APPNOTE.TXT 6.3, 4.3.7 to 4.3.16."""
@@ -145,19 +147,6 @@ def _read_record(folder: Path, frame: int, names: Iterable[str], run: bytes) -> 
     return values
 
 
-def discard(folder: Path, frames: Collection[int]) -> None:
-    """Discard the records of some frames for good; no other run may write meanwhile.
-
-    Raises
-    ------
-    ResultError
-        The disk refuses.
-    """
-    for frame in frames:
-        with writing(file := record_file(folder, frame)):
-            file.unlink(missing_ok=True)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameTable:
     """Which frames a result holds at the time it is loaded; reads them.
@@ -183,15 +172,17 @@ class FrameTable:
     damaged: BoolArray
 
     @classmethod
-    def load(cls, folder: Path, sizes: Mapping[str, int], count: int, run: bytes) -> FrameTable:
-        """Look which of `count` frames are there; none of them is read.
+    def load(cls, path: Path, sizes: Mapping[str, int], count: int, run: bytes) -> FrameTable:
+        """Look which of `count` frames the result in a folder holds now; none of them is read.
+
+        `run` is the digest of the run.
 
         Raises
         ------
         ResultError
             The folder cannot be read.
         """
-        written = np.full(count, -1, dtype=np.int64)
+        folder, written = path / FRAMES, np.full(count, -1, dtype=np.int64)
         with disk_faults(ResultError, f"{folder} cannot be read"):
             for frame, file in record_files(folder).items():
                 with suppress(FileNotFoundError, IndexError):  # discarded just now, or of no frame
