@@ -16,7 +16,7 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.extras import optional
 from rgbmidic.results.files import read_arrays, read_json
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK, digest, fingerprint, read_provenance
-from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, FrameRecord, Quantities
+from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, STACKED, FrameRecord
 from rgbmidic.results.records import FrameTable
 from rgbmidic.settings import read_section
 from rgbmidic.settings.schema import section_kinds
@@ -47,7 +47,7 @@ class Portable:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Result(Portable, Quantities, Described):
+class Result(Portable, Described):
     """The result of a test, for post-processing.
 
     `Result.open` opens a result folder, also during a run, and reads only the mesh and which frames there are. The
@@ -322,9 +322,16 @@ class Result(Portable, Quantities, Described):
         dataset: xr.Dataset = optional("rgbmidic.results.dataset", "xarray").to_dataset(self, scale)
         return dataset
 
-    def _quantity(self, name: str, /) -> AnyArray:
+    def __getattr__(self, name: str, /) -> AnyArray:
+        """Read a quantity of the table in all frames, at its first use."""
+        if name not in STACKED:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
         stacked = self.__dict__[name] = self.stack(name)
         return stacked
+
+    def __dir__(self) -> list[str]:
+        """Return the names of all attributes, quantities included."""
+        return [*object.__dir__(self), *STACKED]
 
     @property
     def strain(self) -> FloatArray:
