@@ -184,8 +184,7 @@ class Result(Portable, Described):
     @cached_property
     def deformed(self) -> tuple[int, ...]:
         """Indices of the frames that are no reference."""
-        references = set(self.provenance["references"])
-        return tuple(index for index in range(len(self)) if index not in references)
+        return tuple(sorted({*range(len(self))} - {*self.provenance["references"]}))
 
     def section(self, kind: type[S]) -> S:
         """Return a section of the settings that the result was measured with; its defaults where none were kept.
