@@ -211,22 +211,18 @@ class Physical(Portable):
     @property
     def places(self) -> list[tuple[Quantity, FloatArray]]:
         """Coordinates of the nodes, each with its values (N,): with a camera those on the image too."""
-        image, plane, ways = (
-            "the reference image",
-            "the plane of the specimen at the reference",
-            ("to the right", "down"),
-        )
-        on = image if self.rectified.camera is None else plane
-        stated = [("", self.units.length, self.length * self.mesh.nodes, on, ways)]
-        if self.rectified.camera is not None:
+        image, camera = "the reference image", self.rectified.camera
+        plane, ways = "the plane of the specimen at the reference", ("to the right", "down")
+        stated = [("", self.units.length, self.length * self.mesh.nodes, image if camera is None else plane, ways)]
+        if camera is not None:
             stated.append(("_image", "px", self.result.nodes, image, ways))
         if self.result.node_mm is not None:
-            along = ("along its axis x", "along its axis y")
-            stated.append(("_mesh", "mm", self.result.node_mm, "the mesh of mesh.file", along))
+            ways = ("along its axis x", "along its axis y")
+            stated.append(("_mesh", "mm", self.result.node_mm, "the mesh of mesh.file", ways))
         return [
             (Quantity(f"{axis}{end}", ("node",), unit, "", f"position of the node on {on}, {way}"), values)
-            for end, unit, nodes, on, ways in stated
-            for axis, way, values in zip("xy", ways, nodes.T, strict=True)
+            for end, unit, nodes, on, each_way in stated
+            for axis, way, values in zip("xy", each_way, nodes.T, strict=True)
         ]
 
     @property
