@@ -8,6 +8,7 @@ declared in the field table and here.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, Self
@@ -234,6 +235,11 @@ class Physical(Portable):
         if (camera := self.rectified.camera) is not None:
             facts["camera"] = f"{camera.name}: {camera.summary()}"
         return facts
+
+    def displacements(self, frames: Iterable[int]) -> Iterator[FloatArray]:
+        """Read u, v and their uncertainties (4, N) in some frames, in rectified px."""
+        for read in self.result.table.each(MOVED, frames):
+            yield np.stack(self.rectified.displacement(*(np.asarray(read[name], np.float64) for name in MOVED)))
 
     @cached_property
     def covariance(self) -> NodalCovariance:
