@@ -27,7 +27,7 @@ from rgbmidic.pipeline.suitability import light_levels
 from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
-from rgbmidic.results.store import listed, read_mesh
+from rgbmidic.results.result import listed, read_mesh
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.weights import LightWeights
 

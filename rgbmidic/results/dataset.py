@@ -15,7 +15,6 @@ import xarray as xr
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
-from rgbmidic._version import __version__
 from rgbmidic.results.maps import Maps
 from rgbmidic.results.physical import Physical, frame_times
 from rgbmidic.results.quantities import QUANTITIES, SHARED
@@ -111,12 +110,10 @@ def _coordinates(physical: Physical) -> dict[str, xr.Variable]:
         "component": xr.Variable("component", list(_COMPONENTS), {"long_name": "component of the strain tensor"}),
     }
     coordinates |= {dimension: xr.Variable(dimension, list(parts)) for dimension, parts in _PARTS.values()}
-    for name, (unit, values) in physical.places.items():
-        about = {"units": unit, "long_name": f"position of the node on {physical.where(name)}"}
-        coordinates[name] = xr.Variable("node", values, about)
-    for name, axis in {"node_number": "node", "element_number": "element"}.items():
-        if (numbers := getattr(result, name)) is not None:
-            coordinates[name] = xr.Variable(axis, numbers, SHARED[name].attributes)
+    numbers = [(SHARED[name], getattr(result, name)) for name in ("node_number", "element_number")]
+    for entry, values in [*physical.places, *numbers]:
+        if values is not None:
+            coordinates[entry.name] = xr.Variable(entry.axes, values, entry.attributes)
     if (times := frame_times(result, physical.scale)) is not None:
         about = {"units": "s", "long_name": "time of the frame from the trigger"}
         coordinates["time"] = xr.Variable("frame", times, about)
@@ -125,13 +122,7 @@ def _coordinates(physical: Physical) -> dict[str, xr.Variable]:
 
 def _provenance(physical: Physical) -> dict[str, Any]:
     """Collect the attributes of the Dataset as plain numbers and texts, which a file can hold."""
-    result, scale, camera = physical.result, physical.units, physical.rectified.camera
-    kept, places = result.provenance, {"references": list(result.provenance["references"])}
-    facts = {name: kept[name] for name in ("created", "finished", "frame_rate", "exposure_ns") if kept.get(name)}
-    if scale.mm_per_pixel is not None:
-        facts |= {"mm_per_pixel": scale.mm_per_pixel, "mm_per_pixel_std": scale.mm_per_pixel_std}
-    if camera is not None:
-        facts["camera"] = f"{camera.name}: {camera.summary()}"
+    kept = physical.result.provenance
+    plain = {name: kept[name] for name in ("created", "finished", "frame_rate", "exposure_ns") if kept.get(name)}
     texts = {name: json.dumps(kept[name]) for name in ("settings", "calibration", "versions") if name in kept}
-    about = {"title": f"result {result.path.name}", "source": f"rgbmidic {__version__}"}
-    return {**about, **facts, **places, **texts}
+    return {**physical.facts, **plain, "references": list(kept["references"]), **texts}

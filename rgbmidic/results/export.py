@@ -14,7 +14,7 @@ import os
 import re
 import shutil
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -92,42 +92,37 @@ def _write_shared(out: h5py.File, physical: Physical) -> None:
     import h5py
 
     result, mesh, units, text = physical.result, physical.mesh, physical.units, h5py.string_dtype()
-    out.attrs.update({"title": f"result {result.path.name}", "source": f"rgbmidic {__version__}", "axes": _AXES})
-    if units.mm_per_pixel is not None:
-        out.attrs.update({"mm_per_pixel": units.mm_per_pixel, "mm_per_pixel_std": units.mm_per_pixel_std})
-    if (camera := physical.rectified.camera) is not None:
-        out.attrs["camera"] = f"{camera.name}: {camera.summary()}"
+    out.attrs.update({**physical.facts, "axes": _AXES})
     out.create_dataset("provenance", data=json.dumps(dict(result.provenance)), dtype=text)
     meaning = "time of the frame" if units.timed else "place of the frame, counted from 0"
     scales: dict[str, tuple[AnyArray, str, str]] = {
         "time": (physical.times, units.time, meaning),
-        "node": (np.arange(len(mesh.nodes), dtype=np.int32), "1", "index of the node, as in elements"),
-        "element": (np.arange(len(mesh.elements), dtype=np.int32), "1", "index of the element"),
-        "corner": (np.arange(3, dtype=np.int32), "1", "corner of the element"),
-        "light": (np.array(result.lights, dtype=text), "1", "name of the light"),
+        "node": (np.arange(len(mesh.nodes), dtype=np.int32), "", "index of the node, as in elements"),
+        "element": (np.arange(len(mesh.elements), dtype=np.int32), "", "index of the element"),
+        "corner": (np.arange(3, dtype=np.int32), "", "corner of the element"),
+        "light": (np.array(result.lights, dtype=text), "", "name of the light"),
     }
     for name, (values, unit, meaning) in scales.items():
-        _add(out, name, values, (), unit, meaning).make_scale(name)
-    x_element, y_element = physical.length * mesh.centres.T
-    node, element = ("node",), ("element",)
-    _add(out, "name", np.array(result.names, dtype=text), ("time",), "1", "name of the frame")
-    for name, (unit, values) in physical.places.items():
-        _add(out, name, values, node, unit, f"position of the node on {physical.where(name)}")
-    for name, axes in {"node_number": node, "element_number": element}.items():
-        if (numbers := getattr(result, name)) is not None:
-            _add(out, name, numbers, axes, "1", SHARED[name].meaning)
-    _add(out, "elements", mesh.elements, ("element", "corner"), "1", "nodes of the element, counted from 0")
-    _add(out, "x_element", x_element, element, units.length, "middle of the element, to the right")
-    _add(out, "y_element", y_element, element, units.length, "middle of the element, down")
-    _add(out, "area", physical.length**2 * mesh.areas, element, f"{units.length}^2", "area of the element")
+        _add(out, Quantity(name, (), unit, "", meaning), (), data=values).make_scale(name)
+    (x, y), element = physical.length * mesh.centres.T, ("element",)
+    shared: list[tuple[Quantity, AnyArray | None]] = [
+        (Quantity("name", ("time",), "", "", "name of the frame"), np.array(result.names, dtype=text)),
+        *physical.places,
+        *((SHARED[name], getattr(result, name)) for name in ("node_number", "element_number")),
+        (Quantity("elements", ("element", "corner"), "", "", "nodes of the element, counted from 0"), mesh.elements),
+        (Quantity("x_element", element, units.length, "", "middle of the element, to the right"), x),
+        (Quantity("y_element", element, units.length, "", "middle of the element, down"), y),
+        (Quantity("area", element, f"{units.length}^2", "", "area of the element"), physical.length**2 * mesh.areas),
+    ]
+    for entry, array in shared:
+        if array is not None:
+            _add(out, entry, entry.axes, data=array)
 
 
-def _add(out: h5py.File, name: str, values: AnyArray, axes: tuple[str, ...], unit: str, meaning: str) -> h5py.Dataset:
-    return _describe(out, out.create_dataset(name, data=values), axes, {"units": unit, "long_name": meaning})
-
-
-def _describe(out: h5py.File, dataset: h5py.Dataset, axes: tuple[str, ...], about: dict[str, Any]) -> h5py.Dataset:
-    dataset.attrs.update(about)
+def _add(out: h5py.File, entry: Quantity, axes: Sequence[str | int], **content: Any) -> h5py.Dataset:
+    """Create the array of a quantity along axes whose scales are there."""
+    dataset = out.create_dataset(entry.name, **content)
+    dataset.attrs.update(entry.attributes)
     for axis, name in zip(dataset.dims, axes, strict=False):
         axis.attach_scale(out[name])
     return dataset
@@ -138,10 +133,11 @@ def _declare(out: h5py.File, physical: Physical, entry: Quantity) -> None:
     axes = tuple(axis if isinstance(axis, str) else f"part_of_{axis}" for axis in entry.axes)
     for name, axis in zip(axes, entry.axes, strict=True):
         if name not in out:  # an axis of a fixed length gets its scale when it is first met
-            _add(out, name, np.arange(int(axis), dtype=np.int32), (), "1", "index").make_scale(name)
+            _add(out, Quantity(name, (), "", "", "index"), (), data=np.arange(int(axis), dtype=np.int32)).make_scale(
+                name
+            )
     shape = (len(physical.result), *(len(out[axis]) for axis in axes))
-    dataset = out.create_dataset(entry.name, shape, np.dtype(entry.dtype).newbyteorder("<"))
-    _describe(out, dataset, ("time", *axes), entry.attributes)
+    dataset = _add(out, entry, ("time", *axes), shape=shape, dtype=np.dtype(entry.dtype).newbyteorder("<"))
     if physical.is_strain(entry.name):
         length = f"{physical.gauges.length * physical.length:.6g} {physical.units.length}"
         dataset.attrs["measure"] = "hencky" if entry.name.startswith("equivalent") else physical.measure
@@ -268,14 +264,14 @@ def _write_csv(physical: Physical, file: BinaryIO) -> None:
     label = [] if result.node_number is None else [result.node_number.tolist()]
     head = ["frame", "number", "name", *(["time_s"] if timed else []), "status", "node"]
     head += [*(["node_number"] if label else []), "node_status"]
-    head += [column(name, unit) for name, (unit, _) in places.items()]
+    head += [column(entry.name, entry.unit) for entry, _ in places]
     head += [column(name, unit) for name, unit in fields.items()]
 
     def rows() -> Iterator[list[object]]:
         for index, seconds in enumerate(physical.times.tolist()):
             values = physical.frame(index)
             start = [index, values["number"], result.names[index], *([f"{seconds:.12g}"] if timed else [])]
-            numbers = np.column_stack([*(place for _, place in places.values()), *(values[name] for name in fields)])
+            numbers = np.column_stack([*(place for _, place in places), *(values[name] for name in fields)])
             for node, (code, row) in enumerate(zip(values["node_status"].tolist(), numbers.tolist(), strict=True)):
                 yield [*start, values["status"], node, *(known[node] for known in label), code, *row]
 

@@ -38,19 +38,14 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, AnyArray]:
     """
     try:
         with zipfile.ZipFile(regular(path)) as archive:
-            return {name: _read_array(archive, name) for name in names}
+            entries = {name: archive.getinfo(f"{name}.npy") for name in names}
+            if packed := [name for name, entry in entries.items() if entry.compress_type != zipfile.ZIP_STORED]:
+                raise ValueError(f"{packed[0]} is compressed")
+            return {name: npy_array(archive.read(entry)) for name, entry in entries.items()}
     except FileNotFoundError:
         raise ResultError(f"{path} is missing: the result is incomplete") from None
     except Exception as error:  # zipfile and numpy raise a dozen kinds on damaged files
         raise ResultError(f"{path} is damaged: {error}") from None
-
-
-def _read_array(archive: zipfile.ZipFile, name: str) -> AnyArray:
-    """Read one array; a header that promises more than the file holds takes no memory."""
-    entry = archive.getinfo(f"{name}.npy")
-    if entry.compress_type != zipfile.ZIP_STORED:
-        raise ValueError(f"{name} is compressed")
-    return npy_array(archive.read(entry))
 
 
 def npy_bytes(array: npt.ArrayLike) -> bytes:

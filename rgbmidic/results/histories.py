@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,18 +18,18 @@ import numpy as np
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields.history import History, Nodal, Probe, Rates, rate_frames, rate_words, rates
-from rgbmidic.fields.nodal import NodalCovariance, RigidMotion
+from rgbmidic.fields.nodal import RigidMotion
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.probes import make_probe
 from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.fields.units import Units
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.files import check_file, write_complete, write_table
-from rgbmidic.results.physical import MOVED, frame_times, rectification_of, reference_frames, shared_part
+from rgbmidic.results.physical import MOVED, Physical, frame_times, reference_frames, shared_part
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.text import rounded
-from rgbmidic.typing import FloatArray, IntArray
+from rgbmidic.typing import AnyArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -123,17 +123,14 @@ def write_histories(histories: Histories, out: Path | str, *, overwrite: bool = 
 
 def history_csv(histories: Histories, file: BinaryIO) -> None:
     """Write histories as CSV: a header line whose names carry the units, then one row a frame; empty: no value."""
-    columns: dict[str, FloatArray] = {}
+    columns: dict[str, AnyArray] = {"frame": histories.frames, "number": histories.numbers, "status": histories.status}
     if histories.times is not None:
         columns["time_s"] = histories.times
     for quantity in histories.quantities:
         columns[quantity.column] = quantity.values
         if quantity.std is not None:
             columns[f"{quantity.column}_std"] = quantity.std
-    heads = np.stack([histories.frames, histories.numbers, histories.status], axis=1).tolist()
-    numbers = np.column_stack([*columns.values()]).tolist()
-    rows = ([*head, *row] for head, row in zip(heads, numbers, strict=True))
-    write_table(file, ["frame", "number", "status", *columns], rows)
+    write_table(file, columns, zip(*(values.tolist() for values in columns.values()), strict=True))
 
 
 def read_histories(
@@ -171,20 +168,18 @@ def read_histories(
     """
     if not probes.places and probes.rigid_motion == "none":
         raise InputError("no probe is stated: give one on the command line, such as --point X,Y, or in [probes]")
-    rectified = rectification_of(result, scale)
-    alone = _frames(result, scale, rectified.units)
-    rectified, there, units = replace(rectified, units=alone.units), alone.frames, alone.units
+    physical = Physical.untimed(result, scale)
+    alone = frames_alone(result, physical)
+    rectified, there, units = replace(physical.rectified, units=alone.units), alone.frames, alone.units
     if not len(there):
         raise InputError(f"no frame of {result.path} is measured yet")
     window = probes.window and rate_frames(probes.window, len(there))
-    covariance = NodalCovariance.from_mesh(rectified.mesh)
     counts, made = Counter[str](), list[Probe]()
     for kind, place in probes.places:
         counts[kind] += 1
-        made.append(make_probe(covariance, kind, counts[kind], place, probes, rectified))
+        made.append(make_probe(physical.covariance, kind, counts[kind], place, probes, rectified))
     clock = alone.numbers.astype(np.float64) if alone.times is None else alone.times
-    each = result.table.each(MOVED, there.tolist())
-    nodal, rigid, speed = _read(each, rectified, covariance, made, probes.rigid_motion, clock)
+    nodal, rigid, speed = _read(physical, there, made, probes.rigid_motion, clock)
     by_probe = {probe.name: probe.histories(part) for probe, part in zip(made, nodal, strict=True)}
     for name, histories in by_probe.items():
         if not any(np.isfinite(history.values).any() for history in histories):
@@ -206,45 +201,36 @@ def read_histories(
     return with_channels(read_off, channels or ChannelSettings())
 
 
-def frames_alone(result: Result) -> Histories:
+def frames_alone(result: Result, physical: Physical | None = None) -> Histories:
     """Return histories of no probe: the measured frames and their times, for channels."""
-    return _frames(result, None, rectification_of(result).units)
-
-
-def _frames(result: Result, scale: ScaleSettings | None, units: Units) -> Histories:
-    there, times = np.flatnonzero(result.finished), frame_times(result, scale)
+    physical = physical or Physical.untimed(result)
+    there, times = np.flatnonzero(result.finished), frame_times(result, physical.scale)
     return Histories(
         frames=there,
         numbers=result.number[there],
         status=result.status[there],
         times=None if times is None else times[there],
-        units=replace(units, timed=times is not None),
+        units=replace(physical.units, timed=times is not None),
     )
 
 
 def _read(
-    each: Iterable[Mapping[str, FloatArray]],
-    rectified: Rectification,
-    covariance: NodalCovariance,
-    probes: list[Probe],
-    rigid: str,
-    clock: FloatArray,
+    physical: Physical, frames: IntArray, probes: list[Probe], rigid: str, clock: FloatArray
 ) -> tuple[list[Nodal], list[History], FloatArray]:
     """Read the displacements that each probe needs, the rigid motion and the speed (T,) of the fast nodes."""
     kept: list[list[FloatArray]] = [[] for _ in probes]
     motions = np.full((len(clock), 3, 2), np.nan)
-    speed, before = np.full(len(clock), np.nan), np.full((2, len(rectified.mesh.nodes)), np.nan)
-    for row, values in enumerate(each):
-        field = np.stack(rectified.displacement(*(values[name] for name in MOVED))).astype(np.float64)
+    speed, before = np.full(len(clock), np.nan), np.full((2, len(physical.mesh.nodes)), np.nan)
+    for row, field in enumerate(physical.displacements(frames.tolist())):
         moved = np.hypot(*(field[:2] - before))
         if row and np.isfinite(moved).any():
             # of the fast nodes: single outliers do not count
             speed[row] = np.nanpercentile(moved, 95) / (clock[row] - clock[row - 1])
         before = field[:2]
         if rigid != "none" and np.isfinite(field).all(axis=0).sum() > 1:
-            motion = RigidMotion.of(covariance, *field)
+            motion = RigidMotion.of(physical.covariance, *field)
             motions[row] = [*zip(motion.shift, motion.shift_std, strict=True), (motion.rotation, motion.rotation_std)]
-            field = motion.removed(rectified.mesh.nodes, field) if rigid == "remove" else field
+            field = motion.removed(physical.mesh.nodes, field) if rigid == "remove" else field
         for fields, probe in zip(kept, probes, strict=True):
             fields.append(field[:, probe.nodes])
     nodal = [Nodal(**dict(zip(MOVED, np.stack(fields, axis=1), strict=True))) for fields in kept]

@@ -147,9 +147,9 @@ class Maps(Portable):
         frames = len(self.result)
         if since is not None and not 0 <= since < frames:
             raise InputError(f"there is no frame {since} in a result of {frames} frames (0 to {frames - 1})")
-        if since is not None and self.result.finished[since] and np.isnan(self.result.frame(since).u).all():
-            reason = self.result.frame(since).reason or "no node"
-            raise InputError(f"nothing is known since frame {since}, in which nothing is measured: {reason}")
+        if since is not None and self.result.finished[since] and np.isnan((first := self.result.frame(since)).u).all():
+            why = first.reason or "no node"
+            raise InputError(f"nothing is known since frame {since}, in which nothing is measured: {why}")
         window = window or self.result.section(ProbeSettings).window or WINDOW
         rate_frames(window, FEWEST)
         physical, measure = self.physical, measure or MEASURES[0]
@@ -260,11 +260,8 @@ class Maps(Portable):
 
     def _with_error(self, name: str, frame: int) -> FloatArray:
         """Compute a field of `WITH_ERROR` (N,) against the test's reference; NaN in frames without."""
-        read = next(
-            self.result.table.each(
-                [f"{one}{end}" for one in COMPONENTS for end in ("_std", "_mesh_error")] + ["u", "v"], [frame]
-            )
-        )
+        names = [f"{one}{end}" for one in COMPONENTS for end in ("_std", "_mesh_error")]
+        read = next(self.result.table.each([*names, "u", "v"], [frame]))
         if not read["u_mesh_error"].size:
             return np.full(len(self.result.nodes), np.nan)
         double = {key: np.asarray(values, dtype=np.float64) for key, values in read.items()}
@@ -276,7 +273,7 @@ class Maps(Portable):
             for end in ("_std", "_mesh_error"):
                 parts = (double[key] for key in ("u", "v", f"u{end}", f"v{end}"))
                 moved = self.physical.rectified.displacement(*parts)[2:]
-                double[f"{one}{end}"] = self._units.lengths(*[moved[UV.index(one)]] * 2)[0]
+                double[f"{one}{end}"] = self.physical.length * moved[UV.index(one)]
         error = double[f"{one}_mesh_error"]
         return error if name.endswith("_error") else np.hypot(error, double[f"{one}_std"])
 
@@ -289,7 +286,7 @@ class Maps(Portable):
             parts = [self._rates(part, frame, entry.order) for part in entry.parts]
         else:
             moved = self.displacement(frame)
-            parts = [(moved[UV.index(part)], moved[2 + UV.index(part)]) for part in entry.parts]
+            parts = [moved[UV.index(part) :: 2] for part in entry.parts]
         values, std = parts[0]
         if len(parts) > 1:
             vector, error = (np.stack(each, axis=1) for each in zip(*parts, strict=True))
@@ -342,14 +339,9 @@ class Maps(Portable):
             lambda x, y, length: StrainGauges.at_points(self.physical.covariance, np.array([[x, y]]), length)
         )
 
-    def _measured(self, frame: int) -> FloatArray:
-        """Read u, v and their uncertainties (4, N) against the test's reference, in rectified px."""
-        read = next(self.result.table.each(MOVED, [frame]))
-        return np.stack(self.physical.rectified.displacement(*(np.asarray(read[name], np.float64) for name in MOVED)))
-
     def _since(self, frame: int) -> FloatArray:
         """Return u, v and their uncertainties (4, N) since the frame that is the reference here."""
-        moved = self._measured(frame)
+        moved = next(self.physical.displacements([frame]))
         if self.since is None:
             return moved
         first, factor = self._first, self._common(frame)
@@ -358,7 +350,7 @@ class Maps(Portable):
 
     @cached_property
     def _first(self) -> FloatArray:
-        return self._measured(0 if self.since is None else self.since)
+        return next(self.physical.displacements([self.since or 0]))
 
     def _common(self, frame: int) -> float:
         """Return the fraction of the smaller variance that a frame has in common with the one of `since`."""
@@ -387,7 +379,7 @@ class Maps(Portable):
         return lru_cache(2)(lambda frame: named(self._strain_of(frame, self.physical.gauges)))
 
     def _strain_of(self, frame: int, gauges: StrainGauges) -> Strain:
-        moved = self._measured(frame)
+        moved = next(self.physical.displacements([frame]))
         if self.since is None:
             gradient, covariance = gauges.gradient(*moved)
         else:  # both gradients of the same nodes, which have data in both frames
@@ -404,14 +396,13 @@ class Maps(Portable):
             gradient, covariance = back @ (np.eye(2) + gradient) - np.eye(2), wide @ covariance @ wide.T
         return strain_of_gradient(gradient, covariance, self.physical.measure)
 
-    def _rates(self, name: str, frame: int, order: int) -> tuple[FloatArray, FloatArray]:
-        """Return the derivative of an order of a field against the test's reference, and its uncertainty."""
+    def _rates(self, name: str, frame: int, order: int) -> FloatArray:
+        """Return the derivative of an order of a field against the test's reference, and its uncertainty, (2, N)."""
         places = np.flatnonzero(self._there == frame)
         if not len(places):  # not measured yet
-            return np.full(len(self.result.nodes), np.nan), np.full(len(self.result.nodes), np.nan)
+            return np.full((2, len(self.result.nodes)), np.nan)
         block, row = divmod(int(places[0]), _AROUND * self.window)
-        values, std = self._block(name, block)[order - 1]
-        return values[row], std[row]
+        return self._block(name, block)[order - 1, :, row]
 
     @cached_property
     def _there(self) -> IntArray:
@@ -448,9 +439,10 @@ class Maps(Portable):
         frames, clock = self._there[outer], self._clock[outer]
         plain = replace(self, since=None, rigid_removed=False)
         if name in UV:
-            series = np.stack([self._measured(frame)[UV.index(name) :: 2] for frame in frames.tolist()], axis=1)
+            each = (moved[UV.index(name) :: 2] for moved in self.physical.displacements(frames.tolist()))
         else:
-            series = np.stack([np.stack(plain._derived(name, frame)) for frame in frames.tolist()], axis=1)
+            each = (np.stack(plain._derived(name, frame)) for frame in frames.tolist())
+        series = np.stack([*each], axis=1)
         span = (taken - 1) * float(np.median(np.diff(self._clock)))
         common, references = shared_part(self.result), reference_frames(self.result)[frames]
         mine = slice(inner.start - outer.start, inner.stop - outer.start)

@@ -8,12 +8,14 @@ declared in the field table and here.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
+from rgbmidic._version import __version__
 from rgbmidic.fields.nodal import NodalCovariance, reference_fraction
 from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
@@ -112,30 +114,20 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     there = result.finished
     stamps, numbers = result.time_ns[there], result.number[there]
     if (stamps == UNKNOWN_TIME).any():
-        camera_rate = result.provenance.get("frame_rate")
-        rate = scale.frame_rate or camera_rate
+        recorded, taken = result.provenance.get("frame_rate"), "the camera was set to %.6g: the former is taken"
+        rate = scale.frame_rate or recorded
         seconds = numbers / rate if rate else None
-        if camera_rate:
-            _compare(camera_rate, scale.frame_rate, "the camera was set to %.6g: the former is taken")
     else:
-        seconds = stamps * 1e-9
-        if len(seconds) > 1:
-            stamped_rate = float(np.median(np.maximum(np.diff(numbers), 1) / np.diff(seconds)))
-            _compare(stamped_rate, scale.frame_rate, "the frames' own times %.6g: these are taken")
+        seconds, taken = stamps * 1e-9, "the frames' own times %.6g: these are taken"
+        recorded = np.median(np.maximum(np.diff(numbers), 1) / np.diff(seconds)) if len(seconds) > 1 else None
+    # stamps in whole microseconds give the median interval of 10,000 frames per second to 1 %
+    if recorded and scale.frame_rate and abs(recorded / scale.frame_rate - 1) > 0.01:
+        logger.warning(f"scale.frame_rate states %g frames per second, {taken}", scale.frame_rate, recorded)
     if seconds is None:
         return None
     times = np.full(len(result), np.nan)
     times[there] = seconds
     return times
-
-
-def _compare(recorded: float, stated: float | None, contradiction: str) -> None:
-    """Warn where a stated frame rate is not the recorded one.
-
-    Time stamps in whole microseconds give the median interval of 10,000 frames per second to 1 %.
-    """
-    if stated and abs(recorded / stated - 1) > 0.01:
-        logger.warning(f"scale.frame_rate states %g frames per second, {contradiction}", stated, recorded)
 
 
 def reference_frames(result: Result) -> BoolArray:
@@ -150,9 +142,7 @@ def reference_frames(result: Result) -> BoolArray:
     -------
     ndarray, shape (T,), bool
     """
-    chosen = np.zeros(len(result), dtype=bool)
-    chosen[list(result.provenance["references"])] = True
-    return chosen
+    return np.isin(np.arange(len(result)), result.provenance["references"])
 
 
 def shared_part(result: Result) -> float:
@@ -219,23 +209,37 @@ class Physical(Portable):
         """The mesh in rectified px; in px where no camera is stated."""
         return self.rectified.mesh
 
-    def where(self, name: str) -> str:
-        """Say what one of the `places` lies on, and which way it counts."""
-        if name.endswith("_mesh"):
-            return f"the mesh of mesh.file, along its axis {name[0]}"
-        plane = self.rectified.camera is not None and not name.endswith("_image")
-        on = "the plane of the specimen at the reference" if plane else "the reference image"
-        return f"{on}, {'to the right' if name[0] == 'x' else 'down'}"
+    @property
+    def places(self) -> list[tuple[Quantity, FloatArray]]:
+        """Coordinates of the nodes, each with its values (N,): with a camera those on the image too."""
+        image, camera = "the reference image", self.rectified.camera
+        plane, ways = "the plane of the specimen at the reference", ("to the right", "down")
+        stated = [("", self.units.length, self.length * self.mesh.nodes, image if camera is None else plane, ways)]
+        if camera is not None:
+            stated.append(("_image", "px", self.result.nodes, image, ways))
+        if self.result.node_mm is not None:
+            ways = ("along its axis x", "along its axis y")
+            stated.append(("_mesh", "mm", self.result.node_mm, "the mesh of mesh.file", ways))
+        return [
+            (Quantity(f"{axis}{end}", ("node",), unit, "", f"position of the node on {on}, {way}"), values)
+            for end, unit, nodes, on, each_way in stated
+            for axis, way, values in zip("xy", each_way, nodes.T, strict=True)
+        ]
 
     @property
-    def places(self) -> dict[str, tuple[str, FloatArray]]:
-        """Coordinates of the nodes by name, with unit and values (N,): with a camera those on the image too."""
-        found = {name: (self.units.length, self.length * x) for name, x in zip("xy", self.mesh.nodes.T, strict=True)}
-        if self.rectified.camera is not None:
-            found |= {f"{name}_image": ("px", x) for name, x in zip("xy", self.result.nodes.T, strict=True)}
-        if self.result.node_mm is not None:
-            found |= {f"{name}_mesh": ("mm", x) for name, x in zip("xy", self.result.node_mm.T, strict=True)}
-        return found
+    def facts(self) -> dict[str, Any]:
+        """What other programs' formats state of the result as a whole."""
+        facts: dict[str, Any] = {"title": f"result {self.result.path.name}", "source": f"rgbmidic {__version__}"}
+        if (scale := self.units).mm_per_pixel is not None:
+            facts |= {"mm_per_pixel": scale.mm_per_pixel, "mm_per_pixel_std": scale.mm_per_pixel_std}
+        if (camera := self.rectified.camera) is not None:
+            facts["camera"] = f"{camera.name}: {camera.summary()}"
+        return facts
+
+    def displacements(self, frames: Iterable[int]) -> Iterator[FloatArray]:
+        """Read u, v and their uncertainties (4, N) in some frames, in rectified px."""
+        for read in self.result.table.each(MOVED, frames):
+            yield np.stack(self.rectified.displacement(*(np.asarray(read[name], np.float64) for name in MOVED)))
 
     @cached_property
     def covariance(self) -> NodalCovariance:
@@ -281,7 +285,7 @@ class Physical(Portable):
 
     def is_strain(self, name: str) -> bool:
         """Report whether a quantity depends on strain measure and gauge."""
-        return any(entry.name == name for entry in (*STRAIN, *ELEMENT_STRAIN))
+        return name in {entry.name for entry in (*STRAIN, *ELEMENT_STRAIN)}
 
     @property
     def length(self) -> float:

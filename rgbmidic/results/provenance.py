@@ -142,10 +142,11 @@ def check_same(path: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> No
         Settings, calibration, inputs, frames, mesh, lights, references, or a version differ; the message says which.
     """
     before, after = dict(_compared(was)), dict(_compared(now))
+    pairs = {name: (before.get(name), after.get(name)) for name in {**before, **after}}
     # 25 and 25.0 are one number; 1 is a frame, true is not
-    names = [name for name in {**before, **after} if _typed(before.get(name)) != _typed(after.get(name))]
+    names = [name for name, (one, two) in pairs.items() if one != two or isinstance(one, bool) != isinstance(two, bool)]
     if names:
-        stated = [f"{name} was {_short(before.get(name))}, now {_short(after.get(name))}" for name in names[:3]]
+        stated = ["{} was {}, now {}".format(name, *map(_short, pairs[name])) for name in names[:3]]
         differences, more = "; ".join(stated), f"; and {len(names) - 3} more" if len(names) > 3 else ""
         raise AnotherTestError(
             f"{path} is of another test and is not gone on with: {differences}{more}; give another folder"
@@ -167,10 +168,6 @@ def _compared(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     yield from ((name, document[name]) for name in ("lights", "references"))
     for name in (*_ALWAYS, *document["readers"]):
         yield f"the version of {name}", document["versions"].get(name)
-
-
-def _typed(value: Any) -> tuple[bool, Any]:
-    return isinstance(value, bool), value
 
 
 def _short(value: Any) -> str:

@@ -13,22 +13,24 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from rgbmidic.errors import AnotherTestError, ResultError, disk_faults
-from rgbmidic.results.files import npy_array, npy_bytes, write_complete, writing
+from rgbmidic.results.files import npy_array, npy_bytes, write_complete
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
 from rgbmidic.results.quantities import QUANTITIES, FrameRecord
 from rgbmidic.settings import regular
 from rgbmidic.typing import BoolArray, IntArray
 
+FRAMES = "solution"
+"""Folder of the records in that of a result."""
 _NAME = re.compile(r"([0-9]{6}|[1-9][0-9]{6,})\.npz")
 _LOCAL = struct.Struct("<4s5H3I2H")
 """What precedes the name and content of an array; this and the following: PKWARE's APPNOTE.TXT 6.3, 4.3.7 to 4.3.16."""
@@ -40,34 +42,17 @@ _NOT_YET, _DAMAGED = "not measured yet", "damaged"
 _REMEDY = "`rgbmidic run` with --resume measures it again, --partial (partial=True) reads the rest"
 
 
-class _Layout(NamedTuple):
-    """The directory of every record.
-
-    Attributes
-    ----------
-    files
-        Name of each array in the archive, by its quantity.
-    order
-        Its place among them.
-    tail
-        The directory, its end, and the comment without its checksum.
-    found
-        What is read of them: method, CRC-32, bytes and place of every array; run and frame.
-    """
-
-    files: dict[str, bytes]
-    order: dict[str, int]
-    tail: struct.Struct
-    found: struct.Struct
-
-
 @lru_cache(maxsize=4)
-def _layout(names: tuple[str, ...]) -> _Layout:
+def _layout(names: tuple[str, ...]) -> tuple[dict[str, bytes], struct.Struct, struct.Struct]:
+    """Lay out the directory of every record.
+
+    Returns the name of each array in the archive, by its quantity; the directory, its end, and the comment without its
+    checksum; and what is read of them: method, CRC-32, bytes and place of every array, run and frame.
+    """
     files = {name: f"{name}.npy".encode() for name in names}
     tail = "".join(f"4s6H3I5H2I{len(file)}s" for file in files.values())
     found = "".join(f"10xH4x2I18xI{len(file)}x" for file in files.values())
-    order = {name: order for order, name in enumerate(names)}
-    return _Layout(files, order, struct.Struct(f"<{tail}4s4H2IH16sQ"), struct.Struct(f"<{found}{_END}x16sQ"))
+    return files, struct.Struct(f"<{tail}4s4H2IH16sQ"), struct.Struct(f"<{found}{_END}x16sQ")
 
 
 def record_files(folder: Path) -> dict[int, os.DirEntry[str]]:
@@ -101,8 +86,8 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes) -> N
     ResultError
         The disk is full or refuses; nothing is left of the frame.
     """
-    layout, parts, entries, end = _layout(tuple(QUANTITIES)), list[bytes](), list[Any](), 0
-    for name, file in layout.files.items():
+    (files, directory, _), parts, entries, end = _layout(tuple(QUANTITIES)), list[bytes](), list[Any](), 0
+    for name, file in files.items():
         content = npy_bytes(record.values[name])
         picture = QUANTITIES[name].dtype is np.uint8 and not QUANTITIES[name].stackable
         stored = zlib.compress(content, zlib.Z_BEST_SPEED, wbits=-zlib.MAX_WBITS) if picture else content
@@ -111,30 +96,30 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes) -> N
         parts += _LOCAL.pack(b"PK\x03\x04", *about), file, stored
         entries += b"PK\x01\x02", _VERSION, *about, 0, 0, 0, 0, end, file
         end += _LOCAL.size + len(file) + len(stored)
-    count, length = len(layout.files), layout.tail.size + _CHECK.size - _COMMENT - _END
-    tail = layout.tail.pack(*entries, b"PK\x05\x06", 0, 0, count, count, length, end, _COMMENT, run, frame)
+    count, length = len(files), directory.size + _CHECK.size - _COMMENT - _END
+    tail = directory.pack(*entries, b"PK\x05\x06", 0, 0, count, count, length, end, _COMMENT, run, frame)
     content = b"".join([*parts, tail, _CHECK.pack(zlib.crc32(tail))])
     write_complete(record_file(folder, frame), lambda file: file.write(content))
 
 
 def _read_record(folder: Path, frame: int, names: Iterable[str], run: bytes) -> dict[str, Any]:
     """Read some quantities of a frame and verify their checksums; what is of this run has its shapes."""
-    files, order, end, found = _layout(tuple(QUANTITIES))
+    files, directory, read = _layout(tuple(QUANTITIES))
     with regular(record_file(folder, frame)).open("rb") as file:
         size = file.seek(0, os.SEEK_END)
-        file.seek(max(size - end.size - _CHECK.size, 0))
+        file.seek(max(size - directory.size - _CHECK.size, 0))
         tail = file.read()
-        if len(tail) < end.size or _CHECK.pack(zlib.crc32(tail[: end.size])) != tail[end.size :]:
+        if len(tail) < directory.size or _CHECK.pack(zlib.crc32(tail[: directory.size])) != tail[directory.size :]:
             raise ResultError("its directory is damaged or cut off")
-        *places, owner, number = found.unpack(tail[: end.size])
+        *places, owner, number = read.unpack(tail[: directory.size])
         if owner != run:
             raise AnotherTestError(f"{file.name} is of another run than {folder.parent / PROVENANCE}: {PUT_BACK}")
         if number != frame:
             raise ResultError(f"it holds frame {number}")
-        values = {}
+        each = iter(places)
+        found, values = dict(zip(files, zip(each, each, each, each, strict=True), strict=True)), {}
         for name in names:
-            first = 4 * order[name]
-            method, check, length, start = places[first : first + 4]
+            method, check, length, start = found[name]
             file.seek(start + _LOCAL.size + len(files[name]))
             content = file.read(min(length, size))
             content = zlib.decompress(content, wbits=-zlib.MAX_WBITS) if method == _DEFLATED else content
@@ -143,19 +128,6 @@ def _read_record(folder: Path, frame: int, names: Iterable[str], run: bytes) -> 
             array = npy_array(content)
             values[name] = array if QUANTITIES[name].axes else array.item()
     return values
-
-
-def discard(folder: Path, frames: Collection[int]) -> None:
-    """Discard the records of some frames for good; no other run may write meanwhile.
-
-    Raises
-    ------
-    ResultError
-        The disk refuses.
-    """
-    for frame in frames:
-        with writing(file := record_file(folder, frame)):
-            file.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -183,15 +155,17 @@ class FrameTable:
     damaged: BoolArray
 
     @classmethod
-    def load(cls, folder: Path, sizes: Mapping[str, int], count: int, run: bytes) -> FrameTable:
-        """Look which of `count` frames are there; none of them is read.
+    def load(cls, path: Path, sizes: Mapping[str, int], count: int, run: bytes) -> FrameTable:
+        """Look which of `count` frames the result in a folder holds now; none of them is read.
+
+        `run` is the digest of the run.
 
         Raises
         ------
         ResultError
             The folder cannot be read.
         """
-        written = np.full(count, -1, dtype=np.int64)
+        folder, written = path / FRAMES, np.full(count, -1, dtype=np.int64)
         with disk_faults(ResultError, f"{folder} cannot be read"):
             for frame, file in record_files(folder).items():
                 with suppress(FileNotFoundError, IndexError):  # discarded just now, or of no frame

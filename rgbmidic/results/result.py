@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.extras import optional
-from rgbmidic.results.provenance import fingerprint, read_provenance
-from rgbmidic.results.quantities import QUANTITIES, FrameRecord, Quantities
+from rgbmidic.results.files import read_arrays, read_json
+from rgbmidic.results.provenance import PROVENANCE, PUT_BACK, digest, fingerprint, read_provenance
+from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, STACKED, FrameRecord
 from rgbmidic.results.records import FrameTable
-from rgbmidic.results.store import check_complete, listed, load_frames, load_result, read_reference
 from rgbmidic.settings import read_section
 from rgbmidic.settings.schema import section_kinds
 from rgbmidic.text import Described
@@ -32,6 +32,9 @@ S = TypeVar("S")
 
 logger = logging.getLogger(__name__)
 
+NAMES, MESH, REFERENCE = "frames.json", "mesh.npz", "reference.npz"
+"""Files with what all frames share."""
+
 
 class Portable:
     """A dataclass that goes to another process without what it has read or made, which that reads for itself."""
@@ -44,7 +47,7 @@ class Portable:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Result(Portable, Quantities, Described):
+class Result(Portable, Described):
     """The result of a test, for post-processing.
 
     `Result.open` opens a result folder, also during a run, and reads only the mesh and which frames there are. The
@@ -124,10 +127,13 @@ class Result(Portable, Quantities, Described):
             The folder is not a result, is damaged, or is incomplete (unless `partial`).
         """
         path = Path(path)
-        made = cls(path=path, **load_result(path))
-        ended = "finished" in made.provenance
+        provenance = read_provenance(path)
+        names, mesh, lights = read_names(path, provenance), read_mesh(path, provenance), tuple(provenance["lights"])
+        sizes, ended = {"node": len(mesh["nodes"]), "light": len(lights)}, "finished" in provenance
+        table = FrameTable.load(path, sizes, len(names), fingerprint(provenance))
+        made = cls(path=path, table=table, names=names, lights=lights, provenance=provenance, **mesh)
         if not partial:
-            check_complete(path, made.names, made.table, ended=ended)
+            check_complete(made, ended=ended)
         elif check:
             made = replace(made, table=made.table.without_damaged(ended=ended))
             if lost := np.flatnonzero(made.table.damaged).tolist():
@@ -149,7 +155,7 @@ class Result(Portable, Quantities, Described):
         provenance = read_provenance(self.path)
         if {**provenance, "finished": ""} != {**self.provenance, "finished": ""}:
             raise ResultError(f"{self.path} now holds another result; open it again")
-        table = load_frames(self.path, self.table.sizes, len(self), fingerprint(provenance))
+        table = FrameTable.load(self.path, self.table.sizes, len(self), fingerprint(provenance))
         if self.table.damaged.any():
             table = table.without_damaged(ended="finished" in provenance)
         return replace(self, table=table, provenance=provenance)
@@ -178,8 +184,7 @@ class Result(Portable, Quantities, Described):
     @cached_property
     def deformed(self) -> tuple[int, ...]:
         """Indices of the frames that are no reference."""
-        references = set(self.provenance["references"])
-        return tuple(index for index in range(len(self)) if index not in references)
+        return tuple(sorted({*range(len(self))} - {*self.provenance["references"]}))
 
     def section(self, kind: type[S]) -> S:
         """Return a section of the settings that the result was measured with; its defaults where none were kept.
@@ -316,9 +321,16 @@ class Result(Portable, Quantities, Described):
         dataset: xr.Dataset = optional("rgbmidic.results.dataset", "xarray").to_dataset(self, scale)
         return dataset
 
-    def _quantity(self, name: str, /) -> AnyArray:
+    def __getattr__(self, name: str, /) -> AnyArray:
+        """Read a quantity of the table in all frames, at its first use."""
+        if name not in STACKED:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
         stacked = self.__dict__[name] = self.stack(name)
         return stacked
+
+    def __dir__(self) -> list[str]:
+        """Return the names of all attributes, quantities included."""
+        return [*object.__dir__(self), *STACKED]
 
     @property
     def strain(self) -> FloatArray:
@@ -355,7 +367,7 @@ class Result(Portable, Quantities, Described):
 
         Of a frame of which only a part is read it shows that part, which begins at `reference_origin`.
         """
-        return read_reference(self.path, self.table.sizes, fingerprint(self.provenance))
+        return read_reference(self.path, self.table.sizes, self.table.run)
 
     @property
     def reference_origin(self) -> tuple[int, int]:
@@ -370,3 +382,77 @@ class Result(Portable, Quantities, Described):
         if shape is None and self.reference is not None:
             shape = self.reference.shape[1:]
         return shape and (shape[0], shape[1])
+
+
+def check_complete(result: Result, *, ended: bool) -> None:
+    """Raise a `ResultError` that names the frames that are missing, or lost to damage where the result had `ended`."""
+    missing, path, count = np.flatnonzero(~result.finished).tolist(), result.path, len(result)
+    if not missing:
+        return
+    frames = listed(missing, result.names)
+    if ended or result.table.damaged.any():
+        raise ResultError(
+            f"{path} is damaged: of {count} frames are lost {frames}; `rgbmidic run TEST.toml --out {path} "
+            "--resume` measures them again, --partial (partial=True) reads the rest"
+        )
+    raise ResultError(
+        f"{path} is incomplete: of {count} frames are missing {frames}; was the run interrupted, or does it go on?"
+    )
+
+
+def listed(frames: Sequence[int], names: Sequence[str], most: int = 5) -> str:
+    """List the first of some frames with their names, `most` on a line of a terminal, and how many more there are."""
+    more = f" and {len(frames) - most} more" if len(frames) > most else ""
+    return ", ".join(f"{frame} ({names[frame]})" for frame in frames[:most]) + more
+
+
+def read_names(path: Path, provenance: Mapping[str, Any]) -> tuple[str, ...]:
+    """Read the frames' names; a `ResultError` where they are not those of the provenance."""
+    try:
+        names = read_json(path / NAMES)
+    except FileNotFoundError:
+        raise ResultError(f"{path / NAMES} is missing: the result is incomplete") from None
+    texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    if not texts or {"count": len(names), "sha256": digest(names)} != provenance["frames"]:
+        raise ResultError(f"{path / NAMES} is damaged: it does not hold the names of the frames")
+    return tuple(names)
+
+
+def read_mesh(path: Path, provenance: Mapping[str, Any]) -> dict[str, AnyArray]:
+    """Read ``nodes`` (N, 2), ``elements`` (E, 3) and, of a mesh file, `FINITE_ELEMENTS`.
+
+    Raises
+    ------
+    ResultError
+        They are not those of the provenance.
+    """
+    stated = FINITE_ELEMENTS if "finite_elements" in provenance else ()
+    mesh = _read(path / MESH, ["nodes", "elements", *stated], {})
+    if digest(mesh) != provenance["mesh"]:
+        raise ResultError(f"{path / MESH} is damaged or of another result")
+    return mesh
+
+
+def read_reference(path: Path, sizes: Mapping[str, int], run: bytes) -> npt.NDArray[np.uint8] | None:
+    """Read the reference image of each light as a picture, shape (k, H, W); None where none was kept.
+
+    Raises
+    ------
+    ResultError
+        The file is damaged, or of another run than the one with this digest.
+    """
+    file = path / REFERENCE
+    if not file.is_file():
+        return None
+    if read_arrays(file, ["run"])["run"].tobytes() != run:
+        raise ResultError(f"{file} is of another run than {path / PROVENANCE}: {PUT_BACK}")
+    pictures: npt.NDArray[np.uint8] = _read(file, ["reference"], sizes)["reference"]
+    return pictures
+
+
+def _read(path: Path, names: Iterable[str], sizes: Mapping[str, int]) -> dict[str, AnyArray]:
+    arrays = read_arrays(path, names)
+    try:
+        return {name: SHARED[name].convert(array, sizes) for name, array in arrays.items()}
+    except (TypeError, ValueError) as error:
+        raise ResultError(f"{path} is damaged: {error}") from None

@@ -9,37 +9,41 @@ it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results.claim import ALL_FRAMES, Claim
-from rgbmidic.results.files import read_arrays, read_json, remove_parts, write_arrays, write_json, writing
+from rgbmidic.results.files import remove_parts, write_arrays, write_json, writing
 from rgbmidic.results.provenance import (
     PROVENANCE,
-    PUT_BACK,
     Origin,
     check_same,
-    digest,
     fingerprint,
     is_result,
     now,
     read_provenance,
     sealed,
 )
-from rgbmidic.results.quantities import FINITE_ELEMENTS, SHARED, FrameRecord
-from rgbmidic.results.records import FrameTable, discard, record_files, write_record
-from rgbmidic.typing import AnyArray, BoolArray
+from rgbmidic.results.quantities import FrameRecord
+from rgbmidic.results.records import FRAMES, FrameTable, record_file, record_files, write_record
+from rgbmidic.results.result import (
+    MESH,
+    NAMES,
+    REFERENCE,
+    Result,
+    check_complete,
+    read_mesh,
+    read_names,
+    read_reference,
+)
+from rgbmidic.typing import BoolArray
 
 logger = logging.getLogger(__name__)
-
-_NAMES, _MESH, _REFERENCE, _FRAMES = "frames.json", "mesh.npz", "reference.npz", "solution"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,13 +120,7 @@ class ResultStore:
             being written by another run.
         """
         read_provenance(Path(path))
-        store = cls.join(path, origin, frames=frames)
-        with _releasing(store):
-            kept, now = read_provenance(store.path), origin.provenance()
-            stated = {name: now.get(name) for name in ("settings", "camera")}
-            if stated != {name: kept.get(name) for name in stated}:
-                write_json(store.path / PROVENANCE, sealed({**kept, **stated}))
-        return store
+        return cls._claimed(Path(path), origin, frames, restate=True)
 
     @classmethod
     def join(cls, path: Path | str, origin: Origin, *, frames: range | None = None) -> Self:
@@ -143,20 +141,25 @@ class ResultStore:
         -------
         ResultStore
         """
-        return cls._claimed(Path(path), origin, range(len(origin.names)) if frames is None else frames)
+        return cls._claimed(Path(path), origin, frames)
 
     @classmethod
-    def _claimed(cls, path: Path, origin: Origin, frames: range, *, overwrite: bool | None = None) -> Self:
+    def _claimed(
+        cls, path: Path, origin: Origin, frames: range | None, *, overwrite: bool | None = None, restate: bool = False
+    ) -> Self:
         """Claim the frames and start the folder; `overwrite` None: whatever is there stays."""
         count, sizes = len(origin.names), {"node": len(origin.mesh["nodes"]), "light": len(origin.lights)}
         with writing(path):
             path.mkdir(parents=True, exist_ok=True)
-        claim = Claim.take(path, frames)
-        with _releasing(claim):
+        claim = Claim.take(path, range(count) if frames is None else frames)
+        try:
             if overwrite is not None:
                 _make_room(path, overwrite=overwrite)
-            run = _start(path, origin)
-            return cls(path=path, frame_count=count, sizes=sizes, _claim=claim, _run=run)
+            run = _start(path, origin, restate=restate)
+        except BaseException:
+            claim.release()
+            raise
+        return cls(path=path, frame_count=count, sizes=sizes, _claim=claim, _run=run)
 
     def __enter__(self) -> Self:
         """Return the store."""
@@ -193,7 +196,7 @@ class ResultStore:
             raise InputError(f"there is no frame {index} in a result of {self.frame_count} frames")
         if record.sizes != self.sizes:
             raise InputError(f"frame {index} has the sizes {record.sizes}, the result {self.sizes}")
-        write_record(self.path / _FRAMES, index, record, self._run)
+        write_record(self.path / FRAMES, index, record, self._run)
 
     def discard(self, frames: Collection[int]) -> None:
         """Discard frames that are to be measured again.
@@ -210,7 +213,9 @@ class ResultStore:
         """
         if frames:
             self.reopen()
-            discard(self.path / _FRAMES, frames)
+        for frame in frames:
+            with writing(file := record_file(self.path / FRAMES, frame)):
+                file.unlink(missing_ok=True)
 
     def finished(self) -> BoolArray:
         """Read which frames of the test are in the folder, whoever wrote them, shape (T,).
@@ -228,7 +233,7 @@ class ResultStore:
         -------
         FrameTable
         """
-        return load_frames(self.path, self.sizes, self.frame_count, self._run)
+        return FrameTable.load(self.path, self.sizes, self.frame_count, self._run)
 
     def reopen(self) -> None:
         """Take the date of its end out of the provenance, before frames are written."""
@@ -240,16 +245,6 @@ class ResultStore:
         """Release the store and call `finish_result`, when every frame is written."""
         self.release()
         finish_result(self.path)
-
-
-@contextmanager
-def _releasing(holder: ResultStore | Claim) -> Iterator[None]:
-    """Release a store or its claim if the block fails."""
-    try:
-        yield
-    except BaseException:
-        holder.release()
-        raise
 
 
 def finish_result(path: Path | str) -> None:
@@ -265,100 +260,11 @@ def finish_result(path: Path | str) -> None:
     ResultError
         The folder is no result, a frame is missing or damaged, or it cannot be written.
     """
-    path = Path(path)
-    kept = load_result(path)
-    provenance, ended = kept["provenance"], "finished" in kept["provenance"]
-    check_complete(path, kept["names"], kept["table"].without_damaged(ended=ended), ended=ended)
+    result = Result.open(path, partial=True, check=False)
+    ended = "finished" in result.provenance
+    check_complete(replace(result, table=result.table.without_damaged(ended=ended)), ended=ended)
     if not ended:
-        write_json(path / PROVENANCE, sealed({**provenance, "finished": now()}))
-
-
-def check_complete(path: Path, names: tuple[str, ...], table: FrameTable, *, ended: bool) -> None:
-    """Raise a `ResultError` that names the frames that are missing, or lost to damage where the result had `ended`."""
-    missing = np.flatnonzero(~table.finished).tolist()
-    if not missing:
-        return
-    frames = listed(missing, names)
-    if ended or table.damaged.any():
-        raise ResultError(
-            f"{path} is damaged: of {len(names)} frames are lost {frames}; `rgbmidic run TEST.toml --out {path} "
-            "--resume` measures them again, --partial (partial=True) reads the rest"
-        )
-    raise ResultError(
-        f"{path} is incomplete: of {len(names)} frames are missing {frames}; was the run interrupted, or does it go on?"
-    )
-
-
-def listed(frames: Sequence[int], names: Sequence[str], most: int = 5) -> str:
-    """List the first of some frames with their names, `most` on a line of a terminal, and how many more there are."""
-    more = f" and {len(frames) - most} more" if len(frames) > most else ""
-    return ", ".join(f"{frame} ({names[frame]})" for frame in frames[:most]) + more
-
-
-def load_result(path: Path) -> dict[str, Any]:
-    """Read what a `Result` is made of, as far as the folder has come; a `ResultError` where something is damaged."""
-    provenance = read_provenance(path)
-    names, mesh, lights = read_names(path, provenance), read_mesh(path, provenance), tuple(provenance["lights"])
-    sizes = {"node": len(mesh["nodes"]), "light": len(lights)}
-    table = load_frames(path, sizes, len(names), fingerprint(provenance))
-    return {"table": table, "names": names, "lights": lights, "provenance": provenance, **mesh}
-
-
-def load_frames(path: Path, sizes: Mapping[str, int], count: int, run: bytes) -> FrameTable:
-    """Read the table of the frames that a result of `count` frames holds now; `run` is the digest of the run."""
-    return FrameTable.load(path / _FRAMES, sizes, count, run)
-
-
-def read_names(path: Path, provenance: Mapping[str, Any]) -> tuple[str, ...]:
-    """Read the frames' names; a `ResultError` where they are not those of the provenance."""
-    try:
-        names = read_json(path / _NAMES)
-    except FileNotFoundError:
-        raise ResultError(f"{path / _NAMES} is missing: the result is incomplete") from None
-    texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
-    if not texts or {"count": len(names), "sha256": digest(names)} != provenance["frames"]:
-        raise ResultError(f"{path / _NAMES} is damaged: it does not hold the names of the frames")
-    return tuple(names)
-
-
-def read_mesh(path: Path, provenance: Mapping[str, Any]) -> dict[str, AnyArray]:
-    """Read ``nodes`` (N, 2), ``elements`` (E, 3) and, of a mesh file, `FINITE_ELEMENTS`.
-
-    Raises
-    ------
-    ResultError
-        They are not those of the provenance.
-    """
-    stated = FINITE_ELEMENTS if "finite_elements" in provenance else ()
-    mesh = _read(path / _MESH, ["nodes", "elements", *stated], {})
-    if digest(mesh) != provenance["mesh"]:
-        raise ResultError(f"{path / _MESH} is damaged or of another result")
-    return mesh
-
-
-def read_reference(path: Path, sizes: Mapping[str, int], run: bytes) -> npt.NDArray[np.uint8] | None:
-    """Read the reference image of each light as a picture, shape (k, H, W); None where none was kept.
-
-    Raises
-    ------
-    ResultError
-        The file is damaged, or of another run than the one with this digest.
-    """
-    file = path / _REFERENCE
-    if not file.is_file():
-        return None
-    if read_arrays(file, ["run"])["run"].tobytes() != run:
-        raise ResultError(f"{file} is of another run than {path / PROVENANCE}: {PUT_BACK}")
-    pictures: npt.NDArray[np.uint8] = _read(file, ["reference"], sizes)["reference"]
-    return pictures
-
-
-def _read(path: Path, names: Iterable[str], sizes: Mapping[str, int]) -> dict[str, AnyArray]:
-    arrays = read_arrays(path, names)
-    try:
-        return {name: SHARED[name].convert(array, sizes) for name, array in arrays.items()}
-    except (TypeError, ValueError) as error:
-        raise ResultError(f"{path} is damaged: {error}") from None
+        write_json(result.path / PROVENANCE, sealed({**result.provenance, "finished": now()}))
 
 
 def _make_room(path: Path, *, overwrite: bool) -> None:
@@ -371,19 +277,20 @@ def _make_room(path: Path, *, overwrite: bool) -> None:
             "on with it (--resume)"
         )
     with writing(path):
-        old = (path / _FRAMES).glob("[0-9]*.frames")  # of schema versions to 10
-        frames = (Path(entry) for entry in record_files(path / _FRAMES).values())
-        for file in (*old, *frames, *(path / name for name in (_REFERENCE, _MESH, _NAMES, PROVENANCE))):
+        old = (path / FRAMES).glob("[0-9]*.frames")  # of schema versions to 10
+        frames = (Path(entry) for entry in record_files(path / FRAMES).values())
+        for file in (*old, *frames, *(path / name for name in (REFERENCE, MESH, NAMES, PROVENANCE))):
             file.unlink(missing_ok=True)
 
 
-def _start(path: Path, origin: Origin) -> bytes:
+def _start(path: Path, origin: Origin, *, restate: bool) -> bytes:
     """Write what all frames share where it is missing or damaged; refuse a folder of another origin.
 
+    With `restate` the provenance takes over the settings and the camera of `origin`, which state how a result is read.
     Returns the digest of the run from the provenance that is there, which may write the same number in another way.
     """
-    foreign = [file for name in (_MESH, _REFERENCE, _NAMES) if (file := path / name).exists()]
-    foreign += map(Path, record_files(path / _FRAMES).values())
+    foreign = [file for name in (MESH, REFERENCE, NAMES) if (file := path / name).exists()]
+    foreign += map(Path, record_files(path / FRAMES).values())
     stated = origin.provenance()
     if not (path / PROVENANCE).exists():  # looked at after the others: it is the first to appear
         if foreign:
@@ -391,6 +298,9 @@ def _start(path: Path, origin: Origin) -> bytes:
         write_json(path / PROVENANCE, sealed(stated), new=True)
     kept = read_provenance(path)
     check_same(path, kept, stated)
+    read_by = {name: stated.get(name) for name in ("settings", "camera")}
+    if restate and read_by != {name: kept.get(name) for name in read_by}:
+        write_json(path / PROVENANCE, sealed({**kept, **read_by}))
     if kept["machine"] != stated["machine"]:
         logger.warning(
             "%s was begun with %s, and goes on with %s: the last bits of its frames may differ",
@@ -399,21 +309,21 @@ def _start(path: Path, origin: Origin) -> bytes:
             stated["machine"],
         )
     with writing(path):
-        (path / _FRAMES).mkdir(exist_ok=True)
+        (path / FRAMES).mkdir(exist_ok=True)
         remove_parts(path, "*")
-        remove_parts(path / _FRAMES, "*")
+        remove_parts(path / FRAMES, "*")
     run, sizes = fingerprint(kept), {"light": len(origin.lights)}
     if not _readable(lambda: read_names(path, kept)):
-        write_json(path / _NAMES, list(origin.names))
+        write_json(path / NAMES, list(origin.names))
     if not _readable(lambda: read_mesh(path, kept)):
-        write_arrays(path / _MESH, origin.mesh)
+        write_arrays(path / MESH, origin.mesh)
     if origin.reference is not None and not _readable(lambda: read_reference(path, sizes, run)):
         images = np.asarray(origin.reference, dtype=np.float32)  # stretched to 8 bit between percentiles 1 and 99
         known = np.isfinite(images).any(axis=(1, 2), keepdims=True)
         low, high = np.nanpercentile(np.where(known, images, 0), [1, 99], axis=(1, 2), keepdims=True)
         scaled = 255 * (images - low) / np.maximum(high - low, 1e-6)
         pictures = np.clip(np.nan_to_num(scaled), 0, 255).astype(np.uint8)
-        write_arrays(path / _REFERENCE, {"reference": pictures, "run": np.frombuffer(run, dtype=np.uint8)})
+        write_arrays(path / REFERENCE, {"reference": pictures, "run": np.frombuffer(run, dtype=np.uint8)})
     return run
 
 

@@ -26,7 +26,7 @@ from rgbmidic.errors import ResultError, RgbmidicError
 from rgbmidic.results import EXPORT_FORMATS, Result, export_result, finish_result, records
 from rgbmidic.results.files import check_file, npy_bytes
 from rgbmidic.results.provenance import fingerprint
-from rgbmidic.results.store import load_frames
+from rgbmidic.results.records import FrameTable
 from rgbmidic.typing import AnyArray
 
 COPIES = 120
@@ -93,7 +93,7 @@ def test_mutated_frames_are_read_told_or_not_there(copy: Path) -> None:
     told, run = list[str](), fingerprint(whole.provenance)
     for mutated in _mutations(content, 6, RECORD_COPIES):
         file.write_bytes(mutated)
-        table = load_frames(copy, whole.table.sizes, 2, run)
+        table = FrameTable.load(copy, whole.table.sizes, 2, run)
         try:
             for index, values in enumerate(table.each(["u", "status", "reason"], range(2))):
                 np.testing.assert_equal(values, {name: kept[index][name] for name in values})
