@@ -25,8 +25,7 @@ from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import KINDS, Mark, ViewState, probe_marks, probe_place
 from rgbmidic.view.canvas import columns, plain_plot
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.models import ResultControls
-from rgbmidic.view.picture import Background, warning
+from rgbmidic.view.models import Background, ResultControls, warning
 from rgbmidic.view.shown import ShownFields
 
 if TYPE_CHECKING:
@@ -299,7 +298,7 @@ class CurvePanel:
         shown, view = self._shown, self._shown.view
         marks = probe_marks(view.marks)
         alone = not marks and shown.channels.file is not None
-        asked = (marks, shown.gauge, view.measure, shown.scale, shown.changes, alone)
+        asked = (marks, shown.gauge, view.measure, shown.scale, shown.result, alone)
         if asked != self._asked:
             self._asked, self._colours, self.reading = asked, colours, bool(marks)
             if marks:

@@ -14,8 +14,8 @@ from typing import Any
 from rgbmidic.errors import RgbmidicError
 from rgbmidic.report import Movie, write_movie
 from rgbmidic.results import Maps
-from rgbmidic.view.models import ResultControls
-from rgbmidic.view.picture import RawPictures, warning
+from rgbmidic.view.models import ResultControls, warning
+from rgbmidic.view.picture import RawPictures
 from rgbmidic.view.shown import ShownFields
 
 

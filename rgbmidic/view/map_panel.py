@@ -19,7 +19,7 @@ from rgbmidic.view.address import MARKS, SCALE, probe_marks, probe_place
 from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.layers import LabelLayer, LineLayer, MarkLayer, arrow_lines, beside, contour_lines, direction_lines
-from rgbmidic.view.picture import AROUND, Picture, extremes, frame_title, paint, palette
+from rgbmidic.view.picture import AROUND, Picture, paint, palette
 from rgbmidic.view.shown import ShownFields
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class MapPanel:
                 axes[0].annotate(literal(text), (x, y), shift, textcoords="offset points", **look)
 
         times = frame_times(shown.result, shown.maps.physical.scale)
-        title = frame_title(shown.result, view.frame, math.nan if times is None else float(times[view.frame]))
+        title = shown.title(math.nan if times is None else float(times[view.frame]))
         how = dict.fromkeys(shown.maps.how(name) for name in names)
         aspect, title = window.height / window.width, f"{title}\n{'; '.join(filter(None, how))}".strip()
         figure = draw_figure(draw, count=len(names), aspect=aspect, beside=BAR, title=title)
@@ -182,11 +182,11 @@ class MapPanel:
         colours = palette("codes")
         self._blank.show([(*shown.result.nodes[node].tolist(), "", colours[values.status[node]]) for node in missing])
         probes = probe_marks(view.marks).items()
-        gauge, read = shown.gauge, shown.read(view.field)
-        texts = {name: read.probe_text(marks[0].kind, probe_place(marks, gauge)) for name, marks in probes}
+        gauge = shown.gauge
+        texts = {name: shown.probe_text(marks[0].kind, probe_place(marks, gauge)) for name, marks in probes}
         texts[SCALE] = f": {view.distance:g} mm" if view.distance else ""
         self.marks.place(view.marks, shown.result.nodes, nodes, texts, gauge)
-        ends = extremes(field, values) if view.extremes else ()
+        ends = shown.extremes if view.extremes else ()
         names = zip(("smallest", "largest"), ("#56b4e9", "#e69f00"), ends, strict=False)
         self._ends.show(
             [

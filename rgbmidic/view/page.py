@@ -25,8 +25,7 @@ from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv, with_pr
 from rgbmidic.view.film import FilmButton
 from rgbmidic.view.line_panel import LinePanel
 from rgbmidic.view.map_panel import MapPanel
-from rgbmidic.view.models import ResultControls, SharedState, script
-from rgbmidic.view.picture import every, frame_text, guarded, warning
+from rgbmidic.view.models import ResultControls, SharedState, every, guarded, script, warning
 from rgbmidic.view.sections import ChannelControls, FileButtons, ProbeNames
 from rgbmidic.view.shown import ShownFields
 
@@ -199,7 +198,7 @@ class ResultPage:
         of["longer"].title = self.maps.draw(picture)
         of["low"].visible = of["high"].visible = view.range == "hand"
         of["symmetric"].visible = field.signed and view.range != "hand"
-        self.parts.description.text = frame_text(shown.maps, view.frame, field, values, remark)
+        self.parts.description.text = shown.text(remark)
         self._read_out()
         self.curves.plot.visible = not self.line.update(values)
         self.state.query, self.state.shown = view.query(), self.state.asked

@@ -15,8 +15,7 @@ from rgbmidic.settings import PROBE_NAME, ProbeSettings, read_section
 from rgbmidic.view.address import SCALE, Mark, ViewState, probe_marks
 from rgbmidic.view.curves import CurvePanel, marks_of, probes
 from rgbmidic.view.draft import Confirmation, Draft, channel_section, probe_section, scale_section
-from rgbmidic.view.models import WRITTEN, ResultControls
-from rgbmidic.view.picture import warning
+from rgbmidic.view.models import WRITTEN, ResultControls, warning
 from rgbmidic.view.shown import ShownFields
 
 

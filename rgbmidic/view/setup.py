@@ -37,8 +37,8 @@ from rgbmidic.view.draft import (
     region_of,
     region_section,
 )
-from rgbmidic.view.models import SharedState, script
-from rgbmidic.view.picture import AROUND, Background, Overlay, every, guarded, paint, palette, warning
+from rgbmidic.view.models import Background, SharedState, every, guarded, script, warning
+from rgbmidic.view.picture import AROUND, Overlay, paint, palette
 from rgbmidic.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, overview, pictures
 
 _EXPECTED = "expected uncertainty"

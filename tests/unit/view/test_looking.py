@@ -31,20 +31,17 @@ from rgbmidic.view import curves
 from rgbmidic.view.address import CLOCKS, MARKS, PALETTES, UNCERTAINTY, Mark, Steps, ViewState, probe_marks
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
 from rgbmidic.view.layers import LabelLayer, arrow_lines, beside, contour_lines
-from rgbmidic.view.models import ResultControls
+from rgbmidic.view.models import ResultControls, watched
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.picture import (
-    FieldInFrame,
     Overlay,
     Window,
     element_at,
-    frame_text,
     paint,
     palette,
     palette_name,
     range_of_test,
     robust_range,
-    watched,
 )
 from rgbmidic.view.shown import ShownFields
 
@@ -259,13 +256,16 @@ def test_what_is_hatched_lies_below_zero():
     assert (hatched[changed] == 0xFF000000).all()
 
 
-def label(maps, name, kind, *place, frame=5):
-    return read_of(maps, name, frame).probe_text(kind, place)
+def label(shown, name, kind, *place):
+    shown.view = replace(shown.view, field=name)
+    return shown.probe_text(kind, place)
 
 
-def read_of(maps, name, frame):
-    field, values, moved = maps.all[name], maps.read(name, frame), maps.displacement(frame)
-    return FieldInFrame(maps=maps, field=field, values=values, moved=moved, frame=frame)
+def shown_fields(result, **view):
+    """The fields of a view, as a page that was opened just now has them."""
+    shown = ShownFields(result, ViewState(**view))
+    shown.choose()
+    return shown
 
 
 def spread_of(text):
@@ -279,7 +279,8 @@ PLACES |= {"circle": (60.0, 40.0, 17.0), "strain_gauge": (52.0, 41.0, 60.0), "ga
 @pytest.mark.parametrize("measure", MEASURES[:2])
 def test_the_label_of_a_probe_is_its_history_in_that_frame_and_the_pointer_states_the_same(tmp_path, measure):
     result = make_result(tmp_path / "result", frames=6, record=smooth_record, settings=in_mm())
-    maps = Maps.of(result, gauge=60.0, measure=measure)
+    shown = shown_fields(result, frame=5, gauge=60.0, measure=measure)
+    maps = shown.maps
     histories = read_histories(
         result, ProbeSettings(**{f"{kind}s": (place,) for kind, place in PLACES.items()}, measure=measure)
     )
@@ -292,54 +293,57 @@ def test_the_label_of_a_probe_is_its_history_in_that_frame_and_the_pointer_state
         mean = "" if kind == "point" else " mean"
         for name in "uv":
             value, std = history(kind, name)
-            assert label(maps, name, kind, *PLACES[kind]) == f"{mean}: {maps.all[name].text(value, std)}"
-            assert label(maps, f"{name}_std", kind, *PLACES[kind]) == f"{mean}: {maps.all[f'{name}_std'].text(std)}"
+            assert label(shown, name, kind, *PLACES[kind]) == f"{mean}: {maps.all[name].text(value, std)}"
+            assert label(shown, f"{name}_std", kind, *PLACES[kind]) == f"{mean}: {maps.all[f'{name}_std'].text(std)}"
     for name, of_gauge, unit in (("u", "extension", " mm"), ("exx", "strain", "")):
         value, std = history("gauge", of_gauge)
-        assert label(maps, name, "gauge", *PLACES["gauge"]) == f" {of_gauge}: {uncertain(value, std)}{unit}"
-        assert label(maps, f"{name}_std", "gauge", *PLACES["gauge"]) == f" {of_gauge}: {rounded(std, std)}{unit}"
-    assert label(maps, "misfit", "gauge", *PLACES["gauge"]) == ""
+        assert label(shown, name, "gauge", *PLACES["gauge"]) == f" {of_gauge}: {uncertain(value, std)}{unit}"
+        assert label(shown, f"{name}_std", "gauge", *PLACES["gauge"]) == f" {of_gauge}: {rounded(std, std)}{unit}"
+    assert label(shown, "misfit", "gauge", *PLACES["gauge"]) == ""
     for name in ("exx", "eyy", "exy", "e1", "e2", "equivalent"):
         for kind in ("region", "circle"):
-            assert label(maps, name, kind, *PLACES[kind]) == f" mean: {maps.all[name].text(*history(kind, name))}"
+            assert label(shown, name, kind, *PLACES[kind]) == f" mean: {maps.all[name].text(*history(kind, name))}"
     for name in ("exx", "eyy", "exy", "e1", "e2", "direction", "equivalent"):
         value, std = history("strain_gauge", name)
-        assert label(maps, name, "strain_gauge", *PLACES["strain_gauge"]) == f": {maps.all[name].text(value, std)}"
+        assert label(shown, name, "strain_gauge", *PLACES["strain_gauge"]) == f": {maps.all[name].text(value, std)}"
         assert (
-            label(maps, f"{name}_std", "strain_gauge", *PLACES["strain_gauge"])
+            label(shown, f"{name}_std", "strain_gauge", *PLACES["strain_gauge"])
             == f": {maps.all[f'{name}_std'].text(std)}"
         )
     for name in ("u", "v", "u_std"):
         field = maps.all[name]
-        told = read_of(maps, name, 5).pointer_text(result.nodes, *PLACES["point"])
-        assert told.endswith(f"<b>{field.symbol} = {label(maps, name, 'point', *PLACES['point'])[2:]}</b>")
-    assert label(maps, "u", "strain_gauge", *PLACES["strain_gauge"]) == label(maps, "u", "point", *PLACES["point"])
+        shown.view = replace(shown.view, field=name)
+        told = shown.text_at(*PLACES["point"])
+        assert told.endswith(f"<b>{field.symbol} = {label(shown, name, 'point', *PLACES['point'])[2:]}</b>")
+    assert label(shown, "u", "strain_gauge", *PLACES["strain_gauge"]) == label(shown, "u", "point", *PLACES["point"])
 
 
 def test_what_a_history_does_not_have_is_not_stated_too_exactly(tmp_path):
     """Gauges overlap: their mean over three nodes is as uncertain as one, and so is that over an area at most."""
-    maps = Maps.of(make_result(tmp_path / "result", frames=6, record=smooth_record))
+    shown = shown_fields(make_result(tmp_path / "result", frames=6, record=smooth_record), frame=5)
+    maps = shown.maps
     std, (around, _) = maps.read("exx", 5).std, element_at(MESH.nodes, MESH.elements, *PLACES["point"])
     assert (
-        0.97 * std[around].min() < spread_of(label(maps, "exx", "point", *PLACES["point"])) < 1.03 * std[around].max()
+        0.97 * std[around].min() < spread_of(label(shown, "exx", "point", *PLACES["point"])) < 1.03 * std[around].max()
     )
-    std, told = maps.read("shear", 5).std, label(maps, "shear", "region", *PLACES["region"])
+    std, told = maps.read("shear", 5).std, label(shown, "shear", "region", *PLACES["region"])
     assert told.endswith(" at most")
     assert 0.97 * std.min() < spread_of(told) < 1.03 * std.max()
-    assert label(maps, "misfit", "point", 50.0, 40.0) == ": 1"
-    assert label(maps, "node_status", "point", 50.0, 40.0) == ": measured"
-    assert label(maps, "u", "region", 200.0, 200.0, 300.0, 300.0) == ""
-    assert label(maps, "exx", "strain_gauge", 200.0, 200.0, 40.0) == ""
+    assert label(shown, "misfit", "point", 50.0, 40.0) == ": 1"
+    assert label(shown, "node_status", "point", 50.0, 40.0) == ": measured"
+    assert label(shown, "u", "region", 200.0, 200.0, 300.0, 300.0) == ""
+    assert label(shown, "exx", "strain_gauge", 200.0, 200.0, 40.0) == ""
 
 
 def test_a_strain_gauge_at_a_node_is_the_map_at_that_node_since_any_frame(tmp_path):
     result = make_result(tmp_path / "result", frames=6, record=smooth_record)
-    maps = Maps.of(result, gauge=60.0, since=2, rigid_removed=True)
+    shown = shown_fields(result, frame=5, gauge=60.0, since=2, rigid=True)
+    maps = shown.maps
     node = int(np.argmin(np.hypot(*(result.nodes - [60, 40]).T)))
     for name in ("exx", "equivalent"):
         read = maps.read(name, 5)
         stated = maps.all[name].text(read.values[node], read.std[node])
-        assert label(maps, name, "strain_gauge", *result.nodes[node], 60.0) == f": {stated}"
+        assert label(shown, name, "strain_gauge", *result.nodes[node], 60.0) == f": {stated}"
 
 
 def map_values(values, std):
@@ -496,8 +500,7 @@ def test_curves_go_over_the_time_in_the_unit_that_suits_it(tmp_path):
     x, name = time_axis(histories.times, histories.frames)
     assert name == "time (µs)"
     np.testing.assert_allclose(x, [0, 20, 40, 60])
-    words = frame_text(Maps.of(result), 3, Maps.of(result).all["u"], Maps.of(result).read("u", 3), "")
-    assert "frame 3, 60 µs" in words
+    assert "frame 3, 60 µs" in ShownFields(result, ViewState(frame=3)).text()
 
 
 def timed(index, step):
@@ -547,19 +550,9 @@ class Walk:
         page, view, result = self.page, self.page.view, self.opened
         fields = Maps.of(result)
         field, values = fields.all[view.field], fields.read(view.field, view.frame)
-        nodes = values.moved if view.over == "deformed" else result.nodes
-        pointer = page._pointer
-        told = ""
-        if pointer is not None:
-            told = " &nbsp; ".join(
-                [
-                    "x {:.1f}, y {:.1f} px:".format(*pointer),
-                    read_of(fields, view.field, view.frame).pointer_text(nodes, *pointer),
-                ]
-            )
-        assert page.parts.under.text == told
-        remark = page.shown.pictures.frame(view.frame)[1] if view.over == "deformed" else ""
-        assert page.parts.description.text == frame_text(fields, view.frame, field, values, remark)
+        shown = ShownFields(result, view)
+        assert page.parts.under.text == (shown.text_at(*page._pointer) if page._pointer else "")
+        assert page.parts.description.text == shown.text(shown.picture[1])
         assert page.maps.canvas.plot.title.text == field.label
         if field.ends is None:
             whole = range_of_test(fields, view.field)
@@ -639,8 +632,7 @@ def test_a_long_reason_is_short_until_more_is_asked_for(tmp_path):
     store = ResultStore.create(tmp_path / "result", make_origin(1))
     store.write_frame(0, FrameRecord.failed(reason, nodes=NODES, lights=3))
     store.finish()
-    maps = Maps.of(Result.open(tmp_path / "result"))
-    text = frame_text(maps, 0, maps.all["u"], maps.read("u", 0), "")
+    text = ShownFields(Result.open(tmp_path / "result"), ViewState()).text()
     summary, _, rest = text.partition("</summary>")
     assert "failed: the solve stopped because" in summary
     assert summary.endswith("… more")
