@@ -13,9 +13,8 @@ from rgbmidic._kernels.picture import paint_field
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.series import FrameSeries, open_series
-from rgbmidic.report.figures import field_colours, spread
 from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, resampled
-from rgbmidic.results import Maps, MapValues, Profile, Quantity, Result
+from rgbmidic.results import MapValues, Profile, Result
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import AnyArray, FloatArray
 from rgbmidic.view.constants import VIEWER
@@ -154,11 +153,6 @@ def _packed(colours: tuple[str, ...], grey_part: int) -> npt.NDArray[np.uint32]:
     return np.asarray(red | green << 8 | blue << 16 | 0xFF000000, dtype=np.uint32)
 
 
-def palette_name(field: Quantity, *, symmetric: bool) -> str:
-    """Return the name of the colours that suit a field, symmetric about 0 where asked; safe for the colour-blind."""
-    return "RdBu_r" if symmetric and field.signed else "codes" if field.codes else field_colours(field)
-
-
 @cache
 def palette(name: str, levels: int = 256) -> tuple[str, ...]:
     """Return so many colours of a palette, up to 256 as a screen has levels, as ``"#rrggbb"``."""
@@ -237,14 +231,6 @@ def element_at(
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
-
-
-def range_of_test(maps: Maps, name: str) -> tuple[float, float]:
-    """Return the colour range of a field over the whole test, from frames evenly spread over those measured."""
-    there = np.flatnonzero(maps.result.finished).tolist()
-    ends = [robust_range(maps.read(name, frame)) for frame in (spread(there, VIEWER.range_frames) if there else ())]
-    measured = [pair for pair in ends if pair is not None]
-    return (min(low for low, _ in measured), max(high for _, high in measured)) if measured else (0.0, 1.0)
 
 
 def robust_range(read: MapValues | Profile) -> tuple[float, float] | None:

@@ -14,6 +14,7 @@ import numpy as np
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.fields import MEASURES, Area, Mean, Nodal, make_probe
 from rgbmidic.fields.strain import shortest_gauge
+from rgbmidic.report.figures import field_colours, spread
 from rgbmidic.report.style import time_text
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, MapValues, Profile, Quantity, Result
 from rgbmidic.results.histories import in_units
@@ -23,20 +24,23 @@ from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import BESIDE, UNCERTAINTY, ViewState
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.models import warning
-from rgbmidic.view.picture import (
-    Overlay,
-    Picture,
-    RawPictures,
-    element_at,
-    palette,
-    palette_name,
-    range_of_test,
-    reference_picture,
-    robust_range,
-)
+from rgbmidic.view.picture import Overlay, Picture, RawPictures, element_at, palette, reference_picture, robust_range
 
 _REASONS = ("measured", "no light sees enough texture here", "the images around it do not match", "carried over")
 """What a node's status means, under the pointer."""
+
+
+def palette_name(field: Quantity, *, symmetric: bool) -> str:
+    """Return the name of the colours that suit a field, symmetric about 0 where asked; safe for the colour-blind."""
+    return "RdBu_r" if symmetric and field.signed else "codes" if field.codes else field_colours(field)
+
+
+def range_of_test(maps: Maps, name: str) -> tuple[float, float]:
+    """Return the colour range of a field over the whole test, from frames evenly spread over those measured."""
+    there = np.flatnonzero(maps.result.finished).tolist()
+    ends = [robust_range(maps.read(name, frame)) for frame in (spread(there, VIEWER.range_frames) if there else ())]
+    measured = [pair for pair in ends if pair is not None]
+    return (min(low for low, _ in measured), max(high for _, high in measured)) if measured else (0.0, 1.0)
 
 
 class ShownFields:

@@ -28,28 +28,34 @@ from rgbmidic.results.histories import read_histories, write_histories
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, TestSettings
 from rgbmidic.text import rounded, uncertain
 from rgbmidic.view import curves
-from rgbmidic.view.address import CLOCKS, MARKS, PALETTES, UNCERTAINTY, Mark, Steps, ViewState, probe_marks
+from rgbmidic.view.address import (
+    CLOCKS,
+    MARKS,
+    PALETTES,
+    UNCERTAINTY,
+    Mark,
+    Steps,
+    ViewState,
+    marks_of,
+    probe_marks,
+    probes,
+)
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
-from rgbmidic.view.layers import LabelLayer, arrow_lines, beside, contour_lines
+from rgbmidic.view.map_panel import LabelLayer, arrow_lines, beside, contour_lines
 from rgbmidic.view.models import ResultControls, watched
 from rgbmidic.view.page import ResultPage
-from rgbmidic.view.picture import (
-    Overlay,
-    Window,
-    element_at,
-    paint,
-    palette,
-    palette_name,
-    range_of_test,
-    robust_range,
-)
-from rgbmidic.view.shown import ShownFields
+from rgbmidic.view.picture import Overlay, Window, element_at, paint, palette, robust_range
+from rgbmidic.view.shown import ShownFields, palette_name, range_of_test
 
 NAMES = ("u", "v", "e1")
 
 
 def replace_name(mark, name):
     return replace(mark, name=name if len(name) % 2 else "")
+
+
+def read(result, *marks):
+    return read_histories(result, probes(marks, 60.0, ProbeSettings()))
 
 
 numbers = st.floats(-1e6, 1e6).map(lambda x: float(f"{x:.6g}"))
@@ -143,8 +149,8 @@ def test_the_moves_of_a_drag_are_one_step_and_those_of_another_mark_another():
 def test_marks_of_the_probes_that_marks_make_make_the_same(set_, gauge):
     boxes = [mark for mark in set_ if mark.kind == "region"]
     assume(all(one.x != other.x and one.y != other.y for one, other in itertools.pairwise(boxes)))  # else it is refused
-    made = curves.probes([mark for mark in set_ if mark.kind != "circle"], gauge, ProbeSettings())
-    assert curves.probes(curves.marks_of(made), gauge, ProbeSettings()) == made
+    made = probes([mark for mark in set_ if mark.kind != "circle"], gauge, ProbeSettings())
+    assert probes(marks_of(made), gauge, ProbeSettings()) == made
 
 
 @pytest.mark.parametrize(
@@ -421,7 +427,7 @@ def test_marks_make_probes_in_the_order_set_and_a_lone_end_waits():
         Mark("gauge", 7, 8),
         Mark("strain_gauge", 9, 9),
     ]
-    made = curves.probes(set_, 60.0, ProbeSettings(measure="hencky"))
+    made = probes(set_, 60.0, ProbeSettings(measure="hencky"))
     assert made.gauges == ((1, 2, 3, 4),)
     assert made.points == ((5, 6),)
     assert made.strain_gauges == ((9, 9, 60.0),)
@@ -431,13 +437,15 @@ def test_marks_make_probes_in_the_order_set_and_a_lone_end_waits():
 def test_curves_are_grouped_by_what_they_tell_and_saved_as_the_command_does(tmp_path):
     result = make_result(tmp_path / "result", frames=4, record=smooth_record)
     set_ = [Mark("point", 50, 40), Mark("gauge", 30, 30), Mark("gauge", 90, 30), Mark("point", 60, 40)]
-    histories = curves.read(result, set_, 60.0)
+    histories = read(result, *set_)
     groups = {name: [told.name for told in own] for name, own in curves.groups(histories, probe_marks(set_)).items()}
     assert groups["u (px)"] == ["point_1_u", "point_2_u"]
     assert groups["extension (px)"] == ["gauge_1_extension"]
+    page = ResultPage(Document(), result, ViewState(), Progress(4))
+    page.curves.histories = histories
+    page._save()
     write_histories(histories, tmp_path / "own.csv")
-    assert curves.as_csv(histories) == (tmp_path / "own.csv").read_bytes().decode()
-    assert curves.read(result, [], 60.0) is None
+    assert page.state.csv == (tmp_path / "own.csv").read_bytes().decode()
 
 
 def test_the_band_is_open_where_a_frame_is_missing():
@@ -484,8 +492,8 @@ def test_a_frame_that_the_curves_do_not_hold_is_not_pointed_at(tmp_path):
     for index in (0, 1, 4):
         store.write_frame(index, smooth_record(index))
     result = Result.open(store.path, partial=True)
-    panel = CurvePanel(Document(), ShownFields(result, ViewState()), ResultControls(4, 0, dark=False), lambda: None)
-    panel.histories = curves.read(result, [Mark("point", 50, 40)], 60.0)
+    panel = CurvePanel(Document(), ShownFields(result, ViewState()), ResultControls(4, 0, dark=False))
+    panel.histories = read(result, Mark("point", 50, 40))
     shown = []
     for frame in range(5):
         panel.point(frame)
@@ -496,7 +504,7 @@ def test_a_frame_that_the_curves_do_not_hold_is_not_pointed_at(tmp_path):
 
 def test_curves_go_over_the_time_in_the_unit_that_suits_it(tmp_path):
     result = make_result(tmp_path / "result", frames=4, record=lambda index: timed(index, 20_000))
-    histories = curves.read(result, [Mark("point", 50, 40)], 60.0)
+    histories = read(result, Mark("point", 50, 40))
     x, name = time_axis(histories.times, histories.frames)
     assert name == "time (µs)"
     np.testing.assert_allclose(x, [0, 20, 40, 60])
@@ -592,7 +600,7 @@ def test_nothing_is_shown_of_a_frame_that_cannot_be_read(tmp_path):
 
 def test_curves_that_are_being_read_are_not_saved(tmp_path):
     page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), Progress(2))
-    page.curves.histories = curves.read(page.result, [Mark("point", 50, 40)], 60.0)
+    page.curves.histories = read(page.result, Mark("point", 50, 40))
     page.curves.reading = True
     page._save()
     assert page.state.csv == ""
@@ -669,13 +677,13 @@ def probed(tmp_path_factory):
 
 def test_probes_that_the_test_states_are_shown_at_opening(probed):
     page = ResultPage(Document(), probed, ViewState(), Progress(4))
-    assert curves.probes(page.view.marks, page.view.gauge, ProbeSettings()) == PROBES
+    assert probes(page.view.marks, page.view.gauge, ProbeSettings()) == PROBES
     own = (Mark("point", 30, 30),)
     assert ResultPage(Document(), probed, ViewState(marks=own), Progress(4)).view.marks == own
     other = replace(PROBES, strain_gauges=((60, 40, 60), (60, 40, 80)))  # the page has one length for all
-    assert {mark.kind for mark in curves.with_probes(ViewState(), other, 50.0).marks} == {"point", "line"}
-    assert curves.with_probes(ViewState(), PROBES, 61.0).gauge == 0
-    assert curves.with_probes(ViewState(), PROBES, 60.0).gauge == 60
+    assert {mark.kind for mark in ViewState().with_probes(other, 50.0).marks} == {"point", "line"}
+    assert ViewState().with_probes(PROBES, 61.0).gauge == 0
+    assert ViewState().with_probes(PROBES, 60.0).gauge == 60
 
 
 def test_a_picture_for_print_is_light_wide_and_says_what_it_shows(probed):
@@ -690,7 +698,7 @@ def test_a_picture_for_print_is_light_wide_and_says_what_it_shows(probed):
     assert [axis.get_title() for axis in figure.axes] == ["εxx", "u (mm)"]
     assert sum("point 1" in text.get_text() for text in figure.axes[0].texts) == 1
     assert figure.get_facecolor()[:3] == (1, 1, 1)
-    page._print()
+    page._print_maps()
     source, _, name = page.state.png.partition(" ")
     assert name == "exx_000003.png"
     png = base64.b64decode(source.removeprefix("data:image/png;base64,"))
