@@ -13,7 +13,7 @@ from urllib.parse import urlencode
 import bokeh.models as bk
 
 from rgbmidic.fields import MEASURES, Units
-from rgbmidic.settings import PROBE_NAME, ChannelSettings, ScaleSettings
+from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.view.constants import VIEWER
 
 KINDS = {"point": 1, "gauge": 2, "line": 2, "strain_gauge": 1, "region": 2, "circle": 2}
@@ -112,6 +112,33 @@ def probe_place(marks: Sequence[Mark], gauge: float) -> tuple[float, ...]:
     if marks[0].kind == "circle":
         return (*places[:2], math.dist(places[:2], places[2:]))
     return tuple(places)
+
+
+def probes(marks: Sequence[Mark], gauge: float, stated: ProbeSettings, measure: Any = None) -> ProbeSettings:
+    """Return the probes that marks make, each kind in the order set; a last mark without its pair waits for it.
+
+    Strain gauges have the length `gauge` (px); window and, unless it is chosen, strain measure are those `stated`.
+    """
+    places: dict[str, Any] = {f"{kind}s": () for kind in KINDS}
+    names = []
+    for name, pair in probe_marks(marks).items():
+        places[f"{pair[0].kind}s"] += (probe_place(pair, gauge),)
+        if name == pair[0].name:
+            names.append((f"{pair[0].kind}_{len(places[f'{pair[0].kind}s'])}", name))
+    return ProbeSettings(measure=measure or stated.measure, window=stated.window, names=tuple(names), **places)
+
+
+def marks_of(stated: ProbeSettings) -> tuple[Mark, ...]:
+    """Return the marks of the probes stated, of those kinds that can be set with the pointer."""
+    marks, names = [], dict(stated.names)
+    for numbered, (kind, place) in zip(stated.numbered, stated.places, strict=True):
+        if kind not in KINDS:
+            continue
+        x, y, *end = place
+        marks.append(Mark(kind, x, y, names.get(numbered, "")))
+        if KINDS[kind] > 1:
+            marks.append(Mark(kind, x + end[0], y) if kind == "circle" else Mark(kind, end[0], end[1]))
+    return tuple(marks)
 
 
 def entry(usual: Any, kind: type[bk.Widget] | None = None, text: str = "", **options: Any) -> Any:
@@ -253,6 +280,17 @@ class ViewState:
         view = cls(**{"frame": frame, **stated})
         view, plain = replace(view, frame=min(max(view.frame, 0), frames - 1), since=min(view.since, frames - 1)), cls()
         return view if view.low < view.high else replace(view, low=plain.low, high=plain.high, range="frame")
+
+    def with_probes(self, stated: ProbeSettings, least: float) -> Self:
+        """Return the view with the probes stated, where its address has none.
+
+        Strain gauges are among them if all have one length, `least` (px) or more, and the address states no other.
+        """
+        lengths = {length for *_, length in stated.strain_gauges}
+        alike = len(lengths) == 1 and min(lengths) >= least and self.gauge in (0, *lengths)
+        marks = tuple(mark for mark in marks_of(stated) if alike or mark.kind != "strain_gauge")
+        gauge = max(lengths) if alike else self.gauge
+        return self if self.marks or not marks else replace(self, marks=marks, gauge=gauge)
 
     def with_channels(self, stated: ChannelSettings) -> Self:
         """Return the view with what ``[channels]`` states, unless its address names a file."""

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import html
-import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -13,70 +11,24 @@ import bokeh.models as bk
 import numpy as np
 import numpy.typing as npt
 from bokeh.document import Document
+from bokeh.events import Pan, PanEnd, PanStart
 
 from rgbmidic.errors import ResultError, RgbmidicError
 from rgbmidic.fields import History
 from rgbmidic.report import history_figure
 from rgbmidic.report.style import OKABE_ITO, time_axis, time_unit
 from rgbmidic.results import Channels, Histories, Result
-from rgbmidic.results.histories import frames_alone, history_csv, read_histories, with_channels
-from rgbmidic.settings import ProbeSettings, ScaleSettings
+from rgbmidic.results.histories import frames_alone, read_histories, with_channels
+from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.address import KINDS, Mark, ViewState, probe_marks, probe_place
+from rgbmidic.view.address import probe_marks, probes
 from rgbmidic.view.canvas import columns, plain_plot
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.models import ResultControls
-from rgbmidic.view.picture import Background, warning
+from rgbmidic.view.models import Background, ResultControls, warning
 from rgbmidic.view.shown import ShownFields
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-def probes(marks: Sequence[Mark], gauge: float, stated: ProbeSettings, measure: Any = None) -> ProbeSettings:
-    """Return the probes that marks make, each kind in the order set; a last mark without its pair waits for it.
-
-    Strain gauges have the length `gauge` (px); window and, unless it is chosen, strain measure are those `stated`.
-    """
-    places: dict[str, Any] = {f"{kind}s": () for kind in KINDS}
-    names = []
-    for name, pair in probe_marks(marks).items():
-        places[f"{pair[0].kind}s"] += (probe_place(pair, gauge),)
-        if name == pair[0].name:
-            names.append((f"{pair[0].kind}_{len(places[f'{pair[0].kind}s'])}", name))
-    return ProbeSettings(measure=measure or stated.measure, window=stated.window, names=tuple(names), **places)
-
-
-def marks_of(stated: ProbeSettings) -> tuple[Mark, ...]:
-    """Return the marks of the probes stated, of those kinds that can be set with the pointer."""
-    marks, names = [], dict(stated.names)
-    for numbered, (kind, place) in zip(stated.numbered, stated.places, strict=True):
-        if kind not in KINDS:
-            continue
-        x, y, *end = place
-        marks.append(Mark(kind, x, y, names.get(numbered, "")))
-        if KINDS[kind] > 1:
-            marks.append(Mark(kind, x + end[0], y) if kind == "circle" else Mark(kind, end[0], end[1]))
-    return tuple(marks)
-
-
-def with_probes(view: ViewState, stated: ProbeSettings, least: float) -> ViewState:
-    """Return the view with the probes stated, where its address has none.
-
-    Strain gauges are among them if all have one length, `least` (px) or more, and the address states no other.
-    """
-    lengths = {length for *_, length in stated.strain_gauges}
-    alike = len(lengths) == 1 and min(lengths) >= least and view.gauge in (0, *lengths)
-    marks = tuple(mark for mark in marks_of(stated) if alike or mark.kind != "strain_gauge")
-    return view if view.marks or not marks else replace(view, marks=marks, gauge=min(lengths) if alike else view.gauge)
-
-
-def read(
-    result: Result, marks: Sequence[Mark], gauge: float, measure: str | None = None, scale: ScaleSettings | None = None
-) -> Histories | None:
-    """Read the probes that marks make off a result, as `read_histories`; None where they make none."""
-    made = probes(marks, gauge, result.section(ProbeSettings), measure)
-    return read_histories(result, made, scale=scale) if made.places else None
 
 
 def groups(histories: Histories, names: Iterable[str]) -> dict[str, list[History]]:
@@ -102,13 +54,6 @@ def band(x: FloatArray, quantity: History) -> tuple[list[FloatArray], list[Float
         xs.append(np.concatenate([x[start:stop], x[start:stop][::-1]]))
         ys.append(np.concatenate([middle - reach, (middle + reach)[::-1]]))
     return xs, ys
-
-
-def as_csv(histories: Histories) -> str:
-    """Return the text of the file that `rgbmidic history` writes."""
-    file = io.BytesIO()
-    history_csv(histories, file)
-    return file.getvalue().decode("utf-8")
 
 
 def _probe(quantity: History, names: Iterable[str]) -> str:
@@ -235,9 +180,7 @@ class CurvePanel:
     shown
         What is in view, with its probes and channels.
     parts
-        Controls of the page: the choice of a curve, and the texts on probes and channels.
-    offer
-        Called when probes were read.
+        Controls of the page: the choice of curves and channels, and the texts on them.
 
     Attributes
     ----------
@@ -249,9 +192,7 @@ class CurvePanel:
         Whether the probes are being read anew; the histories are those of before until then.
     """
 
-    def __init__(
-        self, document: Document, shown: ShownFields, parts: ResultControls, offer: Callable[[], None]
-    ) -> None:
+    def __init__(self, document: Document, shown: ShownFields, parts: ResultControls) -> None:
         self.histories: Histories | None = None
         self.channels: Channels | None = None
         self.reading = False
@@ -260,11 +201,13 @@ class CurvePanel:
         self._grabbed: tuple[float, Channels] | None = None
         self._asked: object = None
         self._drawn: object = None
-        self._shown, self._parts, self._offer, self._reader = shown, parts, offer, Background(document)
+        self._shown, self._parts, self._reader = shown, parts, Background(document)
         self._lines = bk.ColumnDataSource(columns(_LINES), name="lines")
         self._bands = bk.ColumnDataSource(columns(_BANDS), name="bands")
         self._recorded = bk.ColumnDataSource(columns("xs ys"), name="recorded")
         self._make_plot()
+        for event in (PanStart, PanEnd, Pan):
+            self.plot.on_event(event, self._drag)
         parts.message.text = _HINT
         parts.curve.on_change("value", lambda attr, old, new: self.draw())
 
@@ -299,20 +242,37 @@ class CurvePanel:
         shown, view = self._shown, self._shown.view
         marks = probe_marks(view.marks)
         alone = not marks and shown.channels.file is not None
-        asked = (marks, shown.gauge, view.measure, shown.scale, shown.changes, alone)
+        asked = (marks, shown.gauge, view.measure, shown.scale, shown.result, alone)
         if asked != self._asked:
             self._asked, self._colours, self.reading = asked, colours, bool(marks)
             if marks:
                 self._parts.message.text = "reading all frames …"
-                work = partial(read, shown.result, view.marks, shown.gauge, shown.measure, shown.scale)
-                self._reader.ask(work, self._have)
+                made = probes(view.marks, shown.gauge, shown.result.section(ProbeSettings), shown.measure)
+                self._reader.ask(partial(read_histories, shown.result, made, scale=shown.scale), self._have)
             else:
                 self._reader.drop()
                 self._have(lambda: frames_alone(shown.result) if alone else None)
         elif self._drawn != (shown.channels, view.along, view.beside):
             self._combine()
             self.draw()
+        self.offer()
         self.point(view.frame)
+
+    def offer(self) -> None:
+        """Offer channels and curves as they are now."""
+        p, view = self._parts, self._shown.view
+        names = [] if self.channels is None else list(self.channels.values)
+        quantities = [] if self.histories is None else [one.name for one in self.histories.quantities]
+        read = [name for name in quantities if name not in names]
+        for entry, first, known in (
+            ("trigger", "choose", names), ("align", "choose", names), ("force", "the one in N or kN", names),
+            ("beside", "none", names), ("align_to", "choose", read), ("along", "time", quantities),
+        ):  # fmt: skip
+            stated = getattr(view, entry)
+            p.of[entry].options = [("", first), *dict.fromkeys([*known, *([stated] if stated else [])])]
+        shown = {"trigger": "trigger", "align": "correlation", "align_to": "correlation", "offset": "offset"}
+        for entry, clock in shown.items():
+            p.of[entry].visible = view.clock == clock
 
     def _have(self, read: Callable[[], Histories | None]) -> None:
         self.reading = False
@@ -330,7 +290,7 @@ class CurvePanel:
         wanted, current = new or list(found), self._shown.view.curve
         self._parts.curve.value = current if current in wanted or not wanted else wanted[0]
         self.draw()
-        self._offer()
+        self.offer()
         self.point(self._shown.view.frame)
 
     def _combine(self) -> dict[str, list[History]]:
@@ -390,18 +350,21 @@ class CurvePanel:
         self._recorded.data = columns("xs ys", rows)
         self._axis.update(visible=bool(rows), axis_label=name)
 
-    def grab(self, x: float) -> None:
-        """Take hold of the channels at a place of the axis."""
-        self._grabbed = None if self.channels is None or self._over else (x, self.channels)
-
-    def drag(self, x: float) -> float | None:
-        """Draw the channels so far along the time; return their offset in s, None where they were not taken hold of."""
-        if self._grabbed is None or self.histories is None or self.histories.times is None:
-            return None
+    def _drag(self, event: Any) -> None:
+        """Move the channels along the time with the pointer; their offset is stated where it lets go."""
+        p, times = self._parts, None if self.histories is None else self.histories.times
+        if not p.drag.active or event.x is None:
+            return
+        if isinstance(event, PanStart):
+            self._grabbed = None if self.channels is None or self._over else (event.x, self.channels)
+        if self._grabbed is None or times is None:
+            return
         start, channels = self._grabbed
-        moved = channels.shifted((x - start) / time_unit(self.histories.times)[0])
+        moved = channels.shifted((event.x - start) / time_unit(times)[0])
         self._draw_beside(moved)
-        return moved.offset
+        p.drag.label = f"Offset {moved.offset:.6g} s"
+        if isinstance(event, PanEnd):
+            p.of["clock"].value, p.of["offset"].value = "offset", float(f"{moved.offset:.9g}")
 
     def point(self, frame: int) -> None:
         """Mark a frame, where the curves hold it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,18 +19,8 @@ from rgbmidic.errors import ConfigurationError
 from rgbmidic.mesh import Region
 from rgbmidic.results import Result
 from rgbmidic.results.files import write_complete
-from rgbmidic.settings import (
-    ChannelSettings,
-    FrameSettings,
-    ProbeSettings,
-    RegionSettings,
-    ScaleSettings,
-    TestSettings,
-    plain,
-    read_section,
-    read_toml,
-)
-from rgbmidic.view.address import KINDS, Mark
+from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings, read_section, read_toml
+from rgbmidic.view.address import Mark
 from rgbmidic.view.constants import VIEWER
 
 _FILES = (
@@ -142,12 +133,6 @@ class Draft:
         """The settings of the frames; errors as `TestSettings.from_mapping`."""
         return read_section(FrameSettings, "frames", self.section("frames"), self.file.parent)
 
-    @property
-    def region(self) -> RegionSettings | None:
-        """The settings of the region; None where there is none yet."""
-        content = self.section("region")
-        return read_section(RegionSettings, "region", content, self.file.parent) if content else None
-
     def changed(self, sections: Mapping[str, Mapping[str, Any]]) -> Self:
         """Return the draft with other values of some keys; comments and order stay.
 
@@ -231,52 +216,6 @@ class Draft:
         write_complete(self.file, lambda file: file.write(self.text.encode("utf-8")))
 
 
-def probe_section(draft: Draft, made: ProbeSettings) -> dict[str, Any]:
-    """Return the keys of ``[probes]`` for probes set with the pointer, to a thousandth of a pixel; others stay."""
-    kept = read_section(ProbeSettings, "probes", draft.section("probes"))
-    keys = {f"{kind}s": [[round(value, 3) for value in place] for place in getattr(made, f"{kind}s")] for kind in KINDS}
-    names = [list(pair) for pair in kept.names if pair[0].rpartition("_")[0] not in KINDS]
-    names += [list(pair) for pair in made.names]
-    measure = {"measure": made.measure} if made.measure != kept.measure else {}
-    return {**{key: value or None for key, value in keys.items()}, "names": names or None, **measure}
-
-
-def channel_section(draft: Draft, stated: ChannelSettings) -> dict[str, Any]:
-    """Return the keys of ``[channels]``, the file relative to the TEST.toml where it is beside it.
-
-    Raises
-    ------
-    ConfigurationError
-        No file is stated.
-    """
-    if stated.file is None:
-        raise ConfigurationError("state the channels' file first (channels.file)")
-    keys = {**plain(stated), "file": _path(draft, stated.file)}
-    return {key: value or None for key, value in keys.items()}
-
-
-def scale_section(draft: Draft, stated: ScaleSettings | None) -> dict[str, Any]:
-    """Return the keys of ``[scale]``, the scale rounded as `rgbmidic scale` prints it.
-
-    Raises
-    ------
-    ConfigurationError
-        No scale is stated.
-    """
-    if stated is None:
-        raise ConfigurationError("set two points and state their distance in mm, or name the camera file")
-    keys: dict[str, Any] = dict.fromkeys(("mm_per_pixel", "mm_per_pixel_std", "camera"))
-    if stated.camera is not None:
-        return {**keys, "camera": _path(draft, stated.camera)}
-    std = float(f"{stated.mm_per_pixel_std:.2g}")
-    return {**keys, "mm_per_pixel": float(f"{stated.mm_per_pixel:.6g}"), "mm_per_pixel_std": std}
-
-
-def _path(draft: Draft, file: Path) -> str:
-    """Return the path of a file as a TEST.toml states it: its name where it is beside it."""
-    return file.name if file.resolve().parent == draft.file.parent else str(file.resolve())
-
-
 class Confirmation:
     """Second press of a button, which lets files that exist be replaced."""
 
@@ -297,7 +236,8 @@ HOLES = {"hole": 3, "round hole": 2}
 """Kinds of a hole, whose marks have its number too, and the marks that it takes at least."""
 MASK = "mask"
 """Kind of a polygon in which a light does not count; its marks have its number and the light too."""
-_LEAST = {**OUTLINES, **HOLES, MASK: 3}
+SHAPES = {**OUTLINES, **HOLES, MASK: 3}
+"""All kinds of shapes and the marks that they take at least."""
 
 Ring = list[list[float]]
 
@@ -322,7 +262,7 @@ def region_section(draft: Draft, marks: Sequence[Mark]) -> dict[str, Any]:
 
 def _shape(mark: str) -> str:
     """Return the kind of shape that a kind of marks makes: they may have its number, and a light."""
-    return next(shape for shape in _LEAST if mark.startswith(shape))
+    return next(shape for shape in SHAPES if mark.startswith(shape))
 
 
 def _by_kind(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
@@ -336,7 +276,7 @@ def _complete(marks: Sequence[Mark], shapes: Iterable[str]) -> dict[str, Ring]:
     """
     found = {}
     for kind, own in _by_kind(marks).items():
-        if _shape(kind) in shapes and len(own) >= _LEAST[_shape(kind)]:
+        if _shape(kind) in shapes and len(own) >= SHAPES[_shape(kind)]:
             places = [(mark.x, mark.y) for mark in own]
             if _shape(kind) in ("circle", "round hole"):
                 (x, y), on = places[:2]
@@ -367,7 +307,7 @@ def check_complete(marks: Sequence[Mark]) -> None:
         One does: it would be left out.
     """
     for kind, own in _by_kind(marks).items():
-        if len(own) < (least := _LEAST[_shape(kind)]):
+        if len(own) < (least := SHAPES[_shape(kind)]):
             raise ConfigurationError(f"the {kind} needs {least} marks or more and has {len(own)}: finish or remove it")
 
 
@@ -380,8 +320,11 @@ def rings(marks: Sequence[Mark]) -> tuple[Ring, list[Ring]]:
     return region.get("polygon") or [[mark.x, mark.y] for mark in marks if mark.kind in OUTLINES], holes
 
 
-def marks_of(region: RegionSettings) -> tuple[Mark, ...]:
-    """Return the marks that make a region; none for a mask."""
+def marks_of(draft: Draft) -> tuple[Mark, ...]:
+    """Return the marks that make the region of a draft; none for a mask."""
+    if not (content := draft.section("region")):
+        return ()
+    region = read_section(RegionSettings, "region", content, draft.file.parent)
     if region.rectangle is not None:
         x0, y0, x1, y1 = region.rectangle
         outline = [Mark("rectangle", x0, y0), Mark("rectangle", x1, y1)]
@@ -399,16 +342,25 @@ def masks_of(marks: Sequence[Mark]) -> dict[str, list[Ring]]:
     return found
 
 
-def mask_images(masks: Mapping[str, Sequence[Ring]], lights: Sequence[str], shape: tuple[int, int]) -> list[bytes]:
-    """Return a picture (PNG) for each light: 0 within its masks, 255 elsewhere.
+def with_masks(
+    draft: Draft, marks: Sequence[Mark], lights: Sequence[str], shape: tuple[int, int]
+) -> tuple[Draft, dict[Path, bytes]]:
+    """Return a draft with the masks of lights that are drawn, and the files of these: a picture (PNG) for each light.
+
+    A picture is 0 within the masks of its light, 255 elsewhere. Without a mask the draft stays, and there is no file.
 
     Raises
     ------
     ConfigurationError
         A mask is of none of the lights.
     """
+    if not (masks := masks_of(marks)):
+        return draft, {}
     if other := [light for light in masks if light not in lights]:
         raise ConfigurationError(f"there is a mask of {', '.join(other)}, but the lights are {', '.join(lights)}")
-    whole = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1), shape)
-    kept = [whole.without(masks.get(light, ())).mask for light in lights]
-    return [cv2.imencode(".png", np.uint8(255) * mask.astype(np.uint8))[1].tobytes() for mask in kept]
+    whole, files = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1), shape), dict[Path, bytes]()
+    for number, light in enumerate(lights, 1):
+        picture = np.uint8(255) * whole.without(masks.get(light, ())).mask.astype(np.uint8)
+        name = f"{draft.file.stem}_mask_{number}_{re.sub(r'[^A-Za-z0-9]+', '_', light)}.png"
+        files[draft.file.parent / name] = cv2.imencode(".png", picture)[1].tobytes()
+    return draft.changed({"weights": {"method": "images", "images": [file.name for file in files]}}), files

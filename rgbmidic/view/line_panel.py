@@ -25,8 +25,7 @@ from rgbmidic.view.address import probe_marks, probe_place
 from rgbmidic.view.canvas import columns, plain_plot
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.curves import NOW, band
-from rgbmidic.view.models import labelled
-from rgbmidic.view.picture import Background, warning
+from rgbmidic.view.models import Background, labelled, warning
 from rgbmidic.view.shown import ShownFields
 
 if TYPE_CHECKING:
@@ -152,7 +151,7 @@ class LinePanel:
             self._reader.drop()
             self._asked, self._reading, self.told.visible = (), None, False
             return False
-        asked = (view.field, lines[view.line], shown.chosen, shown.changes)
+        asked = (view.field, lines[view.line], shown.chosen, shown.result)
         look = (view.range, view.low, view.high, view.symmetric, view.palette, view.levels)
         if asked != self._asked:
             before = self._reading if asked[:-1] == self._asked[:-1] else None

@@ -1,30 +1,264 @@
-"""Maps of the fields in view: canvases side by side, and what is drawn over the first."""
+"""Maps of the fields in view: canvases side by side, and the layers over the first.
+
+Layers are lines, texts that keep apart, and marks of probes, which move with the material.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import bokeh.models as bk
 import numpy as np
+import numpy.typing as npt
 from bokeh.document import Document
 from bokeh.events import MouseMove
 
-from rgbmidic.report.style import BAR, add_colour_bar, draw_figure, finish_picture, literal
+from rgbmidic.report.style import BAR, OKABE_ITO, add_colour_bar, draw_figure, finish_picture, literal
 from rgbmidic.results import frame_times
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.address import MARKS, SCALE, probe_marks, probe_place
-from rgbmidic.view.canvas import Canvas
+from rgbmidic.view.address import MARKS, SCALE, Mark, probe_marks, probe_place
+from rgbmidic.view.canvas import Canvas, columns
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.layers import LabelLayer, LineLayer, MarkLayer, arrow_lines, beside, contour_lines, direction_lines
-from rgbmidic.view.picture import AROUND, Picture, extremes, frame_title, paint, palette
+from rgbmidic.view.picture import AROUND, Picture, Window, element_at, paint, palette
 from rgbmidic.view.shown import ShownFields
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+_ENDS, _LABEL = "x0 y0 x1 y1", "x y text colour side along down"
+LETTERS = {
+    "text_color": "#ffffff",
+    "text_align": "side",
+    "x_offset": "along",
+    "y_offset": "down",
+    "background_fill_color": "#15181c",
+    "background_fill_alpha": 0.75,
+    "text_font_size": "12px",
+    "padding": 2,
+}
+"""Look of a text over the image, where `beside` places it."""
+_AWAY, _LETTER, _LINE = 8, 7, 20
+"""Pixels of the screen: from a place to its text; width of a letter and height of a line of 12 px."""
+
+
+class LineLayer:
+    """Lines on a canvas, light with a dark edge.
+
+    Parameters
+    ----------
+    canvas
+        Plot on which they are drawn.
+    name
+        Name of their data.
+    width
+        Of the light part, in pixels of the screen.
+    """
+
+    def __init__(self, canvas: Canvas, name: str, width: float = 1.4) -> None:
+        self._lines = bk.ColumnDataSource(columns(_ENDS), name=name)
+        for colour, wide in (("#15181c", width + 1.6), ("#ffffff", width)):
+            canvas.plot.segment(*_ENDS.split(), source=self._lines, line_color=colour, line_width=wide)
+
+    @property
+    def lines(self) -> FloatArray:
+        """The lines (M, 4) that are shown."""
+        return np.stack([np.asarray(self._lines.data[name], dtype=np.float64) for name in _ENDS.split()], axis=1)
+
+    def show(self, ends: FloatArray | None) -> None:
+        """Show lines (M, 4) from x0, y0 to x1, y1; None: none."""
+        if ends is not None or len(self._lines.data["x0"]):
+            self._lines.data = dict(zip(_ENDS.split(), (np.zeros((0, 4)) if ends is None else ends).T, strict=True))
+
+
+class LabelLayer:
+    """Points with a text on a canvas.
+
+    Parameters
+    ----------
+    canvas
+        Plot on which they are drawn.
+    name
+        Name of their data.
+    """
+
+    def __init__(self, canvas: Canvas, name: str, **look: Any) -> None:
+        self._canvas, self._points = canvas, bk.ColumnDataSource(columns(_LABEL), name=name)
+        canvas.plot.scatter("x", "y", source=self._points, line_color="#15181c", fill_color="colour", **look)
+        canvas.plot.text("x", "y", "text", source=self._points, **LETTERS)
+
+    def show(
+        self, points: Sequence[tuple[float, float, str, str]] = (), others: Sequence[tuple[float, float, str]] = ()
+    ) -> None:
+        """Show points with their texts and colours, the texts clear of `others` that `beside` has placed."""
+        if points or len(self._points.data["x"]):
+            placed = beside([*others, *(one[:3] for one in points)], self._canvas.window)[len(others) :]
+            self._points.data = columns(_LABEL, [(*one, *place) for one, place in zip(points, placed, strict=True)])
+
+
+def beside(texts: Sequence[tuple[float, float, str]], window: Window) -> list[tuple[str, int, int]]:
+    """Return alignment and offsets of texts at (x, y) that end within a window and do not lie on each other."""
+    step = (window.right - window.left) / window.width  # px of the image to one of the screen
+    placed, taken = [], list[tuple[float, float, float]]()
+    for x, y, text in texts:
+        left, wide, top = (x - window.left) / step + _AWAY, _LETTER * len(text), (y - window.top) / step
+        turned = left + wide > window.width
+        left, low = left - (wide + 2 * _AWAY if turned else 0), top
+        while any(abs(low - other) < _LINE and left < end and begin < left + wide for begin, end, other in taken):
+            low += _LINE
+        taken.append((left, left + wide, low))
+        placed.append(("right" if turned else "left", -_AWAY if turned else _AWAY, round(low - top)))
+    return placed
+
+
+def _thinned(window: Window, nodes: FloatArray, known: Any) -> tuple[npt.NDArray[np.int64], float]:
+    """Thin out the nodes (N, 2) that are known, evenly over the view; return their indices, and their distance."""
+    cell = max(window.right - window.left, window.bottom - window.top) / VIEWER.lines_across
+    kept = np.flatnonzero(known & np.isfinite(nodes).all(axis=1))
+    places = np.floor(nodes[kept] / cell).astype(int)
+    return kept[np.unique(places, axis=0, return_index=True)[1]], cell
+
+
+def direction_lines(window: Window, nodes: FloatArray, degrees: FloatArray) -> FloatArray:
+    """Lines (M, 4) along directions (N,), in degrees from x towards y, at nodes (N, 2), evenly thinned out."""
+    thinned, cell = _thinned(window, nodes, np.isfinite(degrees))
+    angle = np.radians(degrees[thinned])
+    half = 0.4 * cell * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate([nodes[thinned] - half, nodes[thinned] + half], axis=1)
+
+
+def arrow_lines(window: Window, nodes: FloatArray, moved: FloatArray, longer: float) -> tuple[FloatArray, float]:
+    """Lines (M, 4) of arrows along displacements (N, 2) at nodes (N, 2), thinned out, and how much longer they are.
+
+    With `longer` 0 the longest reaches to the next arrow.
+    """
+    thinned, cell = _thinned(window, nodes, np.isfinite(moved).all(axis=1))
+    start, along = nodes[thinned], moved[thinned]
+    reach = np.hypot(*along.T).max(initial=0)
+    longer = longer or (0.9 * cell / reach if reach > 0 else 1.0)
+    end = start + longer * along
+    parts = [np.concatenate([start, end], axis=1)]
+    for turn in (2.6, -2.6):  # rad from the arrow to the sides of its point
+        c, s = 0.3 * np.cos(turn), 0.3 * np.sin(turn)
+        parts.append(np.concatenate([end, end + longer * along @ np.array([[c, s], [-s, c]])], axis=1))
+    return np.concatenate(parts), float(longer)
+
+
+def contour_lines(
+    nodes: FloatArray, elements: npt.NDArray[np.int32], values: FloatArray, levels: Sequence[float]
+) -> FloatArray:
+    """Lines (M, 4) on which a field, linear in each element, has one of the levels; none beside nodes without data."""
+    whole = elements[np.isfinite(values[elements] + nodes[elements].sum(axis=2)).all(axis=1)]
+    lines = []
+    for level in levels:
+        above = values[whole] > level
+        cut = whole[above.any(axis=1) & ~above.all(axis=1)]
+        ends = []
+        # the corner that is alone on its side: from it, the line cuts both edges
+        side = values[cut] > level
+        alone = np.where(side.sum(axis=1) == 1, side.argmax(axis=1), side.argmin(axis=1))
+        row = np.arange(len(cut))
+        for step in (1, 2):
+            a, b = cut[row, alone], cut[row, (alone + step) % 3]
+            part = ((level - values[a]) / (values[b] - values[a]))[:, None]
+            ends.append(nodes[a] + part * (nodes[b] - nodes[a]))
+        lines.append(np.concatenate(ends, axis=1))
+    return np.concatenate(lines) if lines else np.zeros((0, 4))
+
+
+_COLOURS = tuple(OKABE_ITO.values())
+_PROBE = "xs ys colour x y text side along down"
+
+_TURN = np.linspace(0, 2 * np.pi, 49)
+
+
+def _outline(ends: Sequence[Mark], gauge: float) -> tuple[list[float], list[float]]:
+    """Return the x and y of the lines that show a probe."""
+    xs, ys = [mark.x for mark in ends], [mark.y for mark in ends]
+    if ends[0].kind == "region":
+        return [xs[0], xs[1], xs[1], xs[0], xs[0]], [ys[0], ys[0], ys[1], ys[1], ys[0]]
+    if ends[0].kind in ("circle", "strain_gauge"):
+        radius = gauge / 2 if len(ends) == 1 else float(np.hypot(xs[1] - xs[0], ys[1] - ys[0]))
+        return (xs[0] + radius * np.cos(_TURN)).tolist(), (ys[0] + radius * np.sin(_TURN)).tolist()
+    return xs, ys
+
+
+class MarkLayer:
+    """Marks of probes on a canvas, which move with the material.
+
+    Parameters
+    ----------
+    canvas
+        Plot on which they are set and drawn.
+    elements : ndarray, shape (E, 3)
+        Elements of the mesh that carries them.
+
+    Attributes
+    ----------
+    colours
+        Colour of each probe that the marks make, by its name.
+    """
+
+    def __init__(self, canvas: Canvas, elements: npt.NDArray[np.int32]) -> None:
+        self.colours: dict[str, str] = {}
+        self._canvas, self._elements, self._shown = canvas, elements, dict[object, tuple[Mark, Mark]]()
+        self._drawn: object = None
+        self._joined = bk.ColumnDataSource(columns(_PROBE), name="probes")
+        canvas.plot.multi_line("xs", "ys", source=self._joined, line_color="colour", line_width=3)
+        canvas.plot.text("x", "y", "text", source=self._joined, border_line_color="colour", **LETTERS)
+
+    def place(
+        self, marks: Sequence[Mark], reference: FloatArray, nodes: FloatArray, values: Mapping[str, str], gauge: float
+    ) -> None:
+        """Draw marks, which lie on the `reference` (N, 2) of the nodes, where the nodes (N, 2) carry them.
+
+        Each probe shows its value of `values`; strain gauges are circles of the length `gauge` (px).
+        """
+        at = [self._carried(mark, reference, nodes) for mark in marks]
+        self._shown = {mark.key: (mark, own) for mark, own in zip(at, marks, strict=True)}
+        self._canvas.place(at)
+        drawn = (at, dict(values), gauge, self._canvas.window)
+        if drawn == self._drawn:
+            return
+        self._drawn = drawn
+        ends = [mark for mark in at if mark.kind == SCALE]
+        probes = {**probe_marks(at), **({SCALE: ends} if len(ends) > 1 else {})}
+        self.colours = {name: _COLOURS[place % len(_COLOURS)] for place, name in enumerate(probes)}
+        lines = [_outline(ends, gauge) for ends in probes.values()]
+        texts = [
+            (ends[0].x, ends[0].y, f"{name.replace('_', ' ')}{values.get(name, '')}") for name, ends in probes.items()
+        ]
+        placed = beside(texts, self._canvas.window)
+        parts = zip(lines, self.colours.values(), texts, placed, strict=True)
+        self._joined.data = columns(_PROBE, [(*line, colour, *text, *side) for line, colour, text, side in parts])
+
+    @property
+    def drawn(self) -> list[tuple[Any, ...]]:
+        """Line (xs, ys), colour, and place (x, y) and text of each probe."""
+        return list(zip(*(self._joined.data[name] for name in _PROBE.split()[:6]), strict=True))
+
+    def taken(self, nodes: FloatArray, reference: FloatArray) -> tuple[Mark, ...] | None:
+        """Return the marks, set over nodes (N, 2), on the `reference` (N, 2); None where none has changed."""
+        now = self._canvas.set
+        if now == [mark for mark, _ in self._shown.values()]:
+            return None
+        marks = []
+        for mark in now:
+            shown, own = self._shown.get(mark.key, (None, mark))
+            marks.append(own if mark == shown else self._carried(mark, nodes, reference))
+        return tuple(marks)
+
+    def _carried(self, mark: Mark, before: FloatArray, after: FloatArray) -> Mark:
+        """Carry a mark from the nodes `before` to those `after`; outside the mesh or without data it stays."""
+        found = None if before is after else element_at(before, self._elements, mark.x, mark.y)
+        if found is None:
+            return mark
+        x, y = found[1] @ after[found[0]]
+        return replace(mark, x=float(x), y=float(y)) if np.isfinite(x + y) else mark
 
 
 class MapPanel:
@@ -116,7 +350,7 @@ class MapPanel:
                 axes[0].annotate(literal(text), (x, y), shift, textcoords="offset points", **look)
 
         times = frame_times(shown.result, shown.maps.physical.scale)
-        title = frame_title(shown.result, view.frame, math.nan if times is None else float(times[view.frame]))
+        title = shown.title(math.nan if times is None else float(times[view.frame]))
         how = dict.fromkeys(shown.maps.how(name) for name in names)
         aspect, title = window.height / window.width, f"{title}\n{'; '.join(filter(None, how))}".strip()
         figure = draw_figure(draw, count=len(names), aspect=aspect, beside=BAR, title=title)
@@ -182,11 +416,11 @@ class MapPanel:
         colours = palette("codes")
         self._blank.show([(*shown.result.nodes[node].tolist(), "", colours[values.status[node]]) for node in missing])
         probes = probe_marks(view.marks).items()
-        gauge, read = shown.gauge, shown.read(view.field)
-        texts = {name: read.probe_text(marks[0].kind, probe_place(marks, gauge)) for name, marks in probes}
+        gauge = shown.gauge
+        texts = {name: shown.probe_text(marks[0].kind, probe_place(marks, gauge)) for name, marks in probes}
         texts[SCALE] = f": {view.distance:g} mm" if view.distance else ""
         self.marks.place(view.marks, shown.result.nodes, nodes, texts, gauge)
-        ends = extremes(field, values) if view.extremes else ()
+        ends = shown.extremes if view.extremes else ()
         names = zip(("smallest", "largest"), ("#56b4e9", "#e69f00"), ends, strict=False)
         self._ends.show(
             [

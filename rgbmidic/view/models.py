@@ -1,18 +1,27 @@
-"""Controls of a page, and the scripts that run in the browser."""
+"""What all pages have: controls, the scripts that run in the browser, errors that are shown, work beside the page."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import html
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from importlib.resources import files
-from typing import Any
+from typing import Any, TypeVar
 
 import bokeh.models as bk
 from bokeh.core.properties import Int, String
+from bokeh.document import Document
 from bokeh.layouts import column, row
 from bokeh.model import DataModel
 
+from rgbmidic.errors import RgbmidicError
 from rgbmidic.view.address import ViewState
 from rgbmidic.view.constants import VIEWER
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 def page_file(name: str) -> str:
@@ -28,6 +37,59 @@ def script(name: str, **parts: Any) -> bk.CustomJS:
 def labelled(says: str) -> dict[str, str]:
     """Attributes of a group of controls whose purpose screen readers read out."""
     return {"role": "group", "aria-label": says}
+
+
+def warning(text: str) -> str:
+    """Return a remark as HTML that stands out."""
+    return f'<b style="color:var(--warn)">{html.escape(text)}</b>'
+
+
+def guarded(act: Callable[[], object], complain: Callable[[str], None]) -> None:
+    """Call `act`; an error is reported in one line by `complain`, and the page goes on."""
+    try:
+        act()
+    except (RgbmidicError, OSError) as error:
+        complain(str(error))
+    except Exception as error:  # the last resort of a page
+        logger.exception("the page failed")
+        complain(f"{type(error).__name__}: {error}")
+
+
+def watched(document: Document) -> bool:
+    """Return whether a browser shows the page: one that was left exists for a while, and shall do nothing more."""
+    session = document.session_context.session if document.session_context else None
+    return session is None or session.connection_count > 0
+
+
+def every(milliseconds: int, document: Document, act: Callable[[], None], complain: Callable[[str], None]) -> None:
+    """Call `act`, as `guarded`, again and again while a browser shows the page."""
+    document.add_periodic_callback(lambda: guarded(act, complain) if watched(document) else None, milliseconds)
+
+
+class Background:
+    """Work for a page in another thread, one task after the other, of which only the last that was asked for counts.
+
+    Parameters
+    ----------
+    document
+        Document of the page.
+    """
+
+    def __init__(self, document: Document) -> None:
+        self._document, self._thread, self._task = document, ThreadPoolExecutor(1), Future[Any]()
+        document.on_session_destroyed(lambda context: self._thread.shutdown(wait=False, cancel_futures=True))
+
+    def drop(self) -> None:
+        """Forget the task that was asked for."""
+        self._task.cancel()
+        self._task = Future()
+
+    def ask(self, work: Callable[[], T], take: Callable[[Callable[[], T]], None]) -> None:
+        """Start a task; `take` gets the function that returns its result or raises its error, in the page's thread."""
+        self.drop()
+        task = self._task = self._thread.submit(work)
+        taken = lambda: take(task.result) if task is self._task else None  # noqa: E731
+        task.add_done_callback(lambda _: self._document.add_next_tick_callback(taken))
 
 
 class SharedState(DataModel):  # type: ignore[misc]  # see pyproject.toml

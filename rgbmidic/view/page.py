@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import io
 import time
 from dataclasses import replace
 from functools import partial
@@ -16,18 +17,17 @@ from bokeh.events import DocumentReady, Tap
 from rgbmidic.errors import RgbmidicError
 from rgbmidic.report.style import embedded
 from rgbmidic.results import Result
+from rgbmidic.results.histories import history_csv
 from rgbmidic.settings import ChannelSettings, ProbeSettings
 from rgbmidic.text import uncertain
 from rgbmidic.view.address import BESIDE, OVER, SCALE, UNCERTAINTY, Mark, Steps, ViewState
 from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.curves import CurvePanel, Progress, TimeLine, as_csv, with_probes
-from rgbmidic.view.film import FilmButton
+from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
 from rgbmidic.view.line_panel import LinePanel
 from rgbmidic.view.map_panel import MapPanel
-from rgbmidic.view.models import ResultControls, SharedState, script
-from rgbmidic.view.picture import every, frame_text, guarded, warning
-from rgbmidic.view.sections import ChannelControls, FileButtons, ProbeNames
+from rgbmidic.view.models import ResultControls, SharedState, every, guarded, script, warning
+from rgbmidic.view.sections import FileButtons, FilmButton, ProbeNames
 from rgbmidic.view.shown import ShownFields
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class ResultPage:
     def __init__(self, document: Document, result: Result, view: ViewState, progress: Progress) -> None:
         self.document, self.progress = document, progress
         self.shown = ShownFields(result, view.with_channels(result.section(ChannelSettings)))
-        self.shown.view = view = with_probes(self.shown.view, result.section(ProbeSettings), self.shown.gauge)
+        self.shown.view = view = self.shown.view.with_probes(result.section(ProbeSettings), self.shown.gauge)
         self._told = False
         self._pointer: tuple[float, float] | None = None
         self._grown = 0
@@ -62,8 +62,7 @@ class ResultPage:
         self.maps = MapPanel(document, self.shown, self._redraw, self._hover, dark=dark)
         self.names, self.film = ProbeNames(p, self._take_marks), FilmButton(p, self.shown)
         self.file, self.timeline = FileButtons(p, self.shown), TimeLine(len(result), view.frame)
-        self.curves = CurvePanel(document, self.shown, p, self._offer)
-        self.channels = ChannelControls(p, self.curves)
+        self.curves = CurvePanel(document, self.shown, p)
         self.line = LinePanel(document, self.shown, self.maps.canvas.colours, p.wide)
         panels = [self.line.choice, self.curves.plot, *self.line.parts]
         self.panel = bk.Column(children=panels, sizing_mode="stretch_both")
@@ -92,7 +91,8 @@ class ResultPage:
         """Set the controls to the view, and let them change it."""
         p, view = self.parts, self.view
         self._offer_fields()
-        self._offer()
+        self.curves.offer()
+        self.names.offer(view.marks)
         p.of["since"].high = len(self.result) - 1
         p.over.active = OVER.index(view.over)
         self._draw_progress()
@@ -116,11 +116,6 @@ class ResultPage:
         of["field"].options = groups
         for name in BESIDE:
             of[name].options = {"": [("", "nothing"), (UNCERTAINTY, "its uncertainty")], **groups}
-
-    def _offer(self) -> None:
-        """Offer channels, curves and probes as they are now."""
-        self.channels.offer(self.view)
-        self.names.offer(self.view.marks)
 
     def _set(self, entry: str, attribute: str, old: Any, new: Any) -> None:
         """Take the value of a control into the view; a range by hand starts from that in view."""
@@ -147,7 +142,7 @@ class ResultPage:
             (p.redo, lambda: self.show(marks=self.steps.go(back=False))),
         ):  # fmt: skip
             button.on_click(partial(guarded, act, lambda text: p.written.update(text=warning(text))))
-        for button, act in ((p.print, self._print), (p.png, self._print_curves)):
+        for button, act in ((p.print, self._print_maps), (p.png, self._print_curves)):
             button.on_click(partial(guarded, act, self.complain))
         p.drag.js_on_change("active", script("hold", toggle=p.drag, pan=self.curves.pan))
         p.movie.on_change("active", lambda attr, old, new: guarded(self.film.press, self.film.stop))
@@ -175,7 +170,7 @@ class ResultPage:
         try:
             guarded(self._draw, self._blank)
             self.curves.update(self.maps.marks.colours)
-            self._offer()
+            self.names.offer(self.view.marks)
         finally:
             self.document.unhold()
 
@@ -199,7 +194,7 @@ class ResultPage:
         of["longer"].title = self.maps.draw(picture)
         of["low"].visible = of["high"].visible = view.range == "hand"
         of["symmetric"].visible = field.signed and view.range != "hand"
-        self.parts.description.text = frame_text(shown.maps, view.frame, field, values, remark)
+        self.parts.description.text = shown.text(remark)
         self._read_out()
         self.curves.plot.visible = not self.line.update(values)
         self.state.query, self.state.shown = view.query(), self.state.asked
@@ -257,25 +252,22 @@ class ResultPage:
         elif self.curves.histories is None or not self.curves.histories.quantities:
             self.parts.message.text = "There is no curve yet: set a mark on the field first."
         else:
-            self.state.csv = as_csv(self.curves.histories)
+            history_csv(self.curves.histories, file := io.BytesIO())
+            self.state.csv = file.getvalue().decode("utf-8")
 
-    def _print(self) -> None:
-        """Send the maps in view as a picture for print."""
-        self._send(f"{self.view.field}_{self.view.frame:06}", self.maps.figure())
+    def _print_maps(self) -> None:
+        self._print(f"{self.view.field}_{self.view.frame:06}", self.maps.figure())
 
     def _print_curves(self) -> None:
-        """Send the curves in view, over the time or along a line, as a picture for print."""
-        if self.line.wave.visible:
-            name, figure = "profile", self.line.figure()
-        else:
-            name, figure = "history", self.curves.figure()
+        """Send the curves in view, over the time or along a line."""
+        name, panel = ("profile", self.line) if self.line.wave.visible else ("history", self.curves)
+        self._print(name, panel.figure())
+
+    def _print(self, name: str, figure: Figure | None) -> None:
+        """Send a picture for print, light whatever the page is, as a data URL, a space and the file name."""
         if figure is None:
             self.parts.message.text = "There is no curve yet, or its frames are still being read."
-        else:
-            self._send(name, figure)
-
-    def _send(self, name: str, figure: Figure) -> None:
-        """Send a picture, light whatever the page is, as a data URL, a space and the file name."""
+            return
         source = embedded(figure, dpi=round(VIEWER.print_columns / figure.get_figwidth()))
         self.state.png = f"{source} {name}.png"
 

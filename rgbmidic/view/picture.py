@@ -1,39 +1,23 @@
-"""Picture of a field on the screen: window of the image, resampling, colours, elements.
-
-Nodal fields of a result with units and colour ranges, the images under them, texts on a frame and a place.
-"""
+"""Picture of a field on the screen: window of the image, resampling, colours and their range, elements, images."""
 
 from __future__ import annotations
 
-import html
-import logging
-import math
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
-from typing import Any, TypeVar, cast
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-from bokeh.document import Document
 
 from rgbmidic._kernels.picture import paint_field
-from rgbmidic.errors import FrameError, InputError, RgbmidicError
-from rgbmidic.fields import Area, Mean, Nodal, make_probe
+from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.series import FrameSeries, open_series
-from rgbmidic.report.figures import field_colours, spread
-from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, resampled, time_text
-from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, MapValues, Profile, Quantity, Result
-from rgbmidic.results.histories import in_units
-from rgbmidic.results.quantities import FAILED
-from rgbmidic.settings import ProbeSettings, TestSettings
+from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, resampled
+from rgbmidic.results import MapValues, Profile, Result
+from rgbmidic.settings import TestSettings
 from rgbmidic.typing import AnyArray, FloatArray
 from rgbmidic.view.constants import VIEWER
-
-logger = logging.getLogger(__name__)
 
 Picture = npt.NDArray[np.uint8]
 """A grey picture (H, W)."""
@@ -169,11 +153,6 @@ def _packed(colours: tuple[str, ...], grey_part: int) -> npt.NDArray[np.uint32]:
     return np.asarray(red | green << 8 | blue << 16 | 0xFF000000, dtype=np.uint32)
 
 
-def palette_name(field: Quantity, *, symmetric: bool) -> str:
-    """Return the name of the colours that suit a field, symmetric about 0 where asked; safe for the colour-blind."""
-    return "RdBu_r" if symmetric and field.signed else "codes" if field.codes else field_colours(field)
-
-
 @cache
 def palette(name: str, levels: int = 256) -> tuple[str, ...]:
     """Return so many colours of a palette, up to 256 as a screen has levels, as ``"#rrggbb"``."""
@@ -218,6 +197,16 @@ class RawPictures:
         return grey_picture(self._series.read(self._series.chosen[index])[0])
 
 
+def reference_picture(result: Result) -> Picture:
+    """Return the mean of the lights' reference images that a result keeps, grey where none was kept."""
+    images, (left, top) = result.reference, result.reference_origin
+    columns, rows = np.ceil(result.nodes.max(axis=0) + 1).astype(int)
+    picture = np.full(result.frame_shape or (rows, columns), 60, dtype=np.uint8)
+    if images is not None:
+        picture[top : top + images.shape[1], left : left + images.shape[2]] = images.mean(axis=0)
+    return picture
+
+
 def stretched(image: AnyArray) -> Picture:
     """Stretch an image (H, W) between its 1 % and 99 % quantiles, of every fourth pixel, to 0 to 255; NaN is 0."""
     finite = image[::4, ::4][np.isfinite(image[::4, ::4])]
@@ -244,246 +233,7 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
-T = TypeVar("T")
-_REASONS = ("measured", "no light sees enough texture here", "the images around it do not match", "carried over")
-"""What a node's status means, under the pointer."""
-
-
-def range_of_test(maps: Maps, name: str) -> tuple[float, float]:
-    """Return the colour range of a field over the whole test, from frames evenly spread over those measured."""
-    there = np.flatnonzero(maps.result.finished).tolist()
-    ends = [robust_range(maps.read(name, frame)) for frame in (spread(there, VIEWER.range_frames) if there else ())]
-    measured = [pair for pair in ends if pair is not None]
-    return (min(low for low, _ in measured), max(high for _, high in measured)) if measured else (0.0, 1.0)
-
-
 def robust_range(read: MapValues | Profile) -> tuple[float, float] | None:
     """Return the colour range of what was read without doubtful nodes and outliers; None where nothing is measured."""
     ordinary = ordinary_values(read.values, read.std)
     return colour_range(ordinary) if ordinary.size else None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Pictures:
-    """Images under the fields: the reference that the result keeps, and the raw frames, where they still exist.
-
-    Attributes
-    ----------
-    result
-        The result.
-    """
-
-    result: Result
-
-    @cached_property
-    def reference(self) -> Picture:
-        """Mean of the lights' reference images, grey where none was kept."""
-        images, (left, top) = self.result.reference, self.result.reference_origin
-        columns, rows = np.ceil(self.result.nodes.max(axis=0) + 1).astype(int)
-        picture = np.full(self.result.frame_shape or (rows, columns), 60, dtype=np.uint8)
-        if images is not None:
-            picture[top : top + images.shape[1], left : left + images.shape[2]] = images.mean(axis=0)
-        return picture
-
-    def frame(self, place: int) -> tuple[Picture, str]:
-        """Return the raw frame of an index in the result; where it cannot be read, the reference and the reason."""
-        try:
-            return self._read(place), ""
-        except (RgbmidicError, OSError, IndexError, KeyError) as error:
-            return self.reference, f"the raw frame cannot be shown ({error}): this is the reference image"
-
-    @cached_property
-    def _read(self) -> Callable[[int], Picture]:
-        return lru_cache(VIEWER.raw_frames)(RawPictures(result=self.result))
-
-
-def warning(text: str) -> str:
-    """Return a remark as HTML that stands out."""
-    return f'<b style="color:var(--warn)">{html.escape(text)}</b>'
-
-
-def guarded(act: Callable[[], object], complain: Callable[[str], None]) -> None:
-    """Call `act`; an error is reported in one line by `complain`, and the page goes on."""
-    try:
-        act()
-    except (RgbmidicError, OSError) as error:
-        complain(str(error))
-    except Exception as error:  # the last resort of a page
-        logger.exception("the page failed")
-        complain(f"{type(error).__name__}: {error}")
-
-
-def watched(document: Document) -> bool:
-    """Return whether a browser shows the page: one that was left exists for a while, and shall do nothing more."""
-    session = document.session_context.session if document.session_context else None
-    return session is None or session.connection_count > 0
-
-
-def every(milliseconds: int, document: Document, act: Callable[[], None], complain: Callable[[str], None]) -> None:
-    """Call `act`, as `guarded`, again and again while a browser shows the page."""
-    document.add_periodic_callback(lambda: guarded(act, complain) if watched(document) else None, milliseconds)
-
-
-class Background:
-    """Work for a page in another thread, one task after the other, of which only the last that was asked for counts.
-
-    Parameters
-    ----------
-    document
-        Document of the page.
-    """
-
-    def __init__(self, document: Document) -> None:
-        self._document, self._thread, self._task = document, ThreadPoolExecutor(1), Future[Any]()
-        document.on_session_destroyed(lambda context: self._thread.shutdown(wait=False, cancel_futures=True))
-
-    def drop(self) -> None:
-        """Forget the task that was asked for."""
-        self._task.cancel()
-        self._task = Future()
-
-    def ask(self, work: Callable[[], T], take: Callable[[Callable[[], T]], None]) -> None:
-        """Start a task; `take` gets the function that returns its result or raises its error, in the page's thread."""
-        self.drop()
-        task = self._task = self._thread.submit(work)
-        taken = lambda: take(task.result) if task is self._task else None  # noqa: E731
-        task.add_done_callback(lambda _: self._document.add_next_tick_callback(taken))
-
-
-def frame_title(result: Result, place: int, seconds: float) -> str:
-    """Return a frame's place, name and time; NaN: it is not known."""
-    time = f", {time_text(seconds, np.array([seconds]))}" if math.isfinite(seconds) else ""
-    return f"Frame {place} of 0 to {len(result) - 1}: {result.names[place]}{time}"
-
-
-def frame_text(maps: Maps, place: int, field: Quantity, values: MapValues, remark: str) -> str:
-    """Describe what is in view, as HTML: the frame, how it ended, the field with its extremes, and a remark."""
-    result = maps.result
-    read = next(result.table.each(["status", "reason", "node_status", "time_ns"], [place]))
-    missing = float(np.mean(read["node_status"] != 0))
-    measured = bool(result.finished[place])
-    end = QUANTITIES["status"].codes[read["status"]] if measured else "not measured yet"
-    without = f", {missing:.1%} of the nodes not measured" if missing and read["status"] != FAILED else ""
-    seconds = math.nan if read["time_ns"] == UNKNOWN_TIME else read["time_ns"] * 1e-9
-    lines = [html.escape(frame_title(result, place, seconds)), f"{end}{without}"]
-    if read["reason"] and measured:
-        first, rest = read["reason"][: VIEWER.reason_letters], read["reason"][VIEWER.reason_letters :]
-        lines[1] = warning(f"{end}: {first}")
-        if rest:
-            lines[1] = f"<details><summary>{lines[1]} … more</summary>… {html.escape(rest)}</details>"
-    lines.append(f"<b>{html.escape(field.label)}</b>: {html.escape(field.meaning.partition(':')[0])}")
-    found = extremes(field, values)
-    if found:
-        ends = [
-            f"{name} {field.text(values.values[node], values.std[node])} at {maps.physical.place_text(x, y)}"
-            for name, node, (x, y) in zip(("smallest", "largest"), found, result.nodes[[*found]], strict=True)
-        ]
-        lines.append(html.escape(", ".join(ends)))
-    elif not np.isfinite(values.values).any():
-        lines.append("Nothing is measured here: choose another frame below.")
-    lines += [html.escape(text) for text in [maps.how(field.name)] if text]
-    return "<br>".join([*lines, *([html.escape(remark)] if remark else [])])
-
-
-def extremes(field: Quantity, values: MapValues) -> tuple[int, ...]:
-    """Return the nodes with the smallest and the largest value; none where nothing is measured, or of a status."""
-    if field.codes or not np.isfinite(values.values).any():
-        return ()
-    return int(np.nanargmin(values.values)), int(np.nanargmax(values.values))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FieldInFrame:
-    """A field in one frame, as it is stated under the pointer and at probes.
-
-    Attributes
-    ----------
-    maps, field, values, frame
-        The fields of the result, which one it is, what was read of it, and the index of the frame.
-    moved : ndarray, shape (4, N)
-        As `Maps.displacement` returns it.
-    """
-
-    maps: Maps
-    field: Quantity
-    values: MapValues
-    moved: FloatArray
-    frame: int
-
-    @property
-    def measured(self) -> str:
-        """Name of the field, or of that whose uncertainty it is."""
-        return self.field.name.removesuffix("_std")
-
-    def pointer_text(self, nodes: FloatArray, x: float, y: float) -> str:
-        """Return the value at a place over nodes (N, 2), as HTML; where there is none, why."""
-        found = element_at(nodes, self.maps.result.elements, x, y)
-        if found is None:
-            return "outside the mesh"
-        corners, weights = found[0].astype(np.int64), found[1]
-        correlation, least = self.maps.physical.covariance.part(corners), VIEWER.least_weight
-        mean = Mean(name="", nodes=corners, weights=weights, correlation=correlation, least=least)
-        value, std = self.mean_of(mean)
-        text = f"{self.field.symbol} = {self.field.text(value, std)}"
-        blank = self.values.status[corners].max()
-        if not np.isfinite(value):
-            text += f" ({_REASONS[blank] if blank else 'a node beside it has no data'})"
-        return f"<b>{html.escape(text)}</b>"
-
-    def probe_text(self, kind: str, place: tuple[float, ...]) -> str:
-        """Return what a probe of a kind measures of the field, with its uncertainty, as its history has it.
-
-        A probe whose history does not have the field shows its value at the centre, or its mean; see `mean_of`. A
-        gauge shows its extension, or over a strain its own.
-        """
-        maps, name = self.maps, self.measured
-        group = maps.all.get(name, self.field).group
-        strain = group == "Strain"
-        if self.field.stepped and kind in ("line", "region", "circle"):
-            return ""
-        try:
-            if kind == "strain_gauge" and strain:
-                read = maps.strain_at(self.frame, *place)
-                return f": {self._told(float(read[name][0]), float(read[f'{name}_std'][0]), self.field.unit)}"
-            kind, place = ("point", place[:2]) if kind == "strain_gauge" else (kind, place)
-            stated = ProbeSettings(measure=cast(Any, maps.physical.measure))
-            probe = make_probe(maps.physical.covariance, kind, 1, place, stated, maps.physical.rectified)
-        except InputError:
-            return ""
-        of_gauge = {"Displacement": "extension", "Strain": "strain"}.get(group) if kind == "gauge" else None
-        wanted = of_gauge or (name if isinstance(probe, Area) and strain else None)
-        if wanted and maps.since is None and not maps.rigid_removed:
-            part = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), self.moved[:, None, probe.nodes], strict=True)))
-            whole = (one for one in probe.histories(part) if one.name == f"{probe.name}_{wanted}")
-            for one in (read for history in whole for read in in_units(history, maps.physical.units, None)):
-                if one.std is not None:
-                    return f" {of_gauge or 'mean'}: {self._told(float(one.values[0]), float(one.std[0]), one.unit)}"
-        if not isinstance(probe, Mean):
-            return ""
-        value, std = self.mean_of(probe)
-        most = " at most" if kind != "point" and name not in ("u", "v") and np.isfinite(std) else ""
-        return f"{' mean' if kind != 'point' else ''}: {self.field.text(value, std)}{most}"
-
-    def _told(self, value: float, std: float, unit: str) -> str:
-        """State a value, or where the field is an uncertainty that of the value."""
-        stated = replace(self.field, unit=unit)
-        return stated.text(value, std) if self.measured == self.field.name else stated.text(std)
-
-    def mean_of(self, mean: Mean) -> tuple[float, float]:
-        """Average the field over a place, as a history does, with its standard uncertainty; NaN where it has none.
-
-        That of u and v is exact, from their displacement; the errors of other fields are taken as the same at all
-        nodes, which is the most that they can add up to: gauges overlap.
-        """
-        name, values = self.measured, self.values
-        if self.field.stepped:
-            return float(values.values[mean.nodes[mean.weights.argmax()]]), math.nan
-        exact = name in ("u", "v")
-        read = self.moved["uv".index(name) :: 2] if exact else np.stack([values.values, values.std])
-        of_nodes, stds = read[:, None, mean.nodes]
-        stated = bool(np.isfinite(stds).any())
-        pair = mean.average(of_nodes, stds, np.isfinite(of_nodes + (stds if stated else 0)), alike=not exact)
-        (value,), (std,) = self.maps.physical.units.lengths(*pair) if exact else pair
-        if exact and name != self.field.name:
-            return float(std), math.nan
-        return float(value), float(std) if stated else math.nan

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import re
 from collections.abc import Callable
 from functools import partial
 from operator import methodcaller
@@ -25,20 +24,17 @@ from rgbmidic.settings import ELEMENT_SIZE, RegionSettings, TestSettings, read_s
 from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.draft import (
-    HOLES,
-    MASK,
-    OUTLINES,
+    SHAPES,
     Confirmation,
     Draft,
     check_complete,
     marks_of,
-    mask_images,
-    masks_of,
     region_of,
     region_section,
+    with_masks,
 )
-from rgbmidic.view.models import SharedState, script
-from rgbmidic.view.picture import AROUND, Background, Overlay, every, guarded, paint, palette, warning
+from rgbmidic.view.models import Background, SharedState, every, guarded, script, warning
+from rgbmidic.view.picture import AROUND, Overlay, paint, palette
 from rgbmidic.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, overview, pictures
 
 _EXPECTED = "expected uncertainty"
@@ -77,12 +73,10 @@ class SetupPage:
         self.parts = SetupControls(draft, len(self.source.series) - 1, out, dark=dark)
         self._reader = Background(document)
         rows, columns = self.source.shape
-        kinds = (*OUTLINES, *HOLES, MASK)
-        self.canvas = Canvas(document, kinds, (-0.5, -0.5, columns - 0.5, rows - 0.5), self.show)
+        self.canvas = Canvas(document, tuple(SHAPES), (-0.5, -0.5, columns - 0.5, rows - 0.5), self.show)
         self._edges, thin = ColumnDataSource({"xs": [], "ys": []}), {"line_width": 0.7, "line_alpha": 0.7}
         self.canvas.plot.multi_line("xs", "ys", source=self._edges, line_color="#ffd166", **thin)
-        marks = () if draft.region is None else marks_of(draft.region)
-        self.drawing = RegionDrawing(document, self.canvas, marks, self._remesh)
+        self.drawing = RegionDrawing(document, self.canvas, marks_of(draft), self._remesh)
         self.confirmation = Confirmation()
         self._offer_lights()
         self._listen()
@@ -103,7 +97,7 @@ class SetupPage:
         p.calibration.on_change("value", lambda attr, old, new: self._guarded(self._reopen))
         for button, act in (
             (p.undo, partial(self.drawing.go, back=True)), (p.redo, partial(self.drawing.go, back=False)),
-            (p.next, self.drawing.next_hole), (p.clear, self.drawing.clear),
+            (p.next, self.drawing.next_hole), (p.clear, partial(self.drawing.keep, ())),
             (p.inspect, self._inspect), (p.write, self._write), (p.go, self._run),
         ):  # fmt: skip
             button.on_click(partial(self._guarded, act))
@@ -257,13 +251,8 @@ class SetupPage:
         self.drawing.settle()  # else it takes the place of what is reported here
         check_complete(self.drawing.marks)
         self._reopen()
-        draft, pictures = self.draft.at(Path(self.parts.file.value)), dict[Path, bytes]()
-        if masks := masks_of(self.drawing.marks):
-            lights, stem = self.source.lights, draft.file.stem
-            names = [f"{stem}_mask_{at}_{re.sub(r'[^A-Za-z0-9]+', '_', one)}.png" for at, one in enumerate(lights, 1)]
-            images = mask_images(masks, lights, self.source.shape)
-            pictures = {draft.file.parent / name: image for name, image in zip(names, images, strict=True)}
-            draft = draft.changed({"weights": {"method": "images", "images": names}})
+        draft = self.draft.at(Path(self.parts.file.value))
+        draft, pictures = with_masks(draft, self.drawing.marks, self.source.lights, self.source.shape)
         draft.check()
         same = draft.file == self._opened.file
         files = [*pictures, *([] if same and self._opened.is_file else [draft.file])]

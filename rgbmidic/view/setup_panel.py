@@ -19,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 from bokeh.document import Document
 from bokeh.layouts import column, row
-from bokeh.models import ColumnDataSource
 
 from rgbmidic.errors import ResultError
 from rgbmidic.frames.series import FrameSeries, open_series
@@ -165,7 +164,7 @@ class RegionDrawing:
         self._document, self._canvas, self._changed = document, canvas, changed
         self.light = ""
         self._steps, self._hole, self._coming = Steps(marks), 1, False
-        self._rings = ColumnDataSource(columns("xs ys colour"), name="rings")
+        self._rings = bk.ColumnDataSource(columns("xs ys colour"), name="rings")
         canvas.plot.multi_line("xs", "ys", source=self._rings, line_color="colour", line_width=2.5)
         canvas.place(marks)
         canvas.marks.on_change("data", lambda attr, old, new: self._marked())
@@ -179,10 +178,6 @@ class RegionDrawing:
         """Return to the marks before the last step, or do it again."""
         self._canvas.place(self._steps.go(back=back))
         self.draw()
-
-    def clear(self) -> None:
-        """Remove all marks."""
-        self._keep(())
 
     def next_hole(self) -> None:
         """Let the marks of a hole or a mask that are set from now on belong to another one."""
@@ -198,17 +193,12 @@ class RegionDrawing:
         """Draw the lines."""
         self._coming = False
         outline, holes = rings(self.marks)
-        masks = [
-            (ring, _COLOURS[2 + at % (len(_COLOURS) - 2)])
-            for at, own in enumerate(masks_of(self.marks).values())
-            for ring in own
-        ]
-        closed = [[*ring, *ring[:1]] for ring in (outline, *holes, *(ring for ring, _ in masks))]
-        self._rings.data = {
-            "xs": [[x for x, _ in ring] for ring in closed],
-            "ys": [[y for _, y in ring] for ring in closed],
-            "colour": ["#56b4e9", *["#e69f00"] * len(holes), *(colour for _, colour in masks)],
-        }
+        drawn = [(outline, "#56b4e9"), *((hole, "#e69f00") for hole in holes)]
+        for at, own in enumerate(masks_of(self.marks).values()):
+            drawn += [(ring, _COLOURS[2 + at % (len(_COLOURS) - 2)]) for ring in own]
+        closed = [([*ring, *ring[:1]], colour) for ring, colour in drawn]
+        rows = [([x for x, _ in ring], [y for _, y in ring], colour) for ring, colour in closed]
+        self._rings.data = columns("xs ys colour", rows)
         self._changed()
 
     def _marked(self) -> None:
@@ -224,9 +214,10 @@ class RegionDrawing:
             kind = f"{MASK} {number} {self.light}" if kind == MASK else f"{kind} {number}" if kind in HOLES else kind
             now.append(replace(mark, kind=kind))
         if tuple(now) != self.marks:
-            self._keep(arranged(now, next((mark.kind for mark in now if mark.key not in known), "")))
+            self.keep(arranged(now, next((mark.kind for mark in now if mark.key not in known), "")))
 
-    def _keep(self, marks: tuple[Mark, ...]) -> None:
+    def keep(self, marks: tuple[Mark, ...]) -> None:
+        """Take marks as a step that can be undone, and draw their lines."""
         self._steps.keep(marks)
         self._canvas.place(marks)
         if not self._coming:

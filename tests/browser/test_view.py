@@ -17,7 +17,7 @@ from rgbmidic.results import FrameRecord, Maps, Result, ResultStore
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.profiles import read_profile
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings
-from rgbmidic.view import film
+from rgbmidic.view import sections
 from rgbmidic.view.picture import element_at, robust_range
 
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
@@ -547,7 +547,7 @@ def test_a_movie_of_what_is_in_view_is_written_beside_the_others(driver, wave, t
         view = "frame=5&field=exx&second=u&range=hand&low=-0.01&high=0.02&opacity=0.5&gauge=60&since=1&measure=hencky"
         page = Page(driver, f"{told}?{view}")
         shown(page, 5)
-        monkeypatch.setattr(film, "find_spec", lambda name: None)
+        monkeypatch.setattr(sections, "find_spec", lambda name: None)
         page.driver.execute_script(*click("Movie"))
         page.until("model('said').text.startsWith('movie_exx_u') && model('movie').label === '■ Movie'")
         page.until(f"model('said').text.startsWith('written: {first} (a .gif; for .mp4: pip install')", patience=60)

@@ -22,7 +22,7 @@ from rgbmidic.report import curves, figures, gallery, remove_pictures, save_figu
 from rgbmidic.results import QUANTITIES, FrameRecord, Maps, Origin, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, ScaleSettings, TestSettings
 from rgbmidic.typing import AnyArray
-from rgbmidic.view.picture import Pictures
+from rgbmidic.view.picture import reference_picture
 
 IMAGE = np.random.default_rng(0).normal(1000, 100, (80, 120))
 X, Y = MESH.nodes.T
@@ -94,7 +94,7 @@ def test_a_reference_that_shows_a_part_of_the_frame_lies_where_it_belongs(tmp_pa
         v=Y / 20,
         reflection_thumbnail=cover,
     )
-    whole = Pictures(result=result).reference
+    whole = reference_picture(result)
     assert whole.shape == (80, 120)
     np.testing.assert_array_equal(whole[4:, 8:], result.reference[0])
     assert (whole[:4] == whole[0, 0]).all()

@@ -181,7 +181,7 @@ def test_write_states_what_was_written_and_refuses_what_would_be_left_out(page, 
     browser.settle()
     assert "the polygon needs 3 marks or more and has 2: finish or remove it" in page.press()
     assert file.read_text(encoding="utf-8") == TEXT
-    page.drawing.clear()
+    page.drawing.keep(())
     assert "[region] is missing or empty" in page.press()
     assert file.read_text(encoding="utf-8") == TEXT
     for corner in CORNERS:
@@ -218,7 +218,7 @@ def test_masks_of_lights_of_any_names_have_files_of_their_own(page, monkeypatch,
     lights = ("rot-1", "rot 1", "красный", "红")
     monkeypatch.setattr(DraftFrames, "lights", lights)
     marks = [Mark(f"mask {n} {light}", 20 * n + x, y) for n, light in enumerate(lights, 1) for x, y in CORNER]
-    page.drawing._keep((*RECTANGLE, *marks))
+    page.drawing.keep((*RECTANGLE, *marks))
     assert "are written" in page.press()
     files = read_test(tmp_path / "TEST.toml").weights.images
     assert len(set(files)) == 4

@@ -4,18 +4,18 @@ from types import SimpleNamespace
 
 import pytest
 
-from rgbmidic.view import film
+from rgbmidic.view import sections
 
 
 def test_an_unexpected_error_is_told_and_not_called_the_end_of_the_process(monkeypatch, tmp_path):
     def broken(*_, **__):
         raise ZeroDivisionError("a fault of ours")
 
-    monkeypatch.setattr(film, "Movie", broken)
-    monkeypatch.setattr(film.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(sections, "Movie", broken)
+    monkeypatch.setattr(sections.signal, "signal", lambda *_: None)
     told = []
     with pytest.raises(ZeroDivisionError):
-        film._write(SimpleNamespace(send=told.append), None, tmp_path / "movie.gif", ["u"], {"limits": {}})
+        sections._write(SimpleNamespace(send=told.append), None, tmp_path / "movie.gif", ["u"], {"limits": {}})
     ((text, ended),) = told
     assert ended
     assert "movie.gif: unexpected error: ZeroDivisionError: a fault of ours" in text

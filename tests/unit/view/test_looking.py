@@ -28,31 +28,34 @@ from rgbmidic.results.histories import read_histories, write_histories
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, TestSettings
 from rgbmidic.text import rounded, uncertain
 from rgbmidic.view import curves
-from rgbmidic.view.address import CLOCKS, MARKS, PALETTES, UNCERTAINTY, Mark, Steps, ViewState, probe_marks
-from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
-from rgbmidic.view.layers import LabelLayer, arrow_lines, beside, contour_lines
-from rgbmidic.view.models import ResultControls
-from rgbmidic.view.page import ResultPage
-from rgbmidic.view.picture import (
-    FieldInFrame,
-    Overlay,
-    Window,
-    element_at,
-    frame_text,
-    paint,
-    palette,
-    palette_name,
-    range_of_test,
-    robust_range,
-    watched,
+from rgbmidic.view.address import (
+    CLOCKS,
+    MARKS,
+    PALETTES,
+    UNCERTAINTY,
+    Mark,
+    Steps,
+    ViewState,
+    marks_of,
+    probe_marks,
+    probes,
 )
-from rgbmidic.view.shown import ShownFields
+from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
+from rgbmidic.view.map_panel import LabelLayer, arrow_lines, beside, contour_lines
+from rgbmidic.view.models import ResultControls, watched
+from rgbmidic.view.page import ResultPage
+from rgbmidic.view.picture import Overlay, Window, element_at, paint, palette, robust_range
+from rgbmidic.view.shown import ShownFields, palette_name, range_of_test
 
 NAMES = ("u", "v", "e1")
 
 
 def replace_name(mark, name):
     return replace(mark, name=name if len(name) % 2 else "")
+
+
+def read(result, *marks):
+    return read_histories(result, probes(marks, 60.0, ProbeSettings()))
 
 
 numbers = st.floats(-1e6, 1e6).map(lambda x: float(f"{x:.6g}"))
@@ -146,8 +149,8 @@ def test_the_moves_of_a_drag_are_one_step_and_those_of_another_mark_another():
 def test_marks_of_the_probes_that_marks_make_make_the_same(set_, gauge):
     boxes = [mark for mark in set_ if mark.kind == "region"]
     assume(all(one.x != other.x and one.y != other.y for one, other in itertools.pairwise(boxes)))  # else it is refused
-    made = curves.probes([mark for mark in set_ if mark.kind != "circle"], gauge, ProbeSettings())
-    assert curves.probes(curves.marks_of(made), gauge, ProbeSettings()) == made
+    made = probes([mark for mark in set_ if mark.kind != "circle"], gauge, ProbeSettings())
+    assert probes(marks_of(made), gauge, ProbeSettings()) == made
 
 
 @pytest.mark.parametrize(
@@ -259,13 +262,16 @@ def test_what_is_hatched_lies_below_zero():
     assert (hatched[changed] == 0xFF000000).all()
 
 
-def label(maps, name, kind, *place, frame=5):
-    return read_of(maps, name, frame).probe_text(kind, place)
+def label(shown, name, kind, *place):
+    shown.view = replace(shown.view, field=name)
+    return shown.probe_text(kind, place)
 
 
-def read_of(maps, name, frame):
-    field, values, moved = maps.all[name], maps.read(name, frame), maps.displacement(frame)
-    return FieldInFrame(maps=maps, field=field, values=values, moved=moved, frame=frame)
+def shown_fields(result, **view):
+    """The fields of a view, as a page that was opened just now has them."""
+    shown = ShownFields(result, ViewState(**view))
+    shown.choose()
+    return shown
 
 
 def spread_of(text):
@@ -279,7 +285,8 @@ PLACES |= {"circle": (60.0, 40.0, 17.0), "strain_gauge": (52.0, 41.0, 60.0), "ga
 @pytest.mark.parametrize("measure", MEASURES[:2])
 def test_the_label_of_a_probe_is_its_history_in_that_frame_and_the_pointer_states_the_same(tmp_path, measure):
     result = make_result(tmp_path / "result", frames=6, record=smooth_record, settings=in_mm())
-    maps = Maps.of(result, gauge=60.0, measure=measure)
+    shown = shown_fields(result, frame=5, gauge=60.0, measure=measure)
+    maps = shown.maps
     histories = read_histories(
         result, ProbeSettings(**{f"{kind}s": (place,) for kind, place in PLACES.items()}, measure=measure)
     )
@@ -292,54 +299,57 @@ def test_the_label_of_a_probe_is_its_history_in_that_frame_and_the_pointer_state
         mean = "" if kind == "point" else " mean"
         for name in "uv":
             value, std = history(kind, name)
-            assert label(maps, name, kind, *PLACES[kind]) == f"{mean}: {maps.all[name].text(value, std)}"
-            assert label(maps, f"{name}_std", kind, *PLACES[kind]) == f"{mean}: {maps.all[f'{name}_std'].text(std)}"
+            assert label(shown, name, kind, *PLACES[kind]) == f"{mean}: {maps.all[name].text(value, std)}"
+            assert label(shown, f"{name}_std", kind, *PLACES[kind]) == f"{mean}: {maps.all[f'{name}_std'].text(std)}"
     for name, of_gauge, unit in (("u", "extension", " mm"), ("exx", "strain", "")):
         value, std = history("gauge", of_gauge)
-        assert label(maps, name, "gauge", *PLACES["gauge"]) == f" {of_gauge}: {uncertain(value, std)}{unit}"
-        assert label(maps, f"{name}_std", "gauge", *PLACES["gauge"]) == f" {of_gauge}: {rounded(std, std)}{unit}"
-    assert label(maps, "misfit", "gauge", *PLACES["gauge"]) == ""
+        assert label(shown, name, "gauge", *PLACES["gauge"]) == f" {of_gauge}: {uncertain(value, std)}{unit}"
+        assert label(shown, f"{name}_std", "gauge", *PLACES["gauge"]) == f" {of_gauge}: {rounded(std, std)}{unit}"
+    assert label(shown, "misfit", "gauge", *PLACES["gauge"]) == ""
     for name in ("exx", "eyy", "exy", "e1", "e2", "equivalent"):
         for kind in ("region", "circle"):
-            assert label(maps, name, kind, *PLACES[kind]) == f" mean: {maps.all[name].text(*history(kind, name))}"
+            assert label(shown, name, kind, *PLACES[kind]) == f" mean: {maps.all[name].text(*history(kind, name))}"
     for name in ("exx", "eyy", "exy", "e1", "e2", "direction", "equivalent"):
         value, std = history("strain_gauge", name)
-        assert label(maps, name, "strain_gauge", *PLACES["strain_gauge"]) == f": {maps.all[name].text(value, std)}"
+        assert label(shown, name, "strain_gauge", *PLACES["strain_gauge"]) == f": {maps.all[name].text(value, std)}"
         assert (
-            label(maps, f"{name}_std", "strain_gauge", *PLACES["strain_gauge"])
+            label(shown, f"{name}_std", "strain_gauge", *PLACES["strain_gauge"])
             == f": {maps.all[f'{name}_std'].text(std)}"
         )
     for name in ("u", "v", "u_std"):
         field = maps.all[name]
-        told = read_of(maps, name, 5).pointer_text(result.nodes, *PLACES["point"])
-        assert told.endswith(f"<b>{field.symbol} = {label(maps, name, 'point', *PLACES['point'])[2:]}</b>")
-    assert label(maps, "u", "strain_gauge", *PLACES["strain_gauge"]) == label(maps, "u", "point", *PLACES["point"])
+        shown.view = replace(shown.view, field=name)
+        told = shown.text_at(*PLACES["point"])
+        assert told.endswith(f"<b>{field.symbol} = {label(shown, name, 'point', *PLACES['point'])[2:]}</b>")
+    assert label(shown, "u", "strain_gauge", *PLACES["strain_gauge"]) == label(shown, "u", "point", *PLACES["point"])
 
 
 def test_what_a_history_does_not_have_is_not_stated_too_exactly(tmp_path):
     """Gauges overlap: their mean over three nodes is as uncertain as one, and so is that over an area at most."""
-    maps = Maps.of(make_result(tmp_path / "result", frames=6, record=smooth_record))
+    shown = shown_fields(make_result(tmp_path / "result", frames=6, record=smooth_record), frame=5)
+    maps = shown.maps
     std, (around, _) = maps.read("exx", 5).std, element_at(MESH.nodes, MESH.elements, *PLACES["point"])
     assert (
-        0.97 * std[around].min() < spread_of(label(maps, "exx", "point", *PLACES["point"])) < 1.03 * std[around].max()
+        0.97 * std[around].min() < spread_of(label(shown, "exx", "point", *PLACES["point"])) < 1.03 * std[around].max()
     )
-    std, told = maps.read("shear", 5).std, label(maps, "shear", "region", *PLACES["region"])
+    std, told = maps.read("shear", 5).std, label(shown, "shear", "region", *PLACES["region"])
     assert told.endswith(" at most")
     assert 0.97 * std.min() < spread_of(told) < 1.03 * std.max()
-    assert label(maps, "misfit", "point", 50.0, 40.0) == ": 1"
-    assert label(maps, "node_status", "point", 50.0, 40.0) == ": measured"
-    assert label(maps, "u", "region", 200.0, 200.0, 300.0, 300.0) == ""
-    assert label(maps, "exx", "strain_gauge", 200.0, 200.0, 40.0) == ""
+    assert label(shown, "misfit", "point", 50.0, 40.0) == ": 1"
+    assert label(shown, "node_status", "point", 50.0, 40.0) == ": measured"
+    assert label(shown, "u", "region", 200.0, 200.0, 300.0, 300.0) == ""
+    assert label(shown, "exx", "strain_gauge", 200.0, 200.0, 40.0) == ""
 
 
 def test_a_strain_gauge_at_a_node_is_the_map_at_that_node_since_any_frame(tmp_path):
     result = make_result(tmp_path / "result", frames=6, record=smooth_record)
-    maps = Maps.of(result, gauge=60.0, since=2, rigid_removed=True)
+    shown = shown_fields(result, frame=5, gauge=60.0, since=2, rigid=True)
+    maps = shown.maps
     node = int(np.argmin(np.hypot(*(result.nodes - [60, 40]).T)))
     for name in ("exx", "equivalent"):
         read = maps.read(name, 5)
         stated = maps.all[name].text(read.values[node], read.std[node])
-        assert label(maps, name, "strain_gauge", *result.nodes[node], 60.0) == f": {stated}"
+        assert label(shown, name, "strain_gauge", *result.nodes[node], 60.0) == f": {stated}"
 
 
 def map_values(values, std):
@@ -417,7 +427,7 @@ def test_marks_make_probes_in_the_order_set_and_a_lone_end_waits():
         Mark("gauge", 7, 8),
         Mark("strain_gauge", 9, 9),
     ]
-    made = curves.probes(set_, 60.0, ProbeSettings(measure="hencky"))
+    made = probes(set_, 60.0, ProbeSettings(measure="hencky"))
     assert made.gauges == ((1, 2, 3, 4),)
     assert made.points == ((5, 6),)
     assert made.strain_gauges == ((9, 9, 60.0),)
@@ -427,13 +437,15 @@ def test_marks_make_probes_in_the_order_set_and_a_lone_end_waits():
 def test_curves_are_grouped_by_what_they_tell_and_saved_as_the_command_does(tmp_path):
     result = make_result(tmp_path / "result", frames=4, record=smooth_record)
     set_ = [Mark("point", 50, 40), Mark("gauge", 30, 30), Mark("gauge", 90, 30), Mark("point", 60, 40)]
-    histories = curves.read(result, set_, 60.0)
+    histories = read(result, *set_)
     groups = {name: [told.name for told in own] for name, own in curves.groups(histories, probe_marks(set_)).items()}
     assert groups["u (px)"] == ["point_1_u", "point_2_u"]
     assert groups["extension (px)"] == ["gauge_1_extension"]
+    page = ResultPage(Document(), result, ViewState(), Progress(4))
+    page.curves.histories = histories
+    page._save()
     write_histories(histories, tmp_path / "own.csv")
-    assert curves.as_csv(histories) == (tmp_path / "own.csv").read_bytes().decode()
-    assert curves.read(result, [], 60.0) is None
+    assert page.state.csv == (tmp_path / "own.csv").read_bytes().decode()
 
 
 def test_the_band_is_open_where_a_frame_is_missing():
@@ -480,8 +492,8 @@ def test_a_frame_that_the_curves_do_not_hold_is_not_pointed_at(tmp_path):
     for index in (0, 1, 4):
         store.write_frame(index, smooth_record(index))
     result = Result.open(store.path, partial=True)
-    panel = CurvePanel(Document(), ShownFields(result, ViewState()), ResultControls(4, 0, dark=False), lambda: None)
-    panel.histories = curves.read(result, [Mark("point", 50, 40)], 60.0)
+    panel = CurvePanel(Document(), ShownFields(result, ViewState()), ResultControls(4, 0, dark=False))
+    panel.histories = read(result, Mark("point", 50, 40))
     shown = []
     for frame in range(5):
         panel.point(frame)
@@ -492,12 +504,11 @@ def test_a_frame_that_the_curves_do_not_hold_is_not_pointed_at(tmp_path):
 
 def test_curves_go_over_the_time_in_the_unit_that_suits_it(tmp_path):
     result = make_result(tmp_path / "result", frames=4, record=lambda index: timed(index, 20_000))
-    histories = curves.read(result, [Mark("point", 50, 40)], 60.0)
+    histories = read(result, Mark("point", 50, 40))
     x, name = time_axis(histories.times, histories.frames)
     assert name == "time (µs)"
     np.testing.assert_allclose(x, [0, 20, 40, 60])
-    words = frame_text(Maps.of(result), 3, Maps.of(result).all["u"], Maps.of(result).read("u", 3), "")
-    assert "frame 3, 60 µs" in words
+    assert "frame 3, 60 µs" in ShownFields(result, ViewState(frame=3)).text()
 
 
 def timed(index, step):
@@ -547,19 +558,9 @@ class Walk:
         page, view, result = self.page, self.page.view, self.opened
         fields = Maps.of(result)
         field, values = fields.all[view.field], fields.read(view.field, view.frame)
-        nodes = values.moved if view.over == "deformed" else result.nodes
-        pointer = page._pointer
-        told = ""
-        if pointer is not None:
-            told = " &nbsp; ".join(
-                [
-                    "x {:.1f}, y {:.1f} px:".format(*pointer),
-                    read_of(fields, view.field, view.frame).pointer_text(nodes, *pointer),
-                ]
-            )
-        assert page.parts.under.text == told
-        remark = page.shown.pictures.frame(view.frame)[1] if view.over == "deformed" else ""
-        assert page.parts.description.text == frame_text(fields, view.frame, field, values, remark)
+        shown = ShownFields(result, view)
+        assert page.parts.under.text == (shown.text_at(*page._pointer) if page._pointer else "")
+        assert page.parts.description.text == shown.text(shown.picture[1])
         assert page.maps.canvas.plot.title.text == field.label
         if field.ends is None:
             whole = range_of_test(fields, view.field)
@@ -599,7 +600,7 @@ def test_nothing_is_shown_of_a_frame_that_cannot_be_read(tmp_path):
 
 def test_curves_that_are_being_read_are_not_saved(tmp_path):
     page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), Progress(2))
-    page.curves.histories = curves.read(page.result, [Mark("point", 50, 40)], 60.0)
+    page.curves.histories = read(page.result, Mark("point", 50, 40))
     page.curves.reading = True
     page._save()
     assert page.state.csv == ""
@@ -639,8 +640,7 @@ def test_a_long_reason_is_short_until_more_is_asked_for(tmp_path):
     store = ResultStore.create(tmp_path / "result", make_origin(1))
     store.write_frame(0, FrameRecord.failed(reason, nodes=NODES, lights=3))
     store.finish()
-    maps = Maps.of(Result.open(tmp_path / "result"))
-    text = frame_text(maps, 0, maps.all["u"], maps.read("u", 0), "")
+    text = ShownFields(Result.open(tmp_path / "result"), ViewState()).text()
     summary, _, rest = text.partition("</summary>")
     assert "failed: the solve stopped because" in summary
     assert summary.endswith("… more")
@@ -677,13 +677,13 @@ def probed(tmp_path_factory):
 
 def test_probes_that_the_test_states_are_shown_at_opening(probed):
     page = ResultPage(Document(), probed, ViewState(), Progress(4))
-    assert curves.probes(page.view.marks, page.view.gauge, ProbeSettings()) == PROBES
+    assert probes(page.view.marks, page.view.gauge, ProbeSettings()) == PROBES
     own = (Mark("point", 30, 30),)
     assert ResultPage(Document(), probed, ViewState(marks=own), Progress(4)).view.marks == own
     other = replace(PROBES, strain_gauges=((60, 40, 60), (60, 40, 80)))  # the page has one length for all
-    assert {mark.kind for mark in curves.with_probes(ViewState(), other, 50.0).marks} == {"point", "line"}
-    assert curves.with_probes(ViewState(), PROBES, 61.0).gauge == 0
-    assert curves.with_probes(ViewState(), PROBES, 60.0).gauge == 60
+    assert {mark.kind for mark in ViewState().with_probes(other, 50.0).marks} == {"point", "line"}
+    assert ViewState().with_probes(PROBES, 61.0).gauge == 0
+    assert ViewState().with_probes(PROBES, 60.0).gauge == 60
 
 
 def test_a_picture_for_print_is_light_wide_and_says_what_it_shows(probed):
@@ -698,7 +698,7 @@ def test_a_picture_for_print_is_light_wide_and_says_what_it_shows(probed):
     assert [axis.get_title() for axis in figure.axes] == ["εxx", "u (mm)"]
     assert sum("point 1" in text.get_text() for text in figure.axes[0].texts) == 1
     assert figure.get_facecolor()[:3] == (1, 1, 1)
-    page._print()
+    page._print_maps()
     source, _, name = page.state.png.partition(" ")
     assert name == "exx_000003.png"
     png = base64.b64decode(source.removeprefix("data:image/png;base64,"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,19 +11,18 @@ import pytest
 
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.mesh import Region
-from rgbmidic.settings import ProbeSettings, RegionSettings, ScaleSettings, read_section, read_test
+from rgbmidic.settings import ProbeSettings, ScaleSettings, read_section, read_test
 from rgbmidic.view.address import Mark
 from rgbmidic.view.draft import (
     Confirmation,
     Draft,
     arranged,
     marks_of,
-    mask_images,
     masks_of,
-    probe_section,
     region_of,
-    scale_section,
+    with_masks,
 )
+from rgbmidic.view.sections import probe_section, scale_section
 from rgbmidic.view.setup import SetupPage
 from rgbmidic.view.setup_panel import SetupControls
 
@@ -109,8 +109,8 @@ def test_drawn_shapes_are_the_region_that_is_read_again():
         "polygon": [[5, 5], [60, 5], [60, 50]],
         "holes": [[[40, 10], [50, 10], [50, 20]]],
     }
-    region = read_section(RegionSettings, "region", content)
-    assert region_of(marks_of(region)) == content
+    draft = Draft(file=Path("TEST.toml"), text="").changed({"region": content})
+    assert region_of(marks_of(draft)) == content
 
 
 def test_a_round_hole_has_the_area_of_its_circle():
@@ -178,4 +178,4 @@ def test_masks_of_a_light_that_there_is_not_are_refused():
     assert masks_of(marks) == {"red": [[[2, 2], [8, 2], [8, 8]]]}
     assert region_of([Mark("rectangle", 0, 0), Mark("rectangle", 9, 9), *marks]) == {"rectangle": [0, 0, 9, 9]}
     with pytest.raises(ConfigurationError, match="mask of red, but the lights are green, blue"):
-        mask_images(masks_of(marks), ("green", "blue"), (10, 10))
+        with_masks(Draft(file=Path("TEST.toml"), text=""), marks, ("green", "blue"), (10, 10))
