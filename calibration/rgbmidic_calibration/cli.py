@@ -290,7 +290,7 @@ def show(file: Annotated[Path, Argument(help="Calibration file.")], picture: Pat
     from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic_calibration import display
-    from rgbmidic_calibration.jobs import CameraEstimate
+    from rgbmidic_calibration.camera import CameraEstimate
     from rgbmidic_calibration.pictures import draw_calibration, draw_camera
 
     if CameraCalibration.is_in(file):
