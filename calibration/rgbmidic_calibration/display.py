@@ -27,12 +27,12 @@ from rgbmidic_calibration.registration import RegistrationEstimate
 def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
     """Print the matrix with its uncertainties, what it means for the noise, and the warnings."""
     table, words = _matrix(estimate.crosstalk)
-    fits = estimate.lights
-    table.add_row("signal, DN", *(f"{fit.signal:.0f}" for fit in fits))
-    table.add_row("captures", *(str(fit.captures) for fit in fits))
-    table.add_row("blocks used, %", *(f"{100 * fit.used:.0f}" for fit in fits))
-    table.add_row("varies over field, rms", *(f"{fit.variation.rms:.5f}" for fit in fits))
-    table.add_row("  by chance, p", *(f"{fit.variation.p_value:.2g}" for fit in fits))
+    fits, variations = estimate.lights, estimate.variations
+    table.add_row("signal, DN", *(f"{fit.level:.0f}" for fit in fits))
+    table.add_row("captures", *(str(len(fit.weights)) for fit in fits))
+    table.add_row("blocks used, %", *(f"{100 * fit.weights.mean():.0f}" for fit in fits))
+    table.add_row("varies over field, rms", *(f"{found.rms:.5f}" for found in variations))
+    table.add_row("  by chance, p", *(f"{found.p_value:.2g}" for found in variations))
     table.add_row("strength drift, %", *(f"{100 * fit.intensity_drift:.2f}" for fit in fits))
     _print([*_marked(estimate.warnings), table, words, _written(out)])
 

@@ -47,7 +47,8 @@ def calibrate_crosstalk(
         "block": block,
         "waived_checks": list(allow),
         "variation_over_field": {
-            fit.name: {"p_value": fit.variation.p_value, "rms": fit.variation.rms} for fit in estimate.lights
+            name: {"p_value": found.p_value, "rms": found.rms}
+            for name, found in zip(means, estimate.variations, strict=True)
         },
     }
     return _calibration("crosstalk", captures.groups, uneven, details, estimate), estimate
