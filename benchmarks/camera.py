@@ -24,7 +24,6 @@ import cv2
 import numpy as np
 from target_scene import LENS, SHAPE, imaged, on_plane, pose, random_views, view_of
 
-from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic_calibration.camera import estimate_lens, estimate_plane
@@ -57,12 +56,11 @@ def draw(random: np.random.Generator) -> tuple[dict[str, float], dict[str, tuple
     lens, (tilt, about) = LENS.copy(), random.uniform([0, 0], [5, 2 * np.pi])
     lens[3] = random.uniform(-0.02, 0.02) / (np.hypot(*SHAPE) / 2 / lens[0]) ** 2
     where = pose(tilt * np.cos(about), tilt * np.sin(about), random.uniform(-5, 5))
-    found = estimate_lens(random_views(random, VIEWS, lens=lens, noise=NOISE))
-    std = np.sqrt(np.diag(found.covariance))
+    found = estimate_lens(random_views(random, VIEWS, lens=lens, noise=NOISE)).camera
+    std = np.sqrt(np.diag(found.covariance))[:8]
     names = ("f", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     off = {name: (a - b) / s for name, a, b, s in zip(names, found.lens, lens, std, strict=True) if s > 0}
-    camera = CameraCalibration(shape=SHAPE, lens=found.lens, covariance=np.pad(found.covariance, (0, 8)))
-    camera = estimate_plane(view_of(where, random, lens=lens, noise=NOISE), camera).camera
+    camera = estimate_plane(view_of(where, random, lens=lens, noise=NOISE), found).camera
     seen, seen_std = camera.tilt_deg
     off["tilt"] = (seen - np.degrees(np.arccos(where[0][2, 2]))) / seen_std
     ends = np.array([[40.0, 40], [600, 60], [580, 440], [60, 420]])
@@ -104,15 +102,16 @@ def pictures(folder: Path) -> None:
         )  # fmt: skip
         rows = {"OpenCV, its corners": (rms / np.sqrt(2), np.r_[matrix[0, 0], matrix[:2, 2], distortion.ravel()[:5]])}
         fit = estimate_lens(ours)
-        rows |= {"find_view": (fit.rms, fit.lens), "  stated": (np.nan, np.sqrt(np.diag(fit.covariance)))}
-        rows |= {f"{name} half": (half.rms, half.lens) for name, half in
-                 {"one": estimate_lens(ours[::2]), "other": estimate_lens(ours[1::2])}.items()}  # fmt: skip
+        halves = {"one half": estimate_lens(ours[::2]), "other half": estimate_lens(ours[1::2])}
+        for name, found in {"find_view": fit, **halves}.items():
+            rows[name] = (found.camera.details["lens"]["rms_px"], found.camera.lens)
+        rows["find_view, stated"] = (np.nan, np.sqrt(np.diag(fit.camera.covariance))[:8])
         if side in PUBLISHED:
             rows["published"] = (0.3926 / np.sqrt(2), np.array(PUBLISHED[side]))
         for name, (rms, values) in rows.items():
             print(f"{name:20s} {rms:7.3f}  {values[0]:8.2f} {values[1]:8.2f} {values[2]:8.2f}",
                   *(f"{value:9.5f}" for value in values[3:]))  # fmt: skip
-        print("rms of every picture:", *(f"{np.sqrt((part**2).mean()):.3f}" for part in fit.residuals))
+        print("rms of every picture:", *(f"{np.sqrt((part**2).mean()):.3f}" for _, part in fit.residuals))
 
 
 @cache

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -64,39 +65,23 @@ def covered(points: Sequence[FloatArray], shape: tuple[int, int]) -> float:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LensEstimate:
-    """Result of `estimate_lens`.
+class CameraEstimate:
+    """Result of `estimate_lens`, `estimate_plane` and `rgbmidic_calibration.jobs.calibrate_camera`.
 
     Attributes
     ----------
-    lens : ndarray, shape (8,)
-        `rgbmidic.fields.plane.LENS_PARAMETERS`; those not taken up are 0.
-    covariance : ndarray, shape (8, 8)
-        Of them.
-    residuals : tuple of ndarray, shape (m, 2)
-        Of the points of each view, px.
-    rms : float
-        Root mean square of their components, px.
-    angle : float
-        Largest angle between two views, degrees.
-    covered : float
-        Fraction of the frame within the hull of all points.
-    tests : mapping
-        p value of every distortion term that was tried.
-    warnings : tuple of str
+    camera : CameraCalibration
+        What is written. Its `details` state ``"lens"`` (views, residual, largest angle between two of them, p values of
+        the distortion terms that were tried), ``"plane"`` (residual, scale, tilt) and ``"warnings"``.
+    residuals : tuple of (ndarray, ndarray), each of shape (m, 2)
+        Points of every photograph and their residuals, px.
     """
 
-    lens: FloatArray
-    covariance: FloatArray
-    residuals: tuple[FloatArray, ...]
-    rms: float
-    angle: float
-    covered: float
-    tests: dict[str, float]
-    warnings: tuple[str, ...] = ()
+    camera: CameraCalibration
+    residuals: tuple[tuple[FloatArray, FloatArray], ...] = ()
 
 
-def estimate_lens(views: Sequence[View], rejected: Sequence[str] = ()) -> LensEstimate:
+def estimate_lens(views: Sequence[View], rejected: Sequence[str] = ()) -> CameraEstimate:
     """Calibrate a lens by the target's points in several views.
 
     The pixels are square. Circles are corrected by `_centre_offset`, as a first fit places them. Distortion terms are
@@ -213,19 +198,19 @@ def _centred(views: Sequence[View], fit: _Fit) -> list[View]:
     return [replace(view, pixels=centres(view, pose)) for view, pose in zip(views, fit.poses, strict=True)]
 
 
-def _concluded(views: Sequence[View], fit: _Fit, tests: dict[str, float], warnings: list[str]) -> LensEstimate:
+def _concluded(views: Sequence[View], fit: _Fit, tests: dict[str, float], warnings: list[str]) -> CameraEstimate:
     """Covariance, residuals and checks of the chosen fit; the poses are eliminated view by view."""
     active = np.ix_(*[np.flatnonzero(np.r_[True, True, True, fit.lens[3:] != 0])] * 2)
     normal, residuals = np.zeros((8, 8)), []
     for view, pose in zip(views, fit.poses, strict=True):
         there, slopes = fit.image(view.points, *pose)
-        residuals.append(view.pixels - there)
+        residuals.append((view.pixels, view.pixels - there))
         by_pose, by_lens = slopes[:, :6], np.c_[slopes[:, 6] + slopes[:, 7], slopes[:, 8:15]]
         free = by_lens - by_pose @ np.linalg.lstsq(by_pose, by_lens, rcond=None)[0]
         normal += free.T @ free
-    squares = sum(float((residual**2).sum()) for residual in residuals)
+    squares = sum(float((off**2).sum()) for _, off in residuals)
     count = 2 * sum(len(view.points) for view in views)
-    covariance = np.zeros((8, 8))
+    covariance = np.zeros((16, 16))
     covariance[active] = np.linalg.inv(normal[active]) * squares / (count - fit.unknowns)
     normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn, _ in fit.poses])
     angle = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1, 1))))
@@ -234,7 +219,7 @@ def _concluded(views: Sequence[View], fit: _Fit, tests: dict[str, float], warnin
             f"all views are parallel within {angle:.1f} degrees: the focal length needs views that differ by "
             f"{LIMITS.least_angle:g} degrees at least; tilt the target by 20 to 40 degrees about both axes"
         )
-    rms, sizes = float(np.sqrt(squares / count)), np.array([np.sqrt((residual**2).mean()) for residual in residuals])
+    rms, sizes = float(np.sqrt(squares / count)), np.array([np.sqrt((off**2).mean()) for _, off in residuals])
     if rms > LIMITS.largest_residual:
         raise CalibrationError(
             f"the points are off by {rms:.2f} px rms, at most {LIMITS.largest_residual:g} is what a flat, rigid "
@@ -252,28 +237,20 @@ def _concluded(views: Sequence[View], fit: _Fit, tests: dict[str, float], warnin
         for view, size in zip(views, sizes, strict=True)
         if size > LIMITS.outlying * np.median(sizes)
     ]
-    return LensEstimate(
-        lens=fit.lens,
-        covariance=covariance,
-        residuals=tuple(residuals),
-        rms=rms,
-        angle=angle,
-        covered=seen,
-        tests=tests,
-        warnings=tuple(warnings),
+    details = {
+        "views": [view.name for view in views],
+        "rms_px": rms,
+        "largest_angle_deg": angle,
+        "covered": seen,
+        "p_values": tests,
+    }
+    camera = CameraCalibration(
+        shape=views[0].shape, lens=fit.lens, covariance=covariance, details={"lens": details, "warnings": warnings}
     )
+    return CameraEstimate(camera=camera, residuals=tuple(residuals))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlaneEstimate:
-    """Result of `estimate_plane`: the camera with its plane, the residual (m, 2) of the points in px, its rms."""
-
-    camera: CameraCalibration
-    residual: FloatArray
-    rms: float
-
-
-def estimate_plane(view: View, camera: CameraCalibration, std: float | None = None) -> PlaneEstimate:
+def estimate_plane(view: View, camera: CameraCalibration, std: float | None = None) -> CameraEstimate:
     """Fit the plane to the target's points in one photograph.
 
     Parameters
@@ -347,4 +324,15 @@ def estimate_plane(view: View, camera: CameraCalibration, std: float | None = No
         covariance[:8, 8:] = covariance[8:, :8].T
         covariance[8:, 8:] += follows @ known @ follows.T
     plane = replace(camera, homography=np.r_[entries, 1.0].reshape(3, 3), covariance=covariance)
-    return PlaneEstimate(camera=plane, residual=residual.reshape(-1, 2), rms=rms)
+    details = {**camera.details, **_plane_details(plane, view, rms)}
+    return CameraEstimate(camera=replace(plane, details=details), residuals=((view.pixels, residual.reshape(-1, 2)),))
+
+
+def _plane_details(camera: CameraCalibration, view: View, rms: float) -> dict[str, Any]:
+    names = ("mm_per_pixel", "mm_per_pixel_std", "tilt_deg", "tilt_std_deg")
+    figures = zip(names, (*camera.scale(camera.centre), *camera.tilt_deg), strict=True)
+    known = {name: value for name, value in figures if np.isfinite(value)}
+    warnings = list(camera.details.get("warnings", ()))
+    if (hull := covered([view.pixels], view.shape)) < LIMITS.covered / 2:
+        warnings.append(f"the target covers {hull:.0%} of the frame on the plane: beyond it the plane is extrapolated")
+    return {"plane": {"photograph": view.name, "rms_px": rms, **known}, "warnings": warnings}

@@ -232,9 +232,9 @@ def check(
 
     limits, calibration = read_limits(limit or ()), Calibration.read(file)
     found = captures(calibration=calibration, together=named_patterns(together or (), "--together"))
-    verdict = check_calibration(calibration, found, limits=limits, region=_region(region))
-    display.verdict(verdict)
-    if not verdict.passed:
+    checks = check_calibration(calibration, found, limits=limits, region=_region(region))
+    display.verdict(checks)
+    if not all(one.passed for one in checks):
         raise typer.Exit(1)
 
 
@@ -290,7 +290,7 @@ def show(file: Annotated[Path, Argument(help="Calibration file.")], picture: Pat
     from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic_calibration import display
-    from rgbmidic_calibration.jobs import CameraEstimate
+    from rgbmidic_calibration.camera import CameraEstimate
     from rgbmidic_calibration.pictures import draw_calibration, draw_camera
 
     if CameraCalibration.is_in(file):

@@ -103,11 +103,13 @@ class LightSignal:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ColumnFit:
-    """A column of A as a polynomial over the field.
+class LightFit:
+    """A light's column of A as a polynomial over the field.
 
     Attributes
     ----------
+    signal : LightSignal
+        What it was fitted to.
     coefficients : ndarray, shape (T, C)
         Per Legendre product and channel; (1, 0, 0 ...) in the reference channel.
     covariance : ndarray, shape (T, C, T, C)
@@ -118,19 +120,38 @@ class ColumnFit:
         1 for the blocks used, 0 for the others.
     residual : ndarray, shape (N, C, R, S)
         y - a x of the blocks used, 0 elsewhere.
-    mass : ndarray, shape (N,)
-        Sum of the reference channel over the blocks used, per capture.
     """
 
+    signal: LightSignal
     coefficients: FloatArray
     covariance: FloatArray
     leverage: FloatArray
     weights: FloatArray
     residual: FloatArray
-    mass: FloatArray
+
+    @property
+    def mass(self) -> FloatArray:
+        """Sum (N,) of the reference channel over the blocks used, per capture."""
+        return np.asarray((self.weights * self.signal.base).sum(axis=(1, 2)))
+
+    @property
+    def level(self) -> float:
+        """Mean grey level (DN above dark) of the reference channel in the blocks used."""
+        return float(self.mass.sum() / self.weights.sum(axis=(1, 2)).sum())
+
+    @property
+    def rejected(self) -> float:
+        """Fraction of the blocks that were left out as outliers."""
+        return float((self.signal.valid & (self.weights == 0)).mean())
+
+    @property
+    def intensity_drift(self) -> float:
+        """Range of the light's strength over the captures, relative to its mean."""
+        strength = self.mass / np.maximum(self.weights.sum(axis=(1, 2)), 1)
+        return float(np.ptp(strength) / strength.mean())
 
 
-def fit_column(signal: LightSignal, design: FloatArray) -> ColumnFit:
+def fit_column(signal: LightSignal, design: FloatArray) -> LightFit:
     """Fit one light's column of A by ratios of sums (equation of the module), without outliers.
 
     Parameters
@@ -150,13 +171,13 @@ def fit_column(signal: LightSignal, design: FloatArray) -> ColumnFit:
     total = np.einsum("nrs,rst->t", weights, design)
     lever = np.einsum("tu,u,cd->tcd", inverse, total, np.eye(channels))
     lever[:, :, signal.reference] -= inverse @ _moment(weights, design) @ coefficients
-    return ColumnFit(
+    return LightFit(
+        signal=signal,
         coefficients=coefficients,
         covariance=np.einsum("tu,ucvd,wv->tcwd", inverse, spread, inverse),
         leverage=lever,
         weights=weights,
         residual=residual,
-        mass=(weights * signal.base).sum(axis=(1, 2)),
     )
 
 
@@ -249,7 +270,7 @@ def variation(signal: LightSignal, design: FloatArray, known: int) -> Variation:
     )
 
 
-def capture_scatter(fit: ColumnFit, significance: float = 0.01) -> FloatArray:
+def capture_scatter(fit: LightFit, significance: float = 0.01) -> FloatArray:
     """Variance (C,) of the entries between captures beyond their noise; zero where an F test finds none.
 
     The noise comes from the residuals' departures from the mean over the captures, where the target's texture cancels.
@@ -266,12 +287,13 @@ def capture_scatter(fit: ColumnFit, significance: float = 0.01) -> FloatArray:
     return np.where(scatter > limit * noise, scatter - noise, 0.0)
 
 
-def offsets_left(signal: LightSignal, weights: FloatArray, design: FloatArray) -> tuple[FloatArray, FloatArray]:
+def offsets_left(fit: LightFit, design: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Grey level (C,) that every channel keeps where the light is absent, and its standard uncertainty.
 
     ``y = x a + o`` with the other captures' x as instrument for the slope: their noise is independent. NaN for fewer
     than two captures. The offset of a dark level that is right is zero; on a plain target it is poorly determined.
     """
+    signal = fit.signal
     count, channels = signal.values.shape[:2]
     offset, std = np.full((2, channels), np.nan)
     if count < 2:
@@ -279,7 +301,7 @@ def offsets_left(signal: LightSignal, weights: FloatArray, design: FloatArray) -
     base = signal.base
     others = (base.sum(axis=0) - base) / (count - 1)
     instruments = [np.broadcast_to(design, (count, *design.shape)), others[..., None]]
-    left = weights[..., None] * np.concatenate(instruments, axis=-1)
+    left = fit.weights[..., None] * np.concatenate(instruments, axis=-1)
     right = np.concatenate([base[..., None] * design, np.ones((*base.shape, 1))], axis=-1)
     inverse = np.linalg.inv(np.einsum("nrsi,nrsj->ij", left, right))
     for channel in signal.others:
@@ -291,51 +313,24 @@ def offsets_left(signal: LightSignal, weights: FloatArray, design: FloatArray) -
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LightFit:
-    """Fit of one light's column of A, with its diagnostics.
+class CrosstalkEstimate:
+    """Result of `estimate_crosstalk`.
 
     Attributes
     ----------
-    name : str
-    reference : int
-        Channel that sees the light best.
-    column : ndarray, shape (C,)
-        Column of A; 1 in the reference channel.
-    signal : float
-        Mean grey level (DN above dark) of the reference channel in the blocks used.
-    used, rejected : float
-        Fractions of the blocks that were used, and left out as outliers.
-    intensity_drift : float
-        Range of the light's strength over the captures, relative to its mean.
-    colour_drift : float
-        Largest scatter (standard deviation) of an entry between captures beyond their noise.
-    offset, offset_std : ndarray, shape (C,)
-        Grey level that remains where the light is absent, and its uncertainty (`offsets_left`).
-    variation : Variation
-        The test whether the column varies over the field.
-    captures : int
+    crosstalk : Crosstalk
+        The matrix.
+    lights : tuple of LightFit
+        The fit of every light.
+    variations : tuple of Variation
+        The test of every light whether its column varies over the field.
+    warnings : tuple of str
+        What the user should know.
     """
-
-    name: str
-    reference: int
-    column: FloatArray
-    signal: float
-    used: float
-    rejected: float
-    intensity_drift: float
-    colour_drift: float
-    offset: FloatArray
-    offset_std: FloatArray
-    variation: Variation
-    captures: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CrosstalkEstimate:
-    """Result of `estimate_crosstalk`: the matrix, the fit of every light, and what the user should know."""
 
     crosstalk: Crosstalk
     lights: tuple[LightFit, ...]
+    variations: tuple[Variation, ...]
     warnings: tuple[str, ...]
 
 
@@ -385,17 +380,13 @@ def estimate_crosstalk(
         of_mean = of_frame / len(frames)
     signals = [_above_dark(name, captures, level) for name, captures in lights.items()]
     asked = legendre_products(centres, shape, LIMITS.automatic_order)
-    tests = [_needed_degree(signal, asked) for signal in signals]
-    order = max(needed for needed, _ in tests) if order is None else order
+    needed, variations = zip(*(_needed_degree(signal, asked) for signal in signals), strict=True)
+    order = max(needed) if order is None else order
     design = legendre_products(centres, shape, order)
-    columns = [fit_column(signal, design) for signal in signals]
-    fits = tuple(
-        _summary(signal, column, test, design)
-        for signal, column, (_, test) in zip(signals, columns, tests, strict=True)
-    )
-    warnings += judged(matrix_checks(fits), allow)
-    matrices = np.stack([fit.coefficients for fit in columns], axis=-1)
-    covariance = _covariance(columns, of_mean, of_frame)
+    fits = tuple(fit_column(signal, design) for signal in signals)
+    warnings += judged(matrix_checks(fits, design), allow)
+    matrices = np.stack([fit.coefficients for fit in fits], axis=-1)
+    covariance = _covariance(fits, of_mean, of_frame)
     field, size = None, matrices[0].size
     if order:
         std = np.sqrt(np.einsum("tcktck->tck", covariance))
@@ -403,7 +394,7 @@ def estimate_crosstalk(
     crosstalk = Crosstalk(
         matrix=matrices[0], lights=tuple(lights), covariance=covariance[0, :, :, 0].reshape(size, size), field=field
     )
-    return CrosstalkEstimate(crosstalk=crosstalk, lights=fits, warnings=tuple(warnings))
+    return CrosstalkEstimate(crosstalk=crosstalk, lights=fits, variations=variations, warnings=tuple(warnings))
 
 
 def _above_dark(name: str, captures: Sequence[BlockMeans], dark: FloatArray) -> LightSignal:
@@ -427,27 +418,7 @@ def _needed_degree(signal: LightSignal, design: FloatArray) -> tuple[int, Variat
     return LIMITS.automatic_order, tests[0]
 
 
-def _summary(signal: LightSignal, fit: ColumnFit, found: Variation, design: FloatArray) -> LightFit:
-    count = fit.weights.sum(axis=(1, 2))
-    strength = fit.mass / np.maximum(count, 1)
-    offset, offset_std = offsets_left(signal, fit.weights, design)
-    return LightFit(
-        name=signal.name,
-        reference=signal.reference,
-        column=fit.coefficients[0],
-        signal=float(fit.mass.sum() / count.sum()),
-        used=float((fit.weights > 0).mean()),
-        rejected=float((signal.valid & (fit.weights == 0)).mean()),
-        intensity_drift=float(np.ptp(strength) / strength.mean()),
-        colour_drift=float(np.sqrt(capture_scatter(fit).max())),
-        offset=offset,
-        offset_std=offset_std,
-        variation=found,
-        captures=len(signal.values),
-    )
-
-
-def _covariance(columns: Sequence[ColumnFit], of_mean: FloatArray, of_frame: FloatArray) -> FloatArray:
+def _covariance(columns: Sequence[LightFit], of_mean: FloatArray, of_frame: FloatArray) -> FloatArray:
     """Covariance (T, C, k, T, C, k) of all coefficients.
 
     The error of the dark frames' mean (covariance `of_mean`) is common to all blocks and lights, that of one frame's
@@ -464,37 +435,38 @@ def _covariance(columns: Sequence[ColumnFit], of_mean: FloatArray, of_frame: Flo
     return full
 
 
-def matrix_checks(fits: Sequence[LightFit]) -> Iterator[Check]:
+def matrix_checks(fits: Sequence[LightFit], design: FloatArray) -> Iterator[Check]:
     """Check the fitted columns: the right channel for each light's name, one light per channel, quiet lamps.
 
     The condition number of three LEDs on nine measured cameras is 1.6 to 2.5 (calibration/README.md).
     """
-    lower = [fit.name.lower() for fit in fits]
+    signals = [fit.signal for fit in fits]
+    lower = [signal.name.lower() for signal in signals]
     if all(name in (*COLOURS, "r", "g", "b") for name in lower):  # single letters count where all names are colours
         lower = [COLOURS["rgb".index(name[0])] for name in lower]
-    for fit, name in zip(fits, lower, strict=True):
-        if name in COLOURS and name != COLOURS[fit.reference]:
+    for signal, name in zip(signals, lower, strict=True):
+        if name in COLOURS and name != COLOURS[signal.reference]:
             text = (
-                f"light {fit.name} is seen best by the {COLOURS[fit.reference]} channel: are the captures of two "
+                f"light {signal.name} is seen best by the {COLOURS[signal.reference]} channel: are the captures of two "
                 "lights swapped, or is the colour filter array (--cfa) another one?"
             )
             yield Check("name", text)
-    for index, fit in enumerate(fits):
-        for twin in [other for other in fits[:index] if other.reference == fit.reference][:1]:
+    for index, signal in enumerate(signals):
+        for twin in [other for other in signals[:index] if other.reference == signal.reference][:1]:
             text = (
-                f"lights {twin.name} and {fit.name} are both seen best by the {COLOURS[fit.reference]} channel: did "
-                "the same lamp shine in both captures?"
+                f"lights {twin.name} and {signal.name} are both seen best by the {COLOURS[signal.reference]} channel: "
+                "did the same lamp shine in both captures?"
             )
             yield Check("same-channel", text)
     for fit in fits:
-        yield from _fit_checks(fit)
-    condition = float(np.linalg.cond(np.column_stack([fit.column for fit in fits])))
+        yield from _fit_checks(fit, design)
+    condition = float(np.linalg.cond(np.column_stack([fit.coefficients[0] for fit in fits])))
     text = (
         f"the matrix has condition number {condition:.1f}: unmixing amplifies noise strongly. Are two lamps close in "
         "colour, or did a second lamp or daylight shine in the captures of one?"
     )
     yield warning(text, condition, above=6.0)
-    unseen = [colour for c, colour in enumerate(COLOURS) if c not in {fit.reference for fit in fits}]
+    unseen = [colour for c, colour in enumerate(COLOURS) if c not in {signal.reference for signal in signals}]
     text = (
         f"no light is seen best by the {' and '.join(unseen)} channel: if such a lamp shines during the test it must "
         "be calibrated too"
@@ -502,25 +474,26 @@ def matrix_checks(fits: Sequence[LightFit]) -> Iterator[Check]:
     yield warning(text, len(unseen) if len(fits) < 3 else 0)
 
 
-def _fit_checks(fit: LightFit) -> Iterator[Check]:
-    light = f"light {fit.name}: "
+def _fit_checks(fit: LightFit, design: FloatArray) -> Iterator[Check]:
+    light = f"light {fit.signal.name}: "
+    drift, scatter = fit.intensity_drift, float(np.sqrt(capture_scatter(fit).max()))
     text = (
-        f"its strength differs by {100 * fit.intensity_drift:.1f} % between captures: let the lamp warm up (the matrix "
-        "does not suffer)"
+        f"its strength differs by {100 * drift:.1f} % between captures: let the lamp warm up (the matrix does not "
+        "suffer)"
     )
     # captures that differ by 30 % are an exposure series, which is meant
-    yield warning(light + text, fit.intensity_drift if fit.intensity_drift < 0.30 else 0.0, above=0.05)
+    yield warning(light + text, drift if drift < 0.30 else 0.0, above=0.05)
     text = (
-        f"its colour drifts between captures (entries scatter by {fit.colour_drift:.2g} beyond noise); the stated "
-        "uncertainty covers it"
+        f"its colour drifts between captures (entries scatter by {scatter:.2g} beyond noise); the stated uncertainty "
+        "covers it"
     )
-    yield warning(light + text, fit.colour_drift, above=LIMITS.tolerance)
+    yield warning(light + text, scatter, above=LIMITS.tolerance)
     # .2 % of the signal leaks as much, of the order of what `check` allows (`verify.Limits.leakage`)
-    left = np.abs(fit.offset)
-    left = np.where((left > 5 * fit.offset_std) & (left > 0.002 * fit.signal), left, 0)
+    offset, std = offsets_left(fit, design)
+    left = np.where((np.abs(offset) > 5 * std) & (np.abs(offset) > 0.002 * fit.level), np.abs(offset), 0)
     channel = int(left.argmax())
     text = (
-        f"the {COLOURS[channel]} channel keeps {fit.offset[channel]:+.1f} DN where the light is absent: dark frames of "
+        f"the {COLOURS[channel]} channel keeps {offset[channel]:+.1f} DN where the light is absent: dark frames of "
         "other settings or another ambient light, or a camera that is not linear"
     )
     yield warning(light + text, left[channel])

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from rgbmidic.fields.plane import LENS_PARAMETERS, CameraCalibration
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.checks import Check, reported
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise
@@ -21,18 +22,17 @@ from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
 from rgbmidic_calibration.design import Design
 from rgbmidic_calibration.noise import NoiseEstimate
 from rgbmidic_calibration.registration import RegistrationEstimate
-from rgbmidic_calibration.verify import Verdict
 
 
 def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
     """Print the matrix with its uncertainties, what it means for the noise, and the warnings."""
     table, words = _matrix(estimate.crosstalk)
-    fits = estimate.lights
-    table.add_row("signal, DN", *(f"{fit.signal:.0f}" for fit in fits))
-    table.add_row("captures", *(str(fit.captures) for fit in fits))
-    table.add_row("blocks used, %", *(f"{100 * fit.used:.0f}" for fit in fits))
-    table.add_row("varies over field, rms", *(f"{fit.variation.rms:.5f}" for fit in fits))
-    table.add_row("  by chance, p", *(f"{fit.variation.p_value:.2g}" for fit in fits))
+    fits, variations = estimate.lights, estimate.variations
+    table.add_row("signal, DN", *(f"{fit.level:.0f}" for fit in fits))
+    table.add_row("captures", *(str(len(fit.weights)) for fit in fits))
+    table.add_row("blocks used, %", *(f"{100 * fit.weights.mean():.0f}" for fit in fits))
+    table.add_row("varies over field, rms", *(f"{found.rms:.5f}" for found in variations))
+    table.add_row("  by chance, p", *(f"{found.p_value:.2g}" for found in variations))
     table.add_row("strength drift, %", *(f"{100 * fit.intensity_drift:.2f}" for fit in fits))
     _print([*_marked(estimate.warnings), table, words, _written(out)])
 
@@ -75,22 +75,20 @@ def camera(found: CameraCalibration, file: Path, *, written: bool = True) -> Non
     _print([*parts, _written(file) if written else escape(str(file))])
 
 
-def verdict(result: Verdict) -> None:
+def verdict(checks: Sequence[Check]) -> None:
     """Print every figure with its limit, and the verdict."""
     table = _table("Check of the calibration", ("figure", "value", "limit", ""))
-    for item in result.items:
-        figure = uncertain(item.value, item.std, item.unit)
+    figures = [check for check in checks if check.name]
+    for item in figures:
         word = "[green]passed[/]" if item.passed else "[bold red]failed[/]"
+        figure = uncertain(item.value, item.std, item.unit)
         table.add_row(escape(item.name), figure, f"{item.limit:g} {item.unit}", word)
-    sums = (
-        f"{'+'.join(total.lights)} minus the sum of the single captures: {total.mean:+.2f} DN on average, scatter "
-        f"{total.spread:.2f} DN where noise explains {total.noise:.2f} DN; offset {total.offset:+.2f} DN"
-        for total in result.sums
-    )
-    skipped = (f"[dim]{escape(text)}[/]" for text in result.skipped)
-    failed = sum(not item.passed for item in result.items)
-    words = f"[bold red]FAILED[/]: {failed} of {len(result.items)} figures break their limit"
-    _print([*_marked(result.warnings), table, *sums, *skipped, "[bold green]PASSED[/]" if result.passed else words])
+    doubts = [check.text for check in reported(checks) if not check.name]
+    sums = (escape(item.text) for item in figures if item.text)
+    skipped = (f"[dim]{escape(check.text)}[/]" for check in checks if not check.name and check.text not in doubts)
+    failed = sum(not item.passed for item in figures)
+    words = f"[bold red]FAILED[/]: {failed} of {len(figures)} figures break their limit"
+    _print([*_marked(doubts), table, *sums, *skipped, words if failed else "[bold green]PASSED[/]"])
 
 
 def designs(found: Sequence[Design]) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,7 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.unevenness import unevenness
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings
-from rgbmidic.typing import FloatArray
-from rgbmidic_calibration.camera import LIMITS, covered, estimate_lens, estimate_plane
+from rgbmidic_calibration.camera import LIMITS, CameraEstimate, estimate_lens, estimate_plane
 from rgbmidic_calibration.captures import BlockMeans, CaptureFiles, Captures, block_means, provenance
 from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk
 from rgbmidic_calibration.noise import NoiseEstimate, photon_transfer
@@ -48,7 +47,8 @@ def calibrate_crosstalk(
         "block": block,
         "waived_checks": list(allow),
         "variation_over_field": {
-            fit.name: {"p_value": fit.variation.p_value, "rms": fit.variation.rms} for fit in estimate.lights
+            name: {"p_value": found.p_value, "rms": found.rms}
+            for name, found in zip(means, estimate.variations, strict=True)
         },
     }
     return _calibration("crosstalk", captures.groups, uneven, details, estimate), estimate
@@ -145,14 +145,6 @@ def _calibration(
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraEstimate:
-    """Result of `calibrate_camera`: what is written, and of every photograph the points and their residuals, px."""
-
-    camera: CameraCalibration
-    residuals: tuple[tuple[FloatArray, FloatArray], ...] = ()
-
-
 def read_corners(corners: str, size: str, std: float, shape: tuple[int, int]) -> View:
     """Read the corners of a rectangle on the specimen, in px, and its two sides in mm.
 
@@ -237,26 +229,18 @@ def calibrate_camera(
         raise ConfigurationError("--views calibrate a lens, --lens takes one from a file: state one of them")
     if plane and corners:
         raise ConfigurationError("--plane and --corners both state the plane: state one of them")
-    details: dict[str, Any] = {} if lens is None else {"lens": dict(lens.details).get("lens")}
-    groups, residuals, warnings = list[CaptureFiles](), list[tuple[FloatArray, FloatArray]](), list[str]()
+    groups, parts = list[CaptureFiles](), list[CameraEstimate]()
     # of an earlier calibration the lens, its plane left out
-    camera = lens and replace(lens, homography=None, covariance=np.pad(lens.covariance[:8, :8], (0, 8)))
+    camera = lens and replace(
+        lens,
+        homography=None,
+        covariance=np.pad(lens.covariance[:8, :8], (0, 8)),
+        details={"lens": lens.details.get("lens")},
+    )
     if views and target:
         groups.append(CaptureFiles.find("views", views, stated))
-        found, reasons = find_views(groups[-1], target)
-        estimate = estimate_lens(found, reasons)
-        warnings += estimate.warnings
-        residuals += [(view.pixels, off) for view, off in zip(found, estimate.residuals, strict=True)]
-        camera = CameraCalibration(
-            shape=found[0].shape, lens=estimate.lens, covariance=np.pad(estimate.covariance, (0, 8))
-        )
-        details["lens"] = {
-            "views": [view.name for view in found],
-            "rms_px": estimate.rms,
-            "largest_angle_deg": estimate.angle,
-            "covered": estimate.covered,
-            "p_values": estimate.tests,
-        }
+        parts.append(estimate_lens(*find_views(groups[-1], target)))
+        camera = parts[-1].camera
     view = None
     if plane and target:
         groups.append(CaptureFiles.find("plane", plane, stated))
@@ -267,20 +251,13 @@ def calibrate_camera(
             raise ConfigurationError("--corners need the frames' size: --shape ROWSxCOLUMNS, or --lens")
         view = read_corners(*corners, shape)
     if view is not None:
-        fitted = estimate_plane(view, camera or CameraCalibration(shape=view.shape), corners[2] if corners else None)
-        camera = fitted.camera
-        residuals.append((view.pixels, fitted.residual))
-        names = ("mm_per_pixel", "mm_per_pixel_std", "tilt_deg", "tilt_std_deg")
-        figures = zip(names, (*camera.scale(camera.centre), *camera.tilt_deg), strict=True)
-        known = {name: value for name, value in figures if np.isfinite(value)}
-        details["plane"] = {"photograph": view.name, "rms_px": fitted.rms, **known}
-        if (hull := covered([view.pixels], view.shape)) < LIMITS.covered / 2:
-            warnings.append(
-                f"the target covers {hull:.0%} of the frame on the plane: beyond it the plane is extrapolated"
-            )
+        camera = camera or CameraCalibration(shape=view.shape)
+        parts.append(estimate_plane(view, camera, corners[2] if corners else None))
+        camera = parts[-1].camera
     assert camera is not None
-    details |= {"warnings": warnings, "provenance": provenance("camera", groups, {})}
-    return CameraEstimate(camera=replace(camera, details=details), residuals=tuple(residuals))
+    details = {**camera.details, "provenance": provenance("camera", groups, {})}
+    residuals = tuple(points for part in parts for points in part.residuals)
+    return CameraEstimate(camera=replace(camera, details=details), residuals=residuals)
 
 
 def _mean_view(files: CaptureFiles, target: Target) -> View:

@@ -15,9 +15,9 @@ from rgbmidic.illumination.crosstalk import Crosstalk, Sensitivities
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise
 from rgbmidic.report.style import literal
+from rgbmidic_calibration.camera import CameraEstimate
 from rgbmidic_calibration.crosstalk import CHANNELS
 from rgbmidic_calibration.design import Design, Lamp
-from rgbmidic_calibration.jobs import CameraEstimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

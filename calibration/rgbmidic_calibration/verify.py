@@ -13,11 +13,10 @@ import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.checks import Check
+from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
-from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.captures import (
     TILE,
     BlockMeans,
@@ -57,43 +56,15 @@ class Limits:
     noise: float = 10.0
 
 
-def _line(name: str, value: float, std: float, limit: float, unit: str = "%") -> Check:
-    """A line of the verdict."""
-    return Check(name, "", value=value, limit=limit, std=std, unit=unit)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Leakage:
-    """Fraction of light j (column) that unmixing leaves in the image of light i (row).
-
-    Attributes
-    ----------
-    lights : tuple of str, length k
-        Lights of the calibration.
-    alone : tuple of str, length m
-        Lights that were captured alone.
-    mean, std : ndarray, shape (k, m)
-        Ratio of the sums over the field, and its standard uncertainty; the light itself gives 1.
-    """
-
-    lights: tuple[str, ...]
-    alone: tuple[str, ...]
-    mean: FloatArray
-    std: FloatArray
-
-    def items(self, limit: float) -> list[Check]:
-        """One line per pair of lights."""
-        return [
-            _line(f"{alone} left in {light}", 100 * self.mean[row, column], 100 * self.std[row, column], limit)
-            for column, alone in enumerate(self.alone)
-            for row, light in enumerate(self.lights)
-            if light != alone
-        ]
+LIMITS = Limits()
 
 
 def leakage(
-    crosstalk: Crosstalk, lights: Mapping[str, Sequence[BlockMeans]], dark: Sequence[BlockMeans] = ()
-) -> Leakage:
+    crosstalk: Crosstalk,
+    lights: Mapping[str, Sequence[BlockMeans]],
+    dark: Sequence[BlockMeans] = (),
+    limits: Limits = LIMITS,
+) -> list[Check]:
     """Fraction of a light that unmixing leaves in the images of the other lights, from captures with one light on.
 
     Parameters
@@ -104,6 +75,13 @@ def leakage(
         Block averages of the captures, by light.
     dark
         Block averages of the dark frames; none: the stated black level.
+    limits
+        What may be left.
+
+    Returns
+    -------
+    list of Check
+        For every light that is on and every other one: ratio of the sums over the field and its standard uncertainty.
 
     Raises
     ------
@@ -117,8 +95,8 @@ def leakage(
     level = np.mean([frame.channels for frame in dark], axis=0) if dark else np.float64(0)
     first = next(iter(lights.values()))[0]
     unmixing = crosstalk.unmixing_at(block_centres(first.camera.shape, first.block))
-    mean, std = np.empty((2, len(crosstalk.lights), len(lights)))
-    for column, (name, captures) in enumerate(lights.items()):
+    checks = []
+    for name, captures in lights.items():
         clear = ~np.any([frame.saturated for frame in captures], axis=0)
         if clear.sum() < 4:
             raise CalibrationError(f"light {name}: nearly every block holds saturated samples; shorten the exposure")
@@ -131,10 +109,14 @@ def leakage(
                 f"the captures of light {name} show most light in {crosstalk.lights[brightest]} after unmixing: are "
                 "the captures swapped, was the lamp off, or is the calibration of another camera?"
             )
-        mean[:, column] = values.sum(axis=1) / total
-        scatter = values - mean[:, column, None] * values[lit]
-        std[:, column] = np.sqrt((scatter**2).sum(axis=1)) / total
-    return Leakage(lights=crosstalk.lights, alone=tuple(lights), mean=mean, std=std)
+        mean = values.sum(axis=1) / total
+        std = np.sqrt(((values - mean[:, None] * values[lit]) ** 2).sum(axis=1)) / total
+        checks += [
+            Check(f"{name} left in {light}", "", 100 * mean[row], limits.leakage, std=100 * std[row], unit="%")
+            for row, light in enumerate(crosstalk.lights)
+            if light != name
+        ]
+    return checks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,7 +125,6 @@ class Additivity:
 
     Attributes
     ----------
-    lights : tuple of str, length k
     mean, spread : float
         Mean and standard deviation of the difference over all samples, DN.
     noise : float
@@ -151,31 +132,16 @@ class Additivity:
         not known.
     offset : float
         DN; what a wrong black level leaves.
-    change, change_std : ndarray, shape (k,)
-        Relative change of every light's strength between its own and the common capture.
-    left : float
-        Rms over tiles of what remains, as a fraction of the mean signal, noise taken out.
+    checks : tuple of Check
+        Rms over tiles of what remains, noise taken out, of the mean signal; then of every light the relative change of
+        its strength between its own and the common capture.
     """
 
-    lights: tuple[str, ...]
     mean: float
     spread: float
     noise: float
     offset: float
-    change: FloatArray
-    change_std: FloatArray
-    left: float
-
-    def items(self, limits: Limits) -> list[Check]:
-        """Lines of the verdict."""
-        together = "+".join(self.lights)
-        return [
-            _line(f"{together} not the sum", 100 * self.left, 0.0, limits.additivity),
-            *(
-                _line(f"strength of {name} in {together}", 100 * change, 100 * std, limits.strength)
-                for name, change, std in zip(self.lights, self.change, self.change_std, strict=True)
-            ),
-        ]
+    checks: tuple[Check, ...]
 
 
 def additivity(
@@ -184,6 +150,7 @@ def additivity(
     dark: TemporalStack | None = None,
     *,
     noise: NoiseModel | None = None,
+    limits: Limits = LIMITS,
 ) -> Additivity:
     """Compare captures of several lights together with the sum of their single captures, sample by sample.
 
@@ -200,6 +167,8 @@ def additivity(
         Captures with all lights off; none: the stated black level.
     noise
         Camera noise; None: from the captures where each group has two or more, else rounding to grey levels alone.
+    limits
+        What may be left.
     """
     same_camera([together, *singles.values(), *([dark] if dark else [])])
     level = dark.mean if dark else np.float32(0)
@@ -224,17 +193,19 @@ def additivity(
     score = design * residual[:, None]
     std = np.sqrt(np.diag(inverse @ (score.T @ score) @ inverse))
     signal = float(of_lights.sum(axis=0).mean())
-    left = max(float((residual**2).mean() - variance.mean()), 0.0)
-    return Additivity(
-        lights=tuple(singles),
-        mean=float(samples[0].mean()),
-        spread=float(samples[0].std()),
-        noise=float(np.sqrt(samples[1].mean())),
-        offset=float(solution[0]),
-        change=solution[1:],
-        change_std=std[1:],
-        left=float(np.sqrt(left)) / max(signal, 1e-9),
+    left = np.sqrt(max(float((residual**2).mean() - variance.mean()), 0.0)) / max(signal, 1e-9)
+    mean, spread, explained = float(samples[0].mean()), float(samples[0].std()), float(np.sqrt(samples[1].mean()))
+    names = "+".join(singles)
+    text = (
+        f"{names} minus the sum of the single captures: {mean:+.2f} DN on average, scatter {spread:.2f} DN where noise "
+        f"explains {explained:.2f} DN; offset {solution[0]:+.2f} DN"
     )
+    changes = (
+        Check(f"strength of {name} in {names}", "", 100 * change, limits.strength, std=100 * error, unit="%")
+        for name, change, error in zip(singles, solution[1:], std[1:], strict=True)
+    )
+    checks = (Check(f"{names} not the sum", text, 100 * left, limits.additivity, unit="%"), *changes)
+    return Additivity(mean=mean, spread=spread, noise=explained, offset=float(solution[0]), checks=checks)
 
 
 def _variance(stack: TemporalStack, noise: NoiseModel | None) -> npt.NDArray[np.floating]:
@@ -250,7 +221,8 @@ def registration_left(
     dark: TemporalStack | None = None,
     *,
     region: Sequence[float] | None = None,
-) -> list[tuple[str, float, float]]:
+    limits: Limits = LIMITS,
+) -> list[Check]:
     """Displacement between the lights that the registration leaves in captures of a speckled target.
 
     Parameters
@@ -263,11 +235,14 @@ def registration_left(
         Captures with all lights off; none: the stated black level.
     region
         Rectangle (x0, y0, x1, y1) of the target in px; None: the whole frame.
+    limits
+        What may be left.
 
     Returns
     -------
-    list of (str, float, float)
-        Light, largest displacement left on a grid over the frame (px), and its standard uncertainty there.
+    list of Check
+        For every light after the first the largest displacement left on a grid over the frame, and its standard
+        uncertainty there.
     """
     ordered = {name: lights[name] for name in registration.lights if name in lights}
     found = estimate_registration(ordered, dark, region=region).registration
@@ -279,8 +254,10 @@ def registration_left(
     left = np.linalg.norm(found.displacement(grid) - (known - known[0]), axis=2)
     std = found.displacement_std(grid)
     errors = np.zeros_like(left) if std is None else np.linalg.norm(std, axis=2)
-    worst = [(float(row.max()), float(error[row.argmax()])) for row, error in zip(left, errors, strict=True)]
-    return [(name, *figures) for name, figures in list(zip(ordered, worst, strict=True))[1:]]
+    return [
+        Check(f"registration of {name}", "", row.max(), limits.registration, std=error[row.argmax()], unit="px")
+        for name, row, error in list(zip(ordered, left, errors, strict=True))[1:]
+    ]
 
 
 def noise_ratio(stack: TemporalStack, noise: NoiseModel, same_exposure: float = 0.05) -> tuple[float, float]:
@@ -308,28 +285,13 @@ def noise_ratio(stack: TemporalStack, noise: NoiseModel, same_exposure: float = 
     return ratio, ratio / np.sqrt(2 * max(samples, 1) * (stack.count - 1))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
-    """Result of `check_calibration`: lines with limits, sums of lights, what was not checked, warnings."""
-
-    items: tuple[Check, ...]
-    sums: tuple[Additivity, ...]
-    skipped: tuple[str, ...]
-    warnings: tuple[str, ...]
-
-    @property
-    def passed(self) -> bool:
-        """Every line keeps its limit."""
-        return all(item.passed for item in self.items)
-
-
 def check_calibration(
     calibration: Calibration,
     captures: Captures,
     *,
-    limits: Limits | None = None,
+    limits: Limits = LIMITS,
     region: Sequence[float] | None = None,
-) -> Verdict:
+) -> list[Check]:
     """Check a calibration on captures that were not used to make it.
 
     Parameters
@@ -343,12 +305,17 @@ def check_calibration(
     region
         Rectangle of the speckled target for the registration, px.
 
+    Returns
+    -------
+    list of Check
+        Those with a name are the verdict: each has a figure, its uncertainty and its limit. Those without are doubts
+        (`rgbmidic.illumination.checks.reported`), and sentences about what was not checked.
+
     Raises
     ------
     CalibrationError
         The calibration has no crosstalk, or captures cannot be compared with it.
     """
-    limits = limits or Limits()
     if not captures.lights:
         raise ConfigurationError("check needs captures with one light on: --light NAME=FILES")
     calibration = calibration.cropped(None, next(iter(captures.lights.values())).series.shape)
@@ -362,41 +329,41 @@ def check_calibration(
     }
     lit = (*captures.lights.values(), *captures.together.values())
     reused = [path for group in lit for path, fingerprint in group.fingerprints.items() if fingerprint in known]
-    made = f"{len(reused)} of these captures made the calibration ({[*reused, ''][0]} ...): they always agree"
-    warnings = [f"{made}; a check needs others"] if reused else []
+    checks = []
+    if reused:
+        made = f"{len(reused)} of these captures made the calibration ({reused[0]} ...): they always agree"
+        checks.append(warning(f"{made}; a check needs others"))
     stacks, dark = captures.stacks()
+    if dark is None:
+        checks.append(warning("no dark frames: the stated black level is taken for the dark level"))
     means = {name: [block_means(frame) for frame in files.frames()] for name, files in captures.lights.items()}
     dark_means = [block_means(frame) for frame in captures.dark.frames()] if captures.dark else []
-    items, skipped = leakage(calibration.crosstalk, means, dark_means).items(limits.leakage), []
-    sums = []
+    checks += leakage(calibration.crosstalk, means, dark_means, limits)
     for names, files in captures.together.items():
         singles = {name: stacks[name] for name in names.split("+")}
-        sums.append(additivity(files.stack(), singles, dark, noise=calibration.noise))
-    items += [item for total in sums for item in total.items(limits)]
+        checks += additivity(files.stack(), singles, dark, noise=calibration.noise, limits=limits).checks
 
     def noise() -> Iterator[Check]:
         if calibration.noise is None:
             raise CalibrationError("the calibration has no noise section")
         for name, stack in stacks.items():
             ratio, std = noise_ratio(stack, calibration.noise)
-            yield _line(f"noise of {name} against prediction", 100 * (ratio - 1), 100 * std, limits.noise)
+            text = f"noise of {name} against prediction"
+            yield Check(text, "", 100 * (ratio - 1), limits.noise, std=100 * std, unit="%")
 
-    def registration() -> Iterator[Check]:
+    def registration() -> list[Check]:
         if calibration.registration is None:
             raise CalibrationError("the calibration has no registration section")
-        for name, value, std in registration_left(calibration.registration, stacks, dark, region=region):
-            yield _line(f"registration of {name}", value, std, limits.registration, "px")
+        return registration_left(calibration.registration, stacks, dark, region=region, limits=limits)
 
-    for check in (noise, registration):
+    for measure in (noise, registration):
         try:
-            items += list(check())
+            checks += list(measure())
         except CalibrationError as error:
-            skipped.append(f"{check.__name__} was not checked: {error}")
-    if dark is None:
-        warnings.append("no dark frames: the stated black level is taken for the dark level")
+            checks.append(Check("", f"{measure.__name__} was not checked: {error}", value=0))
     if not captures.together:
-        skipped.append("additivity was not checked: no captures with lights together (--together)")
-    return Verdict(items=tuple(items), sums=tuple(sums), skipped=tuple(skipped), warnings=tuple(warnings))
+        checks.append(Check("", "additivity was not checked: no captures with lights together (--together)", value=0))
+    return checks
 
 
 def read_limits(options: Sequence[str]) -> Limits:
@@ -407,7 +374,7 @@ def read_limits(options: Sequence[str]) -> Limits:
     ConfigurationError
         An unknown name, or a value that is not a positive number.
     """
-    limits, names = Limits(), [entry.name for entry in fields(Limits)]
+    limits, names = LIMITS, [entry.name for entry in fields(Limits)]
     for text in options:
         name, _, value = text.partition("=")
         try:

@@ -64,8 +64,7 @@ def lens_of(percent: float) -> FloatArray:
 def calibrated(where: Any, lens: FloatArray, seed: int, noise: float = CORNER) -> CameraCalibration:
     """Calibration from noisy corners of 20 views and one on the plane."""
     random = np.random.default_rng(seed)
-    found = estimate_lens(random_views(random, 20, lens=lens, noise=noise))
-    camera = CameraCalibration(shape=SHAPE, lens=found.lens, covariance=np.pad(found.covariance, (0, 8)))
+    camera = estimate_lens(random_views(random, 20, lens=lens, noise=noise)).camera
     return estimate_plane(view_of(where, random, lens=lens, noise=noise), camera).camera
 
 
