@@ -158,7 +158,7 @@ def geometry_weights(quick: bool) -> Iterator[dict[str, object]]:
             exact, cells = truth(scene, state), {}
             known: dict[str, Any] = {
                 "scene": scene, "states": (State(), state), "reference_frames": (0,), "order": (0, 1, 2),
-                "instrument": Instrument.of(scene), "step": 4,
+                "instrument": Instrument.of(scene),
             }  # fmt: skip
             ways = {
                 "geometry": GeometryWeights(limit_deg=None, **known),

@@ -7,16 +7,18 @@ projection, a lens blur, colour channels, noise and quantisation.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import InputError
+from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities, spectral_response
 from rgbmidic.illumination.linear import NoiseModel
+from rgbmidic.settings.conversion import Checked, bounded
 from rgbmidic.typing import FloatArray
 
 NOMINAL_DISTANCE = 600.0
@@ -30,8 +32,21 @@ Vector = tuple[float, float, float]
 Floating = TypeVar("Floating", bound=np.floating)
 
 
+class Physical(Checked):
+    """What a scene consists of: checked as the settings of a test are, and `InputError` where a value is impossible."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        try:
+            super().__post_init__()
+        except ConfigurationError as error:
+            raise InputError(f"{type(self).__name__}: {error}") from None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Light:
+class Light(Physical):
     """A point light; the irradiance falls with the square of the distance.
 
     Attributes
@@ -52,17 +67,10 @@ class Light:
 
     name: str
     position: Vector
-    power: float = 1.0
+    power: float = bounded(1.0, at_least=0)
     spectrum: Led | None = None
-    magnification: float = 0.0
+    magnification: float = bounded(0.0, above=-0.1, below=0.1)
     shift: tuple[float, float] = (0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if not (np.isfinite(self.position).all() and self.power >= 0 and math.isfinite(self.power)):
-            raise InputError(f"light {self.name}: position must be finite, power not negative: {self}")
-        if not abs(self.magnification) < 0.1:
-            raise InputError(f"light {self.name}: magnification is a small relative change, not {self.magnification}")
 
     def aimed(self, target: Vector, irradiance: float = 1.0) -> Light:
         """Return the light with the power that gives `irradiance` (1: the camera's exposure) at the target.
@@ -101,7 +109,7 @@ class Light:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Polarisers:
+class Polarisers(Physical):
     """Crossed linear polarisers, one before every lamp and one before the camera.
 
     Diffuse light counts as depolarised, the reflection as polarised like the lamp but for a small fraction.
@@ -119,17 +127,9 @@ class Polarisers:
         refractive index 1.5, 45 degrees), and a fifth of the light at most meets a second facet.
     """
 
-    extinction: float = 1e-2
-    transmission: float = 0.25
-    depolarised: float = 0.01
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if not (0 <= self.extinction <= 1 and 0 < self.transmission <= 0.5 and 0 <= self.depolarised <= 1):
-            raise InputError(
-                f"polarisers: extinction and depolarised lie in 0 to 1, transmission above 0 and up to 0.5; given are "
-                f"extinction {self.extinction}, depolarised {self.depolarised}, transmission {self.transmission}"
-            )
+    extinction: float = bounded(1e-2, at_least=0, at_most=1)
+    transmission: float = bounded(0.25, above=0, at_most=0.5)
+    depolarised: float = bounded(0.01, at_least=0, at_most=1)
 
     @property
     def glare(self) -> float:
@@ -176,11 +176,9 @@ MEASURED_CROSSTALK = ((1.0, 0.10, 0.05), (0.10, 1.0, 0.33), (0.01, 0.29, 1.0))
 al., J. Opt. Soc. Am. A 32, 2015) and shipped by colour-science (BSD-3-Clause). The median of nine measured cameras has
 .24 and .33 between green and blue."""
 
-CameraKind = Literal["bayer", "rgb", "monochrome"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Camera:
+class Camera(Physical):
     """A camera at the origin that looks along +z, x to the right and y downwards.
 
     Attributes
@@ -218,40 +216,25 @@ class Camera:
         Seconds; a body with a velocity is blurred over it.
     """
 
-    shape: tuple[int, int]
-    focal_px: float = DISTANCE / PIXEL
-    lens_blur: float = 0.45
-    kind: CameraKind = "bayer"
+    shape: tuple[int, int] = bounded(at_least=2)
+    focal_px: float = bounded(DISTANCE / PIXEL, above=0)
+    lens_blur: float = bounded(0.45, at_least=0, at_most=20)
+    kind: Literal["bayer", "rgb", "monochrome"] = "bayer"
     cfa: str = "RGGB"
     crosstalk: FloatArray | None = None
     sensitivities: Sensitivities | None = None
-    exposure: float = 0.5
-    bits: int = 12
-    black_level: int = 64
-    gain: float = 4.0
-    read_noise: float = 12.0
-    samples: int | None = None
-    exposure_time: float = 0.0
+    exposure: float = bounded(0.5, above=0)
+    bits: int = bounded(12, at_least=8, at_most=16)
+    black_level: int = bounded(64, at_least=0)
+    gain: float = bounded(4.0, above=0)
+    read_noise: float = bounded(12.0, at_least=0)
+    samples: int | None = bounded(None, at_least=1, at_most=64)
+    exposure_time: float = bounded(0.0, at_least=0)
 
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if not (len(self.shape) == 2 and min(self.shape) >= 2):
-            raise InputError(f"a frame has at least 2 rows and 2 columns, not {self.shape}")
-        if self.kind not in ("bayer", "rgb", "monochrome"):
-            raise InputError(f"unknown camera kind {self.kind!r}; allowed are bayer, rgb, monochrome")
+    def _problems(self) -> Iterator[str]:
         cfa_channels(self.cfa)
-        if not (8 <= self.bits <= 16 and 0 <= self.black_level < 2**self.bits - 1):
-            raise InputError(f"bits lie in 8 to 16 and black_level below saturation: {self.bits}, {self.black_level}")
-        if not (self.focal_px > 0 and 0 <= self.lens_blur <= 20 and (self.samples is None or 1 <= self.samples <= 64)):
-            raise InputError(
-                f"focal_px is positive, lens_blur 0 to 20 px, samples 1 to 64; given are {self.focal_px}, "
-                f"{self.lens_blur}, {self.samples}"
-            )
-        if not (self.gain > 0 and self.read_noise >= 0 and self.exposure > 0 and self.exposure_time >= 0):
-            raise InputError(
-                f"gain and exposure are positive, read_noise and exposure_time not negative; given are {self.gain}, "
-                f"{self.exposure}, {self.read_noise}, {self.exposure_time}"
-            )
+        if not self.black_level < self.white_level:
+            yield f"black_level must be below saturation at {self.white_level}, not {self.black_level}"
         if self.crosstalk is not None:
             object.__setattr__(self, "crosstalk", np.asarray(self.crosstalk, dtype=np.float64))
 

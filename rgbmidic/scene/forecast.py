@@ -116,13 +116,10 @@ class Forecast:
     bias : ndarray, shape (...)
         Root mean square, per component, of the apparent displacement (px) by the droplets' domes: their lit sides
         change when a reflection moves.
-    weight_fraction : ndarray, shape (k, ...)
-        Fraction of the information about the displacement that each light gives.
     """
 
     std: FloatArray
     bias: FloatArray
-    weight_fraction: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,20 +251,13 @@ class Instrument:
         variance = np.einsum("jj...->j...", residual)
         contrast = np.where(self._seen(variance, before, after), 1 - (before.fraction + after.fraction) / 2, 0.0)
         pull = light_pull(contrast, variance)
-        information = self.energy * pull * contrast
-        total = information.sum(axis=0)
+        total = (self.energy * pull * contrast).sum(axis=0)
         drag = np.nan_to_num((self._dome_factor(after) - self._dome_factor(before)) * pull[:, None]).sum(axis=0)
         square = np.einsum("jk...,j...,k...->...", np.nan_to_num(score), pull, pull)
         with np.errstate(invalid="ignore", divide="ignore"):
             std = np.sqrt(node_constant() * square) / (self.element_size * total)
             bias = self.dome_pull * np.sqrt((drag**2).sum(axis=0) / 2) / total
-            fraction = information / total
-        sees = total > 0
-        return Forecast(
-            std=np.where(sees, std, np.nan),
-            bias=np.where(sees, bias, np.nan),
-            weight_fraction=np.where(sees, fraction, 0.0),
-        )
+        return Forecast(std=np.where(total > 0, std, np.nan), bias=np.where(total > 0, bias, np.nan))
 
     def weights(self, before: Zones, after: Zones, *, known: bool = True) -> FloatImage:
         """Weights in [0, 1] for the solve: inverse variance of the pull of each light on the displacement.
@@ -351,9 +341,7 @@ class Instrument:
         finer than the pixel and is left out: wrinkles have no slope on average.
         """
         parts = [
-            _facet_covariance(one.geometry.slopes, other.geometry.slopes, *self._roughness)
-            * one.fraction
-            * other.fraction
+            _facet_covariance(one.slopes, other.slopes, *self._roughness) * one.fraction * other.fraction
             for one, other in ((before, before), (after, after), (before, after))
         ]
         area = self.wrinkle_area * (self.scene.surface.white.spacing / pixel_size(self.scene)) ** 2
@@ -365,7 +353,7 @@ class Instrument:
         A slope s changes the reflection at the half-way slope h by the factor exp(h.s/(a^2 + b^2)); its linear part is
         taken.
         """
-        return np.asarray(zones.fraction[:, None] * zones.geometry.slopes / sum(self._roughness))
+        return np.asarray(zones.fraction[:, None] * zones.slopes / sum(self._roughness))
 
     @property
     def _roughness(self) -> tuple[float, float]:
@@ -388,9 +376,7 @@ class Instrument:
 
     def white_level(self, zones: Zones) -> FloatArray:
         """Grey level (k, ...) of the white paint under each light, DN above black."""
-        return zones.irradiance * (
-            self.scene.surface.white.albedo * zones.geometry.lambert + zones.geometry.specular(zones.reflectance)
-        )
+        return zones.irradiance * (self.scene.surface.white.albedo * zones.lambert + zones.specular)
 
 
 def trace_change(displacement: FloatArray) -> FloatArray:

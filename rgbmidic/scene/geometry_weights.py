@@ -19,6 +19,9 @@ from rgbmidic.scene.zones import Zones, material_points, predict_zones, unit, zo
 from rgbmidic.settings import TestSettings, regular
 from rgbmidic.typing import FloatArray, FloatImage
 
+_STEP = 4
+"""Pixels between the points of the prediction, which is interpolated in between: reflections are far wider."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GeometryWeights:
@@ -38,8 +41,6 @@ class GeometryWeights:
         Angle of binary weights; None: soft weights, the inverse of the variance that is expected.
     instrument
         For the soft weights.
-    step
-        Pixels between the points of the prediction; in between it is interpolated.
     surface
         Points and normals (3, h, w) on the grid of the prediction, from a height map; None: the scene's body.
     """
@@ -52,12 +53,11 @@ class GeometryWeights:
     order: tuple[int, ...]
     limit_deg: float | None
     instrument: Instrument
-    step: int
     surface: tuple[FloatArray, FloatArray] | None = None
 
     @classmethod
     def prepare(
-        cls, settings: TestSettings, *, lights: Sequence[str], shape: tuple[int, int], frames: int, step: int = 4
+        cls, settings: TestSettings, *, lights: Sequence[str], shape: tuple[int, int], frames: int
     ) -> GeometryWeights:
         """Read the scene that the settings name and check that it is that of the test.
 
@@ -67,8 +67,6 @@ class GeometryWeights:
             With ``weights.method = "geometry"``.
         lights, shape, frames
             Names of the lights, size of the frames (H, W) and their number.
-        step
-            Pixels between the points of the prediction: reflections are far wider.
 
         Raises
         ------
@@ -102,8 +100,7 @@ class GeometryWeights:
                 demosaic=settings.illumination.demosaic,
                 prefilter=settings.solver.prefilter,
             ),
-            step=step,
-            surface=None if weights.height_map is None else _read_surface(weights.height_map, scene, step),
+            surface=None if weights.height_map is None else _read_surface(weights.height_map, scene),
         )
 
     def reference(self, images: IlluminationImages) -> FloatImage:
@@ -127,7 +124,7 @@ class GeometryWeights:
         return np.asarray(images.valid * self._at_pixels(weights, images))
 
     def _binary(self, state: State, images: IlluminationImages, limit_deg: float) -> FloatImage:
-        deviation = self._zones(state, state).geometry.deviation_deg
+        deviation = self._zones(state, state).deviation_deg
         seen = self._at_pixels(np.isfinite(deviation).astype(np.float32), images) > 0.5
         smooth = self._at_pixels(np.nan_to_num(deviation, nan=180.0).astype(np.float32), images)
         return angle_weights(np.where(seen, smooth, np.nan), limit_deg)
@@ -139,20 +136,20 @@ class GeometryWeights:
         """Zones in a state at the material points that the grid's pixels see in another one."""
         if self.surface is not None:
             return zones_on_surface(self.scene, *self.surface)
-        pixels = _grid(self.scene.camera.shape, self.step)
-        return predict_zones(self.scene, state, material=material_points(self.scene, seen, pixels))
+        material = material_points(self.scene, seen, _grid(self.scene.camera.shape))
+        return predict_zones(self.scene, state, material=material)
 
     def _at_pixels(self, coarse: FloatImage, images: IlluminationImages) -> FloatImage:
         """Values (k, h, w) on the grid at the pixels of images (k, H, W), in the order of the test's lights."""
         (left, top), (height, width) = images.origin, images.shape
         x, y = np.meshgrid(*(np.arange(a, a + n, dtype=np.float32) for a, n in ((left, width), (top, height))))
-        place = x / self.step, y / self.step
+        place = x / _STEP, y / _STEP
         return np.stack([cv2.remap(coarse[light], *place, cv2.INTER_LINEAR) for light in self.order])
 
 
-def _grid(shape: tuple[int, int], step: int) -> tuple[FloatArray, FloatArray]:
+def _grid(shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """Image points (x, y) of the prediction, up to beyond the last pixel."""
-    rows, columns = (np.arange(0, size + step, step, dtype=np.float64) for size in shape)
+    rows, columns = (np.arange(0, size + _STEP, _STEP, dtype=np.float64) for size in shape)
     x, y = np.meshgrid(columns, rows)
     return x, y
 
@@ -166,7 +163,7 @@ def _order(scene: Scene, lights: Sequence[str], file: Path) -> tuple[int, ...]:
     raise ConfigurationError(f"{file}: the scene's lights are {', '.join(names)}, the test's are {', '.join(lights)}")
 
 
-def _read_surface(path: Path, scene: Scene, step: int) -> tuple[FloatArray, FloatArray]:
+def _read_surface(path: Path, scene: Scene) -> tuple[FloatArray, FloatArray]:
     """Points and normals on the grid, from a height map on disk."""
     camera = scene.camera
     try:
@@ -181,14 +178,12 @@ def _read_surface(path: Path, scene: Scene, step: int) -> tuple[FloatArray, Floa
             f"{getattr(heights, 'shape', 'several arrays')}"
         )
     try:
-        points, normals = surface_from_heights(
-            heights, distance=scene.body.front[2], focal_px=camera.focal_px, centre=camera.centre
-        )
+        points, normals = surface_from_heights(heights, scene)
     except InputError as error:
         raise ConfigurationError(f"weights.height_map {path}: {error}") from None
     limits = camera.shape[1] - 1, camera.shape[0] - 1
     columns, rows = (
-        np.minimum(place, limit).astype(int) for place, limit in zip(_grid(camera.shape, step), limits, strict=True)
+        np.minimum(place, limit).astype(int) for place, limit in zip(_grid(camera.shape), limits, strict=True)
     )
     return points[:, rows, columns], normals[:, rows, columns]
 
@@ -208,20 +203,16 @@ def angle_weights(deviation_deg: FloatArray, limit_deg: float = 15.0) -> FloatIm
     return (deviation_deg > limit_deg).astype(np.float32)
 
 
-def surface_from_heights(
-    heights: npt.ArrayLike, *, distance: float, focal_px: float, centre: tuple[float, float]
-) -> tuple[FloatArray, FloatArray]:
+def surface_from_heights(heights: npt.ArrayLike, scene: Scene) -> tuple[FloatArray, FloatArray]:
     """Points and normals of a surface given as a height map over the pixels of the reference image.
 
     Parameters
     ----------
     heights : array_like, shape (H, W)
-        Height (mm) towards the camera over the plane at `distance`, at every pixel; NaN where not known. Smooth at the
-        scale of the speckle: droplets and wrinkles belong to the reflectance.
-    distance
-        Distance (mm) of that plane from the camera.
-    focal_px, centre
-        Focal length and principal point (x, y) in px.
+        Height (mm) towards the camera over the plane through the body's front point, at every pixel; NaN where not
+        known. Smooth at the scale of the speckle: droplets and wrinkles belong to the reflectance.
+    scene
+        Its camera, and the distance of that plane.
 
     Returns
     -------
@@ -230,15 +221,14 @@ def surface_from_heights(
     Raises
     ------
     InputError
-        Not one image, or a height that reaches the camera.
+        A height reaches the camera.
     """
-    height = np.asarray(heights, dtype=np.float64)
-    if height.ndim != 2 or min(height.shape) < 2:
-        raise InputError(f"a height map is one image (H, W), not an array of shape {height.shape}")
-    depth = distance - height
+    camera, distance = scene.camera, scene.body.front[2]
+    depth = distance - np.asarray(heights, dtype=np.float64)
     if not np.nanmin(depth, initial=np.inf) > 0:
         raise InputError(f"heights must stay below the distance of {distance:g} mm to the camera")
-    rows, columns = np.mgrid[: height.shape[0], : height.shape[1]]
-    points = np.stack([depth * (columns - centre[0]) / focal_px, depth * (rows - centre[1]) / focal_px, depth])
+    rows, columns = np.indices(depth.shape)
+    x0, y0 = camera.centre
+    points = np.stack([depth * (columns - x0) / camera.focal_px, depth * (rows - y0) / camera.focal_px, depth])
     down, right = np.gradient(points, axis=(1, 2))
     return points, unit(np.cross(down, right, axis=0))

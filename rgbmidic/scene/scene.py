@@ -5,8 +5,7 @@ The file is read strictly: an unknown key is an error that names it.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,14 +15,51 @@ import numpy as np
 from rgbmidic._kernels import render as kernels
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Led, Sensitivities
-from rgbmidic.scene.camera import PIXEL, Camera, Light, Polarisers, Vector, reference_camera, rotation, three_lights
+from rgbmidic.scene.camera import (
+    PIXEL,
+    Camera,
+    Light,
+    Physical,
+    Polarisers,
+    Vector,
+    reference_camera,
+    rotation,
+    three_lights,
+)
 from rgbmidic.scene.surface import AffineField, InPlaneField, MeshField, Surface
 from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value, read_section, read_table, read_toml, regular
+from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
 
+class _Body(Physical):
+    """What bodies have in common."""
+
+    __slots__ = ()
+    centre: Vector
+
+    @property
+    def front(self) -> Vector:
+        """The point nearest to the camera's plane, on a line along z through the centre."""
+        x, y, z = self.centre
+        return x, y, z - float(self.parameters()[1])
+
+    def parameters(self) -> FloatArray:
+        """[kind, radius, half width, half height] for the kernels.
+
+        Returns
+        -------
+        ndarray, shape (4,)
+        """
+        raise NotImplementedError
+
+    def _problems(self) -> Iterator[str]:
+        if not self.front[2] > 0:
+            yield f"a body lies in front of the camera, not at z = {self.front[2]:g} mm"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sphere:
+class Sphere(_Body):
     """A sphere.
 
     Attributes
@@ -34,17 +70,8 @@ class Sphere:
         (x, y, z) in mm, camera axes.
     """
 
-    radius: float = 41.25
+    radius: float = bounded(41.25, above=0)
     centre: Vector = (0.0, 0.0, 641.25)
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        _check_size(self.radius, self.radius, self.centre[2] - self.radius)
-
-    @property
-    def front(self) -> Vector:
-        """The point nearest to the camera's plane, about which the paper's sphere turns."""
-        return self.centre[0], self.centre[1], self.centre[2] - self.radius
 
     @property
     def attitude(self) -> FloatArray:
@@ -52,17 +79,12 @@ class Sphere:
         return np.eye(3)
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels.
-
-        Returns
-        -------
-        ndarray, shape (4,)
-        """
+        """[kind, radius, half width, half height] for the kernels."""
         return np.array([kernels.SPHERE, self.radius, np.inf, np.inf])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Cylinder:
+class Cylinder(_Body):
     """The mantle of a cylinder; its axis is parallel to y until it is tilted.
 
     Attributes
@@ -75,19 +97,10 @@ class Cylinder:
         Degrees about z.
     """
 
-    radius: float = 15.0
-    length: float = 1000.0
+    radius: float = bounded(15.0, above=0)
+    length: float = bounded(1000.0, above=0)
     centre: Vector = (0.0, 0.0, 615.0)
     tilt_deg: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        _check_size(self.radius, self.length, self.centre[2] - self.radius)
-
-    @property
-    def front(self) -> Vector:
-        """Middle of the generatrix nearest to the camera."""
-        return self.centre[0], self.centre[1], self.centre[2] - self.radius
 
     @property
     def attitude(self) -> FloatArray:
@@ -95,17 +108,12 @@ class Cylinder:
         return rotation(self.tilt_deg, (0.0, 0.0, 1.0))
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels.
-
-        Returns
-        -------
-        ndarray, shape (4,)
-        """
+        """[kind, radius, half width, half height] for the kernels."""
         return np.array([kernels.CYLINDER, self.radius, np.inf, self.length / 2])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plate:
+class Plate(_Body):
     """A flat plate facing the camera until it is tilted.
 
     Attributes
@@ -118,19 +126,10 @@ class Plate:
         Degrees about y, then about x.
     """
 
-    width: float = 75.0
-    height: float = 50.0
+    width: float = bounded(75.0, above=0)
+    height: float = bounded(50.0, above=0)
     centre: Vector = (0.0, 0.0, 600.0)
     tilt_deg: tuple[float, float] = (0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        _check_size(self.width, self.height, self.centre[2])
-
-    @property
-    def front(self) -> Vector:
-        """The plate's middle."""
-        return self.centre
 
     @property
     def attitude(self) -> FloatArray:
@@ -138,12 +137,7 @@ class Plate:
         return rotation(self.tilt_deg[1], (1.0, 0.0, 0.0)) @ rotation(self.tilt_deg[0], (0.0, 1.0, 0.0))
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels.
-
-        Returns
-        -------
-        ndarray, shape (4,)
-        """
+        """[kind, radius, half width, half height] for the kernels."""
         return np.array([kernels.PLATE, 0.0, self.width / 2, self.height / 2])
 
 
@@ -316,11 +310,6 @@ class Scene:
         return float(position[0]), float(position[1]), float(position[2])
 
 
-def _check_size(a: float, b: float, front: float) -> None:
-    if not (a > 0 and b > 0 and math.isfinite(front) and front > 0):
-        raise InputError(f"a body has positive sizes ({a}, {b} mm) and lies in front of the camera (z {front} mm)")
-
-
 BODIES: dict[str, type[Sphere] | type[Cylinder] | type[Plate]] = {
     "sphere": Sphere,
     "cylinder": Cylinder,
@@ -332,7 +321,7 @@ _FIELD_KEYS = ("displacement_gradient", "displacement_offset", "displacement_fil
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DatasetSettings:
+class DatasetSettings(Physical):
     """Settings of the output (``[output]``).
 
     Attributes
@@ -354,17 +343,12 @@ class DatasetSettings:
     """
 
     format: Literal["dng", "tiff"] = "dng"
-    seed: int = 0
-    calibration_frames: int = 3
+    seed: int = bounded(0, at_least=0)
+    calibration_frames: int = bounded(3, at_least=1)
     target: Target = "white"
     region: tuple[float, float, float, float] | None = None
-    element_size: float = ELEMENT_SIZE
+    element_size: float = bounded(ELEMENT_SIZE, above=0)
     noise_free: bool = False
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if self.calibration_frames < 1 or self.element_size <= 0 or self.seed < 0:
-            raise InputError("calibration_frames and element_size must be positive, seed not negative")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@ In-plane displacement fields of a plate: uniform gradient, nodal values on a mes
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +15,8 @@ import numpy.typing as npt
 from rgbmidic._kernels.mesh import interpolate_at_points
 from rgbmidic._kernels.render import PLATE, sample_paint
 from rgbmidic.errors import InputError
+from rgbmidic.scene.camera import Physical
+from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
 WRINKLE_FREQUENCY = 0.525
@@ -26,7 +28,7 @@ BOUND = math.sqrt(6.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finish:
+class Finish(Physical):
     """How one paint reflects.
 
     Attributes
@@ -43,20 +45,15 @@ class Finish:
         Distance between wrinkles (mm).
     """
 
-    albedo: float
-    gloss: float = 1.5
-    lobe_deg: float = 4.0
-    slope_deg: float = 6.0
-    spacing: float = 0.025
+    albedo: float = bounded(at_least=0, at_most=1)
+    gloss: float = bounded(1.5, at_least=0)
+    lobe_deg: float = bounded(4.0, above=0, at_most=30)
+    slope_deg: float = bounded(6.0, at_least=0, at_most=30)
+    spacing: float = bounded(0.025, above=0)
 
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if not (0 <= self.albedo <= 1 and self.gloss >= 0 and 0 <= self.slope_deg <= 30):
-            raise InputError(f"albedo lies in 0 to 1, gloss is not negative, slope_deg is 0 to 30: {self}")
-        if not (0 < self.lobe_deg <= 30 and self.spacing > 0):
-            raise InputError(f"lobe_deg lies in 0 to 30 and spacing is positive: {self}")
+    def _problems(self) -> Iterator[str]:
         if self.reflectance > 1:
-            raise InputError(
+            yield (
                 f"the paint would reflect {self.reflectance:.2f} times the light it receives: lower albedo, gloss or "
                 f"lobe_deg of {self}"
             )
@@ -73,7 +70,7 @@ class Finish:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Surface:
+class Surface(Physical):
     """White paint under a spray of black droplets, thrown at random (Boolean model).
 
     Attributes
@@ -96,25 +93,17 @@ class Surface:
 
     white: Finish = field(default_factory=lambda: Finish(albedo=0.80))
     black: Finish = field(default_factory=lambda: Finish(albedo=0.10))
-    droplet: float = 0.23
-    spread: float = 0.2
-    coverage: float = 0.45
-    softness: float = 0.02
-    dome: float = 0.0
-    seed: int = 0
+    droplet: float = bounded(0.23, above=0)
+    spread: float = bounded(0.2, at_least=0, at_most=0.6)
+    coverage: float = bounded(0.45, at_least=0, at_most=0.95)
+    softness: float = bounded(0.02, at_least=0)
+    dome: float = bounded(0.0, at_least=0)
+    seed: int = bounded(0, at_least=0)
 
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if not (self.droplet > 0 and 0 <= self.spread <= 0.6 and 0 <= self.coverage <= 0.95):
-            raise InputError(
-                f"a droplet is larger than 0, its spread 0 to 0.6, the coverage 0 to 0.95; given are droplet "
-                f"{self.droplet}, spread {self.spread}, coverage {self.coverage}"
-            )
-        if not (0 <= self.softness <= self.droplet and 0 <= self.dome <= self.droplet):
-            raise InputError(
-                f"softness and dome lie between 0 and the droplet's diameter {self.droplet} mm, not {self.softness} "
-                f"and {self.dome}"
-            )
+    def _problems(self) -> Iterator[str]:
+        for name, length in {"softness": self.softness, "dome": self.dome}.items():
+            if length > self.droplet:
+                yield f"{name} must be at most the droplet's diameter of {self.droplet:g} mm, not {length:g}"
 
     @property
     def droplets_per_area(self) -> float:

@@ -17,12 +17,12 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.scene.camera import NOMINAL_DISTANCE, Light
+from rgbmidic.scene.camera import NOMINAL_DISTANCE, Light, Physical
 from rgbmidic.scene.scene import Cylinder, Plate, Scene, Sphere, State
 from rgbmidic.scene.surface import Finish, Surface, material_from_spatial
+from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
 REFLECTS = 0.2
@@ -189,7 +189,7 @@ def region_in_view(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reflectance:
+class Reflectance(Physical):
     """How a painted surface reflects, at the scale of the speckle.
 
     Radiance under unit irradiance: ``diffuse n.l + specular exp(-t^2/(2 width^2)) / (v.h)``, with t the tangent of the
@@ -205,103 +205,9 @@ class Reflectance:
         Standard deviation of the lobe, as the angle of the half-way vector: half of that by which the light turns.
     """
 
-    diffuse: float
-    specular: float
-    width_deg: float
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if not (self.diffuse > 0 and self.specular >= 0 and 0 < self.width_deg < 45):
-            raise InputError(
-                f"a reflectance has a positive diffuse and a non-negative specular part and a width of 0 to 45 degrees;"
-                f" given are {self.diffuse}, {self.specular}, {self.width_deg}"
-            )
-
-    @classmethod
-    def from_goniometry(cls, *, diffuse: float, specular: float, width_deg: float) -> Reflectance:
-        """From a lobe measured while the light turns about a fixed specimen (`rgbmidic.lab.measures.Lobe`).
-
-        Parameters
-        ----------
-        diffuse, specular
-            Grey levels at normal incidence and at the lobe's peak.
-        width_deg
-            Standard deviation of the lobe in the angle of the light, twice that of the half-way vector.
-        """
-        return cls(diffuse=diffuse, specular=specular, width_deg=width_deg / 2)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reflection:
-    """Where lights reflect, at points of a surface; NaN where a light or the camera does not see the surface.
-
-    Attributes
-    ----------
-    slopes : ndarray, shape (k, 3, ...)
-        The half-way vector relative to the normal, ``h/(n.h) - n``: the slope that a facet needs to be a mirror.
-    lambert : ndarray, shape (k, ...)
-        Cosine between normal and light.
-    half : ndarray, shape (k, ...)
-        Cosine v.h between the camera and the half-way vector.
-    deviation_deg : ndarray, shape (k, ...)
-        Angle between the light and the mirror direction of the camera's ray.
-    """
-
-    slopes: FloatArray
-    lambert: FloatArray
-    half: FloatArray
-    deviation_deg: FloatArray
-
-    def diffuse(self, reflectance: Reflectance) -> FloatArray:
-        """Radiance (k, ...) of the diffuse light under unit irradiance across the rays."""
-        return reflectance.diffuse * self.lambert
-
-    def specular(self, reflectance: Reflectance) -> FloatArray:
-        """Return the expected radiance (k, ...) of the specular light under unit irradiance across the rays."""
-        square = (self.slopes**2).sum(axis=1)
-        lobe = np.exp(-square / (2 * math.radians(reflectance.width_deg) ** 2))
-        return np.asarray(reflectance.specular * lobe / self.half)
-
-    def fraction(self, reflectance: Reflectance) -> FloatArray:
-        """Return the expected specular fraction q/(d + q) of the light that reaches the camera, (k, ...), 0 to 1."""
-        q = self.specular(reflectance)
-        return np.asarray(q / (self.diffuse(reflectance) + q))
-
-
-def reflection(points: FloatArray, normals: FloatArray, lamps: npt.ArrayLike) -> Reflection:
-    """Where lamps reflect on a surface seen from the origin.
-
-    Parameters
-    ----------
-    points, normals : ndarray, shape (3, ...)
-        Positions (mm) and outward unit normals; NaN off the surface.
-    lamps : array_like, shape (k, 3)
-        Positions (mm).
-
-    Raises
-    ------
-    InputError
-        The shapes do not fit.
-    """
-    positions = np.asarray(lamps, dtype=np.float64)
-    if points.shape != normals.shape or len(points) != 3 or positions.ndim != 2 or positions.shape[1] != 3:
-        raise InputError(
-            f"points and normals have shape (3, ...), lamps (k, 3); given are {points.shape}, {normals.shape}, "
-            f"{positions.shape}"
-        )
-    view, light = unit(-points), unit(positions.reshape(-1, 3, *[1] * (points.ndim - 1)) - points, axis=1)
-    halfway = unit(light + view, axis=1)
-    lambert, facing = (normals * light).sum(axis=1), (normals * view).sum(axis=0)
-    mirror = 2 * facing * normals - view
-    with np.errstate(invalid="ignore", divide="ignore"):
-        slopes = halfway / (normals * halfway).sum(axis=1, keepdims=True) - normals
-    seen = (lambert > 0) & (facing > 0)
-    return Reflection(
-        slopes=np.where(seen[:, None], slopes, np.nan),
-        lambert=np.where(seen, lambert, np.nan),
-        half=np.where(seen, (view * halfway).sum(axis=1), np.nan),
-        deviation_deg=np.where(seen, np.degrees(np.arccos(np.clip((mirror * light).sum(axis=1), -1, 1))), np.nan),
-    )
+    diffuse: float = bounded(above=0)
+    specular: float = bounded(at_least=0)
+    width_deg: float = bounded(above=0, below=45)
 
 
 def unit(vectors: FloatArray, axis: int = 0) -> FloatArray:
@@ -339,31 +245,47 @@ def slope_variance(paint: Finish) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Zones:
-    """Reflection and grey level expected of each light at points of the surface, in one state; NaN where it is hidden.
+    """Reflection and grey level expected of each light at points of a surface, in one state.
+
+    NaN where a light or the camera does not see the surface.
 
     Attributes
     ----------
-    geometry
-        Angles of the reflection; the slopes are in the body's axes.
+    slopes : ndarray, shape (k, 3, ...)
+        The half-way vector relative to the normal, ``h/(n.h) - n``: the slope that a facet needs to be a mirror.
+    deviation_deg : ndarray, shape (k, ...)
+        Angle between the light and the mirror direction of the camera's ray.
+    lambert : ndarray, shape (k, ...)
+        Cosine between normal and light.
+    specular : ndarray, shape (k, ...)
+        Expected radiance of the specular light under unit irradiance across the rays.
     irradiance : ndarray, shape (k, ...)
         Across the rays, in grey levels of the channel that sees the light best (DN of an ideal white).
-    reflectance
-        The paint's.
+    albedo
+        Mean diffuse reflection of the paint.
     """
 
-    geometry: Reflection
+    slopes: FloatArray
+    deviation_deg: FloatArray
+    lambert: FloatArray
+    specular: FloatArray
     irradiance: FloatArray
-    reflectance: Reflectance
+    albedo: float
+
+    @property
+    def radiance(self) -> FloatArray:
+        """Radiance (k, ...), diffuse and specular, under unit irradiance across the rays."""
+        return self.albedo * self.lambert + self.specular
 
     @property
     def fraction(self) -> FloatArray:
-        """Specular fraction (k, ...) of the light that reaches the camera."""
-        return self.geometry.fraction(self.reflectance)
+        """Specular fraction (k, ...), 0 to 1, of the light that reaches the camera."""
+        return self.specular / self.radiance
 
     @property
     def level(self) -> FloatArray:
         """Expected mean grey level (k, ...) of the light's image, DN above black."""
-        return self.irradiance * (self.geometry.diffuse(self.reflectance) + self.geometry.specular(self.reflectance))
+        return self.irradiance * self.radiance
 
 
 def predict_zones(
@@ -372,9 +294,8 @@ def predict_zones(
     *,
     material: FloatArray | None = None,
     lights: tuple[Light, ...] | None = None,
-    reflectance: Reflectance | None = None,
 ) -> Zones:
-    """Predict where the lights of a scene reflect.
+    """Predict where the lights of a scene reflect; the slopes are in the body's axes.
 
     Parameters
     ----------
@@ -386,37 +307,39 @@ def predict_zones(
         Material points (mm) to be followed; None: those that the camera's pixels see in this state.
     lights
         Instead of the scene's, in the same colours.
-    reflectance
-        Of the paint, for instance from a goniometry; None: that of the scene's facets and wrinkles.
     """
     where = material_points(scene, state) if material is None else material
-    zones = zones_on_surface(scene, *placed(scene, where, state), lights=lights, reflectance=reflectance)
+    zones = zones_on_surface(scene, *placed(scene, where, state), lights)
     turn, _ = (state or State()).pose(scene.body)
-    slopes = np.einsum("ji,kj...->ki...", turn, zones.geometry.slopes)
-    return replace(zones, geometry=replace(zones.geometry, slopes=slopes))
+    return replace(zones, slopes=np.einsum("ji,kj...->ki...", turn, zones.slopes))
 
 
 def zones_on_surface(
-    scene: Scene,
-    points: FloatArray,
-    normals: FloatArray,
-    *,
-    lights: tuple[Light, ...] | None = None,
-    reflectance: Reflectance | None = None,
+    scene: Scene, points: FloatArray, normals: FloatArray, lights: tuple[Light, ...] | None = None
 ) -> Zones:
     """Predict where the lights reflect on any surface before the scene's camera, for instance one from a height map.
 
-    `points` (mm) and unit `normals` of shape (3, ...) in camera axes, which the slopes then have, too; `lights` and
-    `reflectance` as in `predict_zones`.
+    `points` (mm) and outward unit `normals` of shape (3, ...), NaN off the surface, are in camera axes, which the
+    slopes then have, too; `lights` as in `predict_zones`.
     """
-    chosen, camera = scene.lights if lights is None else lights, scene.camera
-    positions = np.array([light.position for light in chosen])
+    chosen, camera, paint = scene.lights if lights is None else lights, scene.camera, macroscopic(scene.surface)
+    rest = (1,) * (points.ndim - 1)
+    rays = np.array([light.position for light in chosen]).reshape(-1, 3, *rest) - points
+    view, light = unit(-points), unit(rays, axis=1)
+    halfway = unit(light + view, axis=1)
+    lambert, facing = (normals * light).sum(axis=1), (normals * view).sum(axis=0)
+    seen = (lambert > 0) & (facing > 0)
+    mirror = 2 * facing * normals - view
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slopes = np.where(seen[:, None], halfway / (normals * halfway).sum(axis=1, keepdims=True) - normals, np.nan)
+    lobe = np.exp(-(slopes**2).sum(axis=1) / (2 * math.radians(paint.width_deg) ** 2))
     levels = camera.full_scale * camera.exposure * camera.response(scene.lights).max(axis=0)
     powers = np.array([light.power for light in chosen]) * NOMINAL_DISTANCE**2 * levels
-    rest = (1,) * (points.ndim - 1)
-    square = ((positions.reshape(-1, 3, *rest) - points) ** 2).sum(axis=1)
     return Zones(
-        geometry=reflection(points, normals, positions),
-        irradiance=np.asarray(powers.reshape(-1, *rest) / square),
-        reflectance=reflectance or macroscopic(scene.surface),
+        slopes=slopes,
+        deviation_deg=np.where(seen, np.degrees(np.arccos(np.clip((mirror * light).sum(axis=1), -1, 1))), np.nan),
+        lambert=np.where(seen, lambert, np.nan),
+        specular=paint.specular * lobe / (view * halfway).sum(axis=1),
+        irradiance=np.asarray(powers.reshape(-1, *rest) / (rays**2).sum(axis=1)),
+        albedo=paint.diffuse,
     )

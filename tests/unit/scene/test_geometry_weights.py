@@ -73,7 +73,7 @@ def test_soft_weights_are_low_where_a_light_reflects_and_the_motion_changes_it(p
 def test_binary_weights_are_those_of_the_angle_at_every_pixel(prepare, tmp_path):
     weights = prepare(limit_deg=15.0).deformed(IMAGES, 1)
     scene = read_scene(tmp_path / "scene.toml").scene
-    deviation = predict_zones(scene, State(angle_deg=3.0)).geometry.deviation_deg
+    deviation = predict_zones(scene, State(angle_deg=3.0)).deviation_deg
     clear = abs(deviation - 15) > 0.3  # the prediction is interpolated between every fourth pixel
     np.testing.assert_array_equal(weights[clear], (deviation > 15)[clear])
     assert set(np.unique(weights)) == {0, 1}
