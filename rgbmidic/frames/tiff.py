@@ -21,8 +21,8 @@ import numpy as np
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import SECOND, Integers, Recording, even_times, fraction
 from rgbmidic.frames.images import decode
-from rgbmidic.frames.source import FrameSource, Movie, MovieHeader, remembered
-from rgbmidic.frames.stored import CHECKED_FROM, Layout, StoredFrame, check_count, check_size, damaged
+from rgbmidic.frames.source import FrameSource, Movie, remembered
+from rgbmidic.frames.stored import CHECKED_FROM, EvenFrames, MovieHeader, StoredFrame, check_count, check_size, damaged
 from rgbmidic.frames.tiff_pages import (
     UNCOMPRESSED,
     PageList,
@@ -56,19 +56,10 @@ class TiffFile(FrameSource):
         with _only_page(self.path) as page:
             return int(page.imagelength), int(page.imagewidth)
 
-    def _stored(self, index: int) -> StoredFrame:
+    def _rows(self, index: int, rows: slice) -> StoredFrame:
         with _only_page(self.path) as page:
-            return _only_frame(page, self.path, range(page.imagelength))
-
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        with _only_page(self.path) as page:
-            return _only_frame(page, self.path, rows)
-
-
-def _only_frame(page: TiffPage, path: Path, rows: range) -> StoredFrame:
-    """Read some rows of the only page of a file."""
-    values = _stored_rows(page, path, rows)
-    return _as_shown(_by_opencv(page, path)[rows.start : rows.stop] if values is None else values, page, path)
+            values = _stored_rows(page, self.path, range(page.imagelength)[rows])
+            return _as_shown(_by_opencv(page, self.path)[rows] if values is None else values, page, self.path)
 
 
 def _stored_rows(page: TiffPage, path: Path, rows: range, index: int = 0, count: int = 1) -> AnyArray | None:
@@ -79,9 +70,15 @@ def _stored_rows(page: TiffPage, path: Path, rows: range, index: int = 0, count:
     in_planes = page.planarconfig == 2 and page.samplesperpixel > 1
     if not is_stored_as_is(page) or not page.is_final or in_planes:
         return None
-    layout = Layout.checked(path, count=count, start=page.dataoffsets[0], size=page.nbytes)
-    stored = np.dtype(page.dtype).newbyteorder(page.parent.byteorder)
-    return layout.samples(path, index, rows, page.imagelength, stored).reshape(len(rows), page.imagewidth, -1)
+    frames = EvenFrames(
+        shape=(page.imagelength, page.imagewidth),
+        recording=Recording(count=count),
+        start=page.dataoffsets[0],
+        channels=(page.samplesperpixel * page.imagedepth,),
+        stored_bits=page.bitspersample,
+        order=page.parent.byteorder,
+    )
+    return frames.checked(path).read(path, index, rows).values
 
 
 def _as_shown(values: AnyArray, page: TiffPage, path: Path) -> StoredFrame:
