@@ -16,13 +16,13 @@ import numpy.typing as npt
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stored import StoredFrame, check_size, complaints, damaged
-from rgbmidic.frames.tiff_pages import Tag, is_stored_as_is, missing_data, tag, tiff_pages
+from rgbmidic.frames.tiff import Tag, is_stored_as_is, missing_data, tag, tiff_pages
 from rgbmidic.settings import BAYER_PATTERNS, regular
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
     import rawpy
-    from tifffile import TiffPage
+    import tifffile
 
 logger = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ def _tags(path: Path) -> tuple[bool, FloatArray | None]:
     return stored_as_is, black
 
 
-def _black_cell(page: TiffPage) -> FloatArray | None:
+def _black_cell(page: tifffile.TiffPage) -> FloatArray | None:
     levels, repeat = tag(page, Tag.BLACK), tag(page, Tag.BLACK_REPEAT) or (1, 1)
     varies = Tag.BLACK_DELTA_H in page.tags or Tag.BLACK_DELTA_V in page.tags
     if levels is None or varies or not set(repeat) <= {1, 2}:

@@ -21,8 +21,8 @@ import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import SECOND, Recording
-from rgbmidic.frames.source import Movie, MovieHeader, remembered
-from rgbmidic.frames.stored import StoredFrame, check_size, cut_short, damaged, unpack_bits
+from rgbmidic.frames.source import Movie, remembered
+from rgbmidic.frames.stored import MovieHeader, StoredFrame, check_size, cut_short, damaged, unpack_bits
 from rgbmidic.settings import FrameKind
 from rgbmidic.typing import AnyArray
 

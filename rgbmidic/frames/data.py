@@ -81,16 +81,6 @@ class Window:
         """Whether it is all of the frame."""
         return self.shape == self.frame
 
-    @property
-    def rows(self) -> range:
-        """Its rows in the frame."""
-        return range(self.origin[1], self.origin[1] + self.shape[0])
-
-    @property
-    def columns(self) -> range:
-        """Its columns in the frame."""
-        return range(self.origin[0], self.origin[0] + self.shape[1])
-
     def part_of(self, other: Window) -> tuple[slice, slice]:
         """Return where it lies, rows and columns, in a window that holds all of it.
 

@@ -122,10 +122,7 @@ class HeaderlessFile(FrameSource):
             raise FrameError(f"{self.path} has no header: both its shape (rows, columns) and its dtype must be stated")
         return self.stated.shape
 
-    def _stored(self, index: int) -> StoredFrame:
-        return self._rows(index, range(self._shape()[0]))
-
-    def _rows(self, index: int, rows: range) -> StoredFrame:
+    def _rows(self, index: int, rows: slice) -> StoredFrame:
         shape, dtype = self._shape(), np.dtype("<u2" if self.stated.dtype == "uint16" else self.stated.dtype)
         channels = 3 if self.stated.kind == "rgb" else 1
         needed, size = math.prod(shape) * channels * dtype.itemsize, self.path.stat().st_size
@@ -134,9 +131,10 @@ class HeaderlessFile(FrameSource):
                 f"{self.path} has {size} bytes; {shape[0]} rows of {shape[1]} {self.stated.dtype} samples with "
                 f"{channels} channel(s) need {needed}"
             )
+        first, last, _ = rows.indices(shape[0])
         row = shape[1] * channels
-        values = np.fromfile(self.path, dtype=dtype, count=len(rows) * row, offset=rows.start * row * dtype.itemsize)
-        return StoredFrame.plain(values.reshape(len(rows), shape[1], channels), self.path)
+        values = np.fromfile(self.path, dtype, count=(last - first) * row, offset=first * row * dtype.itemsize)
+        return StoredFrame.plain(values.reshape(-1, shape[1], channels), self.path)
 
 
 def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float] | None = None) -> None:

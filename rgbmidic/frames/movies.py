@@ -16,7 +16,7 @@ import math
 import re
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import BinaryIO
@@ -26,8 +26,8 @@ import numpy as np
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import SECOND, Integers, Recording, even_times, fraction
-from rgbmidic.frames.source import EvenFrames, Movie, remembered
-from rgbmidic.frames.stored import Layout, StoredFrame, damaged
+from rgbmidic.frames.source import Movie, remembered
+from rgbmidic.frames.stored import EvenFrames, StoredFrame, damaged
 
 logger = logging.getLogger(__name__)
 
@@ -86,22 +86,21 @@ def _mraw_header(path: Path) -> EvenFrames:
     rows, columns = entries.whole("Image Height"), entries.whole("Image Width")
     stored_bits = _stored_bits(entries)
     depth, side = entries.whole("EffectiveBit Depth", stored_bits), entries.text("EffectiveBit Side", "Lower").lower()
-    size, rest = divmod(rows * columns * stored_bits, 8)
-    if min(rows, columns) < 1 or rest:
+    if min(rows, columns) < 1 or rows * columns * stored_bits % 8:
         raise damaged(path, f"it announces {rows} rows of {columns} samples of {stored_bits} bit")
     count = entries.whole("Total Frame")
     if side not in ("lower", "higher", "upper") or not 8 <= depth <= 16:
         raise damaged(path, f'it announces {depth} effective bits, "{side}"; allowed are lower and higher')
     if side == "lower" and depth > stored_bits:
         logger.warning("%s holds the lower %d of %d bits: brighter samples are lost", path, stored_bits, depth)
-    return EvenFrames(
+    header = EvenFrames(
         shape=(rows, columns),
+        recording=Recording(count=count),
         stored_bits=stored_bits,
-        stated=StoredFrame(bits=min(stored_bits, depth)),
         shift=0 if side == "lower" else max(stored_bits - depth, 0),
-        layout=Layout.checked(path, count=count, start=0, size=size),
-        recording=_recording(entries, count, depth),
-    )
+        stated=StoredFrame(bits=min(stored_bits, depth)),
+    ).checked(path)
+    return replace(header, recording=_recording(entries, count, depth))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -222,36 +221,33 @@ def _seq_header(path: Path) -> EvenFrames:
             raise damaged(path, f"it announces {rows} rows of {columns} samples, {bits} of {stored_bits} bits")
         if size != rows * columns * stored_bits // 8 or oldest >= max(count, 1):
             raise damaged(path, f"it announces {size} bytes for {rows} rows of {columns} samples of {stored_bits} bits")
-        layout = Layout.checked(path, count=count, start=8192 if version >= 5 else 1024, size=size, stride=stride)
-        times = _stamps_ns(file, layout, oldest, "<iHH" if version >= 5 else "<iH")
-    order, upper = _RAW[form]
-    cfa = _PATTERNS.get(pattern) if form % 2 else None
-    return EvenFrames(
-        shape=(rows, columns),
-        stored_bits=stored_bits,
-        order=order,
-        shift=stored_bits - bits if upper else 0,
-        stated=StoredFrame(kind="bayer" if cfa else None, cfa=cfa, bits=bits),
-        oldest=oldest,
-        layout=layout,
-        recording=Recording(
-            count=count,
-            bit_depth=bits,
-            frame_rate=rate if math.isfinite(rate) and rate > 0 else None,
-            times_ns=times,
-        ),
-    )
+        order, upper = _RAW[form]
+        cfa = _PATTERNS.get(pattern) if form % 2 else None
+        header = EvenFrames(
+            shape=(rows, columns),
+            recording=Recording(
+                count=count, bit_depth=bits, frame_rate=rate if math.isfinite(rate) and rate > 0 else None
+            ),
+            start=8192 if version >= 5 else 1024,
+            gap=stride - size,
+            stored_bits=stored_bits,
+            order=order,
+            shift=stored_bits - bits if upper else 0,
+            stated=StoredFrame(kind="bayer" if cfa else None, cfa=cfa, bits=bits),
+            oldest=oldest,
+        ).checked(path)
+        times = _stamps_ns(file, header, "<iHH" if version >= 5 else "<iH")
+    return replace(header, recording=replace(header.recording, times_ns=times))
 
 
-def _stamps_ns(file: BinaryIO, layout: Layout, oldest: int, stamp: str) -> Integers | None:
+def _stamps_ns(file: BinaryIO, header: EvenFrames, stamp: str) -> Integers | None:
     """Read the time of every frame from the first; None where the file ends before the last or they do not grow."""
-    size = struct.calcsize(stamp)
-    behind = layout.start + layout.size
-    if layout.stride < layout.size + size or file.seek(0, 2) < behind + (layout.count - 1) * layout.stride + size:
+    size, count, end = struct.calcsize(stamp), header.recording.count, file.seek(0, 2)
+    if header.gap < size or end < header.start + count * (header.size + header.gap) - header.gap + size:
         return None
-    times = np.empty(layout.count, dtype=np.int64)
-    for index in range(layout.count):
-        file.seek(behind + (index + oldest) % layout.count * layout.stride)
+    times = np.empty(count, dtype=np.int64)
+    for index in range(count):
+        file.seek(header.begin(index) + header.size)
         seconds, *parts = struct.unpack(stamp, file.read(size))
         times[index] = seconds * SECOND + sum(part * 10**power for part, power in zip(parts, (6, 3), strict=False))
     times -= times[0]

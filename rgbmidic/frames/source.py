@@ -11,11 +11,9 @@ from functools import lru_cache, wraps
 from pathlib import Path
 from typing import ClassVar, TypeVar
 
-import numpy as np
-
 from rgbmidic.errors import FrameError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.stored import Camera, Layout, StoredFrame, damaged, raw_frame, unpack_bits
+from rgbmidic.frames.stored import Camera, MovieHeader, StoredFrame, damaged, raw_frame
 from rgbmidic.settings import FrameSettings, regular
 
 _T = TypeVar("_T")
@@ -133,43 +131,25 @@ class FrameSource(ABC):
             raise IndexError(f"there is no frame {index} in {self.path}, which holds {len(self)}")
         with _on_disk(self.path):
             if window is None or window.is_whole:
-                return self._stored(index)
+                return self._rows(index, slice(None))
             if (shape := self._shape()) != window.frame:
                 sizes = "{} rows of {} pixels, the frames of the test {} of {}".format(*shape, *window.frame)
                 raise FrameError(f"{self.path} has {sizes}")
-            stored = self._rows(index, window.rows)
-        return replace(stored, values=stored.values[:, window.columns.start : window.columns.stop])
+            rows, columns = window.part_of(Window.whole(shape))
+            stored = self._rows(index, rows)
+        return replace(stored, values=stored.values[:, columns])
 
-    def _rows(self, index: int, rows: range) -> StoredFrame:
+    def _rows(self, index: int, rows: slice) -> StoredFrame:
         """Read some rows of a frame, the first of which is a whole multiple of 4: alone, where the format allows it."""
         stored = self._stored(index)
-        return replace(stored, values=stored.values[rows.start : rows.stop])
+        return replace(stored, values=stored.values[rows])
+
+    def _stored(self, index: int) -> StoredFrame:
+        """Read a frame, of a format that does not allow to read some rows alone."""
+        raise NotImplementedError
 
     @abstractmethod
     def _shape(self) -> tuple[int, int]: ...
-
-    @abstractmethod
-    def _stored(self, index: int) -> StoredFrame: ...
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MovieHeader(ABC):
-    """What the header of a movie states of all its frames.
-
-    Attributes
-    ----------
-    shape
-        Rows and columns of every frame.
-    recording
-        Number, times and settings of the frames.
-    """
-
-    shape: tuple[int, int]
-    recording: Recording
-
-    @abstractmethod
-    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
-        """Read some rows of a frame, the first of which is a whole multiple of 4."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,51 +193,12 @@ class Movie(FrameSource):
     def _shape(self) -> tuple[int, int]:
         return self._header().shape
 
-    def _stored(self, index: int) -> StoredFrame:
-        return self._rows(index, range(self._shape()[0]))
-
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        return self._header().read(self.path, index, rows)
+    def _rows(self, index: int, rows: slice) -> StoredFrame:
+        header = self._header()
+        return header.read(self.path, index, range(header.shape[0])[rows])
 
     @abstractmethod
     def _header(self) -> MovieHeader: ...
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EvenFrames(MovieHeader):
-    """Frames of one size that lie uncompressed at even distances in a file.
-
-    Attributes
-    ----------
-    layout
-        Where they lie.
-    channels
-        ``(3,)`` of colour pictures, whose samples lie pixel after pixel.
-    stored_bits, order
-        Bits in which a sample is stored, 8 or 16 in the byte order of numpy, else packed; `shift` of them lie below it.
-    stated
-        What the header states of every frame, without samples.
-    oldest
-        Place in the file of the frame that was recorded first.
-    """
-
-    layout: Layout
-    channels: tuple[int, ...] = ()
-    stored_bits: int
-    order: str = "<"
-    shift: int = 0
-    stated: StoredFrame
-    oldest: int = 0
-
-    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
-        """Read some rows of a frame."""
-        index = (index + self.oldest) % self.layout.count
-        if self.stored_bits in (8, 16):
-            stored = np.dtype(f"{self.order}u{self.stored_bits // 8}")
-            values = self.layout.samples(path, index, rows, self.shape[0], stored)
-        else:
-            values = unpack_bits(self.layout.read(path, index, rows, self.shape[0]), self.stored_bits)
-        return replace(self.stated, values=values.reshape(len(rows), -1, *self.channels) >> self.shift)
 
 
 @contextmanager

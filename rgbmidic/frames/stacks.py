@@ -21,11 +21,12 @@ import numpy as np
 
 from rgbmidic.errors import FrameError, first_line, legible
 from rgbmidic.frames.data import Integers, Recording, even_times
-from rgbmidic.frames.source import EvenFrames, Movie, MovieHeader, remembered
+from rgbmidic.frames.source import Movie, remembered
 from rgbmidic.frames.stored import (
     MAXIMUM_BYTES,
     MAXIMUM_FRAMES,
-    Layout,
+    EvenFrames,
+    MovieHeader,
     StoredFrame,
     check_count,
     check_size,
@@ -79,16 +80,15 @@ def _npy_header(path: Path) -> EvenFrames:
         raise FrameError(
             f"{path} is stored in Fortran order; save it with numpy.save(file, numpy.ascontiguousarray(stack))"
         )
-    size = math.prod((height, width, *channels)) * dtype.itemsize
     return EvenFrames(
         shape=(height, width),
         recording=Recording(count=count),
-        layout=Layout.checked(path, count=count, start=head.tell(), size=size),
+        start=head.tell(),
         channels=tuple(channels),
         stored_bits=8 * dtype.itemsize,
         order=dtype.str[0],
         stated=StoredFrame(kind="rgb" if channels else None),
-    )
+    ).checked(path)
 
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".nxs")

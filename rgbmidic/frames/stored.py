@@ -10,17 +10,18 @@ import math
 import os
 import tempfile
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 
 from rgbmidic.errors import FrameError, InputError, RgbmidicError, first_line
-from rgbmidic.frames.data import ChannelFrame, Mosaic, shift_cfa
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, shift_cfa
 from rgbmidic.settings import BAYER_PATTERNS, FrameKind, FrameSettings
 from rgbmidic.typing import AnyArray, FloatArray
 
@@ -97,65 +98,6 @@ def cut_short(path: Path, *, whole: int, count: int) -> FrameError:
     """Return the error for a frame behind the end of a file that holds only the first `whole` of its `count` frames."""
     where = f"after frame {whole - 1} of {count}" if whole else f"before the first frame of {count}"
     return FrameError(f"{path}: the file ends {where} (0 to {count - 1}): truncated or still being written")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Layout:
-    """Where the frames of a file lie.
-
-    Attributes
-    ----------
-    count
-        Number of frames that the header announces; the file may end before.
-    start
-        Byte at which the first begins.
-    size
-        Bytes of the samples of one.
-    stride
-        Bytes from one to the next.
-    """
-
-    count: int
-    start: int
-    size: int
-    stride: int
-
-    @classmethod
-    def checked(cls, path: Path, *, count: int, start: int, size: int, stride: int | None = None) -> Layout:
-        """Check the layout that a header announces; a `stride` that is not given is the size.
-
-        Raises
-        ------
-        FrameError
-            No camera records such frames.
-        """
-        check_count(path, count)
-        if size <= 0 or start < 0 or (stride is not None and stride < size):
-            raise damaged(path, f"its header announces frames of {size} bytes, {stride} apart, from byte {start}")
-        check_size(path, needed=size, stored=size)
-        return cls(count=count, start=start, size=size, stride=size if stride is None else stride)
-
-    def read(self, path: Path, index: int, rows: range, of: int) -> bytes:
-        """Read the bytes of some `rows` of frame `index`, which has `of` rows of one length.
-
-        Raises
-        ------
-        FrameError
-            The file ends before.
-        """
-        with path.open("rb") as file:
-            begin, size = self.start + index * self.stride, file.seek(0, 2)
-            if size < begin + self.size:
-                whole = min(max((size - self.start - self.size) // self.stride + 1, 0), self.count)
-                raise cut_short(path, whole=whole, count=self.count)
-            first, last = (self.size * row // of for row in (rows.start, rows.stop))
-            file.seek(begin + first)
-            return file.read(last - first)
-
-    def samples(self, path: Path, index: int, rows: range, of: int, stored: np.dtype[Any]) -> AnyArray:
-        """Read the samples (n, ...) of some rows that are `stored` one behind the other, as `read` reads bytes."""
-        values = np.frombuffer(self.read(path, index, rows, of), dtype=stored)
-        return values.astype(stored.newbyteorder("="), copy=False).reshape(len(rows), -1)
 
 
 def unpack_bits(packed: bytes | AnyArray, bits: int) -> AnyArray:
@@ -275,6 +217,92 @@ class StoredFrame:
         if values.ndim != 3 or values.shape[2] != 3:
             raise FrameError(f"{path} has samples of shape {values.shape}; allowed are one channel or three (RGB)")
         return cls(values=values, kind="rgb")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MovieHeader(ABC):
+    """What the header of a movie states of all its frames.
+
+    Attributes
+    ----------
+    shape
+        Rows and columns of every frame.
+    recording
+        Number, times and settings of the frames.
+    """
+
+    shape: tuple[int, int]
+    recording: Recording
+
+    @abstractmethod
+    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        """Read some rows of a frame, the first of which is a whole multiple of 4."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvenFrames(MovieHeader):
+    """Frames of one size that lie uncompressed at even distances in a file.
+
+    Attributes
+    ----------
+    start
+        Byte at which the first begins.
+    gap
+        Bytes from the end of one to the next.
+    channels
+        ``(3,)`` of colour pictures, whose samples lie pixel after pixel.
+    stored_bits, order
+        Bits in which a sample is stored, 8 or 16 in the byte order of numpy, else packed; `shift` of them lie below it.
+    stated
+        What the header states of every frame, without samples.
+    oldest
+        Place in the file of the frame that was recorded first.
+    """
+
+    start: int = 0
+    gap: int = 0
+    channels: tuple[int, ...] = ()
+    stored_bits: int
+    order: str = "<"
+    shift: int = 0
+    stated: StoredFrame = field(default_factory=StoredFrame)
+    oldest: int = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes of the samples of a frame."""
+        return math.prod((*self.shape, *self.channels)) * self.stored_bits // 8
+
+    def begin(self, index: int) -> int:
+        """Return the byte at which a frame begins."""
+        return self.start + (index + self.oldest) % self.recording.count * (self.size + self.gap)
+
+    def checked(self, path: Path) -> Self:
+        """Return the header itself, unless it announces what no camera records, which is a FrameError."""
+        check_count(path, self.recording.count)
+        if self.gap < 0:
+            raise damaged(path, f"its header announces frames of {self.size} bytes, {self.size + self.gap} apart")
+        check_size(path, needed=self.size, stored=self.size)
+        return self
+
+    def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        """Read some rows of a frame."""
+        with path.open("rb") as file:
+            begin, end = self.begin(index), file.seek(0, 2)
+            if end < begin + self.size:
+                whole = (end - self.start - self.size) // (self.size + self.gap) + 1
+                raise cut_short(path, whole=max(whole, 0), count=self.recording.count)
+            first, last = (self.size * row // self.shape[0] for row in (rows.start, rows.stop))
+            file.seek(begin + first)
+            content = file.read(last - first)
+        if self.stored_bits in (8, 16):
+            stored = np.dtype(f"{self.order}u{self.stored_bits // 8}")
+            values = np.frombuffer(content, stored).astype(stored.newbyteorder("="), copy=False)
+        else:
+            values = unpack_bits(content, self.stored_bits)
+        if self.shift:
+            values = values >> self.shift
+        return replace(self.stated, values=values.reshape(len(rows), -1, *self.channels))
 
 
 class Camera(Protocol):

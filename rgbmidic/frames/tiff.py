@@ -1,19 +1,25 @@
-"""TIFF files: of one image, grey or RGB, 8 or 16 bit; or of several, one frame a page.
+"""TIFF files: of one image, grey or RGB, 8 or 16 bit; or of several, one frame a page; and the pages of raws.
 
-ImageJ's hyperstacks and OME-TIFF are read as they store their frames and times.
+ImageJ's hyperstacks and OME-TIFF are read as they store their frames and times. DNG, NEF, ARW and other raws are TIFF
+inside. LibRaw and tifffile both open some truncated files and fill what is missing with zeros, so the extents are
+checked first.
 """
 
 from __future__ import annotations
 
+import logging
 import lzma
+import math
 import re
+import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import IntEnum
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,24 +27,185 @@ import numpy as np
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import SECOND, Integers, Recording, even_times, fraction
 from rgbmidic.frames.images import decode
-from rgbmidic.frames.source import FrameSource, Movie, MovieHeader, remembered
-from rgbmidic.frames.stored import CHECKED_FROM, Layout, StoredFrame, check_count, check_size, damaged
-from rgbmidic.frames.tiff_pages import (
-    UNCOMPRESSED,
-    PageList,
-    Tag,
-    cfa_pattern,
-    is_stored_as_is,
-    missing_data,
-    tag,
-    tiff_page,
-    tiff_pages,
+from rgbmidic.frames.source import FrameSource, Movie, remembered
+from rgbmidic.frames.stored import (
+    CHECKED_FROM,
+    EvenFrames,
+    MovieHeader,
+    StoredFrame,
+    check_count,
+    check_size,
+    damaged,
+    faults_of,
 )
 from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
-    from tifffile import TiffPage
+    import tifffile
+
+# A file's faults come back as one FrameError; without a handler Python would print tifffile's log as well.
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
+
+_HEADERS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+"""Of TIFF and BigTIFF; several cameras' raws begin with II or MM, too, and are none."""
+UNCOMPRESSED = 1
+"""Code of the compression of samples that are not compressed."""
+
+
+class Tag(IntEnum):
+    """Codes of the tags that are read (TIFF 6.0; TIFF/EP; DNG 1.4, chapter 4)."""
+
+    NEW_SUBFILE_TYPE = 254
+    COLUMNS = 256
+    ROWS = 257
+    DESCRIPTION = 270
+    ORIENTATION = 274
+    COLOUR_MAP = 320
+    CFA_REPEAT = 33421
+    CFA_PATTERN = 33422
+    DNG_VERSION = 50706
+    BLACK_REPEAT = 50713
+    BLACK = 50714
+    BLACK_DELTA_H = 50715
+    BLACK_DELTA_V = 50716
+    ACTIVE_AREA = 50829
+
+
+Entries = dict[int, tuple[int, int, bytes]]
+"""Type, number of values, and the values or where they lie, of the entries of a page by their codes."""
+
+
+@contextmanager
+def tiff_pages(path: Path) -> Iterator[list[tifffile.TiffPage]]:
+    """Open the images of a TIFF file in full resolution, neither thumbnails nor previews.
+
+    Raises
+    ------
+    FrameError
+        It is no TIFF file, or what is done inside fails over a damaged header.
+    """
+    with _opened(path) as tiff:
+        pages: dict[int, tifffile.TiffPage] = {}
+        for frame in tiff.pages:
+            page = frame.aspage()
+            if page.offset in pages:  # tifffile would go round for ever
+                raise ValueError("its list of images leads back to itself")
+            pages[page.offset] = page
+        found = (one for page in pages.values() for one in (page, *(child.aspage() for child in page.pages or ())))
+        yield [page for page in found if not int(page.subfiletype) & 1]  # not reduced
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tifffile.TiffFile]:
+    import tifffile
+
+    with regular(path).open("rb") as file:
+        PageList(file, path)  # tifffile tries some camera raws that begin as a TIFF file does
+    with faults_of(path, OSError), tifffile.TiffFile(path) as tiff:
+        yield tiff
+
+
+def is_dng(path: Path) -> bool:
+    """Return whether the first image has the tag of DNG, whatever the file's name; False for what cannot be read."""
+    try:
+        with regular(path).open("rb") as file:
+            pages = PageList(file, path)
+            first = pages.page(pages.first) if pages.offset == 4 else None  # LibRaw reads no BigTIFF
+            return first is not None and Tag.DNG_VERSION in first[0]
+    except (OSError, FrameError):
+        return False
+
+
+class PageList:
+    """The pages of an open TIFF file, found without tifffile, which takes seconds for a hundred thousand of them.
+
+    Offsets have `offset` bytes, 4 or in BigTIFF 8, in the byte `order` of the file; the `first` page begins at one.
+    """
+
+    def __init__(self, file: BinaryIO, path: Path) -> None:
+        """Read the header; a FrameError where it is no TIFF file's."""
+        head = file.read(4)
+        if head not in _HEADERS:
+            raise damaged(path, "it is not a TIFF file")
+        self.file, self.offset = file, 8 if head in _HEADERS[2:] else 4
+        self.order: Literal["little", "big"] = "little" if head[:1] == b"I" else "big"
+        file.seek(self.offset)  # of both headers the offset of the first page is the last field
+        self.first = int.from_bytes(file.read(self.offset), self.order)
+        self.size = file.seek(0, 2)
+
+    def offsets(self, path: Path) -> tuple[list[int], bool]:
+        """Where the pages in full resolution begin, and whether their list leads out of the file."""
+        offset, found, seen = self.first, list[int](), set[int]()
+        while offset and (page := self.page(offset)) is not None:
+            if offset in seen:
+                raise damaged(path, "its list of images leads back to itself")
+            seen.add(offset)
+            entries, following = page
+            if not self.value(entries, Tag.NEW_SUBFILE_TYPE) & 1:
+                found.append(offset)
+            offset = following
+        if not found:
+            raise damaged(path, "its header leads to no image")
+        return found, offset > 0
+
+    def page(self, offset: int) -> tuple[Entries, int] | None:
+        """Read the entries of a page and the offset of the next one; None where the file ends before."""
+        counter, entry = (8, "HHQ8s") if self.offset == 8 else (2, "HHI4s")
+        if offset + counter > self.size:
+            return None
+        self.file.seek(offset)
+        number = int.from_bytes(self.file.read(counter), self.order)
+        length = number * (4 + 2 * self.offset)
+        # pages that are seen have a few dozen entries
+        if not 0 < number <= 4096 or offset + counter + length + self.offset > self.size:
+            return None
+        stored = struct.iter_unpack(("<" if self.order == "little" else ">") + entry, self.file.read(length))
+        entries = {code: (kind, many, place) for code, kind, many, place in stored}
+        return entries, int.from_bytes(self.file.read(self.offset), self.order)
+
+    def value(self, entries: Entries, code: int) -> int:
+        """Return the one value of an entry; 0 where there is none."""
+        short = 3  # the type of numbers of 16 bit
+        kind, _, place = entries.get(code, (short, 0, b""))
+        return int.from_bytes(place[: 2 if kind == short else 4], self.order)
+
+    def text(self, entries: Entries, code: int) -> str:
+        """Return the text of an entry; empty where there is none."""
+        _, number, content = entries.get(code, (0, 0, b""))
+        if number > self.offset:  # the entry holds where the text lies
+            self.file.seek(min(int.from_bytes(content, self.order), self.size))
+            content = self.file.read(min(number, 256 * 2**20))  # OME uses some 300 bytes for every frame
+        return content[:number].decode(errors="replace").rstrip("\0")
+
+
+def missing_data(page: tifffile.TiffPage, size: int) -> str | None:
+    """Describe what the page announces that a file of `size` bytes does not hold; None where all is there."""
+    parts = list(zip(page.dataoffsets, page.databytecounts, strict=False))
+    end = max((offset + count for offset, count in parts), default=0)
+    if end > size:
+        return f"the header announces image data up to byte {end}, the file has {size} bytes"
+    if any(count == 0 for _, count in parts):
+        return "a part of its image data has the length zero"
+    return None
+
+
+def is_stored_as_is(page: tifffile.TiffPage) -> bool:
+    """Return whether the page's samples are uncompressed and their bytes are all there."""
+    bits = page.bitspersample if isinstance(page.bitspersample, int) else page.bitspersample[0]
+    needed = math.ceil(page.imagewidth * page.imagelength * page.samplesperpixel * bits / 8)
+    return bool(page.compression == UNCOMPRESSED and sum(page.databytecounts) >= needed)
+
+
+def tag(page: tifffile.TiffPage, code: int) -> tuple[Any, ...] | None:
+    """Return the value of a tag as a tuple, or None where the page does not have it."""
+    if code not in page.tags:
+        return None
+    value = page.tags[code].value
+    return tuple(value) if isinstance(value, tuple | list | bytes) else (value,)
+
+
+# Frames
 
 TIFF_ENDINGS = (".tif", ".tiff")
 
@@ -56,35 +223,31 @@ class TiffFile(FrameSource):
         with _only_page(self.path) as page:
             return int(page.imagelength), int(page.imagewidth)
 
-    def _stored(self, index: int) -> StoredFrame:
+    def _rows(self, index: int, rows: slice) -> StoredFrame:
         with _only_page(self.path) as page:
-            return _only_frame(page, self.path, range(page.imagelength))
-
-    def _rows(self, index: int, rows: range) -> StoredFrame:
-        with _only_page(self.path) as page:
-            return _only_frame(page, self.path, rows)
+            values = _stored_rows(page, self.path, range(page.imagelength)[rows])
+            return _as_shown(_by_opencv(page, self.path)[rows] if values is None else values, page, self.path)
 
 
-def _only_frame(page: TiffPage, path: Path, rows: range) -> StoredFrame:
-    """Read some rows of the only page of a file."""
-    values = _stored_rows(page, path, rows)
-    return _as_shown(_by_opencv(page, path)[rows.start : rows.stop] if values is None else values, page, path)
-
-
-def _stored_rows(page: TiffPage, path: Path, rows: range, index: int = 0, count: int = 1) -> AnyArray | None:
+def _stored_rows(page: tifffile.TiffPage, path: Path, rows: range, index: int = 0, count: int = 1) -> AnyArray | None:
     """Read some rows (n, W, C) of a checked page, or of frame `index` of `count` that lie one behind the other from it.
 
     None where they must be unpacked, all at once.
     """
-    in_planes = page.planarconfig == 2 and page.samplesperpixel > 1
-    if not is_stored_as_is(page) or not page.is_final or in_planes:
+    if not page.is_final or (page.planarconfig == 2 and page.samplesperpixel > 1):
         return None
-    layout = Layout.checked(path, count=count, start=page.dataoffsets[0], size=page.nbytes)
-    stored = np.dtype(page.dtype).newbyteorder(page.parent.byteorder)
-    return layout.samples(path, index, rows, page.imagelength, stored).reshape(len(rows), page.imagewidth, -1)
+    frames = EvenFrames(
+        shape=(page.imagelength, page.imagewidth),
+        recording=Recording(count=count),
+        start=page.dataoffsets[0],
+        channels=(page.samplesperpixel * page.imagedepth,),
+        stored_bits=page.bitspersample,
+        order=page.parent.byteorder,
+    )
+    return frames.checked(path).read(path, index, rows).values
 
 
-def _as_shown(values: AnyArray, page: TiffPage, path: Path) -> StoredFrame:
+def _as_shown(values: AnyArray, page: tifffile.TiffPage, path: Path) -> StoredFrame:
     """Return samples of a page as its tags state that they are shown; a colour table that changes them is refused."""
     if page.photometric == _PALETTE:
         table = np.asarray(page.tags[Tag.COLOUR_MAP].value, dtype=np.int64).reshape(3, -1)
@@ -93,11 +256,13 @@ def _as_shown(values: AnyArray, page: TiffPage, path: Path) -> StoredFrame:
             raise FrameError(f"{path} shows its grey levels through a colour table; save it as a plain grey image")
     elif page.photometric == _MIN_IS_WHITE:
         values = np.iinfo(values.dtype).max - values
-    return StoredFrame.plain(values, path, cfa_pattern(page))
+    pattern = tag(page, Tag.CFA_PATTERN) or ()
+    is_bayer = tag(page, Tag.CFA_REPEAT) == (2, 2) and set(pattern) <= {0, 1, 2}
+    return StoredFrame.plain(values, path, "".join("RGB"[channel] for channel in pattern if is_bayer) or None)
 
 
 @contextmanager
-def _only_page(path: Path) -> Iterator[TiffPage]:
+def _only_page(path: Path) -> Iterator[tifffile.TiffPage]:
     with tiff_pages(path) as pages:
         if not pages:
             raise damaged(path, "its header leads to no image")
@@ -107,7 +272,7 @@ def _only_page(path: Path) -> Iterator[TiffPage]:
         yield pages[0]
 
 
-def _check_page(page: TiffPage, path: Path) -> None:
+def _check_page(page: tifffile.TiffPage, path: Path) -> None:
     """Refuse a page whose samples are no raw frame's or not all there, before anything is unpacked."""
     if page.dtype is None or page.dtype.name not in ("uint8", "uint16"):
         kind = page.dtype or f"{page.bitspersample}-bit"
@@ -124,7 +289,7 @@ def _check_page(page: TiffPage, path: Path) -> None:
     check_size(path, needed=page.nbytes, stored=min(stored, size))
 
 
-def _unpacked(page: TiffPage, path: Path) -> AnyArray:
+def _unpacked(page: tifffile.TiffPage, path: Path) -> AnyArray:
     """Unpack the samples of a page, (H, W) or (H, W, C)."""
     if page.compression not in (UNCOMPRESSED, *_BY_TIFFFILE):
         name = getattr(page.compression, "name", page.compression)
@@ -132,11 +297,11 @@ def _unpacked(page: TiffPage, path: Path) -> AnyArray:
     if page.compression in _BY_TIFFFILE:
         _check_unpacked(page, path)
     values = np.asarray(page.asarray())
-    one_plane_after_the_other = values.ndim == 3 and page.planarconfig == 2
-    return np.moveaxis(values, 0, -1) if one_plane_after_the_other else values
+    # where one plane lies after the other
+    return np.moveaxis(values, 0, -1) if values.ndim == 3 and page.planarconfig == 2 else values
 
 
-def _by_opencv(page: TiffPage, path: Path) -> AnyArray:
+def _by_opencv(page: tifffile.TiffPage, path: Path) -> AnyArray:
     """Unpack the samples of the only page of a file, by OpenCV what tifffile cannot."""
     # OpenCV turns such samples, some more than others
     turned = (tag(page, Tag.ORIENTATION) or (1,)) != (1,) or page.photometric in (_MIN_IS_WHITE, _PALETTE)
@@ -148,7 +313,7 @@ def _by_opencv(page: TiffPage, path: Path) -> AnyArray:
     return values
 
 
-def _check_unpacked(page: TiffPage, path: Path) -> None:
+def _check_unpacked(page: tifffile.TiffPage, path: Path) -> None:
     """Refuse parts that unpack to more than the whole image, and all of them to less: tifffile fills up with zeros."""
     limit, total = max(page.nbytes, CHECKED_FROM), 0
     with path.open("rb") as file:
@@ -192,20 +357,24 @@ class _Hyperstack(MovieHeader):
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame."""
+        import tifffile
+
         if index >= len(self.offsets) > 1:
             raise FrameError(f"{path}: its list of frames ends after {index - 1}: truncated or still being written")
         count = self.recording.count
         behind = len(self.offsets) == 1  # all frames lie behind the first, as ImageJ stores more than 4 GB
-        with tiff_page(path, int(self.offsets[0 if behind else index])) as page:
+        with _opened(path) as tiff:
+            tiff.filehandle.seek(int(self.offsets[0 if behind else index]))
+            page = tifffile.TiffPage(tiff, index=0)
             _check_page(page, path)
             if (page.imagelength, page.imagewidth) != self.shape:
                 here = f"{page.imagelength} rows of {page.imagewidth} pixels"
                 raise FrameError(f"{path}: frame {index} has {here}, the first {self.shape[0]} of {self.shape[1]}")
             values = _stored_rows(page, path, rows, *((index, count) if behind else ()))
-            if values is None and behind:
-                reason = "has one page, whose samples are compressed or in pieces"
-                raise FrameError(f"{path} announces {count} frames but {reason}")
             if values is None:
+                if behind:
+                    reason = "has one page, whose samples are compressed or in pieces"
+                    raise FrameError(f"{path} announces {count} frames but {reason}")
                 values = _unpacked(page, path)[rows.start : rows.stop]
             return _as_shown(values, page, path)
 
@@ -213,7 +382,7 @@ class _Hyperstack(MovieHeader):
 @remembered
 def _stack(path: Path) -> _Hyperstack:
     with regular(path).open("rb") as file:
-        pages = PageList.begin(file, path)
+        pages = PageList(file, path)
         offsets, ends_early = pages.offsets(path)
         entries, _ = pages.page(offsets[0]) or ({}, 0)
         text = pages.text(entries, Tag.DESCRIPTION)
@@ -222,8 +391,7 @@ def _stack(path: Path) -> _Hyperstack:
     count = int(images[1]) if images and len(offsets) == 1 else len(offsets) + (ends_early and len(offsets) > 1)
     check_count(path, count)
     times = _imagej_times(text, count) if images else _ome_times(text, count)
-    recording = Recording(count=count, times_ns=times)
-    return _Hyperstack(offsets=np.array(offsets, dtype=np.int64), shape=shape, recording=recording)
+    return _Hyperstack(shape=shape, recording=Recording(count=count, times_ns=times), offsets=np.array(offsets))
 
 
 def _imagej_times(text: str, count: int) -> Integers | None:
@@ -232,7 +400,8 @@ def _imagej_times(text: str, count: int) -> Integers | None:
     others = {"channels", "slices"} & entries.keys()
     if entries.get("frames", "" if others else str(count)) != str(count):
         return None
-    return _even_times(entries.get("finterval", ""), entries.get("tunit", "s"), count)
+    interval = _seconds(entries.get("finterval", ""), entries.get("tunit", "s"))
+    return even_times(range(count), interval) if interval else None
 
 
 def _ome_times(text: str, count: int) -> Integers | None:
@@ -245,18 +414,14 @@ def _ome_times(text: str, count: int) -> Integers | None:
         return None
     if pixels is None or pixels.get("SizeT") != str(count):
         return None
-    if pixels.get("TimeIncrement"):
-        return _even_times(pixels.get("TimeIncrement", ""), pixels.get("TimeIncrementUnit", "s"), count)
+    if increment := pixels.get("TimeIncrement"):
+        interval = _seconds(increment, pixels.get("TimeIncrementUnit", "s"))
+        return even_times(range(count), interval) if interval else None
     planes = {plane.get("TheT"): plane for plane in pixels.iterfind("{*}Plane")}
     each = [planes.get(str(index), pixels) for index in range(count)]
     times = [_seconds(plane.get("DeltaT", ""), plane.get("DeltaTUnit", "s")) for plane in each]
     known = [round(time * SECOND) for time in times if time is not None]
     return np.array(known, dtype=np.int64) if len(known) == count else None
-
-
-def _even_times(interval: str, unit: str, count: int) -> Integers | None:
-    seconds = _seconds(interval, unit)
-    return even_times(range(count), seconds) if seconds else None
 
 
 def _seconds(text: str, unit: str) -> Fraction | None:
