@@ -11,16 +11,14 @@ from typer import Argument, Option
 
 from rgbmidic import command
 from rgbmidic._version import __version__
-from rgbmidic.cli_parts import Out, Overwrite, Test, explain_first_run, note, print_table, progress_of
+from rgbmidic.command import Out, Overwrite, Test, explain_first_run, note, print_table, progress_of
 from rgbmidic.errors import InputError
 
 app = typer.Typer()
 
 
 @app.command()
-def demo(
-    out: Annotated[Path, Option(help="Output folder; must be empty or new.")] = Path("rgbmidic-demo"),
-) -> None:
+def demo(out: Annotated[Path, Option(help="Output folder; must be empty or new.")] = Path("rgbmidic-demo")) -> None:
     """Make a small virtual test, calibrate and measure it, and compare the result with the exact truth."""
     note(f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}")
     explain_first_run()
@@ -101,10 +99,7 @@ def sample(
 
 
 @app.command()
-def virtual(
-    scene: Annotated[Path, Argument(metavar="SCENE.toml", help="Scene to render.")],
-    out: Out,
-) -> None:
+def virtual(scene: Annotated[Path, Argument(metavar="SCENE.toml", help="Scene to render.")], out: Out) -> None:
     """Render a virtual test: raw frames, calibration captures and the exact truth."""
     from rgbmidic.lab.virtual.dataset import write_dataset
 
@@ -246,10 +241,7 @@ def resolution(
     gauges: Annotated[
         str, Option(help="Lengths of virtual strain gauges in px; else three elements of each size.")
     ] = "",
-    frames: Annotated[
-        str,
-        Option(help="Frames, such as 5,10:20, among which the key frame is; else five."),
-    ] = "",
+    frames: Annotated[str, Option(help="Frames, such as 5,10:20, among which the key frame is; else five.")] = "",
     out: Annotated[Path | None, Option(help="Folder for resolution.csv, .json and .png.")] = None,
     overwrite: Overwrite = False,
 ) -> None:

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 import typer
 from typer import Option
 
-from rgbmidic import cli_parts as parts
 from rgbmidic import command
 from rgbmidic.errors import InputError
 from rgbmidic.extras import optional
@@ -44,7 +43,7 @@ _PROBE_OPTIONS: dict[str, Any] = {
         for key, (option, form, text) in _PLACES.items()
     },
     **_TIP,
-    "measure": parts.Measure,
+    "measure": command.Measure,
     "window": Annotated[int | None, Option(help="Frames that a rate is taken over, 4 or more; 0: no rates.")],
     "rigid_motion": Annotated[str | None, Option("--rigid", help="Rigid motion: none, tell (report) or remove.")],
 }
@@ -81,18 +80,18 @@ def _read_probes(options: dict[str, Any]) -> dict[str, Any]:
 
 
 @app.command()
-@parts.opened_result
+@command.opened_result
 @command.gather("probes", _PROBE_OPTIONS, _read_probes)
 @command.gather("channels", _CHANNEL_OPTIONS, _read_channels)
 def history(
-    opened: parts.Opened,
+    opened: command.Opened,
     probes: dict[str, Any],
     channels: dict[str, Any],
     out: Annotated[
         Path | None, Option(help="CSV file to write; a picture gets the same name. Else printed only.")
     ] = None,
-    px: parts.Pixels = False,
-    overwrite: parts.Overwrite = False,
+    px: command.Pixels = False,
+    overwrite: command.Overwrite = False,
 ) -> None:
     """Displacement, strain and rates over time at points, over areas and along gauges: table, picture and CSV file.
 
@@ -114,24 +113,24 @@ def history(
     histories = read_histories(
         result,
         replace(kept, **(probes | added)),
-        scale=opened.scale_in(px=px),
+        scale=opened.scale(px=px),
         channels=replace(result.section(ChannelSettings) if settings is None else settings.channels, **channels),
     )
     if out is not None:
         write_histories(histories, out, overwrite=overwrite)
         save_figure(history_figure(histories), command.picture_beside(out))
     for remark in histories.remarks:
-        parts.note(f"note: {remark}")
-    parts.print_table(f"{len(histories.frames)} frames", *history_rows(histories))
+        command.note(f"note: {remark}")
+    command.print_table(f"{len(histories.frames)} frames", *history_rows(histories))
     if out is not None:
         print(f"table: {out}   picture: {command.picture_beside(out)}")
 
 
 @app.command()
-@parts.opened_result
-@parts.derived_options
+@command.opened_result
+@command.derived_options
 def profile(
-    opened: parts.Opened,
+    opened: command.Opened,
     line: Annotated[str, Option(metavar="X0,Y0:X1,Y1", help="Ends of the line on the reference, px.")],
     out: Annotated[Path, Option(help="CSV file to write; a picture gets the same name.")],
     derived: dict[str, Any],
@@ -140,7 +139,7 @@ def profile(
     curves: Annotated[str, Option(help="Frames drawn as curves, such as 10,20,30.")] = "",
     speed: Annotated[str, Option(metavar="WHAT", help="Fit the speed of a wave: front or peak.")] = "",
     level: Annotated[float | None, Option(help="Fraction of the peak that defines the front; else 0.5.")] = None,
-    overwrite: parts.Overwrite = False,
+    overwrite: command.Overwrite = False,
 ) -> None:
     """A field along a line in every frame: table, position-time picture, curves, and the speed of a front or peak."""
     from rgbmidic.report import profile_figure, save_figure, wave_text
@@ -164,7 +163,7 @@ def profile(
     if wave is not None:
         print(f"{wave_text(read, wave)}; arrival times: {arrivals_file(out)}")
         if not wave.front.straight:
-            parts.note(
+            command.note(
                 "note: the arrival times do not lie on a line within their uncertainty: the wave changes its speed or "
                 "form, or the mesh does not follow it; the uncertainty of the speed includes that scatter"
             )
@@ -172,10 +171,10 @@ def profile(
 
 
 @app.command()
-@parts.opened_result
-@parts.derived_options
+@command.opened_result
+@command.derived_options
 def movie(
-    opened: parts.Opened,
+    opened: command.Opened,
     out: Annotated[Path, Option(help="File to write: .mp4, .webm or .gif.")],
     derived: dict[str, Any],
     field: Annotated[str, Option(help="Fields side by side, such as u,exx,velocity.")] = "u",
@@ -193,8 +192,8 @@ def movie(
     colours: Annotated[str | None, Option(help="Name of a matplotlib colour map.")] = None,
     opacity: Annotated[float, Option(help="Opacity of the fields over the image, 0 to 1.")] = 1.0,
     width: Annotated[int, Option(help="Width of the movie, px.")] = 1280,
-    workers: parts.Workers = 0,
-    overwrite: parts.Overwrite = False,
+    workers: command.Workers = 0,
+    overwrite: command.Overwrite = False,
 ) -> None:
     """Write a movie of one field or several side by side, over the reference image or the raw frames."""
     from rgbmidic._kernels.threads import threads
@@ -215,6 +214,6 @@ def movie(
         opacity=opacity,
         width=width,
     )
-    with parts.progress_of("movie") as progress:
+    with command.progress_of("movie") as progress:
         write_movie(shown, out, fps=fps, processes=workers or threads(), overwrite=overwrite, progress=progress)
     print(out)

@@ -12,7 +12,7 @@ import typer
 from typer import Argument, Option
 
 from rgbmidic import command
-from rgbmidic.cli_parts import Draw, Out, Overwrite, Test, Workers, explain_first_run, note, progress_of
+from rgbmidic.command import Draw, Out, Overwrite, Test, Workers, explain_first_run, note, progress_of
 from rgbmidic.errors import InputError
 
 if TYPE_CHECKING:
@@ -128,8 +128,7 @@ def batch(
 
 @app.command()
 def finish(
-    result: Annotated[Path, Argument(metavar="DIR", help="Result folder of runs with --frames.")],
-    draw: Draw = True,
+    result: Annotated[Path, Argument(metavar="DIR", help="Result folder of runs with --frames.")], draw: Draw = True
 ) -> None:
     """Finish a result that was measured in parts: check that no frame is missing, and draw it."""
     from rgbmidic.results import Result, finish_result

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from rgbmidic import cli_parts as parts
 from rgbmidic import command
 from rgbmidic.errors import InputError
 from rgbmidic.extras import optional
@@ -17,10 +16,10 @@ app = typer.Typer()
 
 
 @app.command()
-@parts.opened_result
-@parts.derived_options
+@command.opened_result
+@command.derived_options
 def figures(
-    opened: parts.Opened,
+    opened: command.Opened,
     derived: dict[str, Any],
     out: Annotated[Path | None, Option(help="Folder for the pictures; by default RESULT/figures.")] = None,
     frames: Annotated[str, Option(help="Such as 0,5,10:20; by default three frames.")] = "",
@@ -48,26 +47,26 @@ def figures(
 
 
 @app.command()
-@parts.opened_result
+@command.opened_result
 def export(
-    opened: parts.Opened,
+    opened: command.Opened,
     out: Annotated[Path, Option(help="File to write; for crackpy a folder.")],
     to: Annotated[str, Option(help="Format: npz, csv, hdf5 or crackpy.")] = "npz",
-    overwrite: parts.Overwrite = False,
+    overwrite: command.Overwrite = False,
 ) -> None:
     """Write a result for another program: ParaView, MATLAB, xarray, a spreadsheet, CrackPy."""
     from rgbmidic.results import export_result
 
-    export_result(opened.result, to, out, scale=opened.scale, overwrite=overwrite)
+    export_result(opened.result, to, out, scale=opened.scale(), overwrite=overwrite)
 
 
 @app.command()
-@parts.opened_result
+@command.opened_result
 def report(
-    opened: parts.Opened,
+    opened: command.Opened,
     out: Annotated[Path | None, Option(help="HTML file; by default RESULT/report.html.")] = None,
     frames: Annotated[str, Option(help="Frames to show as maps, such as 0,5,10:20.")] = "",
-    overwrite: parts.Overwrite = False,
+    overwrite: command.Overwrite = False,
 ) -> None:
     """Write the report of a test: one HTML page that can be printed."""
     from rgbmidic.report import REPORT, write_report
@@ -83,8 +82,7 @@ def report(
 @command.frame_options
 def view(
     path: Annotated[
-        Path,
-        Argument(metavar="PATH", help="Result, also of a running test; TEST.toml; raw frames; folder of tests."),
+        Path, Argument(metavar="PATH", help="Result, also of a running test; TEST.toml; raw frames; folder of tests.")
     ],
     statement: dict[str, Any],
     port: Annotated[int, Option(min=0, max=65535, help="Port; 0: any free port.")] = 0,
@@ -99,17 +97,16 @@ def view(
 
 
 @app.command()
-@parts.opened_result
+@command.opened_result
 def compare(
-    opened: parts.Opened,
+    opened: command.Opened,
     fe: Annotated[
         Path, Option("--fe", help="Simulation: .vtu, .pvd or a folder of such files, or .csv by node numbers.")
     ],
-    out: parts.Out,
+    out: command.Out,
     mesh: Annotated[Path | None, Option(help="Mesh file with the nodes of a .csv.")] = None,
     points: Annotated[
-        list[str] | None,
-        Option(metavar="X_MM,Y_MM:X_PX,Y_PX", help="Mesh point and its pixel; twice or more."),
+        list[str] | None, Option(metavar="X_MM,Y_MM:X_PX,Y_PX", help="Mesh point and its pixel; twice or more.")
     ] = None,
     unit: Annotated[str, Option(help="Unit of length of the files: mm, m, um or inch.")] = "mm",
     field: Annotated[str | None, Option(help="Name of the displacement in the files.")] = None,
@@ -117,7 +114,7 @@ def compare(
     offset: Annotated[float, Option(metavar="S", help="Time added to the simulation, s.")] = 0.0,
     frames: Annotated[str, Option(help="Such as 0,5,10:20; by default all.")] = "",
     rigid: Annotated[str, Option(help="Rigid motion: tell (report it) or remove.")] = "tell",
-    overwrite: parts.Overwrite = False,
+    overwrite: command.Overwrite = False,
 ) -> None:
     """Measured minus simulated displacement and strain, in mm and in units of the stated uncertainty.
 
@@ -134,22 +131,22 @@ def compare(
     if mesh is not None and fe.suffix.lower() != ".csv":
         raise InputError(f"--mesh is for a .csv with numbers of nodes; {fe} has a mesh of its own")
     pairs = [command.read_place(text, "--points", "X_MM,Y_MM:X_PX,Y_PX") for text in points or ()]
-    chosen, result, scale = command.read_frames(frames), opened.result, opened.scale
+    chosen, result, scale = command.read_frames(frames), opened.result, opened.scale()
     placement = place(result, scale=scale, pairs=pairs)
     numbered = measured_mesh(result) if mesh is None else read_mesh(mesh, unit=unit)
     simulation = Simulation.read(fe, mesh=numbered, unit=unit, field=field, interval=interval, offset=offset)
     comparison = Comparison(result, simulation, placement, scale=scale, frames=chosen, remove_rigid=rigid == "remove")
     check_folder(out, comparison_files(comparison), overwrite=overwrite)
-    with parts.progress_of("comparing") as progress:
+    with command.progress_of("comparing") as progress:
         done = write_comparison(comparison, out, progress)
-    parts.note(f"placed: {placement.summary()}")
+    command.note(f"placed: {placement.summary()}")
     headings = ["frame", "scale", "uncertainty", "chi-square at nodes", "levelled", "after the scale"]
     rows = []
     for made in done:
         squares = [made.agreement[way, "displacement"].chi_square for way in ("nodes", "levelled")]
         numbers = (made.fit.scale, made.fit.scale_std, *squares, made.fit.chi_square)
         rows.append([f"{made.frame}", *(f"{number:.4g}" for number in numbers)])
-    parts.print_table(f"{len(done)} frames against {fe}", headings, rows)
+    command.print_table(f"{len(done)} frames against {fe}", headings, rows)
     print(scale_text(comparison, done))
     print(f"page: {out / PAGE}")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,6 +64,16 @@ class MovieConstants:
     few: int = 100
     around: int = 235
     patience: float = 300.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Panel:
+    """A field, the values of its first and last colour, their name, and whether there are values below or above."""
+
+    field: Quantity
+    ends: _Span
+    colours: str
+    beyond: tuple[bool, bool]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,6 +160,27 @@ class Movie:
         """Times (T,) of all frames of the result in s; None where not known."""
         return frame_times(self.maps.result, self.maps.physical.scale)
 
+    @cached_property
+    def _layout(self) -> tuple[tuple[_Panel, ...], tuple[_Span, _Span]]:
+        """Panels and their limits (px) along x and y, from all frames or evenly spaced ones."""
+        maps, result, panels, corners = self.maps, self.maps.result, [], [self.maps.result.nodes]
+        frames = spread(self.chosen, max(2, self.constants.sample // len(result.nodes)))
+        for name in self.fields:
+            ordinary, field = [], maps.field(name)
+            for frame in frames:
+                read = maps.read(name, frame)
+                ordinary.append(style.ordinary_values(read.values, read.std))
+                seen = read.moved[np.isfinite(read.moved).all(axis=1)]
+                if self.images is not None and len(seen):
+                    corners.append(np.stack([seen.min(axis=0), seen.max(axis=0)]))
+            known = np.concatenate(ordinary)
+            if not known.size:
+                raise InputError(f"{name} is measured in none of the frames of {result.path}")
+            low, high = self.stated.get(name) or field.ends or style.colour_range(known)
+            beyond, colours = (bool(known.min() < low), bool(known.max() > high)), self.colours or field_colours(field)
+            panels.append(_Panel(field=field, ends=(low, high), colours=colours, beyond=beyond))
+        return tuple(panels), picture_limits(result, np.concatenate(corners))
+
 
 def write_movie(
     movie: Movie,
@@ -200,12 +231,13 @@ def write_movie(
     if not 0.1 <= fps <= 240:
         raise InputError(f"a movie has .1 to 240 frames per second, not {fps:g}")
     check_file(out, overwrite=overwrite)
-    chosen, constants, shared = movie.chosen, movie.constants, _Shared.of(movie)
+    chosen, constants = movie.chosen, movie.constants
+    canvas = _Canvas(movie)
     exe = "" if ending == ".gif" else str(optional("imageio_ffmpeg", "movie").get_ffmpeg_exe())
     parts = max(1, min(processes, len(chosen) // constants.few))
 
     def pages() -> Iterator[Page]:
-        for done, page in enumerate(_pages(shared, chosen, parts), 1):
+        for done, page in enumerate(_pages(canvas, chosen, parts), 1):
             yield page
             if progress is not None:
                 progress(done, len(chosen), "")
@@ -214,74 +246,34 @@ def write_movie(
         encoder = [exe, *_ENCODERS[ending].split()]
         write_complete(out, lambda file: video(file, pages(), fps, encoder, constants.patience))
     else:
-        canvas = _Canvas(shared)
         samples = [*canvas.mixtures(), *(canvas.page(frame) for frame in spread(chosen, 3))]
         write_complete(out, lambda file: gif(file, pages(), fps, samples))
     return out
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Panel:
-    """A field, the values of its first and last colour, their name, and whether there are values below or above."""
-
-    field: Quantity
-    ends: _Span
-    colours: str
-    beyond: tuple[bool, bool]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Shared:
-    """What all pages of a movie share, found from all its frames: panels, limits (px) along x and y, times (s)."""
-
-    movie: Movie
-    panels: tuple[_Panel, ...]
-    limits: tuple[_Span, _Span]
-    times: FloatArray | None
-
-    @classmethod
-    def of(cls, movie: Movie) -> _Shared:
-        """Find the colours of the fields from all frames, or from evenly spaced ones."""
-        maps, result = movie.maps, movie.maps.result
-        frames = spread(movie.chosen, max(2, movie.constants.sample // len(result.nodes)))
-        panels, corners = [], [result.nodes]
-        for name in movie.fields:
-            ordinary, field = [], maps.field(name)
-            for frame in frames:
-                read = maps.read(name, frame)
-                ordinary.append(style.ordinary_values(read.values, read.std))
-                seen = read.moved[np.isfinite(read.moved).all(axis=1)]
-                if movie.images is not None and len(seen):
-                    corners.append(np.stack([seen.min(axis=0), seen.max(axis=0)]))
-            known = np.concatenate(ordinary)
-            if not known.size:
-                raise InputError(f"{name} is measured in none of the frames of {result.path}")
-            low, high = movie.stated.get(name) or field.ends or style.colour_range(known)
-            beyond, colours = (bool(known.min() < low), bool(known.max() > high)), movie.colours or field_colours(field)
-            panels.append(_Panel(field=field, ends=(low, high), colours=colours, beyond=beyond))
-        limits = picture_limits(result, np.concatenate(corners))
-        return cls(movie=movie, panels=tuple(panels), limits=limits, times=movie.times)
-
-
 class _Canvas:
     """A page that is drawn once, and the parts of it that change from frame to frame."""
 
-    def __init__(self, shared: _Shared) -> None:
+    def __init__(self, movie: Movie) -> None:
         from matplotlib import colormaps
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.colors import Normalize
 
-        movie, panels, (x, y) = shared.movie, shared.panels, shared.limits
-        self._movie, self._panels, self._limits, self._times = movie, panels, shared.limits, shared.times
-        unit, factor = movie.maps.physical.axes
+        self.movie, self._times, (unit, factor) = movie, movie.times, movie.maps.physical.axes
+        self._panels, (x, y) = panels, _ = movie._layout
 
         def draw(axes: list[Axes]) -> None:
             for axis, panel in zip(axes, panels, strict=False):
                 style.finish_picture(axis, x, y, first=axis is axes[0], unit=unit, factor=factor)
                 axis.set_title(style.literal(panel.field.label))
                 style.add_colour_bar(axis, Normalize(*panel.ends), panel.colours, beyond=panel.beyond)
-            if movie.curve is not None:
-                self._draw_curve(axes[-1], movie.curve)
+            if (curve := movie.curve) is not None:
+                times, label = style.time_axis(curve.times if curve.timed else None, curve.times)
+                axes[-1].plot(times, curve.values, linewidth=1, color=style.OKABE_ITO["blue"])
+                axes[-1].set_title(style.literal(curve.name), pad=15)  # above the power of ten of the numbers
+                style.finish_plot(axes[-1], label, "", whole=not curve.timed)
+                self._factor = style.time_unit(curve.times)[0] if curve.timed else 1.0
+                (self._cursor,) = axes[-1].plot([], [], color="k", linewidth=1.0, animated=True)
 
         count, aspect = len(panels) + (movie.curve is not None), np.ptp(y) / np.ptp(x)
         self.figure = style.draw_figure(draw, count=count, aspect=aspect, beside=style.BAR, title=" ")
@@ -289,17 +281,22 @@ class _Canvas:
         texts = {movie.maps.how(panel.field.name) for panel in panels}
         self._how = "; ".join(sorted(text for text in texts if sum(text in other for other in texts) == 1))
         canvas: Any = FigureCanvasAgg(self.figure)
-        self._canvas = canvas
-        self._title = self.figure.texts[0]
-        self._title.set(visible=False, fontsize=8)  # two lines have room
+        self._canvas, self._title = canvas, self.figure.texts[0]
+        self._title.set_fontsize(8)  # two lines have room
         canvas.draw()
-        self._title.set_visible(True)
         self._bare = canvas.copy_from_bbox(self.figure.bbox)
+        boxes = [axis.get_window_extent() for axis in self.figure.axes[: len(panels)]]
+        height = self.figure.bbox.height  # boxes are from the bottom of the page
         self._boxes = []
-        for axis in self.figure.axes[: len(panels)]:
-            box = axis.get_window_extent()  # from the bottom of the page
-            rows = slice(int(np.ceil(self.figure.bbox.height - box.y1)) + 1, int(self.figure.bbox.height - box.y0) - 1)
-            self._boxes.append((rows, slice(int(np.ceil(box.x0)) + 1, int(box.x1) - 1), box))
+        for box in boxes:
+            ends = (height - box.y1, height - box.y0), (box.x0, box.x1)
+            rows, columns = (slice(int(np.ceil(low)) + 1, int(high) - 1) for low, high in ends)
+            self._boxes.append((rows, columns))
+        # px of the image to a pixel of a panel, and the place of its first pixel: in the first one, whose size all have
+        (rows, columns), box = self._boxes[0], boxes[0]
+        across, down = columns.start + 0.5 - box.x0, rows.start + 0.5 - (height - box.y1)
+        self._step = step = (x[1] - x[0]) / box.width
+        self._first = x[0] + step * across, y[0] + step * down
         solid = np.uint32(round(256 * movie.opacity))
         self._grey_part = 256 - int(solid)
         self._packed = []
@@ -315,28 +312,12 @@ class _Canvas:
         reference = None if result.reference is None else result.reference.mean(axis=0).astype(np.uint8)
         self._reference = None if reference is None else self._resampled(reference, result.reference_origin)
 
-    def _draw_curve(self, axis: Axes, curve: Curve) -> None:
-        times, label = style.time_axis(curve.times if curve.timed else None, curve.times)
-        axis.plot(times, curve.values, linewidth=1, color=style.OKABE_ITO["blue"])
-        axis.set_title(style.literal(curve.name), pad=15)  # above the power of ten of the numbers
-        style.finish_plot(axis, label, "", whole=not curve.timed)
-        self._factor = style.time_unit(curve.times)[0] if curve.timed else 1.0
-        (self._cursor,) = axis.plot([], [], color="k", linewidth=1.0, animated=True)
-
     def _resampled(self, image: AnyArray, origin: tuple[int, int] = (0, 0)) -> npt.NDArray[np.uint8]:
         """Resample an image, which begins at `origin`, in the first panel; all have its size."""
-        rows, columns, _ = self._boxes[0]
-        (step, left), (_, top) = self._steps()
-        size, first = (rows.stop - rows.start, columns.stop - columns.start), (left - origin[0], top - origin[1])
-        return style.resampled(image, (step, step), first, size, self._movie.constants.around)
-
-    def _steps(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return px of the image to a pixel of the panel, and the place of the first pixel, along x and y."""
-        rows, columns, box = self._boxes[0]
-        (left, right), (top, _) = self._limits
-        step = (right - left) / box.width
-        above = self.figure.bbox.height - box.y1
-        return (step, left + step * (columns.start + 0.5 - box.x0)), (step, top + step * (rows.start + 0.5 - above))
+        rows, columns = self._boxes[0]
+        size = rows.stop - rows.start, columns.stop - columns.start
+        first = self._first[0] - origin[0], self._first[1] - origin[1]
+        return style.resampled(image, (self._step, self._step), first, size, self.movie.constants.around)
 
     def mixtures(self) -> Iterator[Page]:
         """Yield for each panel its colours over all grey levels, as many pixels as a page has."""
@@ -348,7 +329,7 @@ class _Canvas:
 
     def page(self, frame: int) -> Page:
         """Draw the page of a frame."""
-        movie, canvas, times = self._movie, self._canvas, self._times
+        movie, canvas, times = self.movie, self._canvas, self._times
         canvas.restore_region(self._bare)
         result = movie.maps.result
         status, time = QUANTITIES["status"].codes[next(result.each("status", [frame]))], ""
@@ -365,12 +346,11 @@ class _Canvas:
             axis.draw_artist(self._cursor)
         page: npt.NDArray[np.uint32] = np.array(canvas.buffer_rgba()).view(np.uint32)[..., 0]
         grey = self._reference if movie.images is None else self._resampled(movie.images(frame))
-        (step, left), (_, top) = self._steps()
-        for (rows, columns, _), part, packed in zip(self._boxes, self._panels, self._packed, strict=True):
+        for (rows, columns), part, packed in zip(self._boxes, self._panels, self._packed, strict=True):
             read = movie.maps.read(part.field.name, frame)
             panel = np.empty((rows.stop - rows.start, columns.stop - columns.start), dtype=np.uint32)
             under = np.full(panel.shape, movie.constants.around, dtype=np.uint8) if grey is None else grey
-            places = ((read.moved if movie.images is not None else result.nodes) - (left, top)).T / step
+            places = ((read.moved if movie.images is not None else result.nodes) - self._first).T / self._step
             x, y = (np.ascontiguousarray(axis, dtype=np.float64) for axis in places)
             paint_field(
                 panel, under, x, y, result.elements, read.values, *map(float, part.ends), packed, self._grey_part,
@@ -380,21 +360,18 @@ class _Canvas:
         return page.view(np.uint8).reshape(*page.shape, 4)
 
 
-def _pages(shared: _Shared, frames: list[int], processes: int) -> Iterator[Page]:
+def _pages(canvas: _Canvas, frames: list[int], processes: int) -> Iterator[Page]:
     """Yield the pages of frames in their order; each process draws every so many of them and waits until they go."""
     if processes == 1:
-        yield from map(_Canvas(shared).page, frames)
+        yield from map(canvas.page, frames)
         return
-    maps = shared.movie.maps
-    bare = replace(maps, result=replace(maps.result))  # without what was read, which each reads for itself
-    shared = replace(shared, movie=replace(shared.movie, maps=bare))
     context, started, ends = multiprocessing.get_context("spawn"), [], []
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which they inherit: Ctrl-C reaches all processes
     try:
         try:
             for part in range(processes):
                 receive, send = context.Pipe(duplex=False)
-                process = context.Process(target=_draw, args=(shared, frames[part::processes], send), daemon=True)
+                process = context.Process(target=_draw, args=(canvas.movie, frames[part::processes], send), daemon=True)
                 process.start()
                 send.close()
                 started.append(process)
@@ -415,11 +392,11 @@ def _pages(shared: _Shared, frames: list[int], processes: int) -> Iterator[Page]
             process.join()
 
 
-def _draw(shared: _Shared, frames: list[int], send: Any) -> None:
+def _draw(movie: Movie, frames: list[int], send: Any) -> None:
     """Draw pages in a process of its own; what goes wrong is sent in place of a page."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes: the one that encodes ends them
     try:
-        canvas = _Canvas(shared)
+        canvas = _Canvas(movie)
         for frame in frames:
             send.send(canvas.page(frame))
     except BrokenPipeError:  # who asked for the pages was killed

@@ -19,7 +19,7 @@ from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.report import movie
-from rgbmidic.report.movie import Movie, MovieConstants, _Canvas, _Shared, write_movie
+from rgbmidic.report.movie import Movie, MovieConstants, _Canvas, write_movie
 from rgbmidic.report.movie_curve import Curve
 from rgbmidic.results import FrameRecord, Maps
 from rgbmidic.view.picture import RawPictures
@@ -45,7 +45,7 @@ def test_a_movie_shows_the_field_in_each_frame(maps: Maps, tmp_path: Path, endin
     out = write_movie(shown, tmp_path / f"m{ending}")
     frames = decoded(out).astype(int)
     assert frames.shape[0] == 3
-    page = _Canvas(_Shared.of(shown)).page(3)[..., :3].astype(int)
+    page = _Canvas(shown).page(3)[..., :3].astype(int)
     part = frames[1][: page.shape[0], : page.shape[1]]
     assert np.abs(part - page).mean() < 4  # what the encoders leave: 1 to 3 of 255
     assert np.abs(frames[0] - frames[2]).mean() > 2
@@ -54,10 +54,9 @@ def test_a_movie_shows_the_field_in_each_frame(maps: Maps, tmp_path: Path, endin
 def test_the_colour_of_a_node_is_that_of_its_value(maps: Maps) -> None:
     from matplotlib import colormaps
 
-    drawer = _Shared.of(Movie(maps=maps, fields=("u",), frames=[5], limits=(-0.5, 0.5)))
-    canvas = _Canvas(drawer)
-    page, (step, left), (_, top) = canvas.page(5), *canvas._steps()
-    rows, columns, _ = canvas._boxes[0]
+    canvas = _Canvas(Movie(maps=maps, fields=("u",), frames=[5], limits=(-0.5, 0.5)))
+    page, step, (left, top) = canvas.page(5), canvas._step, canvas._first
+    rows, columns = canvas._boxes[0]
     for x, y in ((30, 40), (60, 30), (95, 60)):
         value = 0.01 * (x - 60)
         at = page[rows.start + round((y - top) / step), columns.start + round((x - left) / step), :3] / 255
@@ -66,8 +65,7 @@ def test_the_colour_of_a_node_is_that_of_its_value(maps: Maps) -> None:
 
 def test_a_page_states_how_its_fields_are_derived(maps: Maps) -> None:
     since = replace(maps, since=2)
-    drawer = _Shared.of(Movie(maps=since, fields=("u", "exx_std"), frames=[4]))
-    canvas = _Canvas(drawer)
+    canvas = _Canvas(Movie(maps=since, fields=("u", "exx_std"), frames=[4]))
     canvas.page(4)
     first, how = canvas._title.get_text().splitlines()
     assert first.endswith("frame 4")
@@ -87,8 +85,8 @@ def test_pages_are_the_same_for_any_number_of_processes(maps: Maps, monkeypatch:
     monkeypatch.setattr(SpawnProcess, "start", starting)
     before = signal.getsignal(signal.SIGINT)
     curve = Curve(name="force_N", times=np.linspace(0, 5e-5, 9), values=np.arange(9.0), timed=True)
-    drawer = _Shared.of(Movie(maps=maps, fields=("exx", "velocity"), frames=[0, 2, 4], curve=curve))
-    alone, shared = (list(movie._pages(drawer, [0, 2, 4], count)) for count in (1, 2))
+    canvas = _Canvas(Movie(maps=maps, fields=("exx", "velocity"), frames=[0, 2, 4], curve=curve))
+    alone, shared = (list(movie._pages(canvas, [0, 2, 4], count)) for count in (1, 2))
     assert all(np.array_equal(a, b) for a, b in zip(alone, shared, strict=True))
     assert not np.array_equal(alone[0], alone[1])
     assert handlers == [signal.SIG_IGN] * 2  # inherited: a Ctrl-C while they import is no traceback of theirs
@@ -96,12 +94,12 @@ def test_pages_are_the_same_for_any_number_of_processes(maps: Maps, monkeypatch:
 
 
 def test_a_process_whose_pages_nobody_takes_ends_in_silence(maps: Maps) -> None:
-    drawer = _Shared.of(Movie(maps=maps, fields=("u",), frames=[0, 1]))
+    shown = Movie(maps=maps, fields=("u",), frames=[0, 1])
     receive, send = multiprocessing.Pipe(duplex=False)
     receive.close()
     before = signal.getsignal(signal.SIGINT)
     try:
-        movie._draw(drawer, [0, 1], send)
+        movie._draw(shown, [0, 1], send)
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -121,10 +119,9 @@ def test_over_raw_frames_the_field_lies_where_the_specimen_is(tmp_path: Path) ->
 
     maps = Maps.of(make_result(tmp_path / "r", frames=2, record=shifted, notes={"frame_shape": [80, 200]}))
     grey = lambda index: np.full((80, 200), 100, dtype=np.uint8)  # noqa: E731
-    drawer = _Shared.of(Movie(maps=maps, fields=("u",), frames=[0, 1], images=grey))
-    canvas = _Canvas(drawer)
-    (step, left), (_, top) = canvas._steps()
-    rows, columns, _ = canvas._boxes[0]
+    canvas = _Canvas(Movie(maps=maps, fields=("u",), frames=[0, 1], images=grey))
+    step, (left, top) = canvas._step, canvas._first
+    rows, columns = canvas._boxes[0]
     page = canvas.page(1)[rows, columns]
     grey_at = lambda x: np.ptp(page[round((40 - top) / step), round((x - left) / step), :3]) == 0  # noqa: E731
     assert grey_at(25)  # where the mesh begins on the reference

@@ -1,7 +1,8 @@
-"""The JSON schema of a TEST.toml, by which editors complete and check it."""
+"""The JSON schema of a TEST.toml, by which editors complete and check it (docs/reference/test.schema.json)."""
 
 from __future__ import annotations
 
+import json
 import types
 from dataclasses import MISSING, Field, fields
 from pathlib import Path
@@ -71,7 +72,4 @@ def _described(hint: Any, entry: Field[Any]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    import json
-    import sys
-
-    sys.stdout.write(json.dumps(json_schema(), indent=1) + "\n")
+    print(json.dumps(json_schema(), indent=1))
