@@ -8,7 +8,7 @@ bits on any number of threads.
 
 import numpy as np
 
-from rgbmidic._kernels.threads import FAST, compiled, helper, over_ranges
+from rgbmidic._kernels.threads import FAST, compiled, helper
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
@@ -16,8 +16,7 @@ _LANES = 8
 """Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
 
-@over_ranges("out", axis=1)
-@compiled(fastmath=FAST)
+@compiled("out", axis=1, fastmath=FAST)
 def block_sums(start, stop, values, lines, run_offsets, side, out):
     """Sum fields (n, P) over blocks of `side` px: ``out`` (n, h, w)."""
     out[:, start:stop] = 0
@@ -26,8 +25,7 @@ def block_sums(start, stop, values, lines, run_offsets, side, out):
         _add(values, np.uint64(0), lines, run_offsets, e, start * side, stop * side, side, columns, out)
 
 
-@over_ranges("out", axis=1)
-@compiled(fastmath=FAST)
+@compiled("out", axis=1, fastmath=FAST)
 def product_sums(start, stop, values, weights, lines, run_offsets, side, out):
     """Sum ``s a b`` and ``s = sqrt(w_a w_b)`` over blocks for each two fields a, b of `values` (k, P).
 
@@ -53,8 +51,7 @@ def product_sums(start, stop, values, weights, lines, run_offsets, side, out):
         _add(products, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
 
 
-@over_ranges("out", axis=1)
-@compiled(fastmath=FAST)
+@compiled("out", axis=1, fastmath=FAST)
 def score_sums(start, stop, residual, weights, gradient_x, gradient_y, lines, run_offsets, side, out):
     """Sum ``w r gx``, ``w r gy`` and ``w (gx gx + gy gy)`` of fields (k, P) over blocks, and the pixels with weight.
 

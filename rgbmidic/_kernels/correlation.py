@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from rgbmidic._kernels.splines import PAD
-from rgbmidic._kernels.threads import FAST, compiled, helper, over_ranges
+from rgbmidic._kernels.threads import FAST, compiled, helper
 
 _SIXTH = np.float32(1.0 / 6.0)
 _HALF = np.float32(0.5)
@@ -100,8 +100,7 @@ def _element_motion(displacement, elements, barycentric, origin, e):
     )
 
 
-@over_ranges("elements")
-@compiled(fastmath=FAST)
+@compiled("elements", fastmath=FAST)
 def differences(
     start, stop, coefficients, reference, runs, run_offsets, origin, elements, barycentric, displacement, out
 ):
@@ -146,8 +145,7 @@ def differences(
                 slot, left, x = slot + n, left - n, x + np.float32(n)
 
 
-@over_ranges("out")
-@compiled(fastmath=FAST)
+@compiled("out", fastmath=FAST)
 def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_y, offsets, barycentric, out):
     """Hessian (correlation matrix) of one light: ``out`` (E, 3, 3, 3) receives ``sum w D phi_a phi_b``.
 
@@ -209,8 +207,7 @@ def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_
                     out[e, a, b, c] = out[e, b, a, c]
 
 
-@over_ranges("out", axis=1)
-@compiled(fastmath=FAST)
+@compiled("out", axis=1, fastmath=FAST)
 def element_block_products(
     start, stop, gradient_x, gradient_y, weight, runs, run_offsets, origin, barycentric, sign, side, apart, out,
 ):  # fmt: skip
@@ -249,8 +246,7 @@ def element_block_products(
                 slot, left, x = slot + number, left - number, x + number
 
 
-@over_ranges("elements")
-@compiled(fastmath=FAST)
+@compiled("elements", fastmath=FAST)
 def warped_weights(
     start, stop, deformed_weight, partial, reference, difference, reference_weight, runs, run_offsets, origin,
     elements, barycentric, displacement, weight, moments,
@@ -332,8 +328,7 @@ def _beside(weight, base_x, base_y, px, py):
     return (_ONE - ty) * ((_ONE - tx) * a + tx * b) + ty * ((_ONE - tx) * c + tx * d)
 
 
-@over_ranges("offsets")
-@compiled(fastmath=FAST)
+@compiled("offsets", fastmath=FAST)
 def element_squares(start, stop, difference, weight, offsets, out):
     """Sum ``w r^2``, w and the pixels with weight over every element.
 
@@ -350,8 +345,7 @@ def element_squares(start, stop, difference, weight, offsets, out):
             out[light, e, 0], out[light, e, 1], out[light, e, 2] = square, total, number
 
 
-@over_ranges("offsets")
-@compiled(fastmath=FAST)
+@compiled("offsets", fastmath=FAST)
 def element_sums(start, stop, values, factor, offsets, out):
     """Sum fields (n, P) over every element's pixels, and their products with one factor (P,): ``out`` (n, E, 2)."""
     for n in range(len(values)):
@@ -364,8 +358,7 @@ def element_sums(start, stop, values, factor, offsets, out):
             out[n, e, 0], out[n, e, 1] = total, product
 
 
-@over_ranges("out")
-@compiled(fastmath=FAST)
+@compiled("out", fastmath=FAST)
 def element_vector(start, stop, weight, values, first, second, local_x, local_y, offsets, barycentric, out):
     """Project two fields on the shape functions.
 

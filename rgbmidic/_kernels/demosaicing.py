@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from rgbmidic._kernels.grids import between
-from rgbmidic._kernels.threads import FAST, compiled, helper, over_ranges
+from rgbmidic._kernels.threads import FAST, compiled, helper
 
 TILE = 32
 """Side in px of the squares within which the filters are the same."""
@@ -25,8 +25,7 @@ def _channel(i, j, red_row, red_column):
     return 1 if j % 2 == red_column else 2
 
 
-@over_ranges("out")
-@compiled()
+@compiled("out")
 def fill_unknown(start, stop, padded, fraction, red_row, red_column, pad, out, unknown):
     """Replace samples that are NaN by the common texture predicted from the known ones around.
 
@@ -90,8 +89,7 @@ def _spread(taps, parity, channel, index, first, lines):
                 line[2 * j], line[2 * j + 1] = even, odd
 
 
-@over_ranges("index")
-@compiled(fastmath={"contract"})
+@compiled("index", fastmath={"contract"})
 def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, mean_block, mixing, out):
     """Mixtures of the channels ``mean + scale * sum of taps x samples around`` from the scaled contrast.
 
@@ -158,8 +156,7 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
                         target[j] = red * r[j] + green * g[j] + blue * b[j]
 
 
-@over_ranges("out", least=0)
-@compiled(fastmath=FAST)
+@compiled("out", least=0, fastmath=FAST)
 def prediction_taps(
     start, stop, common, own, together, seen, alike, displacement, noise, texture, step, fine, offset, channels, out
 ):
@@ -259,8 +256,7 @@ def prediction_taps(
                     out[entry, phase, e, p // size, p % size] = wanted[e, p]
 
 
-@over_ranges("sums", axis=2)
-@compiled(fastmath={"contract"})
+@compiled("sums", axis=2, fastmath={"contract"})
 def displacement_sums(start, stop, padded, taps, block, red_row, red_column, sums):
     """Sum ``r gx``, ``r gy``, ``(gx gx + gy gy) / 2``, ``r r`` and 1 over samples of each channel in each block.
 

@@ -6,11 +6,10 @@ rectangle. Pixels are counted without sign: an index that may be negative would 
 
 import numpy as np
 
-from rgbmidic._kernels.threads import compiled, over_ranges
+from rgbmidic._kernels.threads import compiled
 
 
-@over_ranges("lines")
-@compiled()
+@compiled("lines")
 def to_image(start, stop, lines, values, top, left, out):
     """Write fields (n, P) float32 of the owned pixels into images ``out`` (n, H, W).
 
@@ -24,8 +23,7 @@ def to_image(start, stop, lines, values, top, left, out):
                 out[n, row, column + i] = values[n, slot + i]
 
 
-@over_ranges("lines")
-@compiled()
+@compiled("lines")
 def from_image(start, stop, lines, image, top, left, out):
     """Read fields ``out`` (n, P) at the owned pixels from such images (n, H, W)."""
     for n in range(len(image)):

@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from rgbmidic._kernels.threads import FAST, compiled, over_ranges
+from rgbmidic._kernels.threads import FAST, compiled
 
 
-@over_ranges("elements")
-@compiled()
+@compiled("elements")
 def interpolate_nodal(start, stop, values, elements, local_x, local_y, offsets, barycentric, out):
     """Nodal field (N, 2) at the owned pixels: ``out`` (2, P) float32."""
     for e in range(start, stop):
@@ -21,8 +20,7 @@ def interpolate_nodal(start, stop, values, elements, local_x, local_y, offsets, 
                 out[c, i] = constant + slope_x * local_x[i] + slope_y * local_y[i]
 
 
-@over_ranges("polynomials")
-@compiled(fastmath=FAST)
+@compiled("polynomials", fastmath=FAST)
 def subtract_quadratic(
     start, stop, difference, gradient_x, gradient_y, polynomials, local_x, local_y, offsets, out,
 ):  # fmt: skip

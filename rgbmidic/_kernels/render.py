@@ -22,7 +22,7 @@ import math
 
 import numpy as np
 
-from rgbmidic._kernels.threads import compiled, helper, over_ranges
+from rgbmidic._kernels.threads import compiled, helper
 
 PLATE, CYLINDER, SPHERE = 0, 1, 2
 TILE = 4
@@ -372,8 +372,7 @@ def _light(energy, left, work, rows, span, lights, j, frame, body, paint):
             line[s] = power * square * total if (row[_SEEN + s] > _ZERO) & (nl > _ZERO) & (ml > _ZERO) else _ZERO
 
 
-@over_ranges("out", axis=1, grain=TILE, least=0)
-@compiled()
+@compiled("out", axis=1, grain=TILE, least=0)
 def trace_rows(
     start, stop, out, first_row, taps, pad, lens, frame, body, affine, material, lights, paint, counts, seed
 ):
@@ -436,8 +435,7 @@ def _decimate(out, line, samples, taps):
         out[c] = total
 
 
-@over_ranges("out", grain=_POINTS, least=0)
-@compiled()
+@compiled("out", grain=_POINTS, least=0)
 def sample_paint(start, stop, out, points, body, paint, counts, seed):
     """Cover, height (mm) and slope vector of the paint at points on the body: `out` (N, 5)."""
     for first in range(start, stop, _POINTS):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rgbmidic._kernels.threads import FAST, compiled, helper, over_ranges
+from rgbmidic._kernels.threads import FAST, compiled, helper
 from rgbmidic.typing import FloatImage
 
 PAD = 2
@@ -36,8 +36,7 @@ def bspline_coefficients(image: FloatImage, out: FloatImage, taps: FloatImage = 
         out[PAD + height - 1 + p] = out[PAD + max(height - 1 - p, 0)]
 
 
-@over_ranges("image", axis=1, grain=_LINE)
-@compiled(fastmath=FAST)
+@compiled("image", axis=1, grain=_LINE, fastmath=FAST)
 def _filter_columns(start, stop, image, taps, out):
     """Filter down the columns, whole rows at a time: by `taps`, then by the recursions, causal and anticausal."""
     n, z = image.shape[0], _POLE
@@ -64,8 +63,7 @@ def _filter_columns(start, stop, image, taps, out):
             before[j] = row[j] = z * (before[j] - row[j])
 
 
-@over_ranges("image")
-@compiled(fastmath=FAST)
+@compiled("image", fastmath=FAST)
 def _filter_rows(start, stop, image, taps, out):
     """Filter along each row, with the recursions as products.
 
@@ -109,8 +107,7 @@ def _mirrored(i, n):
     return j if j < n else 2 * n - 2 - j
 
 
-@over_ranges("lines")
-@compiled(fastmath=FAST)
+@compiled("lines", fastmath=FAST)
 def pixel_gradient(start, stop, lines, coefficients, top, left, gradient_x, gradient_y):
     """Evaluate the gradient of the spline at the whole pixels of `lines` (R, 4) int32.
 
@@ -130,8 +127,7 @@ def pixel_gradient(start, stop, lines, coefficients, top, left, gradient_x, grad
             gradient_y[slot + i] = twelfth * down
 
 
-@over_ranges("x", grain=4096)
-@compiled(fastmath=FAST)
+@compiled("x", grain=4096, fastmath=FAST)
 def sample_with_gradient(start, stop, coefficients, x, y, value, gradient_x, gradient_y):
     """Value and spatial gradient of the spline at the points (x, y), 1-D float64; points outside are clamped.
 

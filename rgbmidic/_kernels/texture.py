@@ -7,7 +7,7 @@ interpolated linearly, beyond the outermost they are constant.
 import numpy as np
 
 from rgbmidic._kernels.grids import between
-from rgbmidic._kernels.threads import compiled, helper, over_ranges
+from rgbmidic._kernels.threads import compiled, helper
 
 REACH = 3
 """Rows and columns beyond a cell that its binomial sums reach."""
@@ -17,8 +17,7 @@ _CELLS = 128
 """Cells of a row at a time."""
 
 
-@over_ranges("sums", axis=1)
-@compiled()
+@compiled("sums", axis=1)
 def block_sums(start, stop, values, block, sums):
     """Sum the finite samples of the four planes in each block, then count them: `sums` (8, h, w) float32."""
     total = np.empty((4, sums.shape[2] * block), np.float32)
@@ -41,8 +40,7 @@ def block_sums(start, stop, values, block, sums):
                 out[b] = value
 
 
-@over_ranges("out")
-@compiled()
+@compiled("out")
 def subtract_mean(start, stop, values, mean, block, out):
     """Write ``out = values - local mean``.
 
@@ -56,8 +54,7 @@ def subtract_mean(start, stop, values, mean, block, out):
             target[j] = line[j] - (above[j] + part * (below[j] - above[j]))
 
 
-@over_ranges("out")
-@compiled()
+@compiled("out")
 def divide_by_mean(start, stop, values, mean, block, least, out):
     """``out = values / local mean``, NaN where the mean is not above `least`.
 
@@ -71,8 +68,7 @@ def divide_by_mean(start, stop, values, mean, block, least, out):
             target[j] = line[j] / level if level > least else np.float32(np.nan)
 
 
-@over_ranges("out")
-@compiled()
+@compiled("out")
 def scaled_contrast(start, stop, contrast, scale, block, pad, out):
     """``out = contrast * scale``, mirrored by `pad` pixels on every side.
 
@@ -105,8 +101,7 @@ def _down(above, here, below, first, last, planes, number):
         planes[1, c] = first * above[j] + ten * here[j] + last * below[j]
 
 
-@over_ranges("sums", axis=1)
-@compiled(fastmath={"contract"})
+@compiled("sums", axis=1, fastmath={"contract"})
 def cell_moments(start, stop, contrast, block, sums):
     """Second moments of the four planes' low-passed contrast, summed over the cells of each block.
 
