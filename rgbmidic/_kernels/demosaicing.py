@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rgbmidic._kernels.grids import between
+from rgbmidic._kernels.texture import between
 from rgbmidic._kernels.threads import FAST, compiled, helper
 
 TILE = 32

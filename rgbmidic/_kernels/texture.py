@@ -6,7 +6,6 @@ interpolated linearly, beyond the outermost they are constant.
 
 import numpy as np
 
-from rgbmidic._kernels.grids import between
 from rgbmidic._kernels.threads import compiled, helper
 
 REACH = 3
@@ -15,6 +14,14 @@ PLANE_PAIRS = tuple((p, q) for p in range(4) for q in range(p, 4))
 """Pairs of the planes of a mosaic; plane 2 a + b has the samples of row a and column b of the 2x2 cells."""
 _CELLS = 128
 """Cells of a row at a time."""
+
+
+@helper()
+def between(row, block, rows):
+    """Return the two rows of a grid that a row of pixels lies between, and how far on from the first it is."""
+    position = min(max((row + 0.5) / block - 0.5, 0.0), rows - 1.0)
+    low = int(position)
+    return low, min(low + 1, rows - 1), np.float32(position - low)
 
 
 @compiled("sums", axis=1)

@@ -16,7 +16,7 @@ from textures import Texture
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from rgbmidic import correlate
-from rgbmidic._kernels.block_sums import block_sums
+from rgbmidic._kernels.owned_pixels import block_sums
 from rgbmidic._kernels.threads import aside, compiled, one_blas_thread, set_threads, threads
 from rgbmidic.errors import InputError
 
