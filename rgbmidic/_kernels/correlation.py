@@ -145,6 +145,12 @@ def differences(
                 slot, left, x = slot + n, left - n, x + np.float32(n)
 
 
+@helper()
+def _shape_function(barycentric, e, a):
+    """Constant and slopes along x and y of a shape function of element e."""
+    return np.float32(barycentric[e, a, 0]), np.float32(barycentric[e, a, 1]), np.float32(barycentric[e, a, 2])
+
+
 @compiled("out", fastmath=FAST)
 def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_y, offsets, barycentric, out):
     """Hessian (correlation matrix) of one light: ``out`` (E, 3, 3, 3) receives ``sum w D phi_a phi_b``.
@@ -152,12 +158,8 @@ def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_
     The last axis of `out` holds D = (gx gx, gx gy, gy gy).
     """
     for e in range(start, stop):
-        b00 = np.float32(barycentric[e, 0, 0])
-        b01 = np.float32(barycentric[e, 0, 1])
-        b02 = np.float32(barycentric[e, 0, 2])
-        b10 = np.float32(barycentric[e, 1, 0])
-        b11 = np.float32(barycentric[e, 1, 1])
-        b12 = np.float32(barycentric[e, 1, 2])
+        b00, b01, b02 = _shape_function(barycentric, e, 0)
+        b10, b11, b12 = _shape_function(barycentric, e, 1)
         x00 = x01 = x11 = x02 = x12 = x22 = _ZERO
         m00 = m01 = m11 = m02 = m12 = m22 = _ZERO
         y00 = y01 = y11 = y02 = y12 = y22 = _ZERO
@@ -366,12 +368,8 @@ def element_vector(start, stop, weight, values, first, second, local_x, local_y,
     (P,) float32.
     """
     for e in range(start, stop):
-        b00 = np.float32(barycentric[e, 0, 0])
-        b01 = np.float32(barycentric[e, 0, 1])
-        b02 = np.float32(barycentric[e, 0, 2])
-        b10 = np.float32(barycentric[e, 1, 0])
-        b11 = np.float32(barycentric[e, 1, 1])
-        b12 = np.float32(barycentric[e, 1, 2])
+        b00, b01, b02 = _shape_function(barycentric, e, 0)
+        b10, b11, b12 = _shape_function(barycentric, e, 1)
         p0 = p1 = p2 = q0 = q1 = q2 = _ZERO
         for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
             l0 = b00 + b01 * local_x[i] + b02 * local_y[i]

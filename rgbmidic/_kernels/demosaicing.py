@@ -57,8 +57,10 @@ def fill_unknown(start, stop, padded, fraction, red_row, red_column, pad, out, u
 
 # contraction to fused multiply-add alone: NaN and infinity keep their meaning
 @helper(fastmath={"contract"}, forceinline=True)
-def _filtered(r0, r1, r2, r3, r4, lines, out):
-    """Sum of the products of five rows of samples with the taps `lines` (25, _STRIP)."""
+def _filtered(padded, row, left, lines, out):
+    """Sum of the products of five rows of samples, from a place on, with the taps `lines` (25, _STRIP)."""
+    r0, r1, r2 = padded[row, left:], padded[row + 1, left:], padded[row + 2, left:]
+    r3, r4 = padded[row + 3, left:], padded[row + 4, left:]
     for j in range(out.size):
         total = np.float32(0.0)
         for b in range(_SIZE):
@@ -127,18 +129,9 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
                     for i in range(top + parity, bottom, 2):
                         made = channels[c, i - top, :number]
                         if size == _SIZE:
-                            _filtered(
-                                padded[i, left:],
-                                padded[i + 1, left:],
-                                padded[i + 2, left:],
-                                padded[i + 3, left:],
-                                padded[i + 4, left:],
-                                lines,
-                                made,
-                            )
+                            _filtered(padded, i, left, lines, made)
                         else:
-                            for j in range(number):
-                                made[j] = 0
+                            made[:] = 0
                             for k in range(_WIDE):
                                 _add_row(padded[i + k, left:], lines[k * _WIDE : (k + 1) * _WIDE], made)
                         low, high, part = between(i, mean_block, mean.shape[1])
@@ -287,15 +280,7 @@ def displacement_sums(start, stop, padded, taps, block, red_row, red_column, sum
             for left in range(0, columns, strip):
                 number = min(strip, columns - left)
                 for n in range(3):
-                    _filtered(
-                        padded[i, left:],
-                        padded[i + 1, left:],
-                        padded[i + 2, left:],
-                        padded[i + 3, left:],
-                        padded[i + 4, left:],
-                        taps[i % 2, n],
-                        made[n, :number],
-                    )
+                    _filtered(padded, i, left, taps[i % 2, n], made[n, :number])
                 for phase in range(2):
                     channel = _channel(i, phase, red_row, red_column)
                     for first in range(0, number, block):

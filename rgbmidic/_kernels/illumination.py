@@ -24,10 +24,7 @@ def unmix(start, stop, channels, valid, grid, step, needed, out, out_valid):
         down = np.float32(y - gy * step) / np.float32(step)
         for light in range(lights):
             values, ok = out[light, y], out_valid[light, y]
-            for x in range(np.uint64(width)):
-                values[x] = 0.0
-            for x in range(np.uint64(width)):
-                ok[x] = True
+            values[:], ok[:] = 0.0, True
             for colour in range(colours):
                 given, known = channels[colour, y], valid[colour, y]
                 for gx in range((width + step - 1) // step):

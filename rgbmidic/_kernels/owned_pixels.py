@@ -127,8 +127,7 @@ def score_sums(start, stop, residual, weights, gradient_x, gradient_y, lines, ru
     scores = np.empty((4, np.diff(offsets).max()), dtype=np.float32)
     for e in range(run_offsets.size - 1):
         first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
-        for i in range(number):
-            scores[0, i] = scores[1, i] = scores[2, i] = scores[3, i] = _ZERO
+        scores[:] = 0
         for light in range(len(weights)):
             for i in range(number):
                 w, gx, gy = weights[light, first + i], gradient_x[light, first + i], gradient_y[light, first + i]

@@ -22,8 +22,7 @@ def gradient_of_others(start, stop, gradient, weights, light, fewest, mean, prod
     own, lights = np.uint64(light), np.uint64(len(weights))
     for block in range(start, stop, BLOCK):
         first, number = np.uint64(block), np.uint64(min(BLOCK, stop - block))
-        for i in range(number):
-            count[i] = _ZERO
+        count[:] = 0
         for j in range(lights):
             for i in range(number):
                 count[i] += _ONE if weights[j, first + i] > _ZERO else _ZERO
@@ -32,8 +31,7 @@ def gradient_of_others(start, stop, gradient, weights, light, fewest, mean, prod
             less[i] = seen if count[i] - seen >= fewest else _ZERO
             products[3, first + i] = seen
         for axis in range(np.uint64(2)):
-            for i in range(number):
-                total[i] = _ZERO
+            total[:] = 0
             for j in range(lights):
                 for i in range(number):
                     total[i] += gradient[axis, j, first + i] if weights[j, first + i] > _ZERO else _ZERO
