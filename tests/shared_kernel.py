@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rgbmidic._kernels.block_sums import block_sums
+from rgbmidic._kernels.owned_pixels import block_sums
 from rgbmidic._kernels.threads import set_threads
 
 

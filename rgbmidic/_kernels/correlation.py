@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from rgbmidic._kernels.splines import PAD
-from rgbmidic._kernels.threads import FAST, compiled, helper, over_ranges
+from rgbmidic._kernels.threads import FAST, compiled, helper
 
 _SIXTH = np.float32(1.0 / 6.0)
 _HALF = np.float32(0.5)
@@ -100,8 +100,7 @@ def _element_motion(displacement, elements, barycentric, origin, e):
     )
 
 
-@over_ranges("elements")
-@compiled(fastmath=FAST)
+@compiled("elements", fastmath=FAST)
 def differences(
     start, stop, coefficients, reference, runs, run_offsets, origin, elements, barycentric, displacement, out
 ):
@@ -146,20 +145,21 @@ def differences(
                 slot, left, x = slot + n, left - n, x + np.float32(n)
 
 
-@over_ranges("out")
-@compiled(fastmath=FAST)
+@helper()
+def _shape_function(barycentric, e, a):
+    """Constant and slopes along x and y of a shape function of element e."""
+    return np.float32(barycentric[e, a, 0]), np.float32(barycentric[e, a, 1]), np.float32(barycentric[e, a, 2])
+
+
+@compiled("out", fastmath=FAST)
 def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_y, offsets, barycentric, out):
     """Hessian (correlation matrix) of one light: ``out`` (E, 3, 3, 3) receives ``sum w D phi_a phi_b``.
 
     The last axis of `out` holds D = (gx gx, gx gy, gy gy).
     """
     for e in range(start, stop):
-        b00 = np.float32(barycentric[e, 0, 0])
-        b01 = np.float32(barycentric[e, 0, 1])
-        b02 = np.float32(barycentric[e, 0, 2])
-        b10 = np.float32(barycentric[e, 1, 0])
-        b11 = np.float32(barycentric[e, 1, 1])
-        b12 = np.float32(barycentric[e, 1, 2])
+        b00, b01, b02 = _shape_function(barycentric, e, 0)
+        b10, b11, b12 = _shape_function(barycentric, e, 1)
         x00 = x01 = x11 = x02 = x12 = x22 = _ZERO
         m00 = m01 = m11 = m02 = m12 = m22 = _ZERO
         y00 = y01 = y11 = y02 = y12 = y22 = _ZERO
@@ -209,8 +209,7 @@ def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_
                     out[e, a, b, c] = out[e, b, a, c]
 
 
-@over_ranges("out", axis=1)
-@compiled(fastmath=FAST)
+@compiled("out", axis=1, fastmath=FAST)
 def element_block_products(
     start, stop, gradient_x, gradient_y, weight, runs, run_offsets, origin, barycentric, sign, side, apart, out,
 ):  # fmt: skip
@@ -249,8 +248,7 @@ def element_block_products(
                 slot, left, x = slot + number, left - number, x + number
 
 
-@over_ranges("elements")
-@compiled(fastmath=FAST)
+@compiled("elements", fastmath=FAST)
 def warped_weights(
     start, stop, deformed_weight, partial, reference, difference, reference_weight, runs, run_offsets, origin,
     elements, barycentric, displacement, weight, moments,
@@ -332,8 +330,7 @@ def _beside(weight, base_x, base_y, px, py):
     return (_ONE - ty) * ((_ONE - tx) * a + tx * b) + ty * ((_ONE - tx) * c + tx * d)
 
 
-@over_ranges("offsets")
-@compiled(fastmath=FAST)
+@compiled("offsets", fastmath=FAST)
 def element_squares(start, stop, difference, weight, offsets, out):
     """Sum ``w r^2``, w and the pixels with weight over every element.
 
@@ -350,8 +347,7 @@ def element_squares(start, stop, difference, weight, offsets, out):
             out[light, e, 0], out[light, e, 1], out[light, e, 2] = square, total, number
 
 
-@over_ranges("offsets")
-@compiled(fastmath=FAST)
+@compiled("offsets", fastmath=FAST)
 def element_sums(start, stop, values, factor, offsets, out):
     """Sum fields (n, P) over every element's pixels, and their products with one factor (P,): ``out`` (n, E, 2)."""
     for n in range(len(values)):
@@ -364,8 +360,7 @@ def element_sums(start, stop, values, factor, offsets, out):
             out[n, e, 0], out[n, e, 1] = total, product
 
 
-@over_ranges("out")
-@compiled(fastmath=FAST)
+@compiled("out", fastmath=FAST)
 def element_vector(start, stop, weight, values, first, second, local_x, local_y, offsets, barycentric, out):
     """Project two fields on the shape functions.
 
@@ -373,12 +368,8 @@ def element_vector(start, stop, weight, values, first, second, local_x, local_y,
     (P,) float32.
     """
     for e in range(start, stop):
-        b00 = np.float32(barycentric[e, 0, 0])
-        b01 = np.float32(barycentric[e, 0, 1])
-        b02 = np.float32(barycentric[e, 0, 2])
-        b10 = np.float32(barycentric[e, 1, 0])
-        b11 = np.float32(barycentric[e, 1, 1])
-        b12 = np.float32(barycentric[e, 1, 2])
+        b00, b01, b02 = _shape_function(barycentric, e, 0)
+        b10, b11, b12 = _shape_function(barycentric, e, 1)
         p0 = p1 = p2 = q0 = q1 = q2 = _ZERO
         for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
             l0 = b00 + b01 * local_x[i] + b02 * local_y[i]

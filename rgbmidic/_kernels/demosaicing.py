@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rgbmidic._kernels.grids import between
-from rgbmidic._kernels.threads import FAST, compiled, helper, over_ranges
+from rgbmidic._kernels.texture import between
+from rgbmidic._kernels.threads import FAST, compiled, helper
 
 TILE = 32
 """Side in px of the squares within which the filters are the same."""
@@ -25,8 +25,7 @@ def _channel(i, j, red_row, red_column):
     return 1 if j % 2 == red_column else 2
 
 
-@over_ranges("out")
-@compiled()
+@compiled("out")
 def fill_unknown(start, stop, padded, fraction, red_row, red_column, pad, out, unknown):
     """Replace samples that are NaN by the common texture predicted from the known ones around.
 
@@ -58,8 +57,10 @@ def fill_unknown(start, stop, padded, fraction, red_row, red_column, pad, out, u
 
 # contraction to fused multiply-add alone: NaN and infinity keep their meaning
 @helper(fastmath={"contract"}, forceinline=True)
-def _filtered(r0, r1, r2, r3, r4, lines, out):
-    """Sum of the products of five rows of samples with the taps `lines` (25, _STRIP)."""
+def _filtered(padded, row, left, lines, out):
+    """Sum of the products of five rows of samples, from a place on, with the taps `lines` (25, _STRIP)."""
+    r0, r1, r2 = padded[row, left:], padded[row + 1, left:], padded[row + 2, left:]
+    r3, r4 = padded[row + 3, left:], padded[row + 4, left:]
     for j in range(out.size):
         total = np.float32(0.0)
         for b in range(_SIZE):
@@ -90,8 +91,7 @@ def _spread(taps, parity, channel, index, first, lines):
                 line[2 * j], line[2 * j + 1] = even, odd
 
 
-@over_ranges("index")
-@compiled(fastmath={"contract"})
+@compiled("index", fastmath={"contract"})
 def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, mean_block, mixing, out):
     """Mixtures of the channels ``mean + scale * sum of taps x samples around`` from the scaled contrast.
 
@@ -129,18 +129,9 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
                     for i in range(top + parity, bottom, 2):
                         made = channels[c, i - top, :number]
                         if size == _SIZE:
-                            _filtered(
-                                padded[i, left:],
-                                padded[i + 1, left:],
-                                padded[i + 2, left:],
-                                padded[i + 3, left:],
-                                padded[i + 4, left:],
-                                lines,
-                                made,
-                            )
+                            _filtered(padded, i, left, lines, made)
                         else:
-                            for j in range(number):
-                                made[j] = 0
+                            made[:] = 0
                             for k in range(_WIDE):
                                 _add_row(padded[i + k, left:], lines[k * _WIDE : (k + 1) * _WIDE], made)
                         low, high, part = between(i, mean_block, mean.shape[1])
@@ -158,8 +149,7 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
                         target[j] = red * r[j] + green * g[j] + blue * b[j]
 
 
-@over_ranges("out", least=0)
-@compiled(fastmath=FAST)
+@compiled("out", least=0, fastmath=FAST)
 def prediction_taps(
     start, stop, common, own, together, seen, alike, displacement, noise, texture, step, fine, offset, channels, out
 ):
@@ -259,8 +249,7 @@ def prediction_taps(
                     out[entry, phase, e, p // size, p % size] = wanted[e, p]
 
 
-@over_ranges("sums", axis=2)
-@compiled(fastmath={"contract"})
+@compiled("sums", axis=2, fastmath={"contract"})
 def displacement_sums(start, stop, padded, taps, block, red_row, red_column, sums):
     """Sum ``r gx``, ``r gy``, ``(gx gx + gy gy) / 2``, ``r r`` and 1 over samples of each channel in each block.
 
@@ -291,15 +280,7 @@ def displacement_sums(start, stop, padded, taps, block, red_row, red_column, sum
             for left in range(0, columns, strip):
                 number = min(strip, columns - left)
                 for n in range(3):
-                    _filtered(
-                        padded[i, left:],
-                        padded[i + 1, left:],
-                        padded[i + 2, left:],
-                        padded[i + 3, left:],
-                        padded[i + 4, left:],
-                        taps[i % 2, n],
-                        made[n, :number],
-                    )
+                    _filtered(padded, i, left, taps[i % 2, n], made[n, :number])
                 for phase in range(2):
                     channel = _channel(i, phase, red_row, red_column)
                     for first in range(0, number, block):

@@ -5,7 +5,7 @@ The solves and the quadratic forms take many vectors at once, side by side in me
 
 import numpy as np
 
-from rgbmidic._kernels.threads import FAST, compiled, over_ranges
+from rgbmidic._kernels.threads import FAST, compiled
 
 _BLOCK = 32
 """Vectors at a time: those of some 3,000 unknowns stay in a core's own cache."""
@@ -50,8 +50,7 @@ def factorise(data, given_starts, given_nodes, given, before_starts, before, sta
         inverse[k, 0], inverse[k, 1], inverse[k, 2] = yy * scale, -xy * scale, xx * scale
 
 
-@over_ranges("x", axis=2, grain=_BLOCK)
-@compiled(fastmath=FAST)
+@compiled("x", axis=2, grain=_BLOCK, fastmath=FAST)
 def solve_factors(start, stop, starts, rows, lower, inverse, x):
     """Solve ``L D L^T x = b`` in place, for x (N, 2, R) float64 and such factors."""
     n = len(inverse)
@@ -77,8 +76,7 @@ def solve_factors(start, stop, starts, rows, lower, inverse, x):
                     x[own, 1, r] -= b * x[i, 0, r] + d * x[i, 1, r]
 
 
-@over_ranges("x", axis=1, grain=_BLOCK)
-@compiled(fastmath=FAST)
+@compiled("x", axis=1, grain=_BLOCK, fastmath=FAST)
 def node_energies(start, stop, values, columns, starts, x, out):
     """Write what each node adds to ``x^T S x`` of every column of x (2 N, R): ``out`` (N, R), S given by its rows."""
     product = np.empty(_BLOCK)

@@ -7,11 +7,10 @@ of red in the 2x2 cell of the unpadded mosaic; blue is diagonal to it.
 
 import numpy as np
 
-from rgbmidic._kernels.threads import compiled, helper, over_ranges
+from rgbmidic._kernels.threads import compiled, helper
 
 
-@over_ranges("out", axis=1)
-@compiled()
+@compiled("out", axis=1)
 def unmix(start, stop, channels, valid, grid, step, needed, out, out_valid):
     """``out = matrix(x, y) @ channels`` with the matrix interpolated linearly between grid points `step` px apart.
 
@@ -25,10 +24,7 @@ def unmix(start, stop, channels, valid, grid, step, needed, out, out_valid):
         down = np.float32(y - gy * step) / np.float32(step)
         for light in range(lights):
             values, ok = out[light, y], out_valid[light, y]
-            for x in range(np.uint64(width)):
-                values[x] = 0.0
-            for x in range(np.uint64(width)):
-                ok[x] = True
+            values[:], ok[:] = 0.0, True
             for colour in range(colours):
                 given, known = channels[colour, y], valid[colour, y]
                 for gx in range((width + step - 1) // step):
@@ -58,8 +54,7 @@ def _mirror(index, size):
     return min(index, period - index)
 
 
-@over_ranges("out")
-@compiled()
+@compiled("out")
 def pad_mosaic(start, stop, values, invalid, out):
     """Copy (H, W) `values` into (H + 4, W + 4) `out`, mirrored at the borders, NaN where `invalid`; H, W >= 2."""
     rows, columns = values.shape
@@ -74,8 +69,7 @@ def pad_mosaic(start, stop, values, invalid, out):
             out[i, columns + PAD + side] = np.nan if invalid[source, right] else values[source, right]
 
 
-@over_ranges("out", axis=1)
-@compiled()
+@compiled("out", axis=1)
 def malvar(start, stop, padded, red_row, red_column, out):
     """Bilinear average corrected by the Laplacian of the sampled channel (Malvar 2004); fills (3, H, W) `out`."""
     columns = out.shape[2]

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from rgbmidic._kernels.threads import compiled, over_ranges
+from rgbmidic._kernels.threads import compiled
 
 
 @compiled()
@@ -61,8 +61,7 @@ _EDGE = -1e-9
 """Shape function from which a point on an edge is inside: rounding of float64 on images of 1e5 px is 1e-11."""
 
 
-@over_ranges("out", grain=4096)
-@compiled()
+@compiled("out", grain=4096)
 def interpolate_at_points(start, stop, out, x, y, nodes, elements, values, box, first, members):
     """Write the linear interpolation (2,) of `values` (N, 2) at every point, NaN outside the mesh.
 

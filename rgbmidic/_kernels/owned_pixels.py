@@ -1,16 +1,25 @@
-"""The owned pixels of a region, moved to and from images of the rectangle around the region.
+"""Fields at the owned pixels of a region: to and from images of the rectangle around it, from nodes, sums over blocks.
 
 `lines` (R, 4) int32 are the rows of pixels of the elements: first slot, number of pixels, row and column in the
-rectangle. Pixels are counted without sign: an index that may be negative would be looked at each time.
+rectangle. They, `run_offsets` and `offsets` (E + 1,) are those of `rgbmidic.mesh.PixelMap`. Pixels are counted without
+sign: an index that may be negative would be looked at each time.
+
+Pixels lie in memory element after element, and are read so: for the sums over square blocks the rows of an element in a
+row of blocks are first added up along its columns, these then over the blocks. A row of blocks is summed by one thread,
+element by element, so that the sums are the same bits on any number of threads.
 """
 
 import numpy as np
 
-from rgbmidic._kernels.threads import compiled, over_ranges
+from rgbmidic._kernels.threads import FAST, compiled, helper
+
+_ZERO = np.float32(0.0)
+_ONE = np.float32(1.0)
+_LANES = 8
+"""Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
 
-@over_ranges("lines")
-@compiled()
+@compiled("lines")
 def to_image(start, stop, lines, values, top, left, out):
     """Write fields (n, P) float32 of the owned pixels into images ``out`` (n, H, W).
 
@@ -24,8 +33,7 @@ def to_image(start, stop, lines, values, top, left, out):
                 out[n, row, column + i] = values[n, slot + i]
 
 
-@over_ranges("lines")
-@compiled()
+@compiled("lines")
 def from_image(start, stop, lines, image, top, left, out):
     """Read fields ``out`` (n, P) at the owned pixels from such images (n, H, W)."""
     for n in range(len(image)):
@@ -34,3 +42,147 @@ def from_image(start, stop, lines, image, top, left, out):
             row, column = np.uint64(top + lines[q, 2]), np.uint64(left + lines[q, 3])
             for i in range(number):
                 out[n, slot + i] = image[n, row, column + i]
+
+
+@compiled("elements")
+def interpolate_nodal(start, stop, values, elements, local_x, local_y, offsets, barycentric, out):
+    """Nodal field (N, 2) at the owned pixels: ``out`` (2, P) float32."""
+    for e in range(start, stop):
+        for c in range(2):
+            constant = slope_x = slope_y = 0.0
+            for a in range(3):
+                value = values[elements[e, a], c]
+                constant += barycentric[e, a, 0] * value
+                slope_x += barycentric[e, a, 1] * value
+                slope_y += barycentric[e, a, 2] * value
+            for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
+                out[c, i] = constant + slope_x * local_x[i] + slope_y * local_y[i]
+
+
+@compiled("polynomials", fastmath=FAST)
+def subtract_quadratic(
+    start, stop, difference, gradient_x, gradient_y, polynomials, local_x, local_y, offsets, out,
+):  # fmt: skip
+    """Take the effect of a displacement d, quadratic in every element, out of a residual.
+
+    ``out`` (k, P) receives ``difference - grad f . d``, all (k, P) float32. `polynomials` (E, 2, 6) float32 holds the
+    coefficients of 1, x, y, x^2, x y, y^2 of the local position, in px.
+    """
+    for light in range(len(difference)):
+        given, gx, gy, less = difference[light], gradient_x[light], gradient_y[light], out[light]
+        for e in range(start, stop):
+            u, v = polynomials[e, 0], polynomials[e, 1]
+            u0, u1, u2, u3, u4, u5 = u[0], u[1], u[2], u[3], u[4], u[5]
+            v0, v1, v2, v3, v4, v5 = v[0], v[1], v[2], v[3], v[4], v[5]
+            for i in range(np.uint64(offsets[e]), np.uint64(offsets[e + 1])):
+                x, y = local_x[i], local_y[i]
+                dx = u0 + x * (u1 + u3 * x + u4 * y) + y * (u2 + u5 * y)
+                dy = v0 + x * (v1 + v3 * x + v4 * y) + y * (v2 + v5 * y)
+                less[i] = given[i] - gx[i] * dx - gy[i] * dy
+
+
+@compiled("out", axis=1, fastmath=FAST)
+def block_sums(start, stop, values, lines, run_offsets, side, out):
+    """Sum fields (n, P) over blocks of `side` px: ``out`` (n, h, w)."""
+    out[:, start:stop] = 0
+    columns = np.zeros((len(values), out.shape[2] * side + _LANES), dtype=np.float32)
+    for e in range(run_offsets.size - 1):
+        _add(values, np.uint64(0), lines, run_offsets, e, start * side, stop * side, side, columns, out)
+
+
+@compiled("out", axis=1, fastmath=FAST)
+def product_sums(start, stop, values, weights, lines, run_offsets, offsets, side, out):
+    """Sum ``s a b`` and ``s = sqrt(w_a w_b)`` over blocks for each two fields a, b of `values` (k, P).
+
+    ``out`` (k (k + 1), h, w) receives both sums, with the fields' `weights` (k, P), for each field with those up to it.
+    """
+    out[:, start:stop] = 0
+    columns = np.zeros((len(out), out.shape[2] * side + _LANES), dtype=np.float32)
+    largest = np.diff(offsets).max()
+    field, root = np.empty((2, len(values), largest), dtype=np.float32)
+    products = np.empty((len(out), largest), dtype=np.float32)
+    for e in range(run_offsets.size - 1):
+        first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
+        n = 0
+        for a in range(len(values)):
+            for i in range(number):
+                root[a, i] = np.sqrt(weights[a, first + i])
+                field[a, i] = root[a, i] * values[a, first + i]
+            for b in range(a + 1):
+                for i in range(number):
+                    products[n, i] = field[a, i] * field[b, i]
+                    products[n + 1, i] = root[a, i] * root[b, i]
+                n += 2
+        _add(products, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
+
+
+@compiled("out", axis=1, fastmath=FAST)
+def score_sums(start, stop, residual, weights, gradient_x, gradient_y, lines, run_offsets, offsets, side, out):
+    """Sum ``w r gx``, ``w r gy`` and ``w (gx gx + gy gy)`` of fields (k, P) over blocks, and the pixels with weight.
+
+    ``out`` (4, h, w) receives the sums over all lights, and the number of pixels where one has weight.
+    """
+    out[:, start:stop] = 0
+    columns = np.zeros((4, out.shape[2] * side + _LANES), dtype=np.float32)
+    scores = np.empty((4, np.diff(offsets).max()), dtype=np.float32)
+    for e in range(run_offsets.size - 1):
+        first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
+        scores[:] = 0
+        for light in range(len(weights)):
+            for i in range(number):
+                w, gx, gy = weights[light, first + i], gradient_x[light, first + i], gradient_y[light, first + i]
+                weighted = w * residual[light, first + i]
+                scores[0, i] += weighted * gx
+                scores[1, i] += weighted * gy
+                scores[2, i] += w * (gx * gx + gy * gy)
+                scores[3, i] = max(scores[3, i], _ONE if w > _ZERO else _ZERO)
+        _add(scores, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
+
+
+@helper()
+def _slots(lines, run_offsets, offsets, e, top, bottom):
+    """First slot of an element and its number of pixels; none where it has no row from `top` to `bottom`."""
+    first, last = run_offsets[e], run_offsets[e + 1] - 1
+    away = last < first or lines[first, 2] >= bottom or lines[last, 2] < top
+    return np.uint64(offsets[e]), np.uint64(0 if away else offsets[e + 1] - offsets[e])
+
+
+@helper(fastmath=FAST)
+def _add(fields, begin, lines, run_offsets, e, top, bottom, side, columns, out):
+    """Add the rows from `top` to `bottom` of an element to the blocks; slot `begin` is the first of `fields` (n, ...).
+
+    `columns` (n, W) are 0 before and after.
+    """
+    block, low, high = np.int64(-1), np.int64(0), np.int64(0)
+    for q in range(run_offsets[e], run_offsets[e + 1]):
+        slot, number, row, column = lines[q, 0], np.int64(lines[q, 1]), lines[q, 2], np.int64(lines[q, 3])
+        if row < top:
+            continue
+        if row >= bottom:
+            break
+        if row // side != block:
+            _flush(columns, low, high, side, block, out)
+            block, low, high = row // side, column, column
+        low, high = min(low, column), max(high, column + number)
+        at, to = np.uint64(slot) - begin, np.uint64(column)
+        # whole vectors, of which the last one may be too long, where memory goes on so far
+        filled = (number + _LANES - 1) // _LANES * _LANES
+        if np.int64(at) + filled > fields.shape[1]:
+            filled = number
+        for n in range(len(fields)):
+            for i in range(np.uint32(filled)):
+                value = fields[n, at + i]
+                columns[n, to + i] += value if np.int32(i) < np.int32(number) else _ZERO
+    _flush(columns, low, high, side, block, out)
+
+
+@helper(fastmath=FAST)
+def _flush(columns, low, high, side, block, out):
+    """Add the columns from `low` to `high` to a row of blocks, and make them 0."""
+    for b in range(low // side, (high + side - 1) // side):
+        for n in range(len(columns)):
+            total = _ZERO
+            for i in range(np.uint64(b * side), np.uint64((b + 1) * side)):
+                total += columns[n, i]
+                columns[n, i] = _ZERO
+            out[n, block, b] += total

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from rgbmidic._kernels.threads import compiled, over_ranges
+from rgbmidic._kernels.threads import compiled
 
 _EDGE = 1e-6
 """Distance (px) within which a pixel on an edge is painted by both elements: no gap through rounding in float64."""
@@ -12,8 +12,7 @@ _EACH, _OPAQUE = np.uint32(0x010101), np.uint32(0xFF000000)
 """A grey level in the three colours of a pixel, and its opacity, as the bytes of a number."""
 
 
-@over_ranges("out", grain=16)
-@compiled()
+@compiled("out", grain=16)
 def paint_field(start, stop, out, grey, x, y, elements, values, low, high, colours, share, nearest):
     """Paint the linear interpolation of `values` (N,) over a grey picture; elements with a NaN node stay grey.
 

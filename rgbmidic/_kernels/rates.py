@@ -6,7 +6,7 @@ a piece is Schwarz's (Ann Stat 6, 1978), with a price for each parameter in plac
 
 import numpy as np
 
-from rgbmidic._kernels.threads import compiled, helper, over_ranges
+from rgbmidic._kernels.threads import compiled, helper
 
 LOWEST, HIGHEST = 2, 4
 """Degrees of the polynomials. A fifth follows sharp pulses better (160 standard uncertainties a square frame: 2.3 times
@@ -283,8 +283,7 @@ def _conclude(w, frames, reference, base, sums, lines, out):
                     out[1, o + 2 + 2 * side, i] = (part[3] + part[2]) / part[0] - mean**2
 
 
-@over_ranges("values", least=0)
-@compiled()
+@compiled("values", least=0)
 def mean_rates(start, stop, times, values, noise, common, reference, most, out):
     """Value, velocity and acceleration of series (N, T), those from before and from after each frame, and variances.
 

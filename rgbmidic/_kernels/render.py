@@ -22,7 +22,7 @@ import math
 
 import numpy as np
 
-from rgbmidic._kernels.threads import compiled, helper, over_ranges
+from rgbmidic._kernels.threads import compiled, helper
 
 PLATE, CYLINDER, SPHERE = 0, 1, 2
 TILE = 4
@@ -43,6 +43,8 @@ _A, _B, _C = 0.80473785, -0.31061722, 0.50587936
 _AS, _BS, _CS = np.float32(_A), np.float32(_B), np.float32(_C)
 _PI, _PJ, _PK = 0x8DA6B343, 0xD8163841, 0xCB1AB31F
 _STEP, _WRINKLES = 0x9E3779B9, 0x5BD1E995
+_UNIT = 1 / 2**32
+"""By which 32 random bits become a number in [0, 1)."""
 # a number of Python's own would make the sums float64, which takes twice as long
 _ZERO, _HALF, _ONE, _TWO, _THREE, _FOUR = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0, 3.0, 4.0))
 _SIX, _TEN, _FIFTEEN, _THIRTY = (np.float32(value) for value in (6.0, 10.0, 15.0, 30.0))
@@ -55,12 +57,6 @@ def _mix(h):
     h = np.uint32((h ^ (h >> 16)) * 0x7FEB352D)
     h = np.uint32((h ^ (h >> 15)) * 0x846CA68B)
     return np.uint32(h ^ (h >> 16))
-
-
-@helper()
-def _unit(h):
-    """Return a hash as a number in [0, 1)."""
-    return h * (1.0 / 4294967296.0)
 
 
 _MIDDLE, _PER_GRADIENT = np.float32(511.5), np.float32(2.0 / 1023.0)
@@ -137,7 +133,7 @@ def _to_surface(x, y, z, body):
 @helper()
 def _throw(found, n, i, j, k, h, x, y, z, slack, body, paint, counts):
     """Append the droplets of one cell that lie near enough."""
-    cell, widest, chance, number = paint[0], paint[2] + slack, _unit(h), 0
+    cell, widest, chance, number = paint[0], paint[2] + slack, h * _UNIT, 0
     while number < counts.size and chance >= counts[number]:
         number += 1
     for _ in range(number):
@@ -145,7 +141,9 @@ def _throw(found, n, i, j, k, h, x, y, z, slack, body, paint, counts):
         hx = _mix(hz + _STEP)
         hy = _mix(hx + _STEP)
         h = _mix(hy + _STEP)
-        height, cx, cy, cz = _to_surface((i + _unit(hx)) * cell, (j + _unit(hy)) * cell, (k + _unit(hz)) * cell, body)
+        height, cx, cy, cz = _to_surface(
+            (i + hx * _UNIT) * cell, (j + hy * _UNIT) * cell, (k + hz * _UNIT) * cell, body
+        )
         cx, cy, cz = cx - x, cy - y, cz - z
         square = cx * cx + cy * cy + cz * cz
         if abs(height) > paint[1] or square > widest * widest:
@@ -311,14 +309,6 @@ def _locate(work, place, rows, span, samples, x0, y0, lens, frame, body, affine)
             at[2 * _ROW + i] = ax * z
 
 
-@helper()
-def _limit(work, place, count, body):
-    """Nothing is seen beyond the body's edge."""
-    for s in range(count):
-        inside = (abs(place[s]) <= body[2]) & (abs(place[_ROW + s]) <= body[3])
-        work[_SEEN + s] = work[_SEEN + s] if inside else _ZERO
-
-
 _FAINT, _SIXTYFOURTH = np.float32(-25.0), np.float32(1 / 64)
 _THIRD, _QUARTER, _FIFTH = (np.float32(1 / n) for n in (3, 4, 5))
 
@@ -328,12 +318,9 @@ def _exp(x):
     """exp(x) of x <= 0, within 5e-6 of its value where it exceeds 1e-4, never below exp(-25): a polynomial squared."""
     x = max(x, _FAINT) * _SIXTYFOURTH
     y = _ONE + x * (_ONE + _HALF * x * (_ONE + _THIRD * x * (_ONE + _QUARTER * x * (_ONE + _FIFTH * x))))
-    y *= y
-    y *= y
-    y *= y
-    y *= y
-    y *= y
-    return y * y
+    for _ in range(6):
+        y *= y
+    return y
 
 
 @helper()
@@ -346,11 +333,8 @@ def _light(energy, left, work, rows, span, lights, j, frame, body, paint):
     px, py, pz = np.float32(lights[j, 0]), np.float32(lights[j, 1]), np.float32(lights[j, 2])
     ox, oy, oz, power = np.float32(frame[0]), np.float32(frame[1]), np.float32(frame[2]), np.float32(lights[j, 3])
     albedo, gloss, variance = np.float32(paint[7]), np.float32(paint[10]), np.float32(paint[11])
-    more, glossier, broader = (
-        np.float32(paint[12]) - albedo,
-        np.float32(paint[15]) - gloss,
-        np.float32(paint[16]) - variance,
-    )
+    more, glossier = np.float32(paint[12]) - albedo, np.float32(paint[15]) - gloss
+    broader = np.float32(paint[16]) - variance
     for r in range(rows):
         line, row = energy[r][left:], work[r * span :]
         for s in range(span):
@@ -372,8 +356,7 @@ def _light(energy, left, work, rows, span, lights, j, frame, body, paint):
             line[s] = power * square * total if (row[_SEEN + s] > _ZERO) & (nl > _ZERO) & (ml > _ZERO) else _ZERO
 
 
-@over_ranges("out", axis=1, grain=TILE, least=0)
-@compiled()
+@compiled("out", axis=1, grain=TILE, least=0)
 def trace_rows(
     start, stop, out, first_row, taps, pad, lens, frame, body, affine, material, lights, paint, counts, seed
 ):
@@ -417,7 +400,9 @@ def trace_rows(
                 for s in range(count):
                     row, column = top + s // span, left + s % span
                     place[s], place[_ROW + s] = material[row, column, 0], material[row, column, 1]
-            _limit(work, place, count, body)
+            for s in range(count):  # nothing is seen beyond the body's edge
+                inside = (abs(place[s]) <= body[2]) & (abs(place[_ROW + s]) <= body[3])
+                work[_SEEN + s] = work[_SEEN + s] if inside else _ZERO
             _paint(work, place, count, (count + span) // 2, found, body, paint, counts, seed)
             for j in range(lights.shape[0]):
                 _light(energy[j], left, work, rows, span, lights, j, frame, body, paint)
@@ -436,8 +421,7 @@ def _decimate(out, line, samples, taps):
         out[c] = total
 
 
-@over_ranges("out", grain=_POINTS, least=0)
-@compiled()
+@compiled("out", grain=_POINTS, least=0)
 def sample_paint(start, stop, out, points, body, paint, counts, seed):
     """Cover, height (mm) and slope vector of the paint at points on the body: `out` (N, 5)."""
     for first in range(start, stop, _POINTS):

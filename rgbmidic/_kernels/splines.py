@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rgbmidic._kernels.threads import FAST, compiled, helper, over_ranges
+from rgbmidic._kernels.threads import FAST, compiled, helper
 from rgbmidic.typing import FloatImage
 
 PAD = 2
@@ -36,14 +36,11 @@ def bspline_coefficients(image: FloatImage, out: FloatImage, taps: FloatImage = 
         out[PAD + height - 1 + p] = out[PAD + max(height - 1 - p, 0)]
 
 
-@over_ranges("image", axis=1, grain=_LINE)
-@compiled(fastmath=FAST)
+@compiled("image", axis=1, grain=_LINE, fastmath=FAST)
 def _filter_columns(start, stop, image, taps, out):
     """Filter down the columns, whole rows at a time: by `taps`, then by the recursions, causal and anticausal."""
     n, z = image.shape[0], _POLE
-    line, before = np.empty(stop - start, dtype=np.float32), np.empty(stop - start, dtype=np.float32)
-    for j in range(before.size):
-        before[j] = 0
+    line, before = np.zeros((2, stop - start), dtype=np.float32)
     for i in range(-_REACH, n):
         middle = image[_mirrored(i, n), start:stop]
         for j in range(line.size):
@@ -64,8 +61,7 @@ def _filter_columns(start, stop, image, taps, out):
             before[j] = row[j] = z * (before[j] - row[j])
 
 
-@over_ranges("image")
-@compiled(fastmath=FAST)
+@compiled("image", fastmath=FAST)
 def _filter_rows(start, stop, image, taps, out):
     """Filter along each row, with the recursions as products.
 
@@ -109,8 +105,7 @@ def _mirrored(i, n):
     return j if j < n else 2 * n - 2 - j
 
 
-@over_ranges("lines")
-@compiled(fastmath=FAST)
+@compiled("lines", fastmath=FAST)
 def pixel_gradient(start, stop, lines, coefficients, top, left, gradient_x, gradient_y):
     """Evaluate the gradient of the spline at the whole pixels of `lines` (R, 4) int32.
 
@@ -130,8 +125,7 @@ def pixel_gradient(start, stop, lines, coefficients, top, left, gradient_x, grad
             gradient_y[slot + i] = twelfth * down
 
 
-@over_ranges("x", grain=4096)
-@compiled(fastmath=FAST)
+@compiled("x", grain=4096, fastmath=FAST)
 def sample_with_gradient(start, stop, coefficients, x, y, value, gradient_x, gradient_y):
     """Value and spatial gradient of the spline at the points (x, y), 1-D float64; points outside are clamped.
 
@@ -144,19 +138,17 @@ def sample_with_gradient(start, stop, coefficients, x, y, value, gradient_x, gra
         py = min(max(y[i], 0.0), height - 1.0)
         column = int(px)
         row = int(py)
-        x0, x1, x2, x3, dx0, dx1, dx2, dx3 = _weights(px - column)
-        y0, y1, y2, y3, dy0, dy1, dy2, dy3 = _weights(py - row)
+        (x0, x1, x2, x3), (dx0, dx1, dx2, dx3) = _weights(px - column)
+        down, slopes = _weights(py - row)
         v = gx = gy = 0.0
         for a in range(4):
             # PAD - 1 = 1: the first of the four taps lies one pixel before the point's own
             c0, c1 = coefficients[row + a + 1, column + 1], coefficients[row + a + 1, column + 2]
             c2, c3 = coefficients[row + a + 1, column + 3], coefficients[row + a + 1, column + 4]
-            weight = y0 if a == 0 else y1 if a == 1 else y2 if a == 2 else y3
-            slope = dy0 if a == 0 else dy1 if a == 1 else dy2 if a == 2 else dy3
             along = x0 * c0 + x1 * c1 + x2 * c2 + x3 * c3
-            v += weight * along
-            gx += weight * (dx0 * c0 + dx1 * c1 + dx2 * c2 + dx3 * c3)
-            gy += slope * along
+            v += down[a] * along
+            gx += down[a] * (dx0 * c0 + dx1 * c1 + dx2 * c2 + dx3 * c3)
+            gy += slopes[a] * along
         value[i] = v
         gradient_x[i] = gx
         gradient_y[i] = gy
@@ -167,13 +159,5 @@ def _weights(t):
     """Return the four cubic B-spline weights at the fraction t behind the second sample, and their slopes."""
     t2, rest = t * t, 1.0 - t
     t3 = t2 * t
-    return (
-        rest * rest * rest / 6,
-        (4 - 6 * t2 + 3 * t3) / 6,
-        (1 + 3 * t + 3 * t2 - 3 * t3) / 6,
-        t3 / 6,
-        -rest * rest / 2,
-        (3 * t2 - 4 * t) / 2,
-        (1 + 2 * t - 3 * t2) / 2,
-        t2 / 2,
-    )
+    weights = rest * rest * rest / 6, (4 - 6 * t2 + 3 * t3) / 6, (1 + 3 * t + 3 * t2 - 3 * t3) / 6, t3 / 6
+    return weights, (-rest * rest / 2, (3 * t2 - 4 * t) / 2, (1 + 2 * t - 3 * t2) / 2, t2 / 2)

@@ -6,8 +6,7 @@ interpolated linearly, beyond the outermost they are constant.
 
 import numpy as np
 
-from rgbmidic._kernels.grids import between
-from rgbmidic._kernels.threads import compiled, helper, over_ranges
+from rgbmidic._kernels.threads import compiled, helper
 
 REACH = 3
 """Rows and columns beyond a cell that its binomial sums reach."""
@@ -17,15 +16,20 @@ _CELLS = 128
 """Cells of a row at a time."""
 
 
-@over_ranges("sums", axis=1)
-@compiled()
+@helper()
+def between(row, block, rows):
+    """Return the two rows of a grid that a row of pixels lies between, and how far on from the first it is."""
+    position = min(max((row + 0.5) / block - 0.5, 0.0), rows - 1.0)
+    low = int(position)
+    return low, min(low + 1, rows - 1), np.float32(position - low)
+
+
+@compiled("sums", axis=1)
 def block_sums(start, stop, values, block, sums):
     """Sum the finite samples of the four planes in each block, then count them: `sums` (8, h, w) float32."""
     total = np.empty((4, sums.shape[2] * block), np.float32)
     for bi in range(start, stop):
-        for n in range(4):
-            for j in range(total.shape[1]):
-                total[n, j] = 0
+        total[:] = 0
         for i in range(bi * block, min((bi + 1) * block, len(values))):
             line, value, known = values[i], total[i % 2], total[2 + i % 2]
             for j in range(line.size):
@@ -41,8 +45,7 @@ def block_sums(start, stop, values, block, sums):
                 out[b] = value
 
 
-@over_ranges("out")
-@compiled()
+@compiled("out")
 def subtract_mean(start, stop, values, mean, block, out):
     """Write ``out = values - local mean``.
 
@@ -56,8 +59,7 @@ def subtract_mean(start, stop, values, mean, block, out):
             target[j] = line[j] - (above[j] + part * (below[j] - above[j]))
 
 
-@over_ranges("out")
-@compiled()
+@compiled("out")
 def divide_by_mean(start, stop, values, mean, block, least, out):
     """``out = values / local mean``, NaN where the mean is not above `least`.
 
@@ -71,8 +73,7 @@ def divide_by_mean(start, stop, values, mean, block, least, out):
             target[j] = line[j] / level if level > least else np.float32(np.nan)
 
 
-@over_ranges("out")
-@compiled()
+@compiled("out")
 def scaled_contrast(start, stop, contrast, scale, block, pad, out):
     """``out = contrast * scale``, mirrored by `pad` pixels on every side.
 
@@ -105,8 +106,7 @@ def _down(above, here, below, first, last, planes, number):
         planes[1, c] = first * above[j] + ten * here[j] + last * below[j]
 
 
-@over_ranges("sums", axis=1)
-@compiled(fastmath={"contract"})
+@compiled("sums", axis=1, fastmath={"contract"})
 def cell_moments(start, stop, contrast, block, sums):
     """Second moments of the four planes' low-passed contrast, summed over the cells of each block.
 
@@ -116,13 +116,12 @@ def cell_moments(start, stop, contrast, block, sums):
     """
     rows, columns = contrast.shape
     half = block // 2
-    one, five, ten = np.float32(1), np.float32(5), np.float32(10)
-    planes, total = np.empty((4, _CELLS + 2), np.float32), np.empty((11, _CELLS), np.float32)
+    zero, one, five, ten = np.float32(0), np.float32(1), np.float32(5), np.float32(10)
+    planes, low = np.empty((4, _CELLS + 2), np.float32), np.empty((4, _CELLS), np.float32)
+    total = np.empty((11, _CELLS), np.float32)
     for bi in range(start, stop):
         for left in range(0, half * sums.shape[2], _CELLS):
-            for moment in range(11):
-                for c in range(_CELLS):
-                    total[moment, c] = 0
+            total[:] = 0
             first = max(left, 1)
             number = min(left + _CELLS, columns // 2 - 1) - first
             for i in range(max(bi * block, 2), min((bi + 1) * block, rows - REACH), 2):
@@ -136,19 +135,15 @@ def cell_moments(start, stop, contrast, block, sums):
                     p2 = planes[2, c] + ten * planes[2, d] + five * planes[2, e]
                     p3 = five * planes[3, c] + ten * planes[3, d] + planes[3, e]
                     known = np.isfinite(p0 + p1 + p2 + p3)
-                    q0, q1 = p0 if known else np.float32(0), p1 if known else np.float32(0)
-                    q2, q3 = p2 if known else np.float32(0), p3 if known else np.float32(0)
-                    total[0, c] += q0 * q0
-                    total[1, c] += q0 * q1
-                    total[2, c] += q0 * q2
-                    total[3, c] += q0 * q3
-                    total[4, c] += q1 * q1
-                    total[5, c] += q1 * q2
-                    total[6, c] += q1 * q3
-                    total[7, c] += q2 * q2
-                    total[8, c] += q2 * q3
-                    total[9, c] += q3 * q3
-                    total[10, c] += one if known else np.float32(0)
+                    low[0, c], low[1, c] = p0 if known else zero, p1 if known else zero
+                    low[2, c], low[3, c] = p2 if known else zero, p3 if known else zero
+                    total[10, c] += one if known else zero
+                moment = 0
+                for p in range(4):
+                    for q in range(p, 4):
+                        for c in range(np.uint64(max(number, 0))):
+                            total[moment, c] += low[p, c] * low[q, c]
+                        moment += 1
             for moment in range(11):
                 for b in range(left // half, min((left + _CELLS) // half, sums.shape[2])):
                     value = np.float32(0)

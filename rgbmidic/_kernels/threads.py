@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from functools import cache, cached_property, partial, update_wrapper, wraps
+from functools import cache, cached_property, partial, update_wrapper
 from itertools import pairwise
 from typing import Any, ParamSpec, TypeVar
 
@@ -89,56 +89,6 @@ _LEAST = 1 << 16
 thread .05 to .1 ms to begin and to report (measured)."""
 
 
-def over_ranges(
-    array: str, *, axis: int = 0, grain: int = 1, least: int | None = None
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Share the items of a compiled ``kernel(start, stop, *arguments)``, which is called without the first two.
-
-    Parameters
-    ----------
-    array, axis
-        Name of the argument that has one entry per item along `axis`.
-    grain : int
-        Ranges start at multiples of it: what is vectorised or gathered in blocks of so many items stays the same on
-        any number of threads.
-    least : int, optional
-        Entries of its largest array from which threads share a kernel; some 65,000 without.
-    """
-
-    def shared(kernel: Any) -> Callable[..., None]:
-        code = kernel.__wrapped__.__code__
-        position = code.co_varnames[: code.co_argcount].index(array) - 2
-
-        @wraps(kernel)
-        def call(*arguments: Any) -> None:
-            most = threads()
-            entries = max(getattr(argument, "size", 0) for argument in arguments) if most > 1 else 0
-            if entries < (_LEAST if least is None else least):
-                most = 1
-            _share(kernel, arguments, arguments[position].shape[axis], grain, most)
-
-        return call
-
-    return shared
-
-
-def _share(kernel: Callable[..., None], arguments: tuple[Any, ...], items: int, grain: int, most: int) -> None:
-    """Run `kernel` on `most` ranges of about equal length: the first in this thread, the others in the pool."""
-    keep_memory()
-    kernel = getattr(kernel, "dispatcher", kernel)  # the first call imports numba, before threads begin
-    grains = -(-items // grain)
-    parts = min(most, grains)
-    if parts <= 1:
-        kernel(0, items, *arguments)
-        return
-    edges = [min(grains * part // parts * grain, items) for part in range(parts + 1)]
-    pool = _pool(os.getpid())
-    others = [pool.submit(kernel, *edge, *arguments) for edge in pairwise(edges[1:])]
-    kernel(0, edges[1], *arguments)
-    for other in others:
-        other.result()
-
-
 def aside(function: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Future[T]:
     """Call a function in a thread of its own where there are several, at once where there is but one.
 
@@ -194,13 +144,26 @@ def _default() -> int:
 
 
 class Kernel:
-    """A function that numba compiles when it is first called, or when a kernel that calls it is."""
+    """A function that numba compiles when it is first called, or when a kernel that calls it is.
+
+    Where it is ``kernel(start, stop, *arguments)``, threads share its items, and it is called without the first two.
+    """
 
     __wrapped__: Callable[..., Any]
 
-    def __init__(self, options: dict[str, Any], function: Callable[..., Any]) -> None:
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        over: str | None = None,
+        *,
+        axis: int = 0,
+        grain: int = 1,
+        least: int | None = None,
+        **options: Any,
+    ) -> None:
         update_wrapper(self, function)
-        self._options = options
+        self._names = function.__code__.co_varnames[2 : function.__code__.co_argcount]
+        self.over, self._axis, self._grain, self._least, self._options = over, axis, grain, least, options
 
     @cached_property
     def dispatcher(self) -> Any:
@@ -213,15 +176,47 @@ class Kernel:
     def _numba_type_(self) -> Any:  # what numba asks of a global of a function that it compiles
         return self.dispatcher._numba_type_
 
+    def __reduce__(self) -> str:  # what pickle takes to another process is the name
+        return self.__wrapped__.__qualname__
+
     def __call__(self, *arguments: Any) -> Any:
-        return self.dispatcher(*arguments)
+        """Run the kernel, shared by ranges of about equal length: the first in this thread, the others in the pool."""
+        if self.over is None:
+            return self.dispatcher(*arguments)
+        keep_memory()
+        items, most = arguments[self._names.index(self.over)].shape[self._axis], threads()
+        kernel = self.dispatcher  # the first call imports numba, before threads begin
+        grains = -(-items // self._grain)
+        largest = max(getattr(argument, "size", 0) for argument in arguments)
+        parts = min(most, grains) if largest >= (_LEAST if self._least is None else self._least) else 1
+        if parts <= 1:
+            return kernel(0, items, *arguments)
+        edges = [min(grains * part // parts * self._grain, items) for part in range(parts + 1)]
+        pool = _pool(os.getpid())
+        others = [pool.submit(kernel, *edge, *arguments) for edge in pairwise(edges[1:])]
+        kernel(0, edges[1], *arguments)
+        for other in others:
+            other.result()
+        return None
 
 
-def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorate a kernel; `options` are those of ``numba.njit``."""
+def compiled(over: str | None = None, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorate a kernel.
+
+    Parameters
+    ----------
+    over
+        Name of the argument that has one entry per item that threads share; None: it is no such kernel.
+    axis, grain, least
+        Axis of the items; ranges start at multiples of the grain, so that what is vectorised or gathered in blocks of
+        so many items stays the same on any number of threads; entries of its largest array from which threads share
+        it, some 65,000 if not stated.
+    **options
+        Those of ``numba.njit``.
+    """
     # a division by zero gives what the processor gives, and C callers are not catered for: less code, sooner compiled
-    always = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-    return partial(Kernel, always | options)
+    always: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+    return partial(Kernel, over=over, **always | options)
 
 
 helper = partial(compiled, no_cpython_wrapper=True)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rgbmidic._kernels.threads import FAST, compiled, over_ranges
+from rgbmidic._kernels.threads import FAST, compiled
 
 BLOCK = 4096
 """Pixels at a time: what a core's fastest cache holds."""
@@ -10,8 +10,7 @@ _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 
 
-@over_ranges("mean", axis=1, grain=BLOCK)
-@compiled(fastmath=FAST)
+@compiled("mean", axis=1, grain=BLOCK, fastmath=FAST)
 def gradient_of_others(start, stop, gradient, weights, light, fewest, mean, products):
     """Mean gradient of the lights other than `light`, and its products with that light's own.
 
@@ -23,8 +22,7 @@ def gradient_of_others(start, stop, gradient, weights, light, fewest, mean, prod
     own, lights = np.uint64(light), np.uint64(len(weights))
     for block in range(start, stop, BLOCK):
         first, number = np.uint64(block), np.uint64(min(BLOCK, stop - block))
-        for i in range(number):
-            count[i] = _ZERO
+        count[:] = 0
         for j in range(lights):
             for i in range(number):
                 count[i] += _ONE if weights[j, first + i] > _ZERO else _ZERO
@@ -33,8 +31,7 @@ def gradient_of_others(start, stop, gradient, weights, light, fewest, mean, prod
             less[i] = seen if count[i] - seen >= fewest else _ZERO
             products[3, first + i] = seen
         for axis in range(np.uint64(2)):
-            for i in range(number):
-                total[i] = _ZERO
+            total[:] = 0
             for j in range(lights):
                 for i in range(number):
                     total[i] += gradient[axis, j, first + i] if weights[j, first + i] > _ZERO else _ZERO
@@ -49,8 +46,7 @@ def gradient_of_others(start, stop, gradient, weights, light, fewest, mean, prod
             products[2, first + i] = seen * (x * x + y * y)
 
 
-@over_ranges("fraction", axis=1, grain=BLOCK)
-@compiled(fastmath=FAST)
+@compiled("fraction", axis=1, grain=BLOCK, fastmath=FAST)
 def best_mean(start, stop, fraction, weights, difference, mean, used):
     """Turn `fraction` (k, P) into the fractions of the lights in a mean: none below 0 or without weight, their sum 1.
 
@@ -75,8 +71,7 @@ def best_mean(start, stop, fraction, weights, difference, mean, used):
             total[i] = _ONE if total[i] > _ZERO else _ZERO
 
 
-@over_ranges("fraction", axis=1, grain=BLOCK)
-@compiled(fastmath=FAST)
+@compiled("fraction", axis=1, grain=BLOCK, fastmath=FAST)
 def robust_weights(start, stop, mean, variance, displacing, unit, freedom, fraction, bend):
     """Multiply `fraction` (k, P) by the robust weight of the lights' `mean` residual (P,); the loss's `bend` (P,).
 

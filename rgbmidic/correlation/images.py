@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.block_sums import product_sums
+from rgbmidic._kernels.owned_pixels import product_sums
 from rgbmidic._kernels.splines import PAD, bspline_coefficients
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import fill_holes
@@ -147,7 +147,7 @@ class SlidingWindow:
         """
         count = len(fields)
         sums = np.empty((count * (count + 1), *pixels.grid(self.step)), dtype=np.float32)
-        product_sums(fields, weights, pixels.lines, pixels.run_offsets, self.step, sums)
+        product_sums(fields, weights, pixels.lines, pixels.run_offsets, pixels.offsets, self.step, sums)
         means = np.empty((count, count, *sums.shape[1:]), dtype=np.float32)
         first, second = np.tril_indices(count)
         means[first, second] = means[second, first] = self._means(sums[::2], sums[1::2])

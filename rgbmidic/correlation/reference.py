@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.block_sums import score_sums
 from rgbmidic._kernels.correlation import (
     BLOCK,
     differences,
@@ -18,7 +17,7 @@ from rgbmidic._kernels.correlation import (
     element_vector,
     warped_weights,
 )
-from rgbmidic._kernels.patches import interpolate_nodal
+from rgbmidic._kernels.owned_pixels import interpolate_nodal, score_sums
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
 from rgbmidic._kernels.weights import gradient_of_others
@@ -388,8 +387,8 @@ class Reference:
         ndarray, shape (4, rows, columns)
             Scores in x and y, information, and the number of pixels where a light has weight.
         """
-        sums = np.empty((4, *self.pixels.grid(side)), dtype=np.float32)
-        score_sums(*fields, self.pixels.lines, self.pixels.run_offsets, side, sums)
+        pixels, sums = self.pixels, np.empty((4, *self.pixels.grid(side)), dtype=np.float32)
+        score_sums(*fields, pixels.lines, pixels.run_offsets, pixels.offsets, side, sums)
         return sums.astype(np.float64)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import differences, element_squares, warped_weights
-from rgbmidic._kernels.patches import interpolate_nodal, subtract_quadratic
+from rgbmidic._kernels.owned_pixels import interpolate_nodal, subtract_quadratic
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data

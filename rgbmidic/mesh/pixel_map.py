@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.block_sums import block_sums
 from rgbmidic._kernels.mesh import claim_pixels
-from rgbmidic._kernels.owned_pixels import from_image, to_image
+from rgbmidic._kernels.owned_pixels import block_sums, from_image, to_image
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh

@@ -10,7 +10,7 @@ import pytest
 from bits import assert_same_on_threads
 
 from rgbmidic._kernels import correlation as kernels
-from rgbmidic._kernels import patches
+from rgbmidic._kernels import owned_pixels
 from rgbmidic._kernels.splines import PAD, bspline_coefficients, pixel_gradient, sample_with_gradient
 from rgbmidic.correlation.reference import _partial_blocks
 from rgbmidic.correlation.residual import curved_deviation
@@ -210,7 +210,7 @@ def test_projection_and_interpolation_of_pixel_fields_equal_their_naive_twins():
     kernels.element_vector(case.weight, case.reference, *case.gradient, *case.on_map, case.pixels.barycentric, out)
     close(out, naive.element_vector(case.weight, case.reference, *case.gradient, case.pixels), scale=1e3)
     fields = np.full((2, case.reference.size), 7, dtype=np.float32)
-    patches.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
+    owned_pixels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
     np.testing.assert_allclose(fields, naive.interpolate_nodal(case.displacement, case.pixels, case.mesh), atol=1e-5)
 
 
@@ -228,7 +228,7 @@ def less_curved(case, carried, bend):
     out = np.full((1, case.reference.size), 7, dtype=np.float32)
     images = case.reference[None], case.gradient[:1], case.gradient[1:]
     deviation = curved_deviation(case.mesh, case.pixels.barycentric, carried, bend)
-    patches.subtract_quadratic(*images, deviation, *case.on_map, out)
+    owned_pixels.subtract_quadratic(*images, deviation, *case.on_map, out)
     return out
 
 
@@ -243,7 +243,7 @@ def all_outputs():
     kernels.element_squares(case.gradient, case.gradient**2, case.pixels.offsets, squares)
     kernels.element_sums(case.gradient, case.weight, case.pixels.offsets, sums)
     kernels.element_vector(case.weight, case.reference, *case.gradient, *case.on_map, case.pixels.barycentric, vector)
-    patches.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
+    owned_pixels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
     curved = less_curved(case, case.displacement, case.random.normal(size=(len(case.mesh.nodes), 2, 3)))
     blocks = block_products(case, np.ones(case.pixels.grid(7), dtype=np.float32), 7, 2)
     found = hessian, difference, weights, moments, squares, sums, vector, fields, curved, blocks

@@ -16,8 +16,8 @@ from textures import Texture
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from rgbmidic import correlate
-from rgbmidic._kernels.block_sums import block_sums
-from rgbmidic._kernels.threads import aside, one_blas_thread, over_ranges, set_threads, threads
+from rgbmidic._kernels.owned_pixels import block_sums
+from rgbmidic._kernels.threads import aside, compiled, one_blas_thread, set_threads, threads
 from rgbmidic.errors import InputError
 
 
@@ -29,19 +29,24 @@ def as_before():
 
 
 class Counted:
-    """A stand-in for a compiled kernel that writes down its ranges."""
+    """A stand-in for numba's function that writes down its ranges."""
 
     def __init__(self):
         self.ranges = []
 
-    @staticmethod
-    def __wrapped__(start, stop, other, items): ...
-
-    __name__ = "counted"
-
     def __call__(self, start, stop, other, items):
         self.ranges.append((start, stop))
         items[:, start:stop] += 1
+
+
+def shared(dispatcher, **options):
+    """A kernel over the `items` that runs the stand-in."""
+
+    @compiled("items", **options)
+    def kernel(start, stop, other, items): ...
+
+    kernel.dispatcher = dispatcher
+    return kernel
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 64, 65, 1000])
@@ -50,7 +55,7 @@ class Counted:
 def test_every_item_is_done_once_in_whole_grains(count, grain, number):
     set_threads(number)
     kernel, items = Counted(), np.zeros((2, count))
-    over_ranges("items", axis=1, grain=grain, least=0)(kernel)(None, items)
+    shared(kernel, axis=1, grain=grain, least=0)(None, items)
     assert (items == 1).all()
     assert len(kernel.ranges) == max(1, min(number, -(-count // grain)))
     assert all(start % grain == 0 for start, _ in kernel.ranges)
@@ -60,7 +65,7 @@ def test_every_item_is_done_once_in_whole_grains(count, grain, number):
 def test_one_thread_does_alone_what_is_small(other, parts):
     set_threads(2)
     kernel = Counted()
-    over_ranges("items", axis=1, least=100)(kernel)(other, np.zeros((2, 8)))
+    shared(kernel, axis=1, least=100)(other, np.zeros((2, 8)))
     assert len(kernel.ranges) == parts
 
 
@@ -78,7 +83,7 @@ def test_a_failure_in_any_thread_is_told():
 
     set_threads(3)
     with pytest.raises(ValueError, match="the last one"):
-        over_ranges("items", least=0)(Failing())(None, np.zeros(9))
+        shared(Failing(), least=0)(None, np.zeros(9))
 
 
 def test_many_threads_may_call_at_once():

@@ -19,8 +19,8 @@ from rgbmidic.lab import demo
 def kernels():
     names = [one.name for one in pkgutil.iter_modules(rgbmidic._kernels.__path__)]
     modules = [importlib.import_module(f"rgbmidic._kernels.{name}") for name in names]
-    shared = [getattr(value, "__wrapped__", None) for module in modules for value in vars(module).values()]
-    return {(one.__name__, form) for one in shared if type(one) is Kernel for form in one.dispatcher.signatures}
+    found = [value for module in modules for value in vars(module).values() if type(value) is Kernel]
+    return {(one.__name__, form) for one in found if one.over for form in one.dispatcher.signatures}
 
 for part in demo._SMALL_MEASUREMENTS.values():
     part()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bits import assert_same_on_threads
 
-from rgbmidic._kernels.block_sums import product_sums, score_sums
+from rgbmidic._kernels.owned_pixels import product_sums, score_sums
 from rgbmidic._kernels.weights import gradient_of_others
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
@@ -46,7 +46,7 @@ def test_sums_of_products_of_two_fields(pixels):
     a, b = values = random.normal(size=(2, pixels.rows.size)).astype(np.float32)
     v, w = weights = np.maximum(random.normal(size=values.shape), 0).astype(np.float32)
     out = np.full((6, *pixels.grid(4)), 7, dtype=np.float32)
-    product_sums(values, weights, pixels.lines, pixels.run_offsets, 4, out)
+    product_sums(values, weights, pixels.lines, pixels.run_offsets, pixels.offsets, 4, out)
     shared = np.sqrt(v * w)
     fields = np.stack([v * a * a, v, shared * a * b, shared, w * b * b, w])
     np.testing.assert_allclose(out, expected_sums(pixels, fields, 4), atol=1e-4)
@@ -58,7 +58,7 @@ def test_scores_of_all_lights_together(pixels, side):
     residual, gx, gy = random.normal(size=(3, 3, pixels.rows.size)).astype(np.float32)
     weight = np.maximum(random.normal(size=residual.shape), 0).astype(np.float32)
     out = np.full((4, *pixels.grid(side)), 7, dtype=np.float32)
-    score_sums(residual, weight, gx, gy, pixels.lines, pixels.run_offsets, side, out)
+    score_sums(residual, weight, gx, gy, pixels.lines, pixels.run_offsets, pixels.offsets, side, out)
     scores = weight * residual * gx, weight * residual * gy, weight * (gx**2 + gy**2)
     fields = np.stack([*(part.sum(axis=0) for part in scores), (weight > 0).any(axis=0)])
     np.testing.assert_allclose(out, expected_sums(pixels, fields, side), atol=2e-4)
@@ -86,8 +86,8 @@ def test_the_same_bits_on_one_and_three_threads(pixels):
 
     def found():
         sums, summed = np.zeros((6, *pixels.grid(4)), np.float32), np.zeros((4, *pixels.grid(4)), np.float32)
-        product_sums(values, values, pixels.lines, pixels.run_offsets, 4, sums)
-        score_sums(values, values, values, values, pixels.lines, pixels.run_offsets, 4, summed)
+        product_sums(values, values, pixels.lines, pixels.run_offsets, pixels.offsets, 4, sums)
+        score_sums(values, values, values, values, pixels.lines, pixels.run_offsets, pixels.offsets, 4, summed)
         many = np.resize(values, (2, 20000))
         mean, products = np.zeros((2, 20000), np.float32), np.zeros((4, 20000), np.float32)
         gradient_of_others(np.stack([many, many**2]), many, 1, 1, mean, products)
