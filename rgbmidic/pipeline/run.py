@@ -16,8 +16,8 @@ from rgbmidic.correlation import NodeStatus, Solution, Start, Status
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.engine import Schedule, Updated, following, open_workers, rank_of
-from rgbmidic.pipeline.frame import Measured, read_state
+from rgbmidic.pipeline.engine import Schedule, following, open_workers, rank_of
+from rgbmidic.pipeline.frame import Measured, Updated, read_state
 from rgbmidic.pipeline.given import check_object, check_type, describe
 from rgbmidic.pipeline.order import dependants
 from rgbmidic.pipeline.plan import Choice, Plan

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, Literal, Unpack, cast
@@ -23,8 +22,8 @@ from rgbmidic.errors import FrameError, InputError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.correlate import solver_settings
-from rgbmidic.pipeline.engine import Schedule, Updated
-from rgbmidic.pipeline.frame import Measured, attempt, next_reference
+from rgbmidic.pipeline.engine import Schedule, Threads
+from rgbmidic.pipeline.frame import Measured, next_reference
 from rgbmidic.pipeline.given import check_object, check_type
 from rgbmidic.pipeline.order import STRIDE
 from rgbmidic.pipeline.plan import Plan
@@ -166,28 +165,20 @@ class _Latest:
 def _solutions(plan: Plan, latest: _Latest, states: Iterable[Any]) -> Iterator[Solution]:
     """The solution of each state, in the order and with the second tries of `Schedule`."""
     live = _Live(plan)
-    schedule = Schedule(plan, live)
+    schedule, worker = Schedule(plan, live), Threads(plan, 1)
     for place, latest.state in enumerate(states):
         schedule.want(place)
-        schedule.run(live)
+        schedule.run(worker)
         yield live.solution
 
 
 class _Live:
-    """Measures the latest state at once, and keeps of all before it what a later one may start from."""
-
-    slots = 1
+    """The sink of a sequence: the latest solution, and of all states before it what a later one may start from."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan, self._starts, self._checksum = plan, dict[int, Start](), NO_CHECKSUM
         self._updates: dict[tuple[int, ...], ReferenceUpdate] = {(): ReferenceUpdate.none(plan.reference)}
         self.solution: Solution
-
-    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
-        """Measure a state from a start."""
-        done: Future[Measured] = Future()
-        done.set_result(attempt(self._plan, index, start, lambda: self._updates[start.reference_updates[-2:]]))
-        return done
 
     def is_finished(self, place: int) -> bool:
         """Whether it is one of those that are kept."""
@@ -197,9 +188,9 @@ class _Live:
         """Initial guess of the states that follow one."""
         return self._starts[place]
 
-    def updated(self, places: Sequence[int]) -> Updated:
-        """References are made here while their state is there."""
-        return ()
+    def updated(self, places: Sequence[int]) -> ReferenceUpdate:
+        """The reference that states made, while they were there."""
+        return self._updates[tuple(places)]
 
     def keep(self, place: int, found: Measured, after: Start) -> None:
         """Take a state's solution, and forget what no later state starts from."""
