@@ -18,11 +18,10 @@ from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, following, open_workers, rank_of
 from rgbmidic.pipeline.frame import Measured, Updated, read_state
-from rgbmidic.pipeline.given import check_object, check_type, describe
+from rgbmidic.pipeline.given import FrameSequence, check_object, check_type, describe
 from rgbmidic.pipeline.order import dependants
 from rgbmidic.pipeline.plan import Choice, Plan
 from rgbmidic.pipeline.resolution import choose, refine
-from rgbmidic.pipeline.source import FrameSequence
 from rgbmidic.pipeline.suitability import light_levels
 from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
@@ -115,11 +114,8 @@ def measure(
     if isinstance(settings, str | Path):
         settings = read_test(settings)
     check_type("settings", settings, TestSettings, "a TestSettings or the path of a TEST.toml")
-    check_type("mesh", mesh, Tri3Mesh | None, "a Tri3Mesh")
     check_type("frames", frames, range | None, "a range of indices")
     check_type("workers", workers, int | None, "a whole number")
-    check_object("separation", separation, "__call__")
-    check_object("weights", weights, "reference", "deformed")
     check_object("progress", progress, "__call__")
     given: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
     choice: Choice | None = None
