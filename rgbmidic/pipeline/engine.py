@@ -26,7 +26,7 @@ from rgbmidic.correlation import NodeStatus, Start, Status
 from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError
 from rgbmidic.pipeline.frame import Measured, Updated, attempt, failed_frame
-from rgbmidic.pipeline.order import STRIDE, children, is_key, lineage, parent
+from rgbmidic.pipeline.order import STRIDE, is_key, parent
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.results import FrameRecord
 
@@ -69,8 +69,7 @@ class Schedule:
 
     def __init__(self, plan: Plan, sink: Sink, places: Iterable[int] = ()) -> None:
         self._plan, self._sink = plan, sink
-        self._ready = list[tuple[int, Start]]()
-        self._wanted, self._last = set[int](), 0
+        self._ready, self._wanted = list[tuple[int, Start]](), set[int]()
         self._waiting: dict[int, list[int]] = {}
         self._first_tries: dict[int, Measured] = {}
         for place in places:
@@ -83,18 +82,19 @@ class Schedule:
 
     def want(self, place: int) -> None:
         """Have a frame measured, and all that it depends on."""
-        first = None
-        for ancestor in lineage(place):
-            if self._sink.is_finished(ancestor):
-                break
-            if ancestor in self._wanted:
-                return
-            self._wanted.add(ancestor)
-            self._last = max(self._last, ancestor)
-            first = ancestor
-        if first is not None:
-            before = parent(first)
-            self._ready.append((first, Start(displacement=None) if before is None else self._sink.start_after(before)))
+        if not (place in self._wanted or self._sink.is_finished(place)):
+            self._wanted.add(place)
+            self._start_from(parent(place), place)
+
+    def _start_from(self, before: int | None, place: int) -> None:
+        """Have a frame measured as soon as the frame `before` it is; None: from a search."""
+        if before is None:
+            self._ready.append((place, Start(displacement=None)))
+        elif self._sink.is_finished(before):
+            self._ready.append((place, self._sink.start_after(before)))
+        else:
+            self._waiting.setdefault(before, []).append(place)
+            self.want(before)
 
     def run(self, workers: Workers) -> None:
         """Have workers measure the frames, and give each to the sink as it finishes.
@@ -151,12 +151,7 @@ class Schedule:
         lost = found.record.status != Status.CONVERGED or rank_of(found.record)[1] > start.unmeasured + 0.01
         if first is None and is_key(place) and lost:  # a hundredth of the nodes more than where it started from
             self._first_tries[place] = found
-            before = place - 1  # it may have to be measured first
-            if self._sink.is_finished(before):
-                self._ready.append((place, self._sink.start_after(before)))
-            else:
-                self._waiting.setdefault(before, []).append(place)
-                self.want(before)
+            self._start_from(place - 1, place)
             return
         if first is not None:
             better = min(first, found, key=lambda one: rank_of(one.record))
@@ -164,8 +159,7 @@ class Schedule:
         after = following(self._plan, found.record.values, start)
         self._sink.keep(place, found, after)
         self._wanted.discard(place)
-        released = [child for child in children(place, self._last + 1) if child in self._wanted]
-        self._ready += [(one, after) for one in (*released, *self._waiting.pop(place, ()))]
+        self._ready += [(one, after) for one in self._waiting.pop(place, ())]
 
 
 def rank_of(record: FrameRecord) -> tuple[bool, float]:

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,13 @@ logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int, str], None]
 
-_MEASURED = ("u", "v", "u_std", "v_std", "exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std", "rigid")
-"""Quantities of a frame that it makes a reference with, beside the status of its nodes."""
+_OF_NODES = {
+    "displacement": ("u", "v"),
+    "displacement_std": ("u_std", "v_std"),
+    "strain": ("exx", "eyy", "exy"),
+    "strain_std": ("exx_std", "eyy_std", "exy_std"),
+}
+"""Quantities of a frame that it makes a reference with, as columns of its solution's arrays."""
 
 
 def measure(
@@ -196,19 +202,13 @@ class _Folder:
         blank = Solution.failed(mesh, lights, "", np.zeros(0))
 
         def solution(kept: Mapping[str, Any]) -> Solution:
-            exact = {name: kept[name].astype(np.float64) for name in _MEASURED}
-            u, v, u_std, v_std, *strain, rigid = exact.values()
-            return replace(
-                blank,
-                displacement=np.stack([u, v], axis=1),
-                displacement_std=np.stack([u_std, v_std], axis=1),
-                strain=np.stack(strain[:3], axis=1),
-                strain_std=np.stack(strain[3:], axis=1),
-                node_status=kept["node_status"],
-                rigid=rigid,
-            )
+            arrays: dict[str, Any] = {
+                name: np.stack([kept[part] for part in parts], axis=1, dtype=np.float64)
+                for name, parts in _OF_NODES.items()
+            }
+            return replace(blank, **arrays, node_status=kept["node_status"], rigid=kept["rigid"].astype(np.float64))
 
-        kept = self._store.table().each([*_MEASURED, "node_status"], places)
+        kept = self._store.table().each([*chain(*_OF_NODES.values()), "node_status", "rigid"], places)
         return [(chosen[place], solution(one)) for place, one in zip(places, kept, strict=True)]
 
     def keep(self, place: int, found: Measured, after: Start) -> None:
@@ -249,7 +249,7 @@ def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
         if retry_failed and kept["status"] == Status.FAILED:
             changed.append(place)
     lost = np.flatnonzero(damaged).tolist()
-    again = {*lost, *changed, *readable, *dependants([*changed, *readable], tries)}
+    again = {*lost, *dependants([*changed, *readable], tries)}
     if lost:
         logger.warning("lost to damage and measured again: %s", listed(lost, names))
     if readable:
