@@ -2,12 +2,11 @@
 
 from rgbmidic.illumination.images import correlated
 from rgbmidic.illumination.separation import LightSeparation, Separation
-from rgbmidic.pipeline.correlate import correlate
 from rgbmidic.pipeline.frame import measure_frame
+from rgbmidic.pipeline.given import FrameSequence
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.run import measure
-from rgbmidic.pipeline.sequence import measure_sequence
-from rgbmidic.pipeline.source import FrameSequence
+from rgbmidic.pipeline.sequence import correlate, measure_sequence
 
 __all__ = [
     "FrameSequence",

@@ -15,8 +15,8 @@ import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from rgbmidic.results import Histories, Maps, Result, shared_part
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.provenance import is_result
-from rgbmidic.settings import TestSettings, read_toml, regular
+from rgbmidic.settings import TestSettings, read_test, read_toml, regular
 
 logger = logging.getLogger(__name__)
 
@@ -45,15 +45,12 @@ class BatchTest:
     ----------
     name
         Its name and that of its folder.
-    document
-        Sections of its settings, or the TEST.toml that has them, which is read when the test's turn comes.
-    base
-        Folder that relative paths start from.
+    read
+        Gives its settings, when its turn comes.
     """
 
     name: str
-    document: Mapping[str, Any] | Path
-    base: Path
+    read: Callable[[], TestSettings]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,7 +93,7 @@ def read_tests(paths: Sequence[Path]) -> list[BatchTest]:
     """
     stems = [path.stem for path in paths]
     names = [path.stem if stems.count(path.stem) == 1 else path.resolve().parent.name for path in paths]
-    tests = [BatchTest(name=name, document=path, base=path.parent) for path, name in zip(paths, names, strict=True)]
+    tests = [BatchTest(name=name, read=partial(read_test, path)) for path, name in zip(paths, names, strict=True)]
     _check_names(tests)
     if missing := [str(path) for path in paths if not path.is_file()]:
         raise InputError(f"there is no settings file {', '.join(missing)}")
@@ -147,7 +144,8 @@ def read_table(template: Path, table: Path) -> list[BatchTest]:
                 continue
             if text:
                 changed.setdefault(section, {})[key] = text
-        tests.append(BatchTest(name=row[0].strip(), document=changed, base=template.parent))
+        settings = partial(TestSettings.from_mapping, changed, template.parent)
+        tests.append(BatchTest(name=row[0].strip(), read=settings))
     _check_names(tests)
     return tests
 
@@ -215,9 +213,7 @@ def _measured(
     test: BatchTest, folder: Path, workers: int | None, progress: Progress | None, *, overwrite: bool
 ) -> tuple[Result, TestSettings, bool]:
     """Measure a test unless it is measured already; whether it was measured now comes last."""
-    document = test.document
-    sections = read_toml(document, "settings file") if isinstance(document, Path) else document
-    settings, moved = TestSettings.from_mapping(sections, test.base), False
+    settings, moved = test.read(), False
 
     def count(done: int, total: int, line: str) -> None:
         nonlocal moved

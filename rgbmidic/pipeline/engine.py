@@ -8,30 +8,29 @@ from __future__ import annotations
 
 import importlib
 import logging
+import sys
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from heapq import nsmallest
+from logging.handlers import BufferingHandler
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
 from rgbmidic._kernels.threads import set_threads, threads
-from rgbmidic.correlation import NodeStatus, Solution, Start, Status
+from rgbmidic.correlation import NodeStatus, Start, Status
 from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError
-from rgbmidic.pipeline.frame import Measured, failed_frame, measure_frame
-from rgbmidic.pipeline.order import STRIDE, children, is_key, lineage, parent
+from rgbmidic.pipeline.frame import Measured, Updated, attempt, failed_frame
+from rgbmidic.pipeline.order import STRIDE, is_key, parent
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.results import FrameRecord
 
 logger = logging.getLogger(__name__)
-
-Updated = Sequence[tuple[int, Solution]]
-"""Index and solution of frames that became the reference, see `measure_frame`."""
 
 
 class Workers(Protocol):
@@ -55,7 +54,7 @@ class Sink(Protocol):
         """Initial guess of the frames that follow a finished one."""
 
     def updated(self, places: Sequence[int]) -> Updated:
-        """Frames that became the reference, for workers that make it of them."""
+        """Frames that became the reference, or the reference that they make."""
 
     def keep(self, place: int, found: Measured, after: Start) -> None:
         """Take a frame, and the initial guess of those that follow it."""
@@ -70,8 +69,7 @@ class Schedule:
 
     def __init__(self, plan: Plan, sink: Sink, places: Iterable[int] = ()) -> None:
         self._plan, self._sink = plan, sink
-        self._ready = list[tuple[int, Start]]()
-        self._wanted, self._last = set[int](), 0
+        self._ready, self._wanted = list[tuple[int, Start]](), set[int]()
         self._waiting: dict[int, list[int]] = {}
         self._first_tries: dict[int, Measured] = {}
         for place in places:
@@ -84,18 +82,19 @@ class Schedule:
 
     def want(self, place: int) -> None:
         """Have a frame measured, and all that it depends on."""
-        first = None
-        for ancestor in lineage(place):
-            if self._sink.is_finished(ancestor):
-                break
-            if ancestor in self._wanted:
-                return
-            self._wanted.add(ancestor)
-            self._last = max(self._last, ancestor)
-            first = ancestor
-        if first is not None:
-            before = parent(first)
-            self._ready.append((first, Start(displacement=None) if before is None else self._sink.start_after(before)))
+        if not (place in self._wanted or self._sink.is_finished(place)):
+            self._wanted.add(place)
+            self._start_from(parent(place), place)
+
+    def _start_from(self, before: int | None, place: int) -> None:
+        """Have a frame measured as soon as the frame `before` it is; None: from a search."""
+        if before is None:
+            self._ready.append((place, Start(displacement=None)))
+        elif self._sink.is_finished(before):
+            self._ready.append((place, self._sink.start_after(before)))
+        else:
+            self._waiting.setdefault(before, []).append(place)
+            self.want(before)
 
     def run(self, workers: Workers) -> None:
         """Have workers measure the frames, and give each to the sink as it finishes.
@@ -111,11 +110,13 @@ class Schedule:
         while self._ready or running:
             while self._ready and len(running) < workers.slots:
                 place, start = self._next(workers.slots)
-                last = start.reference_updates[-2:]  # all that the reference which they make depends on
-                running[workers.submit(self._index(place), start, self._sink.updated(last))] = place, start
+                updated = self._sink.updated(start.reference_updates[-2:])  # all that the reference depends on
+                # a key frame looks for what has been lost; frames between key frames follow what there is
+                own = replace(start, unmeasured=0.0) if is_key(place) else start
+                running[workers.submit(self._plan.series.chosen[place], own, updated)] = place, start
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 place, start = running.pop(future)
-                self._take(place, start, self._outcome(future, place))
+                self._take(place, start, self._outcome(future, self._plan.series.chosen[place]))
 
     def _next(self, slots: int) -> tuple[int, Start]:
         """Take the frame that is to be measured next out of those that can be.
@@ -128,19 +129,14 @@ class Schedule:
         self._ready.remove(found)
         return found
 
-    def _index(self, place: int) -> int:
-        """Place in the series of a frame of the result."""
-        return self._plan.series.chosen[place]
-
-    def _outcome(self, future: Future[Measured], place: int) -> Measured:
+    def _outcome(self, future: Future[Measured], index: int) -> Measured:
         """What a worker found, or why it found nothing."""
         try:
             found = future.result()
         except CancelledError:
             raise RgbmidicError(LOST_CLUSTER) from None
         except Exception as error:  # a worker of a cluster that died over the frame more often than the cluster allows
-            index, kind = self._index(place), type(error).__name__
-            name = self._plan.series.name(index)
+            kind, name = type(error).__name__, self._plan.series.name(index)
             logger.warning("a worker died while %s was measured (%s)", name, str(error) or kind)
             return Measured(record=failed_frame(self._plan, index, f"its worker died: {kind}"))
         for level, text in found.messages:
@@ -155,12 +151,7 @@ class Schedule:
         lost = found.record.status != Status.CONVERGED or rank_of(found.record)[1] > start.unmeasured + 0.01
         if first is None and is_key(place) and lost:  # a hundredth of the nodes more than where it started from
             self._first_tries[place] = found
-            before = place - 1  # it may have to be measured first
-            if self._sink.is_finished(before):
-                self._ready.append((place, self._sink.start_after(before)))
-            else:
-                self._waiting.setdefault(before, []).append(place)
-                self.want(before)
+            self._start_from(place - 1, place)
             return
         if first is not None:
             better = min(first, found, key=lambda one: rank_of(one.record))
@@ -168,8 +159,7 @@ class Schedule:
         after = following(self._plan, found.record.values, start)
         self._sink.keep(place, found, after)
         self._wanted.discard(place)
-        released = [child for child in children(place, self._last + 1) if child in self._wanted]
-        self._ready += [(one, after) for one in (*released, *self._waiting.pop(place, ()))]
+        self._ready += [(one, after) for one in self._waiting.pop(place, ())]
 
 
 def rank_of(record: FrameRecord) -> tuple[bool, float]:
@@ -207,10 +197,10 @@ class Threads:
         """Have one frame measured, at once where there is one thread."""
         if self._executor is None:
             done: Future[Measured] = Future()
-            done.set_result(self._measured(index, start, updated))
+            done.set_result(attempt(self._plan, index, start, updated))
             return done
         self._count(1)
-        future = self._executor.submit(self._measured, index, start, updated)
+        future = self._executor.submit(attempt, self._plan, index, start, updated)
         future.add_done_callback(lambda _: self._count(-1))
         return future
 
@@ -220,9 +210,6 @@ class Threads:
             self._executor.shutdown(cancel_futures=True)
         set_threads(self._before[0])
         cv2.setNumThreads(self._before[1])
-
-    def _measured(self, index: int, start: Start, updated: Updated) -> Measured:
-        return Measured(record=measure_frame(self._plan, index, start, updated))
 
     def _count(self, more: int) -> None:
         """Divide the threads that share kernels among the frames that are being measured."""
@@ -304,25 +291,16 @@ def open_workers(plan: Plan, count: int, scheduler: str | None = None) -> Thread
     return Threads(plan, count) if scheduler is None else Cluster(plan, scheduler)
 
 
-class _Messages(logging.Handler):
-    """Keeps what one thread logs."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.thread, self.kept = threading.get_ident(), list[tuple[int, str]]()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        if record.thread == self.thread:
-            self.kept.append((record.levelno, self.format(record)))
-
-
 def _measure_elsewhere(plan: Plan, index: int, start: Start, updated: Updated) -> Measured:
     """Measure a frame in a worker of a cluster, on one thread; nobody reads its log."""
     cv2.setNumThreads(1)
     set_threads(1)
-    logger, handler = logging.getLogger("rgbmidic"), _Messages()
+    logger, thread, handler = logging.getLogger("rgbmidic"), threading.get_ident(), BufferingHandler(sys.maxsize)
+    handler.addFilter(lambda record: record.thread == thread)
     logger.addHandler(handler)
     try:
-        return Measured(record=measure_frame(plan, index, start, updated), messages=tuple(handler.kept))
+        found = attempt(plan, index, start, updated)
     finally:
         logger.removeHandler(handler)
+    messages = tuple((record.levelno, handler.format(record)) for record in handler.buffer)
+    return Measured(record=found.record, messages=messages)

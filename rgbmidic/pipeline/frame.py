@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,7 +24,7 @@ from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.data import Window
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState, light_images
-from rgbmidic.pipeline.order import STRIDE, is_key
+from rgbmidic.pipeline.order import STRIDE
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.suitability import SUITABILITY, exposure_fault, saturated_fraction, too_small
 from rgbmidic.results import FrameRecord
@@ -53,7 +53,11 @@ class Measured:
     messages: tuple[tuple[int, str], ...] = ()
 
 
-def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[int, Solution]] = ()) -> FrameRecord:
+Updated = Sequence[tuple[int, Solution]] | ReferenceUpdate
+"""Index and solution of the last two frames that became the reference, all that it depends on; or the reference."""
+
+
+def measure_frame(plan: Plan, index: int, start: Start, updated: Updated = ()) -> FrameRecord:
     """Measure one frame of a test.
 
     A frame that cannot be read or measured gives a record with the reason, an error that is not one of rgbmidic's own
@@ -68,28 +72,21 @@ def measure_frame(plan: Plan, index: int, start: Start, updated: Sequence[tuple[
     start
         From where its displacement is looked for; a frame of the reference starts from rest.
     updated
-        Index and solution of the last two of ``start.reference_updates``: all that the reference they make depends on.
+        Index and solution of the last two of ``start.reference_updates``: all that the reference they make depends on;
+        or that reference.
 
     Returns
     -------
     FrameRecord
     """
-
-    def make() -> ReferenceUpdate:
-        reference_update = ReferenceUpdate.none(plan.reference)
-        for number, solution in updated:
-            reference_update = next_reference(plan, reference_update, number, solution)
-        return reference_update
-
-    frames = tuple(number for number, _ in updated)
-    return attempt(plan, index, start, lambda: plan.process.reference_update(frames, make)).record
+    return attempt(plan, index, start, updated).record
 
 
-def attempt(plan: Plan, index: int, start: Start, reference: Callable[[], ReferenceUpdate]) -> Measured:
-    """Measure a frame as `measure_frame` on the `reference` that ``start.reference_updates`` make."""
+def attempt(plan: Plan, index: int, start: Start, updated: Updated = ()) -> Measured:
+    """Measure a frame as `measure_frame`, which gives the record alone."""
     try:
         with timed(plan.timings) as seconds:
-            values = solve_frame(plan, index, start, reference())
+            values = solve_frame(plan, index, start, _reference_of(plan, updated))
         record = FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
         return Measured(record=record, solution=values["solution"])
     except RgbmidicError as error:
@@ -99,6 +96,20 @@ def attempt(plan: Plan, index: int, start: Start, reference: Callable[[], Refere
         reason, unread = f"unexpected error: {type(error).__name__}: {error}", False
         logger.exception("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
     return Measured(record=failed_frame(plan, index, reason, unread=unread))
+
+
+def _reference_of(plan: Plan, updated: Updated) -> ReferenceUpdate:
+    """The reference that updates make in turn."""
+    if isinstance(updated, ReferenceUpdate):
+        return updated
+
+    def make() -> ReferenceUpdate:
+        reference_update = ReferenceUpdate.none(plan.reference)
+        for number, solution in updated:
+            reference_update = next_reference(plan, reference_update, number, solution)
+        return reference_update
+
+    return plan.process.reference_update(tuple(number for number, _ in updated), make)
 
 
 def failed_frame(plan: Plan, index: int, reason: str, *, unread: bool = False) -> FrameRecord:
@@ -152,8 +163,6 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     """
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
     place = plan.series.chosen.index(index)
-    if is_key(place):  # it looks for what has been lost; frames between key frames follow what there is
-        start = replace(start, unmeasured=0.0)
     if index in settings.frames.reference:
         start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
     window = plan.window_of(start.displacement, reference_update.displacement)

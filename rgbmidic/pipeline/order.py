@@ -9,7 +9,7 @@ measured well from there is measured once more from the frame just before it, an
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 STRIDE = 16
 """Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
@@ -25,37 +25,15 @@ def is_key(position: int) -> bool:
     return position > 0 and _step(position) > 1
 
 
-def children(position: int, count: int) -> Iterator[int]:
-    """The frames among `count` that start from a frame."""
-    step = 1
-    while position + step < count:
-        if parent(position + step) == position:
-            yield position + step
-        step *= STRIDE
-
-
-def lineage(position: int) -> Iterator[int]:
-    """A frame, its parent, the parent of that, and so on to the first."""
-    yield position
-    while position:
-        position -= _step(position)
-        yield position
-
-
 def dependants(places: Iterable[int], tries: Sequence[int]) -> set[int]:
-    """The frames that depend on some, directly or through others, of a test with as many frames as `tries`.
+    """Some frames, and all that depend on them, directly or through others, of a test with as many as `tries`.
 
     A frame depends on the one that it starts from; a key frame of 2 `tries` also on the one just before it.
     """
-    found: set[int] = set()
-    ahead = list(places)
-    while ahead:
-        place = ahead.pop()
-        after = set(children(place, len(tries)))
-        if place + 1 < len(tries) and tries[place + 1] > 1:
-            after.add(place + 1)
-        ahead += after - found
-        found |= after
+    found = set(places)
+    for place, tried in enumerate(tries):
+        if parent(place) in found or (tried > 1 and place - 1 in found):
+            found.add(place)
     return found
 
 

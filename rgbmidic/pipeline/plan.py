@@ -19,9 +19,9 @@ import numpy as np
 from rgbmidic.correlation import PrecisionMethod, Reference
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
-from rgbmidic.errors import ConfigurationError, FrameError
+from rgbmidic.errors import ConfigurationError, FrameError, RegionError
 from rgbmidic.fields import CameraCalibration
-from rgbmidic.frames import Window, open_series
+from rgbmidic.frames import Window, open_series, read_frame
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import DARK, IlluminationImages, correlated
@@ -33,16 +33,20 @@ from rgbmidic.illumination.separation import (
     light_images,
     reference_images,
 )
-from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh
+from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
+from rgbmidic.mesh.placement import on_image
 from rgbmidic.pipeline import suitability
-from rgbmidic.pipeline.region import finite_elements_of, read_region, region_and_window, window_around
-from rgbmidic.pipeline.source import FrameSequence, Series, open_sequence
-from rgbmidic.settings import SolverSettings, TestSettings, grey_levels
+from rgbmidic.pipeline.given import FrameSequence, Series, check_given, open_sequence
+from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings, grey_levels
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights
 from rgbmidic.weights.threshold import ThresholdWeights, blurred
 
 logger = logging.getLogger(__name__)
+
+
+_WORTH = 0.5
+"""Share of the frame from which all of it is read: what a window saves would be less than half."""
 
 
 class ProcessState:
@@ -185,31 +189,33 @@ class Plan:
             The settings, the calibration, the region or the reference frames are not usable, or an object contradicts
             the settings.
         """
-        _check_given(settings, source, separation, weights, mesh)
+        check_given(settings, source, separation, weights, mesh)
         camera = None if settings.calibration.file is None else Calibration.read(settings.calibration.file)
         if source is None:
             series: Series = open_series(settings.frames, settings.base, camera)
         else:
             series = open_sequence(source, settings.frames, camera)
+        frame = series.shape
         if settings.scale.camera is not None:
-            CameraCalibration.read(settings.scale.camera).check(series.shape)
-        calibration = camera and camera.cropped(settings.frames.crop_origin, series.shape)
+            CameraCalibration.read(settings.scale.camera).check(frame)
+        calibration = camera and camera.cropped(settings.frames.crop_origin, frame)
         separate = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
-        whole = any(one is not None for one in (source, weights, mesh, region))
+        given = any(one is not None for one in (source, weights, mesh, region))
         finite_elements, placement = None, None
         if settings.mesh.file is not None:
-            finite_elements, placement, mesh, region = finite_elements_of(settings, series.shape)
-        if whole or not isinstance(separate, WindowedSeparation):
-            region, window = region or read_region(settings.region, series.shape), Window.whole(series.shape)
-        else:
-            region, window = region_and_window(settings, region, series.shape)
-            if mesh is not None:
-                mesh = Tri3Mesh(nodes=mesh.nodes - window.origin, elements=mesh.elements)
+            finite_elements, placement, mesh, region = finite_elements_of(settings, frame)
+        region, window = region or read_region(settings.region, frame), Window.whole(frame)
+        if not given and isinstance(separate, WindowedSeparation):
+            window = window_of_reference(region, settings, frame)
+            region = region.part(*window.part_of(Window.whole(frame)))
         state, images, separate = _read_reference(settings, series, separate, window, region, calibration)
         if separation is not None and isinstance(state, IlluminationImages):
             raise ConfigurationError("the source gives images of the lights, which need no separation: give only one")
-        size = settings.mesh.side if mesh is None else mesh.size
-        if mesh is None:
+        if mesh is not None:
+            mesh = Tri3Mesh(nodes=mesh.nodes - window.origin, elements=mesh.elements)
+            size = mesh.size
+        else:
+            size = settings.mesh.side
             cracks = [np.subtract(path, window.origin) for path in settings.mesh.cracks]
             mesh = Tri3Mesh.from_region(region, size, cracks)
         cracked = len(mesh.crack_edges) > 0
@@ -334,47 +340,6 @@ def _reference(
     )
 
 
-def _check_given(
-    settings: TestSettings,
-    source: FrameSequence | None,
-    separation: LightSeparation | None,
-    weights: LightWeights | None,
-    mesh: Tri3Mesh | None,
-) -> None:
-    """Refuse an object that contradicts what the settings name."""
-    if source is not None and settings.frames.path:
-        raise ConfigurationError(
-            f"frames.path names {', '.join(settings.frames.path)}, and a frame source is given: leave the path empty "
-            "(path = [])"
-        )
-    if source is not None and settings.frames.lights > 1:
-        raise ConfigurationError("frames.lights is for files; a frame source gives all lights of a state by one index")
-    if weights is not None and settings.weights.method not in ("statistics", "none"):
-        raise ConfigurationError(
-            f'weights.method = "{settings.weights.method}", and weights are given: state "statistics", with which both '
-            'count, or "none"'
-        )
-    if mesh is not None and settings.mesh.file is not None:
-        raise ConfigurationError(f"mesh.file names {settings.mesh.file}, and a mesh is given: leave one of them out")
-    if mesh is not None and settings.mesh.cracks:
-        raise ConfigurationError("mesh.cracks splits a mesh that is made here; the mesh that is given has its own")
-    if settings.mesh.element_size == "auto":
-        raise ConfigurationError(
-            'mesh.element_size = "auto" is found on the frames of a test by rgbmidic.measure, for a mesh that is made '
-            "there: state a number"
-        )
-    if settings.mesh.refine is not False:
-        raise ConfigurationError(
-            "mesh.refine is done on the frames of a test by rgbmidic.measure, for a mesh made there: leave it out"
-        )
-    kind = settings.frames.kind
-    if kind in ("bayer", "rgb") and separation is None and settings.calibration.file is None:
-        raise ConfigurationError(
-            f'frames.kind = "{kind}" needs the lights\' crosstalk: state calibration.file, a file that '
-            "rgbmidic-calibrate writes"
-        )
-
-
 def _read_reference(
     settings: TestSettings,
     series: Series,
@@ -443,3 +408,71 @@ def _tell_no_effect(weights: ThresholdWeights, images: IlluminationImages, regio
             f"{weights.blur:g} px, exceeds {most:.2g} of the dynamic range in the region. State a lower one, or "
             'weights.method = "statistics"'
         )
+
+
+def finite_elements_of(
+    settings: TestSettings, frame: tuple[int, int]
+) -> tuple[FiniteElementMesh, Placement, Tri3Mesh, Region]:
+    """The part of ``mesh.file`` that is measured, where it lies on frames of this shape, and its pixels."""
+    assert settings.mesh.file is not None
+    camera = None if settings.scale.camera is None else CameraCalibration.read(settings.scale.camera)
+    placement = Placement.fit(settings.mesh.points or (), camera)
+    logger.info("mesh.points: %s", placement.summary())
+    limits = settings.region
+    allowed = read_region(limits, frame) if limits.is_stated else Region.from_mask(np.ones(frame, dtype=bool))
+    every = read_mesh(settings.mesh.file, unit=settings.mesh.unit or "mm", part=settings.mesh.part)
+    part, mesh, region = on_image(every, placement, frame, allowed.without(limits.holes))
+    return part, placement, mesh, region
+
+
+def window_of_reference(region: Region, settings: TestSettings, frame: tuple[int, int]) -> Window:
+    """The part of the reference frames that is read for a region of them."""
+    spans = [np.flatnonzero(region.mask.any(axis=axis)) for axis in (0, 1)]
+    corners = np.array([[span[0], span[-1]] for span in spans], dtype=np.float64).T
+    window = window_around(corners, search_reach(corners), settings, frame)
+    return Window.whole(frame) if np.prod(window.shape) > _WORTH * np.prod(frame) else window
+
+
+def window_around(
+    points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int], around: float = 96.0
+) -> Window:
+    """What lies within `reach` of points (N, 2), and what its images depend on.
+
+    The separation's local statistics use `around` px: three standard deviations of their windows with all that is
+    between (`rgbmidic.lab.inspection.channels.InspectionConstants`).
+    """
+    may_crack = bool(settings.mesh.cracks) or settings.mesh.file is not None
+    sigma, _ = grey_levels(settings.illumination.normalise, settings.solver, cracked=may_crack)
+    return Window.around(points, reach + max(around, 3 * max(sigma, settings.weights.blur)), frame)
+
+
+def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
+    """The region of interest of the settings on images of `shape` (H, W).
+
+    Parameters
+    ----------
+    settings
+        The section ``[region]``.
+    shape
+        Rows and columns of the images.
+
+    Returns
+    -------
+    Region
+
+    Raises
+    ------
+    RegionError
+        The region is empty, outside the image, or the mask image has another size.
+    """
+    if settings.rectangle is not None:
+        outlined = Region.from_rectangle(settings.rectangle, shape)
+    elif settings.polygon is not None:
+        outlined = Region.from_polygon(settings.polygon, shape)
+    else:
+        assert settings.mask is not None
+        try:
+            outlined = Region.from_mask(read_frame(settings.mask, kind="monochrome").values[0], shape)
+        except RegionError as error:
+            raise RegionError(f"region.mask {settings.mask}: {error}") from None
+    return outlined.without(settings.holes)

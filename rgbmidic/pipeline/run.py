@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,12 @@ from rgbmidic.correlation import NodeStatus, Solution, Start, Status
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.engine import Schedule, Updated, following, open_workers, rank_of
-from rgbmidic.pipeline.frame import Measured, read_state
-from rgbmidic.pipeline.given import check_object, check_type, describe
+from rgbmidic.pipeline.engine import Schedule, following, open_workers, rank_of
+from rgbmidic.pipeline.frame import Measured, Updated, read_state
+from rgbmidic.pipeline.given import FrameSequence, check_object, check_type, describe
 from rgbmidic.pipeline.order import dependants
 from rgbmidic.pipeline.plan import Choice, Plan
 from rgbmidic.pipeline.resolution import choose, refine
-from rgbmidic.pipeline.source import FrameSequence
 from rgbmidic.pipeline.suitability import light_levels
 from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
@@ -35,8 +35,13 @@ logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int, str], None]
 
-_MEASURED = ("u", "v", "u_std", "v_std", "exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std", "rigid")
-"""Quantities of a frame that it makes a reference with, beside the status of its nodes."""
+_OF_NODES = {
+    "displacement": ("u", "v"),
+    "displacement_std": ("u_std", "v_std"),
+    "strain": ("exx", "eyy", "exy"),
+    "strain_std": ("exx_std", "eyy_std", "exy_std"),
+}
+"""Quantities of a frame that it makes a reference with, as columns of its solution's arrays."""
 
 
 def measure(
@@ -115,11 +120,8 @@ def measure(
     if isinstance(settings, str | Path):
         settings = read_test(settings)
     check_type("settings", settings, TestSettings, "a TestSettings or the path of a TEST.toml")
-    check_type("mesh", mesh, Tri3Mesh | None, "a Tri3Mesh")
     check_type("frames", frames, range | None, "a range of indices")
     check_type("workers", workers, int | None, "a whole number")
-    check_object("separation", separation, "__call__")
-    check_object("weights", weights, "reference", "deformed")
     check_object("progress", progress, "__call__")
     given: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
     choice: Choice | None = None
@@ -200,19 +202,13 @@ class _Folder:
         blank = Solution.failed(mesh, lights, "", np.zeros(0))
 
         def solution(kept: Mapping[str, Any]) -> Solution:
-            exact = {name: kept[name].astype(np.float64) for name in _MEASURED}
-            u, v, u_std, v_std, *strain, rigid = exact.values()
-            return replace(
-                blank,
-                displacement=np.stack([u, v], axis=1),
-                displacement_std=np.stack([u_std, v_std], axis=1),
-                strain=np.stack(strain[:3], axis=1),
-                strain_std=np.stack(strain[3:], axis=1),
-                node_status=kept["node_status"],
-                rigid=rigid,
-            )
+            arrays: dict[str, Any] = {
+                name: np.stack([kept[part] for part in parts], axis=1, dtype=np.float64)
+                for name, parts in _OF_NODES.items()
+            }
+            return replace(blank, **arrays, node_status=kept["node_status"], rigid=kept["rigid"].astype(np.float64))
 
-        kept = self._store.table().each([*_MEASURED, "node_status"], places)
+        kept = self._store.table().each([*chain(*_OF_NODES.values()), "node_status", "rigid"], places)
         return [(chosen[place], solution(one)) for place, one in zip(places, kept, strict=True)]
 
     def keep(self, place: int, found: Measured, after: Start) -> None:
@@ -253,7 +249,7 @@ def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
         if retry_failed and kept["status"] == Status.FAILED:
             changed.append(place)
     lost = np.flatnonzero(damaged).tolist()
-    again = {*lost, *changed, *readable, *dependants([*changed, *readable], tries)}
+    again = {*lost, *dependants([*changed, *readable], tries)}
     if lost:
         logger.warning("lost to damage and measured again: %s", listed(lost, names))
     if readable:

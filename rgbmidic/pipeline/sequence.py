@@ -1,6 +1,7 @@
-"""States of a test one after the other, as a camera gives them: each solution before the next state is asked for.
+"""States that a script has in memory: one pair (`correlate`), or one after the other (`measure_sequence`).
 
-Initial guesses, tracking and reference updates are those of `rgbmidic.measure`, frame for frame, in constant memory.
+Of a sequence, each solution is there before the next state is asked for, as a camera gives them. Initial guesses,
+tracking and reference updates are those of `rgbmidic.measure`, frame for frame, in constant memory.
 """
 
 from __future__ import annotations
@@ -8,23 +9,33 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import chain
 from typing import Any, Literal, Unpack, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.correlation import Solution, Start
-from rgbmidic.correlation.images import unmasked
+from rgbmidic._kernels.threads import aside
+from rgbmidic.correlation import (
+    Deformed,
+    PrecisionMethod,
+    Reference,
+    Solution,
+    Start,
+    discretisation_error,
+    fill,
+    solve,
+    track,
+)
+from rgbmidic.correlation.images import as_light_stack, unmasked
 from rgbmidic.correlation.reference_update import ReferenceUpdate
-from rgbmidic.errors import FrameError, InputError
+from rgbmidic.errors import ConfigurationError, FrameError, InputError
+from rgbmidic.illumination.images import normalise as divide_by_local_mean
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.correlate import solver_settings
-from rgbmidic.pipeline.engine import Schedule, Updated
-from rgbmidic.pipeline.frame import Measured, attempt, next_reference
+from rgbmidic.pipeline.engine import Schedule, Threads
+from rgbmidic.pipeline.frame import Measured, next_reference
 from rgbmidic.pipeline.given import check_object, check_type
 from rgbmidic.pipeline.order import STRIDE
 from rgbmidic.pipeline.plan import Plan
@@ -36,12 +47,158 @@ from rgbmidic.settings import (
     MeshSettings,
     RegionSettings,
     SolverOptions,
+    SolverSettings,
     TestSettings,
     WeightSettings,
+    check_names,
+    grey_levels,
 )
-from rgbmidic.weights import LightWeights, MaskWeights
+from rgbmidic.typing import FloatArray
+from rgbmidic.weights import LightWeights, MaskWeights, Statistics, as_weights
 
 logger = logging.getLogger(__name__)
+
+
+def correlate(
+    reference: npt.ArrayLike,
+    deformed: npt.ArrayLike,
+    *,
+    region: Sequence[float] | Region | None = None,
+    element_size: float = ELEMENT_SIZE,
+    cracks: Sequence[npt.ArrayLike] = (),
+    weights: npt.ArrayLike | None = None,
+    initial: npt.ArrayLike | None = None,
+    deformed_weights: npt.ArrayLike | None = None,
+    normalise: float | Literal["auto"] | None = None,
+    statistics: bool | PrecisionMethod = True,
+    mesh_error: bool = False,
+    **options: Unpack[SolverOptions],
+) -> Solution:
+    """Measure the displacement between two states seen under k lights (k = 1: plain DIC).
+
+    Parameters
+    ----------
+    reference, deformed : array_like, shape (H, W) or (k, H, W)
+        Grey levels; NaN marks an invalid pixel.
+    region
+        Rectangle (x0, y0, x1, y1) in px, or a `rgbmidic.mesh.Region`; None: the whole image.
+    element_size
+        Side of the triangles in px.
+    cracks
+        Paths, each of corners (x, y) in px, along which the mesh is split, see `Tri3Mesh.from_region`.
+    weights : array_like, shape (H, W) or (k, H, W), optional
+        Weight of each light at each pixel of the reference, finite and not negative; 0 excludes the pixel.
+    initial : array_like, shape (2,) or (N, 2), optional
+        Initial guess of the displacement (u, v) in px; None: it is found by a search.
+    deformed_weights
+        Like `weights`, on the deformed images.
+    normalise
+        Standard deviation in px of the Gaussian of the local mean by which every image is first divided; ``"auto"``: 10
+        px, 30 px if there are cracks. None: grey levels are not changed.
+    statistics
+        True: weight the lights by the statistics of the residual around each pixel (`rgbmidic.weights.Statistics`).
+        False: only by `weights`. Or an object with a method of your own.
+    mesh_error
+        Estimate the discretisation error, too (`rgbmidic.discretisation_error`).
+    **options
+        Fields of `rgbmidic.settings.SolverSettings` and their defaults: prefilter, rigid, brightness, fill,
+        tolerance, max_iterations.
+
+    Returns
+    -------
+    Solution
+        With `nodes` (N, 2), `elements` (E, 3), `displacement` (N, 2) in px, `displacement_std` (N, 2) in px,
+        `status`, and more.
+
+    Raises
+    ------
+    InputError
+        The images have different shapes, a weight or initial guess does not fit them, or a setting is unknown.
+    RegionError
+        The region is empty, too small or outside the image.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.ndimage import gaussian_filter
+    >>> speckle = 1000 + 3000 * gaussian_filter(np.random.default_rng(0).normal(size=(120, 160)), 1.5)
+    >>> solution = correlate(speckle, np.roll(speckle, 2, axis=1), region=(20, 20, 140, 100))
+    >>> solution.status.name
+    'CONVERGED'
+    >>> np.allclose(solution.displacement, (2, 0), atol=0.01)
+    True
+    """
+    f, g = as_light_stack(reference, "reference"), as_light_stack(deformed, "deformed")
+    if f.shape != g.shape:
+        raise InputError(f"reference and deformed images must have one shape; given are {f.shape} and {g.shape}")
+    height, width = f.shape[1:]
+    if not isinstance(region, Region):
+        region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
+    mesh = Tri3Mesh.from_region(region, element_size, cracks)
+    cracked = len(mesh.crack_edges) > 0
+    if not (normalise in (None, "auto") or isinstance(normalise, int | float)):
+        raise InputError(f'normalise must be a width in px or "auto", not {normalise!r}')
+    sigma, solver = grey_levels(0.0 if normalise is None else normalise, solver_settings(options), cracked=cracked)
+    if sigma:
+        f, g = (divide_by_local_mean(stack, sigma, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
+    given = as_weights(weights, f.shape, "weights"), as_weights(deformed_weights, f.shape, "deformed_weights")
+    second = aside(Deformed.prepare, g, given[1], prefilter=solver.prefilter)
+    first = Reference.prepare(f, region, given[0], mesh=mesh, prefilter=solver.prefilter)
+    method = (Statistics() if statistics else None) if isinstance(statistics, bool) else statistics
+    check_object("statistics", method, "precision")
+    start = initial_displacement(initial, len(mesh.nodes))
+    if start is None:
+        solution = track(first, second.result(), Start(displacement=None), solver, method)
+    else:
+        solution = solve(first, second.result(), start, solver, method)
+    if mesh_error:
+        solution = discretisation_error(first, second.result(), solution, solver, method)
+    return fill(mesh, solution, solver.fill) if solver.fill else solution
+
+
+def solver_settings(options: SolverOptions) -> SolverSettings:
+    """The settings of the solve that options of a function state.
+
+    Raises
+    ------
+    InputError
+        An option is unknown or out of range.
+    """
+    try:
+        check_names(options, (entry.name for entry in fields(SolverSettings)), "option", "correlate")
+        return SolverSettings(**options)
+    except ConfigurationError as error:
+        raise InputError(str(error)) from None
+
+
+def initial_displacement(initial: npt.ArrayLike | None, nodes: int) -> FloatArray | None:
+    """Return an initial guess as an array, or None where none is given.
+
+    Parameters
+    ----------
+    initial : array_like, shape (2,) or (N, 2), optional
+        Displacement (u, v) in px.
+    nodes
+        Number N of nodes of the mesh.
+
+    Returns
+    -------
+    ndarray, shape (N, 2), or None
+
+    Raises
+    ------
+    InputError
+        Not (2,) or (N, 2), or not finite.
+    """
+    if initial is None:
+        return None
+    try:
+        values = np.asarray(initial, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"initial must be numbers (u, v) in px; given is {initial!r}") from None
+    if values.shape not in ((2,), (nodes, 2)) or not np.isfinite(values).all():
+        raise InputError(f"initial must be finite with shape (2,) or ({nodes}, 2); given is shape {values.shape}")
+    return np.broadcast_to(values, (nodes, 2)).copy()
 
 
 def measure_sequence(
@@ -132,8 +289,6 @@ def measure_sequence(
         raise InputError(f"settings are given: state in them what {told} says")
     if settings.weights.threshold == "auto":
         raise InputError('weights.threshold = "auto" looks at the first deformed frame, which a sequence has not yet')
-    check_object("separation", separation, "__call__")
-    check_type("mesh", mesh, Tri3Mesh | None, "a Tri3Mesh")
     counted: Any = weights if weights is None or hasattr(weights, "deformed") else MaskWeights(cast(Any, weights))
     frames = replace(settings.frames, reference=(0,), first=0 if own else 1, last=None, step=1)
     plan = Plan.from_settings(
@@ -166,28 +321,20 @@ class _Latest:
 def _solutions(plan: Plan, latest: _Latest, states: Iterable[Any]) -> Iterator[Solution]:
     """The solution of each state, in the order and with the second tries of `Schedule`."""
     live = _Live(plan)
-    schedule = Schedule(plan, live)
+    schedule, worker = Schedule(plan, live), Threads(plan, 1)
     for place, latest.state in enumerate(states):
         schedule.want(place)
-        schedule.run(live)
+        schedule.run(worker)
         yield live.solution
 
 
 class _Live:
-    """Measures the latest state at once, and keeps of all before it what a later one may start from."""
-
-    slots = 1
+    """The sink of a sequence: the latest solution, and of all states before it what a later one may start from."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan, self._starts, self._checksum = plan, dict[int, Start](), NO_CHECKSUM
         self._updates: dict[tuple[int, ...], ReferenceUpdate] = {(): ReferenceUpdate.none(plan.reference)}
         self.solution: Solution
-
-    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
-        """Measure a state from a start."""
-        done: Future[Measured] = Future()
-        done.set_result(attempt(self._plan, index, start, lambda: self._updates[start.reference_updates[-2:]]))
-        return done
 
     def is_finished(self, place: int) -> bool:
         """Whether it is one of those that are kept."""
@@ -197,9 +344,9 @@ class _Live:
         """Initial guess of the states that follow one."""
         return self._starts[place]
 
-    def updated(self, places: Sequence[int]) -> Updated:
-        """References are made here while their state is there."""
-        return ()
+    def updated(self, places: Sequence[int]) -> ReferenceUpdate:
+        """The reference that states made, while they were there."""
+        return self._updates[tuple(places)]
 
     def keep(self, place: int, found: Measured, after: Start) -> None:
         """Take a state's solution, and forget what no later state starts from."""

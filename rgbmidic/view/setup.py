@@ -17,7 +17,7 @@ from bokeh.models import ColumnDataSource
 
 from rgbmidic.lab.inspection import Inspection
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.region import finite_elements_of, read_region
+from rgbmidic.pipeline.plan import finite_elements_of, read_region
 from rgbmidic.report.style import colour_range
 from rgbmidic.results.files import write_complete
 from rgbmidic.settings import ELEMENT_SIZE, RegionSettings, TestSettings, read_section

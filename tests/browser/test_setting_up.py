@@ -13,7 +13,7 @@ from viewer import MISSING, Page, chromium, click, serving
 
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.region import read_region
+from rgbmidic.pipeline.plan import read_region
 from rgbmidic.results import Result
 from rgbmidic.settings import read_test
 from rgbmidic.view.setup import SetupPage

@@ -30,7 +30,7 @@ from rgbmidic.lab.inspection.channels import (
 from rgbmidic.lab.inspection.prediction import LocalContrast, Prediction, predict, separated
 from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.region import finite_elements_of, read_region
+from rgbmidic.pipeline.plan import finite_elements_of, read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatImage
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rgbmidic.pipeline.order import STRIDE, children, dependants, is_key, lineage, parent
+from rgbmidic.pipeline.order import STRIDE, dependants, is_key, parent
 
 
 def test_a_frame_starts_from_the_one_before_it_and_a_key_frame_from_the_key_frame_before() -> None:
@@ -17,26 +16,12 @@ def test_a_frame_starts_from_the_one_before_it_and_a_key_frame_from_the_key_fram
 
 
 @given(st.integers(1, 10**6))
-def test_a_parent_lies_before_and_knows_its_child(position: int) -> None:
-    before = parent(position)
-    assert before is not None
-    assert 0 <= before < position
-    assert position in children(before, position + 1)
-
-
-@pytest.mark.parametrize("count", [1, 2, 15, 16, 17, 300, 5000])
-def test_the_tree_reaches_every_frame_once(count: int) -> None:
-    reached, ready = [], [0]
-    while ready:
-        reached.append(position := ready.pop())
-        ready.extend(children(position, count))
-    assert sorted(reached) == list(range(count))
-
-
-@given(st.integers(0, 10**6))
-def test_the_line_of_a_frame_is_short(position: int) -> None:
-    line = list(lineage(position))
-    assert (line[0], line[-1]) == (position, 0)
+def test_the_line_of_a_frame_goes_back_to_the_first_and_is_short(position: int) -> None:
+    line = [position]
+    while (before := parent(line[-1])) is not None:
+        assert 0 <= before < line[-1]
+        line.append(before)
+    assert line[-1] == 0
     assert len(line) <= 1 + (STRIDE - 1) * 5
 
 
@@ -49,4 +34,4 @@ def test_what_depends_on_a_frame_starts_from_it_by_some_way(data: st.DataObject)
         starts = {parent(place), place - 1} if tries[place] > 1 else {parent(place)}
         if starts & (reached | places):
             reached.add(place)
-    assert dependants(places, tries) == reached
+    assert dependants(places, tries) == reached | places

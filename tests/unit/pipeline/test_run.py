@@ -28,7 +28,6 @@ from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import read_frame, write_tiff
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.pipeline import Plan, engine, frame, measure, run
-from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import ProcessState
 from rgbmidic.results import Maps, Result, finish_result
 from rgbmidic.results.physical import Physical
@@ -120,14 +119,14 @@ def test_frames_share_the_threads_that_share_a_kernel(movie: Path, monkeypatch: 
         return measured
 
     plan = Plan.from_settings(settings(movie))
-    measured = measure_frame(plan, 0, Start(displacement=None))
+    measured = frame.attempt(plan, 0, Start(displacement=None))
     before = threads()
     set_threads(4)
-    monkeypatch.setattr(engine, "measure_frame", watched)
+    monkeypatch.setattr(engine, "attempt", watched)
     try:
         with closing(engine.Threads(plan, 2)) as pool:
             running = [pool.submit(index, Start(displacement=None)) for index in range(2)]
-            assert all(one.result(60).record is measured for one in running)
+            assert all(one.result(60) is measured for one in running)
         assert seen == [2, 2]
         assert threads() == 4
     finally:
@@ -360,11 +359,11 @@ def test_frames_that_failed_otherwise_are_measured_again_where_that_is_asked(
     movie: Path, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def failing(plan: Any, index: int, start: Start, updated: Any) -> Any:
-        record = measure_frame(plan, index, start, updated)
-        return frame.failed_frame(plan, index, "out of memory") if index == 33 else record
+        failed = frame.Measured(record=frame.failed_frame(plan, index, "out of memory"))
+        return failed if index == 33 else frame.attempt(plan, index, start, updated)
 
     with monkeypatch.context() as patched:
-        patched.setattr("rgbmidic.pipeline.engine.measure_frame", failing)
+        patched.setattr("rgbmidic.pipeline.engine.attempt", failing)
         measure(settings(movie), tmp_path / "result")
     measured: list[str] = []
     result = measure(settings(movie), tmp_path / "result", resume=True, progress=counted(measured))
@@ -423,10 +422,10 @@ def test_a_key_frame_that_is_lost_is_measured_from_the_frame_before_it(
     def watched(plan: Any, index: int, start: Start, updated: Any) -> Any:
         moved = np.inf if start.displacement is None else float(start.displacement[:, 1].mean())
         starts.append((index, moved))
-        record = measure_frame(plan, index, start, updated)
-        return frame.failed_frame(plan, index, "lost") if index == 16 and len(starts) == 17 else record
+        lost = frame.Measured(record=frame.failed_frame(plan, index, "lost"))
+        return lost if index == 16 and len(starts) == 17 else frame.attempt(plan, index, start, updated)
 
-    monkeypatch.setattr("rgbmidic.pipeline.engine.measure_frame", watched)
+    monkeypatch.setattr("rgbmidic.pipeline.engine.attempt", watched)
     result = in_order(settings(movie, last=18), tmp_path / "result")
     tries = [moved for index, moved in starts if index == 16]
     assert tries == pytest.approx([0.0, 1.5], abs=0.1)

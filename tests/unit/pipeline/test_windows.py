@@ -20,7 +20,7 @@ from rgbmidic.frames.data import ChannelFrame, sampled_channels
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.pipeline import Plan, region
+from rgbmidic.pipeline import Plan, plan
 from rgbmidic.results import Result
 from rgbmidic.settings import TestSettings
 
@@ -53,7 +53,7 @@ def both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[TestSetti
         assert not Plan.from_settings(given).window.is_whole
         parts = measure(given, tmp_path / "parts")
         with monkeypatch.context() as patch:
-            patch.setattr(region, "_WORTH", 0.0)
+            patch.setattr(plan, "_WORTH", 0.0)
             assert Plan.from_settings(given).window.is_whole
             whole = measure(given, tmp_path / "whole")
         np.testing.assert_allclose(parts.nodes, whole.nodes, atol=1e-9)
