@@ -16,8 +16,7 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from rgbmidic.errors import InputError, RegionError
-from rgbmidic.mesh.finite_elements import oriented
-from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, outline_mesh
+from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, oriented, outline_mesh
 from rgbmidic.mesh.region import Region
 from rgbmidic.typing import BoolArray, FloatArray
 
