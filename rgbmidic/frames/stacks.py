@@ -10,8 +10,6 @@ import io
 import itertools
 import math
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -156,21 +154,14 @@ class _Dataset(MovieHeader):
     name: str
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        import h5py
+
         part = slice(rows.start, rows.stop)
-        with _opened(path) as file:
+        with faults_of(path), h5py.File(path, "r", locking=False) as file:
             dataset = file[self.name]
             _check_written(dataset, index, self, path)
             values = np.asarray(dataset[index, part] if dataset.ndim > len(self.frame) else dataset[part])
         return StoredFrame.plain(values.astype(self.dtype.newbyteorder("="), copy=False), path)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[h5py.File]:
-    """Open the file; what libhdf5 raises while it is open becomes a FrameError."""
-    import h5py
-
-    with faults_of(path), h5py.File(path, "r", locking=False) as file:
-        yield file
 
 
 @remembered
@@ -195,7 +186,7 @@ def _hdf5_stacks(path: Path) -> dict[str, _Dataset]:
             name=f"/{name}",
         )
 
-    with _opened(path) as file:
+    with faults_of(path), h5py.File(path, "r", locking=False) as file:
         file.visititems(look)
     return found
 
