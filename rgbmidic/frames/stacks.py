@@ -1,7 +1,6 @@
-"""Stacks of frames: numpy's own files (.npy), HDF5 datasets (.h5, .hdf5, NeXus .nxs), TIFF files of many pages.
+"""Stacks of frames: numpy's own files (.npy) and HDF5 datasets (.h5, .hdf5, NeXus .nxs).
 
-Arrays hold (T, H, W), (T, H, W, 3), or one frame alone, of uint8 or uint16; TIFF and BigTIFF files one frame a page, as
-ImageJ's hyperstacks and OME-TIFF do, too.
+Arrays hold (T, H, W), (T, H, W, 3), or one frame alone, of uint8 or uint16.
 """
 
 from __future__ import annotations
