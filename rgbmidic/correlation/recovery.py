@@ -205,12 +205,13 @@ def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray])
     """
     value, x, y, xx, xy, yy = polynomials
     element = np.repeat(np.arange(len(mesh.elements)), np.diff(pixels.offsets))
-    out = np.zeros((value.shape[1], pixels.local_x.size), dtype=np.float32)
+    columns, rows = pixels.columns, pixels.rows
+    out = np.zeros((value.shape[1], columns.size), dtype=np.float32)
     for corner in range(3):
         node = mesh.elements[element, corner]
         constant, slope_x, slope_y = pixels.barycentric[element, corner].T
         shape_function = constant + slope_x * pixels.local_x + slope_y * pixels.local_y
-        dx, dy = pixels.columns - mesh.nodes[node, 0], pixels.rows - mesh.nodes[node, 1]
+        dx, dy = columns - mesh.nodes[node, 0], rows - mesh.nodes[node, 1]
         for c in range(len(out)):
             bent = xx[node, c] * dx * dx / 2 + xy[node, c] * dx * dy + yy[node, c] * dy * dy / 2
             out[c] += shape_function * (value[node, c] + x[node, c] * dx + y[node, c] * dy + bent)

@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -55,6 +55,9 @@ _LEAD, _UNINTERPOLATED = 1, 2
 _PACKED_BITS = {256: 10, 1024: 12}
 """Bits of a sample that each code of packed frames means."""
 _PATTERNS = {3: "GBRG", 4: "RGGB"}
+
+_Reading = Callable[[int, int], bytes]
+"""Gives the bytes of a movie's header from some byte on, so many."""
 
 _STEPS = (
     "311111111111101111111111111111011111111111111101111111111111110111111111111111101111111111111110111111111111"
@@ -157,30 +160,34 @@ def _header(path: Path) -> _Header:
     """
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
-        mark, _, compression, version, _, _, first, count, *places, trigger = _FILE.unpack(
-            _piece(path, file, 0, _FILE.size)
-        )
+
+        def piece(start: int, length: int) -> bytes:
+            if start + length > size:
+                what = f"its header goes on to byte {start + length}, behind the end of the file at byte {size}"
+                raise damaged(path, what)
+            file.seek(start)
+            return file.read(length)
+
+        mark, _, compression, version, _, _, first, count, *places, trigger = _FILE.unpack(piece(0, _FILE.size))
         if mark != b"CI":
             raise FrameError(f"{path} is no Phantom movie: it does not begin as one")
         if not 0 < count <= _MOST_FRAMES:
             raise damaged(path, f"its header announces {count} frames")
-        _, columns, height, _, bit_count, packing, _, _, _, _, levels = _BITMAP.unpack(
-            _piece(path, file, places[0], _BITMAP.size)
-        )
-        setup, end = _setup(path, file, places[1])
+        _, columns, height, _, bit_count, packing, *_, levels = _BITMAP.unpack(piece(places[0], _BITMAP.size))
+        setup, end = _setup(path, piece, places[1])
         kind, cfa = _colours(path, compression, bit_count, setup.get("cfa", 0))
         bits, shape = _PACKED_BITS.get(packing, bit_count), (abs(height), columns)
         if packing not in _PACKED_BITS and (packing != 0 or bit_count not in (8, 16)):
-            what = f"its header announces samples of {bit_count} bit, packed in the way {packing}, which is unknown"
-            raise damaged(path, what)
+            way = f"packed in the way {packing}, which is unknown"
+            raise damaged(path, f"its header announces samples of {bit_count} bit, {way}")
         if min(shape) < 1:
             raise damaged(path, f"its header announces {shape[0]} rows of {shape[1]} pixels")
         check_size(path, needed=2 * math.prod(shape), stored=_needed(shape, bits))
         if version not in (0, 1):
             raise damaged(path, f"its header announces the version {version} of the format; known are 0 and 1")
         place = np.dtype("<i8" if version else "<u4")
-        pointers = np.frombuffer(_piece(path, file, places[2], count * place.itemsize), place)
-        times, exposures = _stamps(path, file, (end, places[2]), count)
+        pointers = np.frombuffer(piece(places[2], count * place.itemsize), place)
+        stamps = _stamps(path, piece, (end, places[2]), count)
     # of the code of 10 bit, 12; else the header's number, or as its number of levels needs
     stated = next((one for one in (setup.get("bits", 0), (levels - 1).bit_length()) if 8 <= one <= bits), bits)
     depth = 12 if bits in (10, 12) else stated
@@ -201,8 +208,8 @@ def _header(path: Path) -> _Header:
             count=count,
             bit_depth=depth,
             trigger=-first,
-            times_ns=None if times is None else _since(times, trigger),
-            **_settings(setup, exposures, remarks),
+            times_ns=_since(stamps[_TIMES], trigger) if _TIMES in stamps else None,
+            **_settings(setup, stamps.get(_EXPOSURES), remarks),
         ),
         pointers=pointers.astype(np.int64),
         size=size,
@@ -214,21 +221,13 @@ def _needed(shape: tuple[int, int], bits: int) -> int:
     return -(-math.prod(shape) * bits // 8)
 
 
-def _piece(path: Path, file: BinaryIO, start: int, length: int) -> bytes:
-    size = os.fstat(file.fileno()).st_size
-    if start + length > size:
-        raise damaged(path, f"its header goes on to byte {start + length}, behind the end of the file at byte {size}")
-    file.seek(start)
-    return file.read(length)
-
-
-def _setup(path: Path, file: BinaryIO, start: int) -> tuple[dict[str, Any], int]:
+def _setup(path: Path, piece: _Reading, start: int) -> tuple[dict[str, Any], int]:
     """Read the fields that the camera's settings store, and where these end."""
-    head = _piece(path, file, start, _LENGTH + 2)
+    head = piece(start, _LENGTH + 2)
     length = int.from_bytes(head[_LENGTH:], "little")
     if head[_MARK:_LENGTH] != b"ST" or length < len(head):
         raise damaged(path, "the camera's settings in its header are not where they should be")
-    stored = _piece(path, file, start, length)
+    stored = piece(start, length)
     fields = {
         name: struct.unpack_from("<" + kind, stored, place)[0]
         for name, (place, kind) in _SETUP.items()
@@ -271,23 +270,21 @@ def _levels(setup: Mapping[str, int], depth: int) -> tuple[int | None, int, tupl
     return None, largest, (remark,) if black or white else ()
 
 
-def _stamps(
-    path: Path, file: BinaryIO, between: tuple[int, int], count: int
-) -> tuple[npt.NDArray[np.uint64] | None, npt.NDArray[np.uint32] | None]:
-    """Read times and exposures (count,) of the frames from the tagged blocks; None where there are none."""
+def _stamps(path: Path, piece: _Reading, between: tuple[int, int], count: int) -> dict[int, npt.NDArray[Any]]:
+    """Read times and exposures (count,) of the frames from the tagged blocks, as far as there are any."""
     found: dict[int, npt.NDArray[Any]] = {}
     (place, end), length = between, 8
     for _ in range(_MOST_BLOCKS):
         if place + 8 > end or length < 8:
             break
-        length, kind = struct.unpack("<IH", _piece(path, file, place, 6))
+        length, kind = struct.unpack("<IH", piece(place, 6))
         if kind in _STAMPS:
             stored = np.dtype(_STAMPS[kind])
             if length - 8 < count * stored.itemsize:
                 raise damaged(path, f"block {kind} of its header has {length} bytes, too few for {count} frames")
-            found[kind] = np.frombuffer(_piece(path, file, place + 8, count * stored.itemsize), stored)
+            found[kind] = np.frombuffer(piece(place + 8, count * stored.itemsize), stored)
         place += length
-    return found.get(_TIMES), found.get(_EXPOSURES)
+    return found
 
 
 def _since(times: npt.NDArray[np.uint64], trigger: int) -> npt.NDArray[np.int64]:

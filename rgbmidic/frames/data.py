@@ -291,7 +291,7 @@ class Recording:
             steps = np.diff(self.times_ns)
             period = float(np.median(steps))
             periods = np.round(steps / max(period, 1.0))
-            even = 0.1 * period * np.sqrt(periods)  # a clock of 1 MHz at 100,000 frames a second
+            even = 0.1 * period * np.sqrt(np.abs(periods))  # a clock of 1 MHz at 100,000 frames a second
             if (periods >= 1).all() and (np.abs(steps - periods * period) <= even).all():
                 return np.concatenate([[0], np.cumsum(periods)]).astype(np.int64)
         return np.arange(self.count)

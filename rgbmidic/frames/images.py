@@ -6,7 +6,6 @@ LibRaw reads the frames back bit by bit.
 
 from __future__ import annotations
 
-import math
 import re
 import struct
 import zlib
@@ -20,7 +19,7 @@ import numpy as np
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import StoredFrame, check_size, complaints, damaged
+from rgbmidic.frames.stored import EvenFrames, StoredFrame, check_size, complaints, damaged
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import AnyArray
 
@@ -124,17 +123,14 @@ class HeaderlessFile(FrameSource):
 
     def _rows(self, index: int, rows: slice) -> StoredFrame:
         shape, dtype = self._shape(), np.dtype("<u2" if self.stated.dtype == "uint16" else self.stated.dtype)
-        channels = 3 if self.stated.kind == "rgb" else 1
-        needed, size = math.prod(shape) * channels * dtype.itemsize, self.path.stat().st_size
-        if size != needed:
+        channels, size = 3 if self.stated.kind == "rgb" else 1, self.path.stat().st_size
+        frame = EvenFrames(shape=shape, channels=(channels,), stored_bits=8 * dtype.itemsize, order=dtype.str[0])
+        if size != frame.size:
             raise FrameError(
                 f"{self.path} has {size} bytes; {shape[0]} rows of {shape[1]} {self.stated.dtype} samples with "
-                f"{channels} channel(s) need {needed}"
+                f"{channels} channel(s) need {frame.size}"
             )
-        first, last, _ = rows.indices(shape[0])
-        row = shape[1] * channels
-        values = np.fromfile(self.path, dtype, count=(last - first) * row, offset=first * row * dtype.itemsize)
-        return StoredFrame.plain(values.reshape(-1, shape[1], channels), self.path)
+        return StoredFrame.plain(frame.read(self.path, 0, range(shape[0])[rows]).values, self.path)
 
 
 def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float] | None = None) -> None:

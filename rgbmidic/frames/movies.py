@@ -17,7 +17,7 @@ import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 from xml.etree import ElementTree
@@ -82,13 +82,21 @@ def _beside(path: Path, *endings: str) -> Path | None:
 def _mraw_header(path: Path) -> EvenFrames:
     with path.open("rb") as file:
         content = file.read(4 * 2**20)  # those seen have 9 and 19 kB
-    entries = _Entries(path=path, found=_xml(content, path) if path.suffix.lower() == ".cihx" else _lines(content))
-    rows, columns = entries.whole("Image Height"), entries.whole("Image Width")
-    stored_bits = _stored_bits(entries)
-    depth, side = entries.whole("EffectiveBit Depth", stored_bits), entries.text("EffectiveBit Side", "Lower").lower()
+    entries = _xml(content, path) if path.suffix.lower() == ".cihx" else _lines(content)
+    whole = partial(_whole, path, entries)
+    rows, columns, stored_bits = map(whole, ("Image Height", "Image Width", "Color Bit"))
+    kind = entries.get("Color Type", "")
+    if kind.lower() not in ("mono", "raw") or stored_bits in (24, 30, 36, 48):
+        raise FrameError(
+            f'{path} states {stored_bits} bit of colour type "{kind}": its samples are no longer the sensor\'s; save '
+            "the movie as raw (Bayer) or monochrome"
+        )
+    if stored_bits not in (8, 10, 12, 16):
+        raise damaged(path, f"it announces samples of {stored_bits} bit; allowed are 8, 10, 12 and 16")
+    depth, side = whole("EffectiveBit Depth", stored_bits), entries.get("EffectiveBit Side", "Lower").lower()
     if min(rows, columns) < 1 or rows * columns * stored_bits % 8:
         raise damaged(path, f"it announces {rows} rows of {columns} samples of {stored_bits} bit")
-    count = entries.whole("Total Frame")
+    count = whole("Total Frame")
     if side not in ("lower", "higher", "upper") or not 8 <= depth <= 16:
         raise damaged(path, f'it announces {depth} effective bits, "{side}"; allowed are lower and higher')
     if side == "lower" and depth > stored_bits:
@@ -100,29 +108,16 @@ def _mraw_header(path: Path) -> EvenFrames:
         shift=0 if side == "lower" else max(stored_bits - depth, 0),
         stated=StoredFrame(bits=min(stored_bits, depth)),
     ).checked(path)
-    return replace(header, recording=_recording(entries, count, depth))
+    return replace(header, recording=_recording(path, entries, count, depth))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Entries:
-    """The entries of a header under their names in .cih."""
-
-    path: Path
-    found: Mapping[str, str]
-
-    def text(self, name: str, default: str = "") -> str:
-        return self.found.get(name, default)
-
-    def whole(self, name: str, default: int | None = None) -> int:
-        text = self.text(name, "" if default is None else str(default))
-        largest = 2**40  # the number of a frame after 12 days at a million a second
-        if not re.fullmatch(r"-?[0-9]{1,13}", text) or abs(int(text)) > largest:
-            raise damaged(self.path, f'its "{name}" is "{text}"' if text else f'it does not state "{name}"')
-        return int(text)
-
-    def number(self, name: str) -> Fraction | None:
-        """Return a positive number; None where there is none."""
-        return fraction(self.text(name)) or None
+def _whole(path: Path, entries: Mapping[str, str], name: str, default: int | None = None) -> int:
+    """Return a whole number that a header states."""
+    text = entries.get(name, "" if default is None else str(default))
+    largest = 2**40  # the number of a frame after 12 days at a million a second
+    if not re.fullmatch(r"-?[0-9]{1,13}", text) or abs(int(text)) > largest:
+        raise damaged(path, f'its "{name}" is "{text}"' if text else f'it does not state "{name}"')
+    return int(text)
 
 
 def _lines(content: bytes) -> dict[str, str]:
@@ -147,36 +142,25 @@ def _xml(content: bytes, path: Path) -> dict[str, str]:
     return {name: text.strip() for name, text in texts.items() if text and text.strip()}
 
 
-def _stored_bits(entries: _Entries) -> int:
-    """Return the bits that a sample is stored in; refuse what are not the sensor's own samples."""
-    kind, bits = entries.text("Color Type"), entries.whole("Color Bit")
-    if kind.lower() not in ("mono", "raw") or bits in (24, 30, 36, 48):
-        raise FrameError(
-            f'{entries.path} states {bits} bit of colour type "{kind}": its samples are no longer the sensor\'s; save '
-            "the movie as raw (Bayer) or monochrome"
-        )
-    if bits not in (8, 10, 12, 16):
-        raise damaged(entries.path, f"it announces samples of {bits} bit; allowed are 8, 10, 12 and 16")
-    return bits
-
-
-def _recording(entries: _Entries, count: int, depth: int) -> Recording:
+def _recording(path: Path, entries: Mapping[str, str], count: int, depth: int) -> Recording:
     """Return how the frames were recorded: they count from the trigger, and every `step`-th is stored."""
-    step = max(entries.whole("Save Step", 1), 1)
-    first = entries.whole("Start Frame", 0) - entries.whole("Correct Trigger Frame", 0)
+    step = max(_whole(path, entries, "Save Step", 1), 1)
+    first = _whole(path, entries, "Start Frame", 0) - _whole(path, entries, "Correct Trigger Frame", 0)
     numbers = range(first, first + count * step, step)
-    rate, shutter = entries.number("Record Rate(fps)"), entries.number("Shutter Speed(s)")
-    exposure = entries.number("Shutter Type2(nsec)") or (SECOND * shutter if shutter else None)
+    rate, shutter, exposure = (
+        fraction(entries.get(name, "")) for name in ("Record Rate(fps)", "Shutter Speed(s)", "Shutter Type2(nsec)")
+    )
+    exposure = exposure or (SECOND * shutter if shutter else None)
     try:
-        times = None if rate is None else even_times(numbers, 1 / rate)
+        times = even_times(numbers, 1 / rate) if rate else None
     except OverflowError:
         text = f"it announces frames up to number {numbers[-1]} at {float(rate or 0)} per second"
-        raise damaged(entries.path, text) from None
+        raise damaged(path, text) from None
     return Recording(
         count=count,
         bit_depth=depth,
-        frame_rate=None if rate is None else float(rate),
-        exposure_ns=None if exposure is None else round(exposure),
+        frame_rate=float(rate) if rate else None,
+        exposure_ns=round(exposure) if exposure else None,
         trigger=-first // step,
         times_ns=times,
     )

@@ -1,7 +1,6 @@
-"""Stacks of frames: numpy's own files (.npy), HDF5 datasets (.h5, .hdf5, NeXus .nxs), TIFF files of many pages.
+"""Stacks of frames: numpy's own files (.npy) and HDF5 datasets (.h5, .hdf5, NeXus .nxs).
 
-Arrays hold (T, H, W), (T, H, W, 3), or one frame alone, of uint8 or uint16; TIFF and BigTIFF files one frame a page, as
-ImageJ's hyperstacks and OME-TIFF do, too.
+Arrays hold (T, H, W), (T, H, W, 3), or one frame alone, of uint8 or uint16.
 """
 
 from __future__ import annotations
@@ -10,8 +9,6 @@ import io
 import itertools
 import math
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -156,21 +153,14 @@ class _Dataset(MovieHeader):
     name: str
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
+        import h5py
+
         part = slice(rows.start, rows.stop)
-        with _opened(path) as file:
+        with faults_of(path), h5py.File(path, "r", locking=False) as file:
             dataset = file[self.name]
             _check_written(dataset, index, self, path)
             values = np.asarray(dataset[index, part] if dataset.ndim > len(self.frame) else dataset[part])
         return StoredFrame.plain(values.astype(self.dtype.newbyteorder("="), copy=False), path)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[h5py.File]:
-    """Open the file; what libhdf5 raises while it is open becomes a FrameError."""
-    import h5py
-
-    with faults_of(path), h5py.File(path, "r", locking=False) as file:
-        yield file
 
 
 @remembered
@@ -195,7 +185,7 @@ def _hdf5_stacks(path: Path) -> dict[str, _Dataset]:
             name=f"/{name}",
         )
 
-    with _opened(path) as file:
+    with faults_of(path), h5py.File(path, "r", locking=False) as file:
         file.visititems(look)
     return found
 

@@ -232,7 +232,7 @@ class MovieHeader(ABC):
     """
 
     shape: tuple[int, int]
-    recording: Recording
+    recording: Recording = field(default_factory=Recording)
 
     @abstractmethod
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:

@@ -90,9 +90,8 @@ class MeshContent:
             if len(corners) < CORNERS[shape]:
                 raise InputError(f"element {label} has fewer nodes than a {shape} has corners")
             cells.setdefault(shape, []).append([label, *(index[node] for node in corners[: CORNERS[shape]])])
-        blocks = [
-            (shape, rows[:, 1:], rows[:, 0]) for shape, rows in zip(cells, map(np.array, cells.values()), strict=True)
-        ]
+        tables = {shape: np.array(rows) for shape, rows in cells.items()}
+        blocks = [(shape, table[:, 1:], table[:, 0]) for shape, table in tables.items()]
         points = np.array([place for _, place in nodes], dtype=np.float64).reshape(-1, 3)
         numbers = np.array([label for label, _ in nodes], dtype=np.int64)
         return cls(points=points, numbers=numbers, blocks=blocks, sets=sets, unread=unread)

@@ -213,22 +213,6 @@ class PixelMap:
             from_image(self.lines, image[None], 0, 0, values[None])
         return out
 
-    def window(self, values: FloatImage) -> FloatImage:
-        """`values` (n, P) as images of the rectangle `bounds`; 0 where no pixel is owned.
-
-        Parameters
-        ----------
-        values : ndarray, shape (n, P), float32
-            Fields at the owned pixels.
-
-        Returns
-        -------
-        ndarray, shape (n, height, width), float32
-        """
-        images = np.zeros((len(values), *self.bounds[2:]), dtype=np.float32)
-        to_image(self.lines, values, 0, 0, images)
-        return images
-
     def scatter(self, values: FloatImage, fill: float = 0.0) -> FloatImage:
         """Image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere.
 
