@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic._version import __version__
 from rgbmidic.errors import InputError
-from rgbmidic.lab import write_findings
-from rgbmidic.lab.planning import Outlook, Plan, Proposal
+from rgbmidic.lab import document, write_findings
+from rgbmidic.lab.planning import Outlook, Plan
 from rgbmidic.pipeline.size_figures import rms
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal
 from rgbmidic.scene.scene import Scene
@@ -28,7 +27,7 @@ FILES = ("plan.json", "plan.png")
 
 
 def write_plan(
-    plan: Plan, proposals: dict[str, Proposal], out: Path, *, distance: float | None = None, overwrite: bool = False
+    plan: Plan, proposals: dict[str, Plan], out: Path, *, distance: float | None = None, overwrite: bool = False
 ) -> None:
     """Write plan.json and plan.png.
 
@@ -50,8 +49,8 @@ def write_plan(
     ResultError
         A plan is already there, or the folder cannot be written.
     """
-    contents = plan_document(plan, proposals, distance), plan_figure(plan, proposals)
-    write_findings(out, dict(zip(FILES, contents, strict=True)), overwrite=overwrite)
+    figures, picture = plan_document(plan, proposals, distance), plan_figure(plan, proposals)
+    write_findings(out, FILES, figures, picture, overwrite=overwrite)
 
 
 def zone_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
@@ -143,19 +142,17 @@ def out_of_plane(plan: Plan, distance: float | None = None) -> dict[str, Any]:
     return plain(figures | {"unseen_mm": plan.std / edge})  # type: ignore[no-any-return]
 
 
-def plan_document(plan: Plan, proposals: dict[str, Proposal], distance: float | None = None) -> dict[str, Any]:
+def plan_document(plan: Plan, proposals: dict[str, Plan], distance: float | None = None) -> dict[str, Any]:
     """Return the plan as plain values, for plan.json; fractions are of the field, an unknown number is null."""
-    document = {
-        "schema": "rgbmidic-plan",
-        "rgbmidic": __version__,
+    figures = {
         "field_px": plan.field,
         "element_size_px": plan.instrument.element_size,
         "reflects_from_specular_fraction": REFLECTS,
         "out_of_plane": out_of_plane(plan, distance),
         **_arrangement(plan),
-        "proposals": {name: {"gain": better.gain, **_arrangement(better.plan)} for name, better in proposals.items()},
+        "proposals": {name: {"gain": better.gain, **_arrangement(better)} for name, better in proposals.items()},
     }
-    return plain(document)  # type: ignore[no-any-return]
+    return document("plan", figures)
 
 
 def _arrangement(plan: Plan) -> dict[str, Any]:
@@ -199,14 +196,14 @@ def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
     }
 
 
-def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:
+def plan_figure(plan: Plan, proposals: dict[str, Plan]) -> Figure:
     """Zones of the lights (above) and uncertainty (below) in the first and last state, and in the last as proposed."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     panels = {"first state": (plan, plan.outlooks[0]), "last state": (plan, plan.outlooks[-1])}
-    panels |= {f"last state, {name}": (p.plan, p.plan.outlooks[-1]) for name, p in proposals.items() if p.gain > 1}
+    panels |= {f"last state, {name}": (one, one.outlooks[-1]) for name, one in proposals.items() if one.gain > 1}
     levels = np.concatenate([outlook.std[one.inside] for one, outlook in panels.values()])
     levels = levels[np.isfinite(levels)]
     top = float(np.quantile(levels, 0.98)) if levels.size else 1.0

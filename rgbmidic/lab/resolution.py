@@ -19,14 +19,12 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from rgbmidic._version import __version__
 from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
 from rgbmidic.fields import NodalCovariance, StrainGauges
-from rgbmidic.lab import write_findings
+from rgbmidic.lab import document, write_findings
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.size_figures import ResolutionStudy
+from rgbmidic.pipeline.size_figures import GaugeFigures, ResolutionStudy
 from rgbmidic.pipeline.suitability import SPECKLES
-from rgbmidic.settings.conversion import plain
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -171,9 +169,7 @@ def write_study(study: ResolutionStudy, out: Path, *, overwrite: bool = False) -
     for one in sizes:
         for gauge in one["gauges"] or [_NO_GAUGE]:
             lines.writerow([f"{value:.6g}" for value in (*(one[key] for key in headings), *gauge.values())])
-    document = {
-        "schema": "rgbmidic-resolution",
-        "rgbmidic": __version__,
+    figures = {
         "key_frame": {"index": study.frame, "name": study.name},
         "static_frames": study.static,
         "speckle_px": study.speckle,
@@ -181,8 +177,8 @@ def write_study(study: ResolutionStudy, out: Path, *, overwrite: bool = False) -
         "recommendation": study.choice,
         "sizes": sizes,
     }
-    contents = text.getvalue(), plain(document), _figure(study)
-    write_findings(out, dict(zip(FILES, contents, strict=True)), overwrite=overwrite)
+    contents = text.getvalue(), document("resolution", figures), _figure(study)
+    write_findings(out, FILES, *contents, overwrite=overwrite)
 
 
 _ERRORS = ("bias", "scatter", "stated", "noise", "discretisation", "total")
@@ -193,32 +189,30 @@ _NO_GAUGE = dict.fromkeys(("length_px", "noise", "largest", "cut_off_px"), float
 @lru_cache(maxsize=1)
 def _documents(study: ResolutionStudy) -> list[dict[str, Any]]:
     """Figures of every size with their units in their names, cut-offs and gauges included."""
-    ratios = [[gauge.length / one.element_size for gauge in one.gauges] for one in study.sizes]
-    asked = sorted({ratio for some in ratios for ratio in some})
+    asked = sorted({gauge.length / one.element_size for one in study.sizes for gauge in one.gauges})
     moved, strain, found = cut_offs(asked)
     at = dict(zip(asked, found.tolist(), strict=True))
-    documents = []
-    for one, some in zip(study.sizes, ratios, strict=True):
-        side = one.element_size
-        gauges = [
-            (gauge.length, gauge.noise, gauge.largest, side * at[x]) for gauge, x in zip(one.gauges, some, strict=True)
-        ]
-        documents.append(
-            {
-                "element_size_px": side,
-                "speckles": one.speckles,
-                "nodes": one.nodes,
-                "measured": one.measured,
-                **{f"{name}_px": getattr(one, name) for name in _ERRORS},
-                **{f"strain_{name}": getattr(one.strain, name) for name in _ERRORS},
-                "cut_off_px": side * moved,
-                "strain_cut_off_px": side * strain,
-                "solve_cpu_s": one.seconds,
-                "reason": one.reason,
-                "gauges": [dict(zip(_NO_GAUGE, gauge, strict=True)) for gauge in gauges],
-            }
-        )
-    return documents
+
+    def gauge_figures(gauge: GaugeFigures, side: float) -> dict[str, float]:
+        figures = gauge.length, gauge.noise, gauge.largest, side * at[gauge.length / side]
+        return dict(zip(_NO_GAUGE, figures, strict=True))
+
+    return [
+        {
+            "element_size_px": one.element_size,
+            "speckles": one.speckles,
+            "nodes": one.nodes,
+            "measured": one.measured,
+            **{f"{name}_px": getattr(one, name) for name in _ERRORS},
+            **{f"strain_{name}": getattr(one.strain, name) for name in _ERRORS},
+            "cut_off_px": one.element_size * moved,
+            "strain_cut_off_px": one.element_size * strain,
+            "solve_cpu_s": one.seconds,
+            "reason": one.reason,
+            "gauges": [gauge_figures(gauge, one.element_size) for gauge in one.gauges],
+        }
+        for one in study.sizes
+    ]
 
 
 def _figure(study: ResolutionStudy) -> Figure:
@@ -263,6 +257,9 @@ def _finish(axis: Axes, lengths: Sequence[float], x: str, y: str) -> None:
     """Label the axes: lengths along x, on a logarithmic scale, and plain numbers along y."""
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
+    from rgbmidic.report.style import finish_plot
+
+    finish_plot(axis, x, y)
     shown = sorted(set(lengths))
     axis.set_xscale("log")
     if axis.get_yscale() == "log":
@@ -271,7 +268,3 @@ def _finish(axis: Axes, lengths: Sequence[float], x: str, y: str) -> None:
     axis.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_xticks(shown, [f"{length:g}" for length in shown])
     axis.set_xticks([], minor=True)
-    axis.set_xlabel(x)
-    axis.set_ylabel(y)
-    axis.grid(linewidth=0.4, color="0.88")
-    axis.spines[["top", "right"]].set_visible(False)

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
-from rgbmidic.lab import write_findings
+from rgbmidic.lab import document, write_findings
 from rgbmidic.lab.inspection import Inspection, Spread
 from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal, shade, show_image
-from rgbmidic.settings.conversion import plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,8 +33,8 @@ def write_inspection(inspection: Inspection, out: Path, *, overwrite: bool = Fal
     ResultError
         An inspection is already there, or the folder cannot be written.
     """
-    contents = inspection_document(inspection), _inspection_figure(inspection)
-    write_findings(out, dict(zip(FILES, contents, strict=True)), overwrite=overwrite)
+    figures, picture = inspection_document(inspection), _inspection_figure(inspection)
+    write_findings(out, FILES, figures, picture, overwrite=overwrite)
 
 
 def channel_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
@@ -77,9 +75,7 @@ def _text(value: float, digits: int) -> str:
 def inspection_document(inspection: Inspection) -> dict[str, Any]:
     """Return the figures as plain values, for inspection.json; a number that is not known is null."""
     texture, expected = inspection.texture, inspection.prediction
-    document = {
-        "schema": "rgbmidic-inspection",
-        "rgbmidic": __version__,
+    figures = {
         "frame": inspection.name,
         "kind": inspection.kind,
         "region_px": int(inspection.region.sum()),
@@ -105,7 +101,7 @@ def inspection_document(inspection: Inspection) -> dict[str, Any]:
         "nodes_not_measured": inspection.unmeasured,
         "warnings": [{"code": found.name, "text": found.text} for found in inspection.findings],
     }
-    return plain(document)  # type: ignore[no-any-return]
+    return document("inspection", figures)
 
 
 def _inspection_figure(inspection: Inspection) -> Figure:
