@@ -17,12 +17,12 @@ from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Led, Sensitivities
 from rgbmidic.scene.camera import (
     PIXEL,
+    REFERENCE_CROSSTALK,
     Camera,
     Light,
     Physical,
     Polarisers,
     Vector,
-    reference_camera,
     rotation,
     three_lights,
 )
@@ -224,6 +224,11 @@ class Scene:
     camera: Camera
     surface: Surface = field(default_factory=Surface)
 
+    @property
+    def pixel(self) -> float:
+        """Pixel size on the object, mm per px, at the body's front point."""
+        return self.body.front[2] / self.camera.focal_px
+
     def __post_init__(self) -> None:
         """Check the values."""
         names = [light.name for light in self.lights]
@@ -420,27 +425,28 @@ def _light(table: dict[str, Any], body: Body, base: Path) -> Light:
 
 
 def _camera(table: dict[str, Any], body: Body, base: Path) -> Camera:
-    ready: dict[str, Any] = {"crosstalk": None, "sensitivities": None}
+    ready: dict[str, Any] = {}
+
+    def stated(key: str, kind: Any, default: Any = None) -> Any:
+        return convert_value(table.pop(key, default), kind, f"camera.{key}", base)
+
     if "crosstalk" in table:
-        rows = convert_value(table.pop("crosstalk"), tuple[tuple[float, ...], ...], "camera.crosstalk", base)
+        rows = stated("crosstalk", tuple[tuple[float, ...], ...])
         if len({len(row) for row in rows}) != 1:
             raise ConfigurationError("camera.crosstalk must be rows of the same length")
         ready["crosstalk"] = np.array(rows)
     if "sensitivities" in table:
-        ready["sensitivities"] = Sensitivities.read(
-            convert_value(table.pop("sensitivities"), Path, "camera.sensitivities", base)
-        )
+        ready["sensitivities"] = Sensitivities.read(stated("sensitivities", Path))
     if "model" in table:
-        ready["sensitivities"] = Sensitivities.from_colour(convert_value(table.pop("model"), str, "camera.model", base))
-    pixel = convert_value(table.pop("mm_per_pixel", PIXEL), float, "camera.mm_per_pixel", base)
+        ready["sensitivities"] = Sensitivities.from_colour(stated("model", str))
+    if not ready and table.get("kind") != "monochrome":
+        ready["crosstalk"] = np.array(REFERENCE_CROSSTALK)
+    pixel = stated("mm_per_pixel", float, PIXEL)
     if not pixel > 0:
         raise ConfigurationError(f"camera.mm_per_pixel must be positive, not {pixel}")
     table.setdefault("shape", [640, 640])
     table.setdefault("focal_px", body.front[2] / pixel)
-    camera = read_section(Camera, "camera", table, base, **ready)
-    if ready["crosstalk"] is None and ready["sensitivities"] is None and camera.kind != "monochrome":
-        return replace(camera, crosstalk=reference_camera(camera.shape).crosstalk)
-    return camera
+    return read_section(Camera, "camera", table, base, **ready)
 
 
 def _state(table: dict[str, Any], body: Body, base: Path) -> State:

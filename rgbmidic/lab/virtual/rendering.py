@@ -29,12 +29,11 @@ def samples_needed(scene: Scene) -> int:
     """
     if scene.camera.samples is not None:
         return scene.camera.samples
-    pixel = scene.body.front[2] / scene.camera.focal_px
     needed = 6.0 if scene.surface.coverage else 1.0  # paint without droplets has no edges
     for paint in (scene.surface.white, scene.surface.black):
         if paint.slope_deg > 0:
             sharpness = 2 * max(1.0, 4 / paint.lobe_deg) ** 0.75 if paint.gloss > 0 else 1.0
-            needed = max(needed, 2.7 * pixel / paint.spacing * sharpness)
+            needed = max(needed, 2.7 * scene.pixel / paint.spacing * sharpness)
     return min(math.ceil(needed - 0.1), 24)
 
 
