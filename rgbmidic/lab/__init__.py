@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rgbmidic._version import __version__
 from rgbmidic.errors import ResultError
-from rgbmidic.results.files import writing
+from rgbmidic.results.files import write_json, writing
 from rgbmidic.settings.conversion import plain
 
 if TYPE_CHECKING:
@@ -76,7 +75,7 @@ def write_findings(out: Path, files: Sequence[str], *contents: dict[str, Any] | 
         with writing(path):
             out.mkdir(parents=True, exist_ok=True)
             if isinstance(content, dict):
-                path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+                write_json(path, content)
             elif isinstance(content, str):
                 path.write_text(content, encoding="utf-8")
             else:

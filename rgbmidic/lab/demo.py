@@ -32,7 +32,7 @@ from rgbmidic.pipeline.size_figures import rms
 from rgbmidic.results import Result
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ScaleSettings, TestSettings, read_test
-from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.typing import FloatArray, FloatImage, Progress
 
 _SCENE = """\
 # The paper's sphere (82.5 mm) turning about its front point under a red, a green and a blue lamp, all at once.
@@ -115,7 +115,7 @@ def run_demo(
     out: Path,
     report: Callable[[str], None],
     calibrate: Callable[[Path], None],
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Progress | None = None,
     *,
     size: int = 448,
     angles: Sequence[float] = ANGLES,

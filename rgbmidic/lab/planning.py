@@ -190,8 +190,8 @@ def _directions(scene: Scene) -> FloatArray:
 def _placed(light: Light, scene: Scene, direction: FloatArray) -> Light:
     """Return the light at its distance from the body's front point, in another direction."""
     front = np.array(scene.body.front)
-    x, y, z = (front + np.linalg.norm(np.array(light.position) - front) * direction).tolist()
-    return replace(light, position=(x, y, z))
+    position = front + np.linalg.norm(np.array(light.position) - front) * direction
+    return replace(light, position=position.tolist())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -105,7 +105,7 @@ class Light(Physical):
         Light
         """
         position = rotation(angle_deg, axis) @ (np.array(self.position) - pivot) + pivot
-        return replace(self, position=(float(position[0]), float(position[1]), float(position[2])))
+        return replace(self, position=position.tolist())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -280,7 +280,15 @@ class Camera(Physical):
         InputError
             The crosstalk does not fit the lights, or a light lacks its spectrum.
         """
-        matrix = self._matrix(lights)
+        matrix = np.ones((1, len(lights))) if self.kind == "monochrome" else np.eye(3)[:, : len(lights)]
+        if self.crosstalk is not None:
+            matrix = self.crosstalk
+        elif self.sensitivities is not None:
+            spectra = tuple(light.spectrum for light in lights if light.spectrum is not None)
+            if len(spectra) != len(lights):
+                raise InputError("camera sensitivities are given, so every light needs its spectrum")
+            matrix = spectral_response(self.sensitivities, spectra)
+            matrix = matrix.mean(axis=0, keepdims=True) if self.kind == "monochrome" else matrix
         if matrix.shape != (self.channels, len(lights)) or not np.isfinite(matrix).all() or matrix.min() < 0:
             raise InputError(
                 f"the crosstalk of a {self.kind} camera under {len(lights)} lights is a matrix of shape "
@@ -289,19 +297,6 @@ class Camera(Physical):
         if not (matrix.max(axis=0) > 0).all():
             raise InputError(f"the camera does not see every light: crosstalk {matrix.tolist()}")
         return np.asarray(matrix / matrix.max())
-
-    def _matrix(self, lights: tuple[Light, ...]) -> FloatArray:
-        if self.crosstalk is not None:
-            return self.crosstalk
-        if self.sensitivities is not None:
-            spectra = tuple(light.spectrum for light in lights if light.spectrum is not None)
-            if len(spectra) != len(lights):
-                raise InputError("camera sensitivities are given, so every light needs its spectrum")
-            matrix = spectral_response(self.sensitivities, spectra)
-            return matrix.mean(axis=0, keepdims=True) if self.kind == "monochrome" else matrix
-        if self.kind == "monochrome":
-            return np.ones((1, len(lights)))
-        return np.eye(3)[:, : len(lights)]
 
     def mixing(self, lights: tuple[Light, ...]) -> FloatArray:
         """Return A (C, k) in channels = A . light images; every column's largest entry is 1.

@@ -174,11 +174,6 @@ class State:
     velocity: Vector = (0.0, 0.0, 0.0)
     spin_deg: float = 0.0
 
-    @property
-    def moves(self) -> bool:
-        """Whether the body moves during the exposure."""
-        return any(self.velocity) or self.spin_deg != 0
-
     def after(self, seconds: float) -> State:
         """Return the state some time later, at rest.
 
@@ -291,7 +286,7 @@ class Scene:
         lights = tuple(replace(light, power=light.power * polarisers.transmission) for light in self.lights)
         return replace(self, lights=lights, surface=replace(self.surface, white=white, black=black))
 
-    def mirror_position(self, distance: float, state: State | None = None) -> Vector:
+    def mirror_position(self, distance: float) -> Vector:
         """Where a lamp must stand for its reflection to cover the body's front point, seen from the camera.
 
         On a flat plate it covers the whole field. `distance` from the front point in mm.
@@ -300,26 +295,18 @@ class Scene:
         ----------
         distance
             Distance of the lamp from the front point in mm.
-        state
-            Pose of the body; None: the reference state.
 
         Returns
         -------
         Point (x, y, z) in mm, in the camera's axes
         """
-        turn, origin = (state or State()).pose(self.body)
-        point = turn @ self.body.attitude.T @ (np.array(self.body.front) - np.array(self.body.centre)) + origin
-        normal = turn @ np.array([0.0, 0.0, -1.0])
+        point, normal = np.array(self.body.front), self.body.attitude @ np.array([0.0, 0.0, -1.0])
         view = -point / np.linalg.norm(point)
-        position = point + distance * (2 * (normal @ view) * normal - view)
-        return float(position[0]), float(position[1]), float(position[2])
+        x, y, z = (point + distance * (2 * (normal @ view) * normal - view)).tolist()
+        return x, y, z
 
 
-BODIES: dict[str, type[Sphere] | type[Cylinder] | type[Plate]] = {
-    "sphere": Sphere,
-    "cylinder": Cylinder,
-    "plate": Plate,
-}
+BODIES: dict[str, type[Body]] = {"sphere": Sphere, "cylinder": Cylinder, "plate": Plate}
 Target = Literal["white", "speckled"]
 """Targets of the calibration captures."""
 _FIELD_KEYS = ("displacement_gradient", "displacement_offset", "displacement_file")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,16 +21,15 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.frame_check import Frame
 from rgbmidic.lab.virtual.rendering import render
 from rgbmidic.results.files import writing
 from rgbmidic.scene.camera import Camera, Light, mosaic_samples
 from rgbmidic.scene.scene import DatasetSettings, Plate, Scene, State, Target, read_scene
 from rgbmidic.scene.surface import Finish, Surface
 from rgbmidic.scene.zones import region_in_view, truth
-from rgbmidic.typing import FloatImage
+from rgbmidic.typing import FloatImage, Progress
 
-Frame = Mosaic | ChannelFrame
-Progress = Callable[[int, int, str], None]
 EXPOSURES = tuple(0.13 * time for time in (0.5, 1, 2, 4, 6, 10))
 """Fraction of the full scale that the brightest sample of a white card reaches, .13 per ms of the exposure times that
 calibration/README.md states; in the last it saturates."""
@@ -250,7 +249,7 @@ def record(
     *,
     seed: int,
     on: Collection[str] | None = None,
-) -> Mosaic | ChannelFrame:
+) -> Frame:
     """Return the raw frame that the camera takes.
 
     Electrons = Poisson(gain x signal) + normal(read noise); DN = round(electrons/gain + black), clipped at saturation.

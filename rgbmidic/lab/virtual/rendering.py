@@ -54,7 +54,7 @@ def render(scene: Scene, state: State | None = None) -> FloatImage:
     """
     state, duration = state or State(), scene.camera.exposure_time
     poses = [state]
-    if duration > 0 and state.moves:
+    if duration > 0 and (any(state.velocity) or state.spin_deg):
         # the middles of equal parts of the exposure, each shorter in motion than a quarter of the pixel's own aperture
         swept = np.hypot(*truth(scene, state.after(duration / 2), state.after(-duration / 2)))
         parts = max(1, math.ceil(4 * float(np.nanmax(swept, initial=0.0))))
