@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,6 +42,11 @@ def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
         raise ResultError(
             f"{out / taken[0]} is already there; choose another folder, or overwrite it (overwrite=True, --overwrite)"
         )
+
+
+def number(value: float, form: str = ".3g") -> str:
+    """Write a number in a format of Python's; a dash where it is not finite."""
+    return format(value, form) if math.isfinite(value) else "-"
 
 
 def document(kind: str, figures: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.lab import document, write_findings
+from rgbmidic.lab import document, number, write_findings
 from rgbmidic.lab.planning import Outlook, Plan
 from rgbmidic.pipeline.size_figures import rms
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal
@@ -70,7 +70,7 @@ def uncertainty_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
     for label, state in _labelled(plan):
         std = state["std_px"]
         values = [std["median"], std["q95"], state["random_px"], state["feigned_by_domes_px"]]
-        rows.append([label, *(f"{value:.4f}" if math.isfinite(value) else "-" for value in values)])
+        rows.append([label, *(number(value, ".4f") for value in values)])
     return ["state", "median", "95 %", "random", "feigned"], rows
 
 
@@ -88,9 +88,9 @@ UNCERTAINTY_WORDS = {
 
 
 def _labelled(plan: Plan) -> Iterator[tuple[str, dict[str, Any]]]:
-    for number, outlook in enumerate(plan.outlooks, start=1):
+    for place, outlook in enumerate(plan.outlooks, start=1):
         state = _state(plan, outlook)
-        yield f"{number}: {state['angle_deg']:g} deg" if state["angle_deg"] else str(number), state
+        yield f"{place}: {state['angle_deg']:g} deg" if state["angle_deg"] else str(place), state
 
 
 def lamp_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:

@@ -21,7 +21,7 @@ from scipy.sparse.linalg import splu
 
 from rgbmidic.correlation.recovery import Recovery, linear_fit_offset, mass_matrix
 from rgbmidic.fields import NodalCovariance, StrainGauges
-from rgbmidic.lab import document, write_findings
+from rgbmidic.lab import document, number, write_findings
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.size_figures import GaugeFigures, ResolutionStudy
 from rgbmidic.pipeline.suitability import SPECKLES
@@ -129,11 +129,11 @@ def size_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
     rows = []
     for one in _documents(study):
         micro = [1e6 * one[f"strain_{key}"] for key in ("noise", "discretisation", "total")]
-        cells = [_text(one["speckles"]), f"{one['nodes']}", f"{one['measured']:.0%}"]
-        cells += [", ".join(_text(one[key]) for key in ("bias_px", "scatter_px"))]
-        cells += [_text(one[key]) for key in ("noise_px", "discretisation_px", "total_px")]
-        cells += [", ".join(map(_text, micro)), f"{one['cut_off_px']:.0f}, {one['strain_cut_off_px']:.0f}"]
-        rows.append([f"{one['element_size_px']:g} px", *cells, _text(one["solve_cpu_s"])])
+        cells = [number(one["speckles"]), f"{one['nodes']}", f"{one['measured']:.0%}"]
+        cells += [", ".join(number(one[key]) for key in ("bias_px", "scatter_px"))]
+        cells += [number(one[key]) for key in ("noise_px", "discretisation_px", "total_px")]
+        cells += [", ".join(map(number, micro)), f"{one['cut_off_px']:.0f}, {one['strain_cut_off_px']:.0f}"]
+        rows.append([f"{one['element_size_px']:g} px", *cells, number(one["solve_cpu_s"])])
     headings = ["elements", "speckles", "nodes", "measured", "bias, scatter", "noise", "mesh", "total"]
     return [*headings, "strain: noise, mesh, total", "cut-off", "CPU s"], rows
 
@@ -144,13 +144,9 @@ def gauge_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
     for one in _documents(study):
         for gauge in one["gauges"]:
             length, noise, largest, at = gauge.values()
-            cells = [f"{length:g} px", _text(1e6 * noise), _text(1e6 * largest), f"{at:.0f}"]
+            cells = [f"{length:g} px", number(1e6 * noise), number(1e6 * largest), f"{at:.0f}"]
             rows.append([f"{one['element_size_px']:g} px", *cells])
     return ["elements", "gauge", "resolution", "largest", "cut-off"], rows
-
-
-def _text(value: float) -> str:
-    return f"{value:.3g}" if np.isfinite(value) else "-"
 
 
 def write_study(study: ResolutionStudy, out: Path, *, overwrite: bool = False) -> None:

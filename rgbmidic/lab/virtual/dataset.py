@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -173,8 +173,6 @@ def _save(path: Path, **arrays: npt.ArrayLike) -> None:
 
 def target_scene(scene: Scene, target: Target = "white") -> Scene:
     """Return the same lights and camera before a flat mat target that fills the field at the body's front point."""
-    if target not in ("white", "speckled"):
-        raise InputError(f"unknown target {target!r}; allowed are white, speckled")
     mat = Finish(albedo=0.8, gloss=0.0, slope_deg=0.0)
     paint = replace(scene.surface, white=mat, black=replace(mat, albedo=0.1), dome=0.0)
     if target == "white":
@@ -202,12 +200,11 @@ def single_light_frames(scene: Scene, *, count: int = 3, seed: int, target: Targ
         Light name to its frames.
     """
     images, generator = render(target_scene(scene, target)), np.random.SeedSequence(seed)
-
-    def dimmed(name: str) -> Iterator[Frame]:
+    frames: dict[str, list[Frame]] = {light.name: [] for light in scene.lights}
+    for name, taken in frames.items():
         for step, child in enumerate(generator.spawn(count), start=1):
-            yield from _shots(scene, images * np.float32(step / count), child.generate_state(1), (name,))
-
-    return {light.name: list(dimmed(light.name)) for light in scene.lights}
+            taken += _shots(scene, images * np.float32(step / count), child.generate_state(1), (name,))
+    return frames
 
 
 def dark_frames(scene: Scene, *, count: int = 3, seed: int) -> list[Frame]:
