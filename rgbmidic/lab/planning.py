@@ -24,7 +24,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.scene.camera import Light
 from rgbmidic.scene.forecast import Forecast, Instrument, trace_change
 from rgbmidic.scene.scene import Experiment, Scene, State
-from rgbmidic.scene.zones import REFLECTS, Zones, material_points, predict_zones, region_in_view, truth
+from rgbmidic.scene.zones import REFLECTS, Zones, material_points, predict_zones, region_in_view, truth, unit
 from rgbmidic.settings import IlluminationSettings
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -183,8 +183,7 @@ class _Search:
 
 def _directions(scene: Scene) -> FloatArray:
     """Return unit vectors (k, 3) from the body's front point to the lamps."""
-    towards = np.array([light.position for light in scene.lights]) - scene.body.front
-    return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
+    return unit(np.array([light.position for light in scene.lights]) - scene.body.front, axis=1)
 
 
 def _placed(light: Light, scene: Scene, direction: FloatArray) -> Light:

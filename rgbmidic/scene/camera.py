@@ -14,11 +14,12 @@ from typing import Literal, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import ConfigurationError, InputError
+from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities, spectral_response
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.settings.conversion import Checked, bounded
+from rgbmidic.scene import Physical
+from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
 NOMINAL_DISTANCE = 600.0
@@ -30,19 +31,6 @@ PIXEL = 0.055
 
 Vector = tuple[float, float, float]
 Floating = TypeVar("Floating", bound=np.floating)
-
-
-class Physical(Checked):
-    """What a scene consists of: checked as the settings of a test are, and `InputError` where a value is impossible."""
-
-    __slots__ = ()
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        try:
-            super().__post_init__()
-        except ConfigurationError as error:
-            raise InputError(f"{type(self).__name__}: {error}") from None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,17 +15,8 @@ import numpy as np
 from rgbmidic._kernels import render as kernels
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Led, Sensitivities
-from rgbmidic.scene.camera import (
-    PIXEL,
-    REFERENCE_CROSSTALK,
-    Camera,
-    Light,
-    Physical,
-    Polarisers,
-    Vector,
-    rotation,
-    three_lights,
-)
+from rgbmidic.scene import Physical
+from rgbmidic.scene.camera import PIXEL, REFERENCE_CROSSTALK, Camera, Light, Polarisers, Vector, rotation, three_lights
 from rgbmidic.scene.surface import AffineField, InPlaneField, MeshField, Surface
 from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value, read_section, read_table, read_toml, regular
 from rgbmidic.settings.conversion import bounded

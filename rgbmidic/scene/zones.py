@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.scene.camera import NOMINAL_DISTANCE, Light, Physical
+from rgbmidic.scene import Physical
+from rgbmidic.scene.camera import NOMINAL_DISTANCE, Light
 from rgbmidic.scene.scene import Cylinder, Plate, Scene, Sphere, State
 from rgbmidic.scene.surface import Finish, Surface, material_from_spatial
 from rgbmidic.settings.conversion import bounded

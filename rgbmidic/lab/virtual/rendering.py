@@ -59,10 +59,7 @@ def render(scene: Scene, state: State | None = None) -> FloatImage:
         swept = np.hypot(*truth(scene, state.after(duration / 2), state.after(-duration / 2)))
         parts = max(1, math.ceil(4 * float(np.nanmax(swept, initial=0.0))))
         poses = [state.after(duration * ((i + 0.5) / parts - 0.5)) for i in range(parts)]
-    out = _trace(scene, poses[0])
-    for pose in poses[1:]:
-        out += _trace(scene, pose)
-    return out * np.float32(1 / len(poses))
+    return np.asarray(sum(_trace(scene, pose) for pose in poses) * np.float32(1 / len(poses)))
 
 
 def _trace(scene: Scene, state: State) -> FloatImage:
