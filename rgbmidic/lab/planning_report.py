@@ -13,7 +13,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.lab import document, number, write_findings
 from rgbmidic.lab.planning import Outlook, Plan
 from rgbmidic.pipeline.size_figures import rms
-from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal
+from rgbmidic.report.style import LIGHT_COLOURS, STYLE, finish_picture, literal
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS
 from rgbmidic.settings.conversion import plain
@@ -224,10 +224,6 @@ def plan_figure(plan: Plan, proposals: dict[str, Plan]) -> Figure:
         lines += [Line2D([], [], color="0.3", linestyle="--"), Line2D([], [], color="k", linewidth=0.9)]
         labels = [*(literal(light.name) for light in plan.scene.lights), "at rest", "field"]
         figure.legend(lines, labels, loc="outside upper center", ncols=len(labels))
-        for axis in axes[:, 0]:
-            axis.set_ylabel("y (px)")
-        for axis in axes[1]:
-            axis.set_xlabel("x (px)")
     return figure
 
 
@@ -265,7 +261,6 @@ def _draw_field(axis: Axes, plan: Plan) -> None:
     x0, y0, x1, y1 = plan.field
     axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor="k", linewidth=0.9))
     height, width = plan.scene.camera.shape
-    axis.set_xlim(-0.5, width - 0.5)
-    axis.set_ylim(height - 0.5, -0.5)
-    axis.set_aspect("equal")
-    axis.locator_params(nbins=4)
+    place = axis.get_subplotspec()
+    finish_picture(axis, (-0.5, width - 0.5), (-0.5, height - 0.5), first=place.is_first_col())  # type: ignore[union-attr]
+    axis.label_outer()
