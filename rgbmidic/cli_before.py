@@ -130,7 +130,7 @@ def plan(
     print_table(title, *planning.zone_rows(made), planning.ZONE_WORDS)
     uncertainty = "standard uncertainty to expect over the field, px"
     print_table(uncertainty, *planning.uncertainty_rows(made), planning.UNCERTAINTY_WORDS)
-    better = {name: proposal.plan for name, proposal in proposals.items() if proposal.gain > 1}
+    better = {name: proposed for name, proposed in proposals.items() if proposed.gain > 1}
     for name, lamps in {"lamps as they are": made, **better}.items():
         print_table(f"{name}: {planning.summary(lamps)}", *planning.lamp_rows(lamps))
     if not better:

@@ -1,5 +1,6 @@
-"""Array types of the annotations; a docstring tells their shapes."""
+"""Types of the annotations: arrays, whose shapes a docstring tells, and callbacks."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,3 +14,5 @@ FloatImage = npt.NDArray[np.float32]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 """Indices, and labels of nodes and elements."""
+Progress = Callable[[int, int, str], None]
+"""Called with the number of things done, their total and a line about the last one."""

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rgbmidic._version import __version__
 from rgbmidic.errors import ResultError
+from rgbmidic.results.files import write_json, writing
+from rgbmidic.settings.conversion import plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,15 +44,28 @@ def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
         )
 
 
-def write_findings(out: Path, contents: Mapping[str, Mapping[str, Any] | str | Figure], *, overwrite: bool) -> None:
+def number(value: float, form: str = ".3g") -> str:
+    """Write a number in a format of Python's; a dash where it is not finite."""
+    return format(value, form) if math.isfinite(value) else "-"
+
+
+def document(kind: str, figures: Mapping[str, Any]) -> dict[str, Any]:
+    """Return figures as plain values under the name of their schema, for JSON; a number that is not known is null."""
+    stated: dict[str, Any] = plain({"schema": f"rgbmidic-{kind}", "rgbmidic": __version__, **figures})
+    return stated
+
+
+def write_findings(out: Path, files: Sequence[str], *contents: dict[str, Any] | str | Figure, overwrite: bool) -> None:
     """Write documents (JSON), texts and figures into a folder, which is made where it does not exist.
 
     Parameters
     ----------
     out
         The folder.
-    contents
-        By the names of the files.
+    files
+        Names of the files.
+    *contents
+        What they hold, in their order.
     overwrite
         Whether files of these names may be replaced.
 
@@ -60,14 +76,13 @@ def write_findings(out: Path, contents: Mapping[str, Mapping[str, Any] | str | F
     """
     from rgbmidic.report.style import save_figure
 
-    check_folder(out, list(contents), overwrite=overwrite)
-    for path, content in ((out / name, content) for name, content in contents.items()):
-        if not isinstance(content, str | Mapping):
-            save_figure(content, path)
-            continue
-        text = content if isinstance(content, str) else json.dumps(content, indent=2, allow_nan=False) + "\n"
-        try:
+    check_folder(out, files, overwrite=overwrite)
+    for path, content in zip((out / name for name in files), contents, strict=True):
+        with writing(path):
             out.mkdir(parents=True, exist_ok=True)
-            path.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise ResultError(f"{path} cannot be written: {error.strerror or error}") from None
+            if isinstance(content, dict):
+                write_json(path, content)
+            elif isinstance(content, str):
+                path.write_text(content, encoding="utf-8")
+            else:
+                save_figure(content, path)

@@ -32,7 +32,7 @@ from rgbmidic.pipeline.size_figures import rms
 from rgbmidic.results import Result
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ScaleSettings, TestSettings, read_test
-from rgbmidic.typing import FloatArray, FloatImage
+from rgbmidic.typing import FloatArray, FloatImage, Progress
 
 _SCENE = """\
 # The paper's sphere (82.5 mm) turning about its front point under a red, a green and a blue lamp, all at once.
@@ -49,15 +49,6 @@ ANGLES = (0.33, 1.0, 2.0, 8.0)
 _SIZE = 96
 """Rows and columns of the frames, px: nine elements of the usual size."""
 _REGION = (10, 10, 86, 86)
-_SETTINGS = f"""\
-[frames]
-path = "*.dng"
-[calibration]
-file = "calibration.json"
-[region]
-rectangle = {list(_REGION)}
-"""
-
 
 PLATE_MOTIONS = {"shifted by 1.22 mm": ((1.0, -0.7), 0.0), "and stretched by 1 %": ((0.5, 0.3), 0.01)}
 """Motions of the tilted plate: shift (x, y) in mm, strain along x."""
@@ -124,7 +115,7 @@ def run_demo(
     out: Path,
     report: Callable[[str], None],
     calibrate: Callable[[Path], None],
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Progress | None = None,
     *,
     size: int = 448,
     angles: Sequence[float] = ANGLES,
@@ -341,20 +332,19 @@ def kernels_compiled_meanwhile() -> Iterator[None]:
 
 def _separate() -> None:
     """Prepare a measurement of raw frames and separate their lights."""
-    from rgbmidic.frames.data import Mosaic
-    from rgbmidic.frames.images import write_dng
-    from rgbmidic.lab.virtual.dataset import record, true_calibration
+    from rgbmidic.lab.virtual.dataset import record, settings_text, true_calibration, write_frame
     from rgbmidic.lab.virtual.rendering import sphere_scene
+    from rgbmidic.scene.scene import DatasetSettings
 
-    scene = sphere_scene(size=_SIZE)
+    scene, settings = sphere_scene(size=_SIZE), DatasetSettings()
     with tempfile.TemporaryDirectory() as folder:
         for index in range(2):
             frame = record(_images(index), scene.camera, scene.lights, seed=index)
-            assert isinstance(frame, Mosaic)
-            write_dng(Path(folder) / f"{index}.dng", frame)
+            write_frame(Path(folder) / "frames", index, frame, settings)
         true_calibration(scene).write(Path(folder) / "calibration.json")
-        (Path(folder) / "test.toml").write_text(_SETTINGS, encoding="utf-8")
-        plan = Plan.from_settings(read_test(Path(folder) / "test.toml"))
+        test = Path(folder) / "test.toml"
+        test.write_text(settings_text(scene, settings, _REGION), encoding="utf-8")
+        plan = Plan.from_settings(read_test(test))
         frames = plan.series.read(1)
         assert isinstance(frames, tuple)
         plan.separation(frames)

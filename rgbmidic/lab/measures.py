@@ -287,15 +287,13 @@ def pixel_levels(frames: Sequence[npt.ArrayLike], pixels: npt.ArrayLike) -> Floa
     return np.array(levels)
 
 
-def fit_lobe(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, std: npt.ArrayLike | None = None) -> Lobe:
+def fit_lobe(angles_deg: npt.ArrayLike, levels: npt.ArrayLike) -> Lobe:
     """Fit a diffuse part and a specular lobe to grey levels.
 
     Parameters
     ----------
     angles_deg, levels : array_like, shape (n,)
-        Light angles and mean grey levels.
-    std : array_like, shape (n,), optional
-        Standard uncertainty of the levels; None: equal and unknown, taken from the residual.
+        Light angles and mean grey levels, whose standard uncertainty is equal and taken from the residual.
 
     Returns
     -------
@@ -309,19 +307,17 @@ def fit_lobe(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, std: npt.ArrayLik
     from scipy.optimize import curve_fit
 
     angles, values = np.asarray(angles_deg, dtype=np.float64), np.asarray(levels, dtype=np.float64)
-    if angles.ndim != 1 or angles.shape != values.shape or (np.isfinite(values) & (abs(angles) < 90)).sum() < 8:
+    used = np.isfinite(values) & (abs(angles) < 90) if angles.shape == values.shape else np.zeros(0, dtype=bool)
+    if angles.ndim != 1 or used.sum() < 8:
         raise InputError(f"a lobe is fitted to at least 8 angles below 90 degrees; given are {angles.shape}")
-    used = np.isfinite(values) & (abs(angles) < 90)
     angles, values = angles[used], values[used]
-    errors = None if std is None else np.maximum(np.asarray(std, dtype=np.float64)[used], 1e-9 * np.ptp(values))
     oblique = abs(angles) > np.quantile(abs(angles), 0.6)
     diffuse = float(np.median(values[oblique] / np.cos(np.radians(angles[oblique]))))
     excess = values - diffuse * np.cos(np.radians(angles))
     guess = (diffuse, max(float(excess.max()), 1e-6), float(angles[excess.argmax()]), 10.0)
     try:
-        best, covariance = curve_fit(
-            _lobe, angles, values, guess, sigma=errors, bounds=([0, 0, -90, 0.1], [np.inf, np.inf, 90, 90])
-        )
+        bounds = [0, 0, -90, 0.1], [np.inf, np.inf, 90, 90]
+        best, covariance = curve_fit(_lobe, angles, values, guess, bounds=bounds)
     except RuntimeError as error:
         raise InputError(f"no lobe fits the grey levels: {error}") from None
     diffuse, specular, centre, width = map(float, best)

@@ -24,7 +24,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.scene.camera import Light
 from rgbmidic.scene.forecast import Forecast, Instrument, trace_change
 from rgbmidic.scene.scene import Experiment, Scene, State
-from rgbmidic.scene.zones import REFLECTS, Zones, material_points, predict_zones, region_in_view, truth
+from rgbmidic.scene.zones import REFLECTS, Zones, material_points, predict_zones, region_in_view, truth, unit
 from rgbmidic.settings import IlluminationSettings
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -68,34 +68,13 @@ class PlanningConstants:
 CONSTANTS = PlanningConstants()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Proposal:
-    """Lamps that would stand better.
-
-    Attributes
-    ----------
-    plan
-        Zones and uncertainty with them.
-    gain
-        Cost of the present lamps over theirs; 1 where nothing better was found.
-    """
-
-    plan: Plan
-    gain: float
-
-    @property
-    def lights(self) -> tuple[Light, ...]:
-        """The lights with their new positions."""
-        return self.plan.scene.lights
-
-
-def propose_colours(plan: Plan) -> Proposal:
+def propose_colours(plan: Plan) -> Plan:
     """Return the present lamp directions with the colours exchanged for the best."""
     search = _Search.of(plan, _directions(plan.scene))
     return search.proposal(plan, min(permutations(range(len(plan.scene.lights))), key=search.cost), affordable=1.0)
 
 
-def propose_lamps(plan: Plan) -> Proposal:
+def propose_lamps(plan: Plan) -> Plan:
     """Return the best directions of a grid over azimuth and inclination, with the best colour for each."""
     angles = np.arange(0, 360, CONSTANTS.azimuth_step), np.array(CONSTANTS.inclinations)
     azimuth, inclination = np.radians(np.meshgrid(*angles, indexing="ij")).reshape(2, -1)
@@ -182,7 +161,7 @@ class _Search:
             if not self.cost(choice) < before * (1 - 1e-6):
                 return choice
 
-    def proposal(self, plan: Plan, choice: tuple[int, ...], affordable: float) -> Proposal:
+    def proposal(self, plan: Plan, choice: tuple[int, ...], affordable: float) -> Plan:
         """Return the plan with the lights in the chosen directions, if that gains.
 
         The uncertainty must not grow by more than the factor `affordable`.
@@ -193,23 +172,25 @@ class _Search:
             lights = tuple(
                 _placed(lamp, scene, direction) for lamp, direction in zip(scene.lights, chosen, strict=True)
             )
-            better = plan.with_lamps(replace(scene, lights=lights))
+            scene = replace(scene, lights=lights)
+            states = [outlook.state for outlook in plan.outlooks]
+            reference, outlooks = _predict(scene, plan.instrument, plan.x, plan.y, states)
+            better = replace(plan, scene=scene, reference=reference, outlooks=outlooks, gain=gain)
             if better.std <= affordable * plan.std:
-                return Proposal(plan=better, gain=gain)
-        return Proposal(plan=plan, gain=1.0)
+                return better
+        return plan
 
 
 def _directions(scene: Scene) -> FloatArray:
     """Return unit vectors (k, 3) from the body's front point to the lamps."""
-    towards = np.array([light.position for light in scene.lights]) - scene.body.front
-    return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
+    return unit(np.array([light.position for light in scene.lights]) - scene.body.front, axis=1)
 
 
 def _placed(light: Light, scene: Scene, direction: FloatArray) -> Light:
     """Return the light at its distance from the body's front point, in another direction."""
     front = np.array(scene.body.front)
-    x, y, z = (front + np.linalg.norm(np.array(light.position) - front) * direction).tolist()
-    return replace(light, position=(x, y, z))
+    position = front + np.linalg.norm(np.array(light.position) - front) * direction
+    return replace(light, position=position.tolist())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -268,6 +249,8 @@ class Plan:
         Zones of the reference state at these points.
     outlooks
         One for each state of the scene.
+    gain
+        Cost of the present lamps over that of these, where they are proposed instead; else 1.
     """
 
     scene: Scene
@@ -278,11 +261,7 @@ class Plan:
     inside: BoolArray
     reference: Zones
     outlooks: tuple[Outlook, ...]
-
-    def with_lamps(self, scene: Scene) -> Plan:
-        """Return the same plan with a scene whose lamps stand elsewhere."""
-        reference, outlooks = _predict(scene, self.instrument, self.x, self.y, [o.state for o in self.outlooks])
-        return replace(self, scene=scene, reference=reference, outlooks=outlooks)
+    gain: float = 1.0
 
     def fraction(self, mask: BoolArray) -> float:
         """Fraction of the field on which a mask (h, w) holds."""
@@ -327,14 +306,7 @@ def make_plan(experiment: Experiment) -> Plan:
     if not inside.any() or not np.isfinite(motion[:, :, inside]).all():
         raise InputError(f"the field {list(field)} px does not lie on the body in every state")
     return Plan(
-        scene=scene,
-        instrument=instrument,
-        field=field,
-        x=x,
-        y=y,
-        inside=inside,
-        reference=reference,
-        outlooks=outlooks,
+        scene=scene, instrument=instrument, field=field, x=x, y=y, inside=inside, reference=reference, outlooks=outlooks
     )
 
 

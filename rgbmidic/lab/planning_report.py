@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic._version import __version__
 from rgbmidic.errors import InputError
-from rgbmidic.lab import write_findings
-from rgbmidic.lab.planning import Outlook, Plan, Proposal
+from rgbmidic.lab import document, number, write_findings
+from rgbmidic.lab.planning import Outlook, Plan
 from rgbmidic.pipeline.size_figures import rms
-from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal
+from rgbmidic.report.style import LIGHT_COLOURS, STYLE, finish_picture, literal
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS
 from rgbmidic.settings.conversion import plain
@@ -28,7 +27,7 @@ FILES = ("plan.json", "plan.png")
 
 
 def write_plan(
-    plan: Plan, proposals: dict[str, Proposal], out: Path, *, distance: float | None = None, overwrite: bool = False
+    plan: Plan, proposals: dict[str, Plan], out: Path, *, distance: float | None = None, overwrite: bool = False
 ) -> None:
     """Write plan.json and plan.png.
 
@@ -50,8 +49,8 @@ def write_plan(
     ResultError
         A plan is already there, or the folder cannot be written.
     """
-    contents = plan_document(plan, proposals, distance), plan_figure(plan, proposals)
-    write_findings(out, dict(zip(FILES, contents, strict=True)), overwrite=overwrite)
+    figures, picture = plan_document(plan, proposals, distance), plan_figure(plan, proposals)
+    write_findings(out, FILES, figures, picture, overwrite=overwrite)
 
 
 def zone_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
@@ -71,7 +70,7 @@ def uncertainty_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
     for label, state in _labelled(plan):
         std = state["std_px"]
         values = [std["median"], std["q95"], state["random_px"], state["feigned_by_domes_px"]]
-        rows.append([label, *(f"{value:.4f}" if math.isfinite(value) else "-" for value in values)])
+        rows.append([label, *(number(value, ".4f") for value in values)])
     return ["state", "median", "95 %", "random", "feigned"], rows
 
 
@@ -89,9 +88,9 @@ UNCERTAINTY_WORDS = {
 
 
 def _labelled(plan: Plan) -> Iterator[tuple[str, dict[str, Any]]]:
-    for number, outlook in enumerate(plan.outlooks, start=1):
+    for place, outlook in enumerate(plan.outlooks, start=1):
         state = _state(plan, outlook)
-        yield f"{number}: {state['angle_deg']:g} deg" if state["angle_deg"] else str(number), state
+        yield f"{place}: {state['angle_deg']:g} deg" if state["angle_deg"] else str(place), state
 
 
 def lamp_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
@@ -143,19 +142,17 @@ def out_of_plane(plan: Plan, distance: float | None = None) -> dict[str, Any]:
     return plain(figures | {"unseen_mm": plan.std / edge})  # type: ignore[no-any-return]
 
 
-def plan_document(plan: Plan, proposals: dict[str, Proposal], distance: float | None = None) -> dict[str, Any]:
+def plan_document(plan: Plan, proposals: dict[str, Plan], distance: float | None = None) -> dict[str, Any]:
     """Return the plan as plain values, for plan.json; fractions are of the field, an unknown number is null."""
-    document = {
-        "schema": "rgbmidic-plan",
-        "rgbmidic": __version__,
+    figures = {
         "field_px": plan.field,
         "element_size_px": plan.instrument.element_size,
         "reflects_from_specular_fraction": REFLECTS,
         "out_of_plane": out_of_plane(plan, distance),
         **_arrangement(plan),
-        "proposals": {name: {"gain": better.gain, **_arrangement(better.plan)} for name, better in proposals.items()},
+        "proposals": {name: {"gain": better.gain, **_arrangement(better)} for name, better in proposals.items()},
     }
-    return plain(document)  # type: ignore[no-any-return]
+    return document("plan", figures)
 
 
 def _arrangement(plan: Plan) -> dict[str, Any]:
@@ -199,14 +196,14 @@ def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
     }
 
 
-def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:
+def plan_figure(plan: Plan, proposals: dict[str, Plan]) -> Figure:
     """Zones of the lights (above) and uncertainty (below) in the first and last state, and in the last as proposed."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     panels = {"first state": (plan, plan.outlooks[0]), "last state": (plan, plan.outlooks[-1])}
-    panels |= {f"last state, {name}": (p.plan, p.plan.outlooks[-1]) for name, p in proposals.items() if p.gain > 1}
+    panels |= {f"last state, {name}": (one, one.outlooks[-1]) for name, one in proposals.items() if one.gain > 1}
     levels = np.concatenate([outlook.std[one.inside] for one, outlook in panels.values()])
     levels = levels[np.isfinite(levels)]
     top = float(np.quantile(levels, 0.98)) if levels.size else 1.0
@@ -227,10 +224,6 @@ def plan_figure(plan: Plan, proposals: dict[str, Proposal]) -> Figure:
         lines += [Line2D([], [], color="0.3", linestyle="--"), Line2D([], [], color="k", linewidth=0.9)]
         labels = [*(literal(light.name) for light in plan.scene.lights), "at rest", "field"]
         figure.legend(lines, labels, loc="outside upper center", ncols=len(labels))
-        for axis in axes[:, 0]:
-            axis.set_ylabel("y (px)")
-        for axis in axes[1]:
-            axis.set_xlabel("x (px)")
     return figure
 
 
@@ -268,7 +261,6 @@ def _draw_field(axis: Axes, plan: Plan) -> None:
     x0, y0, x1, y1 = plan.field
     axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor="k", linewidth=0.9))
     height, width = plan.scene.camera.shape
-    axis.set_xlim(-0.5, width - 0.5)
-    axis.set_ylim(height - 0.5, -0.5)
-    axis.set_aspect("equal")
-    axis.locator_params(nbins=4)
+    place = axis.get_subplotspec()
+    finish_picture(axis, (-0.5, width - 0.5), (-0.5, height - 0.5), first=place.is_first_col())  # type: ignore[union-attr]
+    axis.label_outer()

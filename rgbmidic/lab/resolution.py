@@ -19,14 +19,12 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from rgbmidic._version import __version__
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.fields import NodalCovariance, StrainGauges
-from rgbmidic.lab import write_findings
+from rgbmidic.lab import document, number, write_findings
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.pipeline.size_figures import ResolutionStudy
+from rgbmidic.pipeline.size_figures import GaugeFigures, ResolutionStudy
 from rgbmidic.pipeline.suitability import SPECKLES
-from rgbmidic.settings.conversion import plain
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -131,11 +129,11 @@ def size_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
     rows = []
     for one in _documents(study):
         micro = [1e6 * one[f"strain_{key}"] for key in ("noise", "discretisation", "total")]
-        cells = [_text(one["speckles"]), f"{one['nodes']}", f"{one['measured']:.0%}"]
-        cells += [", ".join(_text(one[key]) for key in ("bias_px", "scatter_px"))]
-        cells += [_text(one[key]) for key in ("noise_px", "discretisation_px", "total_px")]
-        cells += [", ".join(map(_text, micro)), f"{one['cut_off_px']:.0f}, {one['strain_cut_off_px']:.0f}"]
-        rows.append([f"{one['element_size_px']:g} px", *cells, _text(one["solve_cpu_s"])])
+        cells = [number(one["speckles"]), f"{one['nodes']}", f"{one['measured']:.0%}"]
+        cells += [", ".join(number(one[key]) for key in ("bias_px", "scatter_px"))]
+        cells += [number(one[key]) for key in ("noise_px", "discretisation_px", "total_px")]
+        cells += [", ".join(map(number, micro)), f"{one['cut_off_px']:.0f}, {one['strain_cut_off_px']:.0f}"]
+        rows.append([f"{one['element_size_px']:g} px", *cells, number(one["solve_cpu_s"])])
     headings = ["elements", "speckles", "nodes", "measured", "bias, scatter", "noise", "mesh", "total"]
     return [*headings, "strain: noise, mesh, total", "cut-off", "CPU s"], rows
 
@@ -146,13 +144,9 @@ def gauge_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
     for one in _documents(study):
         for gauge in one["gauges"]:
             length, noise, largest, at = gauge.values()
-            cells = [f"{length:g} px", _text(1e6 * noise), _text(1e6 * largest), f"{at:.0f}"]
+            cells = [f"{length:g} px", number(1e6 * noise), number(1e6 * largest), f"{at:.0f}"]
             rows.append([f"{one['element_size_px']:g} px", *cells])
     return ["elements", "gauge", "resolution", "largest", "cut-off"], rows
-
-
-def _text(value: float) -> str:
-    return f"{value:.3g}" if np.isfinite(value) else "-"
 
 
 def write_study(study: ResolutionStudy, out: Path, *, overwrite: bool = False) -> None:
@@ -171,9 +165,7 @@ def write_study(study: ResolutionStudy, out: Path, *, overwrite: bool = False) -
     for one in sizes:
         for gauge in one["gauges"] or [_NO_GAUGE]:
             lines.writerow([f"{value:.6g}" for value in (*(one[key] for key in headings), *gauge.values())])
-    document = {
-        "schema": "rgbmidic-resolution",
-        "rgbmidic": __version__,
+    figures = {
         "key_frame": {"index": study.frame, "name": study.name},
         "static_frames": study.static,
         "speckle_px": study.speckle,
@@ -181,8 +173,8 @@ def write_study(study: ResolutionStudy, out: Path, *, overwrite: bool = False) -
         "recommendation": study.choice,
         "sizes": sizes,
     }
-    contents = text.getvalue(), plain(document), _figure(study)
-    write_findings(out, dict(zip(FILES, contents, strict=True)), overwrite=overwrite)
+    contents = text.getvalue(), document("resolution", figures), _figure(study)
+    write_findings(out, FILES, *contents, overwrite=overwrite)
 
 
 _ERRORS = ("bias", "scatter", "stated", "noise", "discretisation", "total")
@@ -193,32 +185,30 @@ _NO_GAUGE = dict.fromkeys(("length_px", "noise", "largest", "cut_off_px"), float
 @lru_cache(maxsize=1)
 def _documents(study: ResolutionStudy) -> list[dict[str, Any]]:
     """Figures of every size with their units in their names, cut-offs and gauges included."""
-    ratios = [[gauge.length / one.element_size for gauge in one.gauges] for one in study.sizes]
-    asked = sorted({ratio for some in ratios for ratio in some})
+    asked = sorted({gauge.length / one.element_size for one in study.sizes for gauge in one.gauges})
     moved, strain, found = cut_offs(asked)
     at = dict(zip(asked, found.tolist(), strict=True))
-    documents = []
-    for one, some in zip(study.sizes, ratios, strict=True):
-        side = one.element_size
-        gauges = [
-            (gauge.length, gauge.noise, gauge.largest, side * at[x]) for gauge, x in zip(one.gauges, some, strict=True)
-        ]
-        documents.append(
-            {
-                "element_size_px": side,
-                "speckles": one.speckles,
-                "nodes": one.nodes,
-                "measured": one.measured,
-                **{f"{name}_px": getattr(one, name) for name in _ERRORS},
-                **{f"strain_{name}": getattr(one.strain, name) for name in _ERRORS},
-                "cut_off_px": side * moved,
-                "strain_cut_off_px": side * strain,
-                "solve_cpu_s": one.seconds,
-                "reason": one.reason,
-                "gauges": [dict(zip(_NO_GAUGE, gauge, strict=True)) for gauge in gauges],
-            }
-        )
-    return documents
+
+    def gauge_figures(gauge: GaugeFigures, side: float) -> dict[str, float]:
+        figures = gauge.length, gauge.noise, gauge.largest, side * at[gauge.length / side]
+        return dict(zip(_NO_GAUGE, figures, strict=True))
+
+    return [
+        {
+            "element_size_px": one.element_size,
+            "speckles": one.speckles,
+            "nodes": one.nodes,
+            "measured": one.measured,
+            **{f"{name}_px": getattr(one, name) for name in _ERRORS},
+            **{f"strain_{name}": getattr(one.strain, name) for name in _ERRORS},
+            "cut_off_px": one.element_size * moved,
+            "strain_cut_off_px": one.element_size * strain,
+            "solve_cpu_s": one.seconds,
+            "reason": one.reason,
+            "gauges": [gauge_figures(gauge, one.element_size) for gauge in one.gauges],
+        }
+        for one in study.sizes
+    ]
 
 
 def _figure(study: ResolutionStudy) -> Figure:
@@ -263,6 +253,9 @@ def _finish(axis: Axes, lengths: Sequence[float], x: str, y: str) -> None:
     """Label the axes: lengths along x, on a logarithmic scale, and plain numbers along y."""
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
+    from rgbmidic.report.style import finish_plot
+
+    finish_plot(axis, x, y)
     shown = sorted(set(lengths))
     axis.set_xscale("log")
     if axis.get_yscale() == "log":
@@ -271,7 +264,3 @@ def _finish(axis: Axes, lengths: Sequence[float], x: str, y: str) -> None:
     axis.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_xticks(shown, [f"{length:g}" for length in shown])
     axis.set_xticks([], minor=True)
-    axis.set_xlabel(x)
-    axis.set_ylabel(y)
-    axis.grid(linewidth=0.4, color="0.88")
-    axis.spines[["top", "right"]].set_visible(False)

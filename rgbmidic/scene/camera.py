@@ -14,11 +14,12 @@ from typing import Literal, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import ConfigurationError, InputError
+from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities, spectral_response
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.settings.conversion import Checked, bounded
+from rgbmidic.scene import Physical
+from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
 NOMINAL_DISTANCE = 600.0
@@ -30,19 +31,6 @@ PIXEL = 0.055
 
 Vector = tuple[float, float, float]
 Floating = TypeVar("Floating", bound=np.floating)
-
-
-class Physical(Checked):
-    """What a scene consists of: checked as the settings of a test are, and `InputError` where a value is impossible."""
-
-    __slots__ = ()
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        try:
-            super().__post_init__()
-        except ConfigurationError as error:
-            raise InputError(f"{type(self).__name__}: {error}") from None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,7 +93,7 @@ class Light(Physical):
         Light
         """
         position = rotation(angle_deg, axis) @ (np.array(self.position) - pivot) + pivot
-        return replace(self, position=(float(position[0]), float(position[1]), float(position[2])))
+        return replace(self, position=position.tolist())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -280,7 +268,15 @@ class Camera(Physical):
         InputError
             The crosstalk does not fit the lights, or a light lacks its spectrum.
         """
-        matrix = self._matrix(lights)
+        matrix = np.ones((1, len(lights))) if self.kind == "monochrome" else np.eye(3)[:, : len(lights)]
+        if self.crosstalk is not None:
+            matrix = self.crosstalk
+        elif self.sensitivities is not None:
+            spectra = tuple(light.spectrum for light in lights if light.spectrum is not None)
+            if len(spectra) != len(lights):
+                raise InputError("camera sensitivities are given, so every light needs its spectrum")
+            matrix = spectral_response(self.sensitivities, spectra)
+            matrix = matrix.mean(axis=0, keepdims=True) if self.kind == "monochrome" else matrix
         if matrix.shape != (self.channels, len(lights)) or not np.isfinite(matrix).all() or matrix.min() < 0:
             raise InputError(
                 f"the crosstalk of a {self.kind} camera under {len(lights)} lights is a matrix of shape "
@@ -289,19 +285,6 @@ class Camera(Physical):
         if not (matrix.max(axis=0) > 0).all():
             raise InputError(f"the camera does not see every light: crosstalk {matrix.tolist()}")
         return np.asarray(matrix / matrix.max())
-
-    def _matrix(self, lights: tuple[Light, ...]) -> FloatArray:
-        if self.crosstalk is not None:
-            return self.crosstalk
-        if self.sensitivities is not None:
-            spectra = tuple(light.spectrum for light in lights if light.spectrum is not None)
-            if len(spectra) != len(lights):
-                raise InputError("camera sensitivities are given, so every light needs its spectrum")
-            matrix = spectral_response(self.sensitivities, spectra)
-            return matrix.mean(axis=0, keepdims=True) if self.kind == "monochrome" else matrix
-        if self.kind == "monochrome":
-            return np.ones((1, len(lights)))
-        return np.eye(3)[:, : len(lights)]
 
     def mixing(self, lights: tuple[Light, ...]) -> FloatArray:
         """Return A (C, k) in channels = A . light images; every column's largest entry is 1.

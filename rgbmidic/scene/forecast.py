@@ -207,9 +207,7 @@ class Instrument:
             The paint has no droplets, hence no texture.
         """
         camera = scene.camera
-        spectrum = SpeckleSpectrum.of(
-            scene.surface, pixel=pixel_size(scene), blur=camera.lens_blur, prefilter=prefilter
-        )
+        spectrum = SpeckleSpectrum.of(scene.surface, pixel=scene.pixel, blur=camera.lens_blur, prefilter=prefilter)
         patch = SpecklePatch.of(scene, len(spectrum.frequency))
         relief = cross_spectra(np.stack([patch.texture, patch.domes]))
         if camera.kind == "bayer":
@@ -344,7 +342,7 @@ class Instrument:
             _facet_covariance(one.slopes, other.slopes, *self._roughness) * one.fraction * other.fraction
             for one, other in ((before, before), (after, after), (before, after))
         ]
-        area = self.wrinkle_area * (self.scene.surface.white.spacing / pixel_size(self.scene)) ** 2
+        area = self.wrinkle_area * (self.scene.surface.white.spacing / self.scene.pixel) ** 2
         return np.asarray(area * np.maximum(parts[0] + parts[1] - 2 * common * parts[2], 0))
 
     def _dome_factor(self, zones: Zones) -> FloatArray:
@@ -386,11 +384,6 @@ def trace_change(displacement: FloatArray) -> FloatArray:
     """
     x, y = np.cos(np.pi * displacement)
     return np.asarray(2 * (1 - np.stack([x, y, x * y])))
-
-
-def pixel_size(scene: Scene) -> float:
-    """Pixel size on the object, mm per px, at the body's front point."""
-    return scene.body.front[2] / scene.camera.focal_px
 
 
 def _channel_mixing(scene: Scene) -> FloatArray:

@@ -15,17 +15,8 @@ import numpy as np
 from rgbmidic._kernels import render as kernels
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Led, Sensitivities
-from rgbmidic.scene.camera import (
-    PIXEL,
-    Camera,
-    Light,
-    Physical,
-    Polarisers,
-    Vector,
-    reference_camera,
-    rotation,
-    three_lights,
-)
+from rgbmidic.scene import Physical
+from rgbmidic.scene.camera import PIXEL, REFERENCE_CROSSTALK, Camera, Light, Polarisers, Vector, rotation, three_lights
 from rgbmidic.scene.surface import AffineField, InPlaneField, MeshField, Surface
 from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value, read_section, read_table, read_toml, regular
 from rgbmidic.settings.conversion import bounded
@@ -174,11 +165,6 @@ class State:
     velocity: Vector = (0.0, 0.0, 0.0)
     spin_deg: float = 0.0
 
-    @property
-    def moves(self) -> bool:
-        """Whether the body moves during the exposure."""
-        return any(self.velocity) or self.spin_deg != 0
-
     def after(self, seconds: float) -> State:
         """Return the state some time later, at rest.
 
@@ -223,6 +209,11 @@ class Scene:
     lights: tuple[Light, ...]
     camera: Camera
     surface: Surface = field(default_factory=Surface)
+
+    @property
+    def pixel(self) -> float:
+        """Pixel size on the object, mm per px, at the body's front point."""
+        return self.body.front[2] / self.camera.focal_px
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -286,7 +277,7 @@ class Scene:
         lights = tuple(replace(light, power=light.power * polarisers.transmission) for light in self.lights)
         return replace(self, lights=lights, surface=replace(self.surface, white=white, black=black))
 
-    def mirror_position(self, distance: float, state: State | None = None) -> Vector:
+    def mirror_position(self, distance: float) -> Vector:
         """Where a lamp must stand for its reflection to cover the body's front point, seen from the camera.
 
         On a flat plate it covers the whole field. `distance` from the front point in mm.
@@ -295,26 +286,18 @@ class Scene:
         ----------
         distance
             Distance of the lamp from the front point in mm.
-        state
-            Pose of the body; None: the reference state.
 
         Returns
         -------
         Point (x, y, z) in mm, in the camera's axes
         """
-        turn, origin = (state or State()).pose(self.body)
-        point = turn @ self.body.attitude.T @ (np.array(self.body.front) - np.array(self.body.centre)) + origin
-        normal = turn @ np.array([0.0, 0.0, -1.0])
+        point, normal = np.array(self.body.front), self.body.attitude @ np.array([0.0, 0.0, -1.0])
         view = -point / np.linalg.norm(point)
-        position = point + distance * (2 * (normal @ view) * normal - view)
-        return float(position[0]), float(position[1]), float(position[2])
+        x, y, z = (point + distance * (2 * (normal @ view) * normal - view)).tolist()
+        return x, y, z
 
 
-BODIES: dict[str, type[Sphere] | type[Cylinder] | type[Plate]] = {
-    "sphere": Sphere,
-    "cylinder": Cylinder,
-    "plate": Plate,
-}
+BODIES: dict[str, type[Body]] = {"sphere": Sphere, "cylinder": Cylinder, "plate": Plate}
 Target = Literal["white", "speckled"]
 """Targets of the calibration captures."""
 _FIELD_KEYS = ("displacement_gradient", "displacement_offset", "displacement_file")
@@ -420,27 +403,28 @@ def _light(table: dict[str, Any], body: Body, base: Path) -> Light:
 
 
 def _camera(table: dict[str, Any], body: Body, base: Path) -> Camera:
-    ready: dict[str, Any] = {"crosstalk": None, "sensitivities": None}
+    ready: dict[str, Any] = {}
+
+    def stated(key: str, kind: Any, default: Any = None) -> Any:
+        return convert_value(table.pop(key, default), kind, f"camera.{key}", base)
+
     if "crosstalk" in table:
-        rows = convert_value(table.pop("crosstalk"), tuple[tuple[float, ...], ...], "camera.crosstalk", base)
+        rows = stated("crosstalk", tuple[tuple[float, ...], ...])
         if len({len(row) for row in rows}) != 1:
             raise ConfigurationError("camera.crosstalk must be rows of the same length")
         ready["crosstalk"] = np.array(rows)
     if "sensitivities" in table:
-        ready["sensitivities"] = Sensitivities.read(
-            convert_value(table.pop("sensitivities"), Path, "camera.sensitivities", base)
-        )
+        ready["sensitivities"] = Sensitivities.read(stated("sensitivities", Path))
     if "model" in table:
-        ready["sensitivities"] = Sensitivities.from_colour(convert_value(table.pop("model"), str, "camera.model", base))
-    pixel = convert_value(table.pop("mm_per_pixel", PIXEL), float, "camera.mm_per_pixel", base)
+        ready["sensitivities"] = Sensitivities.from_colour(stated("model", str))
+    if not ready and table.get("kind") != "monochrome":
+        ready["crosstalk"] = np.array(REFERENCE_CROSSTALK)
+    pixel = stated("mm_per_pixel", float, PIXEL)
     if not pixel > 0:
         raise ConfigurationError(f"camera.mm_per_pixel must be positive, not {pixel}")
     table.setdefault("shape", [640, 640])
     table.setdefault("focal_px", body.front[2] / pixel)
-    camera = read_section(Camera, "camera", table, base, **ready)
-    if ready["crosstalk"] is None and ready["sensitivities"] is None and camera.kind != "monochrome":
-        return replace(camera, crosstalk=reference_camera(camera.shape).crosstalk)
-    return camera
+    return read_section(Camera, "camera", table, base, **ready)
 
 
 def _state(table: dict[str, Any], body: Body, base: Path) -> State:

@@ -46,13 +46,12 @@ class SpecklePatch:
     def of(cls, scene: Scene, size: int, subsamples: int = 3) -> SpecklePatch:
         """Return a piece of `size` x `size` px of a scene's paint, faced at the distance of the body's front point."""
         camera, surface = scene.camera, scene.surface
-        pixel = scene.body.front[2] / camera.focal_px
         white, black = (replace(paint, slope_deg=0.0) for paint in (surface.white, surface.black))
-        place = (np.arange(size * subsamples) + 0.5) / subsamples * pixel
+        place = (np.arange(size * subsamples) + 0.5) / subsamples * scene.pixel
         cover, height = replace(surface, white=white, black=black).on_plate(place, place)
         albedo = surface.white.albedo + cover * (surface.black.albedo - surface.white.albedo)
         texture = _seen(albedo, size, camera.lens_blur)
-        return cls(texture=texture / texture.mean(), domes=_seen(height / pixel, size, camera.lens_blur))
+        return cls(texture=texture / texture.mean(), domes=_seen(height / scene.pixel, size, camera.lens_blur))
 
 
 def _seen(fine: FloatArray, size: int, blur: float) -> FloatArray:

@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import pdtr
 
 from rgbmidic._kernels.mesh import interpolate_at_points
 from rgbmidic._kernels.render import PLATE, sample_paint
 from rgbmidic.errors import InputError
-from rgbmidic.scene.camera import Physical
+from rgbmidic.scene import Physical
 from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
@@ -125,7 +126,9 @@ class Surface(Physical):
         far = radius * math.exp(BOUND * self.spread) + self.softness / 2
         reach = math.hypot(far, shell)
         cell = 1.5 * (reach + 0.5 * radius)
-        counts = _poisson_table(self.droplets_per_area * cell**3 / (2 * shell))
+        mean = self.droplets_per_area * cell**3 / (2 * shell)
+        # a uniform number passes as many entries as there are droplets in a cell
+        counts = np.asarray(pdtr(np.arange(int(mean + 8 * math.sqrt(mean) + 12)), mean), dtype=np.float64)
         head = [cell, shell, reach, radius, self.spread, self.softness, self.dome]
         paint = np.array([*head, *self.white._parameters(), *self.black._parameters()])
         return paint, counts, np.uint32(np.random.SeedSequence(self.seed).generate_state(1)[0])
@@ -202,15 +205,6 @@ def height_map(
     steps = np.arange(round(size / pitch) + 1) * pitch
     cover, height = surface.on_plate(corner[0] + steps, corner[1] + steps)
     return height, cover
-
-
-def _poisson_table(mean: float) -> FloatArray:
-    """Distribution function of the Poisson law; a uniform number passes as many entries as there are droplets."""
-    if mean == 0:
-        return np.ones(1)
-    number = np.arange(int(mean + 8 * math.sqrt(mean) + 12))
-    logarithm = number * math.log(mean) - mean - np.array([math.lgamma(n + 1) for n in number])
-    return np.cumsum(np.exp(logarithm))
 
 
 InPlaneField = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]

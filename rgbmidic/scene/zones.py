@@ -14,12 +14,13 @@ The camera stands in the origin and looks along +z; x to the right, y downwards,
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.scene.camera import NOMINAL_DISTANCE, Light, Physical
+from rgbmidic.scene import Physical
+from rgbmidic.scene.camera import NOMINAL_DISTANCE, Light
 from rgbmidic.scene.scene import Cylinder, Plate, Scene, Sphere, State
 from rgbmidic.scene.surface import Finish, Surface, material_from_spatial
 from rgbmidic.settings.conversion import bounded
@@ -309,18 +310,21 @@ def predict_zones(
         Instead of the scene's, in the same colours.
     """
     where = material_points(scene, state) if material is None else material
-    zones = zones_on_surface(scene, *placed(scene, where, state), lights)
     turn, _ = (state or State()).pose(scene.body)
-    return replace(zones, slopes=np.einsum("ji,kj...->ki...", turn, zones.slopes))
+    return zones_on_surface(scene, *placed(scene, where, state), lights, turn)
 
 
 def zones_on_surface(
-    scene: Scene, points: FloatArray, normals: FloatArray, lights: tuple[Light, ...] | None = None
+    scene: Scene,
+    points: FloatArray,
+    normals: FloatArray,
+    lights: tuple[Light, ...] | None = None,
+    axes: FloatArray | None = None,
 ) -> Zones:
     """Predict where the lights reflect on any surface before the scene's camera, for instance one from a height map.
 
-    `points` (mm) and outward unit `normals` of shape (3, ...), NaN off the surface, are in camera axes, which the
-    slopes then have, too; `lights` as in `predict_zones`.
+    `points` (mm) and outward unit `normals` of shape (3, ...), NaN off the surface, are in camera axes; the slopes are
+    in those which the rotation `axes` turns into the camera's, None: the same; `lights` as in `predict_zones`.
     """
     chosen, camera, paint = scene.lights if lights is None else lights, scene.camera, macroscopic(scene.surface)
     rest = (1,) * (points.ndim - 1)
@@ -332,6 +336,8 @@ def zones_on_surface(
     mirror = 2 * facing * normals - view
     with np.errstate(invalid="ignore", divide="ignore"):
         slopes = np.where(seen[:, None], halfway / (normals * halfway).sum(axis=1, keepdims=True) - normals, np.nan)
+    if axes is not None:
+        slopes = np.einsum("ji,kj...->ki...", axes, slopes)
     lobe = np.exp(-(slopes**2).sum(axis=1) / (2 * math.radians(paint.width_deg) ** 2))
     levels = camera.full_scale * camera.exposure * camera.response(scene.lights).max(axis=0)
     powers = np.array([light.power for light in chosen]) * NOMINAL_DISTANCE**2 * levels

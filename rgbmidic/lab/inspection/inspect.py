@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import align
 from rgbmidic.illumination.demosaicing import SMALLEST_FRAME
-from rgbmidic.illumination.frame_check import check_state
+from rgbmidic.illumination.frame_check import Frame, check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.texture import TextureModel
@@ -32,10 +32,7 @@ from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSum
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import finite_elements_of, read_region
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
-from rgbmidic.typing import BoolArray, FloatImage
-
-Frame = Mosaic | ChannelFrame
-Progress = Callable[[int, int, str], None]
+from rgbmidic.typing import BoolArray, FloatImage, Progress
 
 
 def inspect_files(

@@ -1,6 +1,6 @@
 """Displacement uncertainty expected from one frame: `rgbmidic.scene.forecast` with images of the frame's errors.
 
-Contrast and energy of the speckle's gradient follow from the frame; the errors are drawn (`SeparationErrors`). The
+Contrast and energy of the speckle's gradient follow from the frame; the errors are drawn (`separated`). The
 reflection-aware model of the frame (local means, slope of each channel on the common texture, channel-specific
 component, autocorrelation of the speckle) describes a random frame with the statistics of the one given. Such a frame
 is drawn with all its channels at every pixel and separated as the test does, behind the four phases of the colour
@@ -37,30 +37,13 @@ from rgbmidic.scene.speckle import SpeckleSpectrum, separated_phases
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SeparationErrors:
-    """Images of the errors of the lights of one state.
-
-    Attributes
-    ----------
-    noise : ndarray, shape (k, H, W), float32
-        Change of the lights by the camera noise, DN.
-    mosaic : ndarray, shape (4, k, H, W), float32
-        Difference of the lights behind each phase of the colour filter array from the mean of the four, DN; shape
-        (0, k, H, W) for a camera that has all channels at every pixel.
-    """
-
-    noise: FloatImage
-    mosaic: FloatImage
-
-
 def separated(
     frames: Sequence[LinearMosaic | LinearChannels],
     known: Calibration,
     method: str,
     noise: NoiseModel,
     random: np.random.Generator,
-) -> tuple[IlluminationImages, SeparationErrors]:
+) -> tuple[IlluminationImages, tuple[FloatImage, FloatImage]]:
     """Separate a state as the test would, and draw the errors of that.
 
     Reflection index and speckle of a mosaic are those of the default method.
@@ -75,6 +58,14 @@ def separated(
         How the test separates its mosaics (`rgbmidic.illumination.separation`).
     noise, random
         Camera noise to draw; source of random numbers.
+
+    Returns
+    -------
+    images
+        The lights.
+    errors : tuple of ndarray, shapes (1, k, H, W) and (4, k, H, W), float32
+        Draws of the lights' change by the camera noise, DN; difference of the lights behind each phase of the colour
+        filter array from the mean of the four, none for a camera that has all channels at every pixel.
     """
     first, crosstalk = frames[0], known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
     if isinstance(first, LinearMosaic):
@@ -91,7 +82,7 @@ def separated(
 
         phases = separated_phases(channels, first.cfa, lights_of)
         noisy = lights_of(_noisy(mosaic_samples(channels, first.cfa), noise, random), first.cfa)
-        return images, SeparationErrors(noise=noisy - phases[0], mosaic=phases - phases.mean(axis=0))
+        return images, ((noisy - phases[0])[None], phases - phases.mean(axis=0))
     full = [frame for frame in frames if isinstance(frame, LinearChannels)]
     names = known.registration.lights if known.registration else ()
 
@@ -100,11 +91,9 @@ def separated(
         return IlluminationImages.in_succession(state, names) if single else unmix(state[0], crosstalk)
 
     images = lights(full)
-    change = (
-        lights([replace(frame, values=_noisy(frame.values, noise, random)) for frame in full]).values - images.values
-    )
-    none = np.empty((0, *change.shape), dtype=np.float32)
-    return images, SeparationErrors(noise=np.nan_to_num(change), mosaic=none)
+    noisy = lights([replace(frame, values=_noisy(frame.values, noise, random)) for frame in full]).values
+    change = np.nan_to_num(noisy - images.values)[None]
+    return images, (change, change[:0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -194,7 +183,7 @@ def predict(
     mesh: Tri3Mesh,
     region: Region,
     lights: LocalContrast,
-    errors: SeparationErrors,
+    errors: tuple[FloatImage, FloatImage],
     *,
     texture: TextureModel | None,
     prefilter: str,
@@ -208,7 +197,7 @@ def predict(
     lights
         Their local means and contrasts.
     errors
-        Of one state, DN; those of the other state are as large and independent.
+        Draws of camera noise and mosaic of one state, DN; those of the other state are as large and independent.
     texture
         The speckle's autocorrelation; None: there is none, and nothing can be measured.
     prefilter
@@ -235,12 +224,11 @@ def predict(
     def variance(change: Callable[[FloatImage], FloatImage]) -> FloatImage:
         """Local mean square (k, H, W) of all errors of one state."""
         total = np.zeros_like(contrast)
-        for draws in parts:
+        for draws in errors:
             for images in filtered(draws, change):
                 total += images**2 / np.float32(len(draws))
         return _smooth(total, region.mask, mesh.size)
 
-    parts = errors.noise[None], errors.mosaic
     texture_contrast = np.sqrt(np.maximum(contrast**2 - variance(lambda image: image), 0) * light)
     residual = variance(lambda image: apply_prefilter(image, prefilter))
     pull = light_pull(texture_contrast, residual)
@@ -255,7 +243,7 @@ def predict(
             total[1:] += images**2 / np.float32(len(draws))
         return 2 * _element_means(_smooth(total, region.mask, mesh.size), pixels)
 
-    noise, mosaic = (scores(draws) for draws in parts)
+    noise, mosaic = (scores(draws) for draws in errors)
     information = spectrum.energy * _element_means(pull * texture_contrast, pixels)
     together = expected_std(mesh, information.sum(axis=0), noise[0] + mosaic[0], noise[0], mosaic[0])
     alone = [expected_std(mesh, info, score)[0] for info, score in zip(information, (noise + mosaic)[1:], strict=True)]

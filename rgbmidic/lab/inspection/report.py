@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from pathlib import Path
 from textwrap import fill
@@ -10,12 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic._version import __version__
 from rgbmidic.illumination.images import REFLECTING
-from rgbmidic.lab import write_findings
+from rgbmidic.lab import document, number, write_findings
 from rgbmidic.lab.inspection import Inspection, Spread
 from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal, shade, show_image
-from rgbmidic.settings.conversion import plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,8 +32,8 @@ def write_inspection(inspection: Inspection, out: Path, *, overwrite: bool = Fal
     ResultError
         An inspection is already there, or the folder cannot be written.
     """
-    contents = inspection_document(inspection), _inspection_figure(inspection)
-    write_findings(out, dict(zip(FILES, contents, strict=True)), overwrite=overwrite)
+    figures, picture = inspection_document(inspection), _inspection_figure(inspection)
+    write_findings(out, FILES, figures, picture, overwrite=overwrite)
 
 
 def channel_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
@@ -45,7 +42,7 @@ def channel_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
     for channel in inspection.channels:
         noise = f"{channel.noise_dn:.1f}" if inspection.noise_known else f"~ {channel.noise_dn:.0f}"
         fractions = [f"{value:.1%}" for value in (channel.mean, channel.low, channel.high, channel.saturated)]
-        rows.append([channel.name, *fractions, _text(channel.speckle_px, 1), noise])
+        rows.append([channel.name, *fractions, number(channel.speckle_px, ".1f"), noise])
     return ["channel", "mean", "5 %", "95 %", "saturated", "speckle (px)", "noise (DN)"], rows
 
 
@@ -66,20 +63,14 @@ def uncertainty_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]
         parts |= {"  from noise": Spread.of(expected.noise), "  from the mosaic": Spread.of(expected.mosaic)}
     if len(inspection.lights) > 1:
         parts |= {f"{light.name} alone": light.alone for light in inspection.lights}
-    rows = [[name, _text(spread.median, 4), _text(spread.q95, 4)] for name, spread in parts.items()]
+    rows = [[name, number(spread.median, ".4f"), number(spread.q95, ".4f")] for name, spread in parts.items()]
     return ["", "median", "95 %"], rows
-
-
-def _text(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
 def inspection_document(inspection: Inspection) -> dict[str, Any]:
     """Return the figures as plain values, for inspection.json; a number that is not known is null."""
     texture, expected = inspection.texture, inspection.prediction
-    document = {
-        "schema": "rgbmidic-inspection",
-        "rgbmidic": __version__,
+    figures = {
         "frame": inspection.name,
         "kind": inspection.kind,
         "region_px": int(inspection.region.sum()),
@@ -105,7 +96,7 @@ def inspection_document(inspection: Inspection) -> dict[str, Any]:
         "nodes_not_measured": inspection.unmeasured,
         "warnings": [{"code": found.name, "text": found.text} for found in inspection.findings],
     }
-    return plain(document)  # type: ignore[no-any-return]
+    return document("inspection", figures)
 
 
 def _inspection_figure(inspection: Inspection) -> Figure:
@@ -185,11 +176,11 @@ def _write_summary(axis: Axes, inspection: Inspection) -> None:
     spread = Spread.of(inspection.prediction.std)
     lines = [
         "uncertainty of u and v:",
-        f"  median {_text(spread.median, 4)} px",
-        f"  95 %    {_text(spread.q95, 4)} px",
-        f"elements {inspection.element_size:g} px, speckle {_text(inspection.speckle_px, 1)} px",
+        f"  median {number(spread.median, '.4f')} px",
+        f"  95 %    {number(spread.q95, '.4f')} px",
+        f"elements {inspection.element_size:g} px, speckle {number(inspection.speckle_px, '.1f')} px",
         *(
-            f"{light.name} alone {_text(light.alone.median, 4)} px"
+            f"{light.name} alone {number(light.alone.median, '.4f')} px"
             for light in inspection.lights[: 9 if len(inspection.lights) > 1 else 0]
         ),
     ]

@@ -191,42 +191,28 @@ def _of_set_up(inspection: Inspection) -> Iterator[Check]:
     differ = f"the two greens of the pattern differ by {inspection.greens:.0%}: check cfa, they are one colour"
     yield Check("pattern", differ, inspection.greens, CONSTANTS.greens)
     if not inspection.crosstalk_known:
-        yield Check(
-            "crosstalk unknown",
-            "no crosstalk calibration: the camera's channels stand for the lights, and a reflection of one light "
-            "shows in the others too; rgbmidic-calibrate crosstalk",
-        )
+        why = "the camera's channels stand for the lights, and a reflection of one light shows in the others too"
+        yield Check("crosstalk unknown", f"no crosstalk calibration: {why}; rgbmidic-calibrate crosstalk")
     if not inspection.noise_known:
+        why = "noise and the uncertainty from it are estimated from the frame, up to a few times too high for speckle"
         yield Check(
-            "noise unknown",
-            "no noise calibration: noise and the uncertainty from it are estimated from the frame, up to a few "
-            "times too high for speckle under 4 px and in reflections; rgbmidic-calibrate noise",
+            "noise unknown", f"no noise calibration: {why} under 4 px and in reflections; rgbmidic-calibrate noise"
         )
     for light in inspection.lights:
-        yield Check(
-            "negative light",
-            f"light {light.name} is negative on {light.negative:.0%} of the region: crosstalk, pattern or "
-            "black level are not those of this frame",
-            light.negative,
-            CONSTANTS.negative,
-        )
+        negative = f"light {light.name} is negative on {light.negative:.0%} of the region"
+        text = f"{negative}: crosstalk, pattern or black level are not those of this frame"
+        yield Check("negative light", text, light.negative, CONSTANTS.negative)
 
 
 def _of_exposure(inspection: Inspection) -> Iterator[Check]:
     for channel in inspection.channels:
-        yield Check(
-            "saturated",
-            f"channel {channel.name}: {channel.saturated:.1%} of the samples are saturated and will not be "
-            "measured; less exposure, or another place of the lamp",
-            channel.saturated,
-            CONSTANTS.saturated,
+        bright = (
+            f"channel {channel.name}: {channel.saturated:.1%} of the samples are saturated and will not be measured"
         )
-        yield Check(
-            "dark",
-            f"channel {channel.name} is dark: 95 % of its samples are below {channel.high:.1%} of the full "
-            "scale; more light or exposure",
-            max(CONSTANTS.dark - channel.high, 0.0),
-        )
+        text = f"{bright}; less exposure, or another place of the lamp"
+        yield Check("saturated", text, channel.saturated, CONSTANTS.saturated)
+        dark = f"channel {channel.name} is dark: 95 % of its samples are below {channel.high:.1%} of the full scale"
+        yield Check("dark", f"{dark}; more light or exposure", max(CONSTANTS.dark - channel.high, 0.0))
 
 
 def _of_speckle(inspection: Inspection) -> Iterator[Check]:
@@ -250,11 +236,9 @@ def _of_speckle(inspection: Inspection) -> Iterator[Check]:
     if np.isnan(size):
         yield Check("no texture", "no speckle is seen: its autocorrelation has no width")
     elif inspection.element_size < SPECKLES * size:
-        yield Check(
-            "coarse speckle",
-            f"speckles of {size:.1f} px are coarse for elements of {inspection.element_size:g} px: at least "
-            f"{SPECKLES:g} per side, so element_size = {np.ceil(SPECKLES * size):.0f} or finer speckle",
-        )
+        coarse = f"speckles of {size:.1f} px are coarse for elements of {inspection.element_size:g} px"
+        better = f"element_size = {np.ceil(SPECKLES * size):.0f} or finer speckle"
+        yield Check("coarse speckle", f"{coarse}: at least {SPECKLES:g} per side, so {better}")
 
 
 def _of_region(inspection: Inspection) -> Iterator[Check]:

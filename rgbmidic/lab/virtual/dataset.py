@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,15 +21,15 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.frame_check import Frame
 from rgbmidic.lab.virtual.rendering import render
+from rgbmidic.results.files import writing
 from rgbmidic.scene.camera import Camera, Light, mosaic_samples
 from rgbmidic.scene.scene import DatasetSettings, Plate, Scene, State, Target, read_scene
 from rgbmidic.scene.surface import Finish, Surface
 from rgbmidic.scene.zones import region_in_view, truth
-from rgbmidic.typing import FloatImage
+from rgbmidic.typing import FloatImage, Progress
 
-Frame = Mosaic | ChannelFrame
-Progress = Callable[[int, int, str], None]
 EXPOSURES = tuple(0.13 * time for time in (0.5, 1, 2, 4, 6, 10))
 """Fraction of the full scale that the brightest sample of a white card reaches, .13 per ms of the exposure times that
 calibration/README.md states; in the last it saturates."""
@@ -76,7 +76,7 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: Progress | 
         images = render(scene, state) if index else at_rest
         for (folder, on), seed in zip(_folders(scene).items(), frame_seeds[index], strict=False):
             frame = record(images, scene.camera, scene.lights, seed=int(seed), on=on)
-            _write_frame(out / folder, index, frame, settings)
+            write_frame(out / folder, index, frame, settings)
         if settings.noise_free:
             _save(out / "noise_free" / f"frame_{index:04d}.npz", images=images)
         if progress is not None:
@@ -88,7 +88,7 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: Progress | 
     test = out / "test.toml"
     y, x = np.indices(scene.camera.shape, dtype=float, sparse=True)
     region = settings.region or region_in_view(x, y, displacement, scene.camera.shape)
-    test.write_text(_test_settings(scene, settings, region), encoding="utf-8")
+    test.write_text(settings_text(scene, settings, region), encoding="utf-8")
     shutil.copyfile(scene_toml, out / "scene.toml")
     return test
 
@@ -100,11 +100,9 @@ def _check_output(scene: Scene, out: Path) -> None:
             raise InputError(f"a light's name becomes a folder's: letters, digits, - and _ only, not {light.name!r}")
         if light.name in ("all", "dark"):
             raise InputError(f"a light cannot be called {light.name!r}: that is the name of a folder of captures")
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         taken = any(out.iterdir())
-    except OSError as error:
-        raise ResultError(f"cannot write a data set to {out}: {error.strerror}") from None
     if taken:
         raise ResultError(f"{out} is not empty; nothing is overwritten: choose another folder")
 
@@ -117,7 +115,8 @@ def _folders(scene: Scene) -> dict[str, tuple[str, ...]]:
     return {"frames": names}
 
 
-def _write_frame(folder: Path, index: int, frame: Frame, settings: DatasetSettings) -> None:
+def write_frame(folder: Path, index: int, frame: Frame, settings: DatasetSettings) -> None:
+    """Write a raw frame under its number, in the format of the settings, into a folder that is made."""
     folder.mkdir(parents=True, exist_ok=True)
     if isinstance(frame, Mosaic) and settings.format == "dng":
         write_dng(folder / f"frame_{index:04d}.dng", frame)
@@ -134,7 +133,7 @@ def _write_captures(out: Path, scene: Scene, settings: DatasetSettings, at_rest:
     groups |= {f"check/{name}": frames for name, frames in _check_frames(scene, at_rest, seed=seeds[3]).items()}
     for folder, frames in groups.items():
         for index, frame in enumerate(frames):
-            _write_frame(out / folder, index, frame, settings)
+            write_frame(out / folder, index, frame, settings)
 
 
 def true_calibration(scene: Scene) -> Calibration:
@@ -150,7 +149,7 @@ def true_calibration(scene: Scene) -> Calibration:
     )
 
 
-def _test_settings(scene: Scene, settings: DatasetSettings, region: tuple[float, ...]) -> str:
+def settings_text(scene: Scene, settings: DatasetSettings, region: tuple[float, ...]) -> str:
     """Return the text of test.toml."""
     camera = scene.camera
     suffix = "dng" if camera.kind == "bayer" and settings.format == "dng" else "tif"
@@ -162,7 +161,7 @@ def _test_settings(scene: Scene, settings: DatasetSettings, region: tuple[float,
     lines += ["", "[calibration]", 'file = "calibration.json"', ""]
     lines += ["[region]", f"rectangle = [{', '.join(f'{edge:g}' for edge in region)}]", ""]
     lines += ["[mesh]", f"element_size = {settings.element_size:g}", ""]
-    lines += ["[scale]", f"mm_per_pixel = {scene.body.front[2] / camera.focal_px:.9g}", ""]
+    lines += ["[scale]", f"mm_per_pixel = {scene.pixel:.9g}", ""]
     return "\n".join(lines)
 
 
@@ -174,8 +173,6 @@ def _save(path: Path, **arrays: npt.ArrayLike) -> None:
 
 def target_scene(scene: Scene, target: Target = "white") -> Scene:
     """Return the same lights and camera before a flat mat target that fills the field at the body's front point."""
-    if target not in ("white", "speckled"):
-        raise InputError(f"unknown target {target!r}; allowed are white, speckled")
     mat = Finish(albedo=0.8, gloss=0.0, slope_deg=0.0)
     paint = replace(scene.surface, white=mat, black=replace(mat, albedo=0.1), dome=0.0)
     if target == "white":
@@ -203,12 +200,11 @@ def single_light_frames(scene: Scene, *, count: int = 3, seed: int, target: Targ
         Light name to its frames.
     """
     images, generator = render(target_scene(scene, target)), np.random.SeedSequence(seed)
-
-    def dimmed(name: str) -> Iterator[Frame]:
+    frames: dict[str, list[Frame]] = {light.name: [] for light in scene.lights}
+    for name, taken in frames.items():
         for step, child in enumerate(generator.spawn(count), start=1):
-            yield from _shots(scene, images * np.float32(step / count), child.generate_state(1), (name,))
-
-    return {light.name: list(dimmed(light.name)) for light in scene.lights}
+            taken += _shots(scene, images * np.float32(step / count), child.generate_state(1), (name,))
+    return frames
 
 
 def dark_frames(scene: Scene, *, count: int = 3, seed: int) -> list[Frame]:
@@ -250,7 +246,7 @@ def record(
     *,
     seed: int,
     on: Collection[str] | None = None,
-) -> Mosaic | ChannelFrame:
+) -> Frame:
     """Return the raw frame that the camera takes.
 
     Electrons = Poisson(gain x signal) + normal(read noise); DN = round(electrons/gain + black), clipped at saturation.

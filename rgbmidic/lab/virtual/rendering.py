@@ -29,12 +29,11 @@ def samples_needed(scene: Scene) -> int:
     """
     if scene.camera.samples is not None:
         return scene.camera.samples
-    pixel = scene.body.front[2] / scene.camera.focal_px
     needed = 6.0 if scene.surface.coverage else 1.0  # paint without droplets has no edges
     for paint in (scene.surface.white, scene.surface.black):
         if paint.slope_deg > 0:
             sharpness = 2 * max(1.0, 4 / paint.lobe_deg) ** 0.75 if paint.gloss > 0 else 1.0
-            needed = max(needed, 2.7 * pixel / paint.spacing * sharpness)
+            needed = max(needed, 2.7 * scene.pixel / paint.spacing * sharpness)
     return min(math.ceil(needed - 0.1), 24)
 
 
@@ -55,15 +54,12 @@ def render(scene: Scene, state: State | None = None) -> FloatImage:
     """
     state, duration = state or State(), scene.camera.exposure_time
     poses = [state]
-    if duration > 0 and state.moves:
+    if duration > 0 and (any(state.velocity) or state.spin_deg):
         # the middles of equal parts of the exposure, each shorter in motion than a quarter of the pixel's own aperture
         swept = np.hypot(*truth(scene, state.after(duration / 2), state.after(-duration / 2)))
         parts = max(1, math.ceil(4 * float(np.nanmax(swept, initial=0.0))))
         poses = [state.after(duration * ((i + 0.5) / parts - 0.5)) for i in range(parts)]
-    out = _trace(scene, poses[0])
-    for pose in poses[1:]:
-        out += _trace(scene, pose)
-    return out * np.float32(1 / len(poses))
+    return np.asarray(sum(_trace(scene, pose) for pose in poses) * np.float32(1 / len(poses)))
 
 
 def _trace(scene: Scene, state: State) -> FloatImage:

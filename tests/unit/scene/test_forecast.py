@@ -21,7 +21,7 @@ from rgbmidic.illumination.separation import separate
 from rgbmidic.lab.virtual import Scene, State, record, render, strained_plate, truth, turned
 from rgbmidic.lab.virtual.rendering import paint, plate_scene, sphere_scene
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.scene.forecast import Instrument, node_constant, pixel_size, trace_change
+from rgbmidic.scene.forecast import Instrument, node_constant, trace_change
 from rgbmidic.scene.speckle import SpecklePatch, SpeckleSpectrum, cover_covariance
 from rgbmidic.scene.zones import material_points, predict_zones
 
@@ -239,7 +239,7 @@ def test_droplets_that_stand_out_feign_the_displacement_that_is_forecast():
 
 
 def test_pixel_size_is_that_of_the_front_point():
-    assert pixel_size(plate_scene(size=16)) == pytest.approx(0.055)
+    assert plate_scene(size=16).pixel == pytest.approx(0.055)
 
 
 def test_the_erratic_part_of_a_reflection_has_the_variance_that_is_forecast():

@@ -69,7 +69,7 @@ def test_the_document_is_plain_json_and_says_the_same(made):
     assert 0 < state["std_px"]["median"] <= state["std_px"]["q95"] <= state["std_px"]["largest"]
     assert state["reflecting"]["green"] == plan.fraction(plan.outlooks[1].reflects[1])
     moved = document["proposals"]["lamps moved"]
-    assert moved["lights"][0]["position_mm"] == list(proposals["lamps moved"].lights[0].position)
+    assert moved["lights"][0]["position_mm"] == list(proposals["lamps moved"].scene.lights[0].position)
 
 
 def test_the_picture_shows_zones_and_uncertainty_where_they_are(made):
