@@ -150,9 +150,7 @@ def frames(
     path: Annotated[str, Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")] = "",
     formats: Annotated[bool, Option("--formats", help="List the formats that are read.")] = False,
     json: Annotated[bool, Option("--json", help="Print the list as JSON.")] = False,
-    save: Annotated[
-        tuple[int, Path] | None, Option("--save", metavar="N OUT.tif", help="Write frame N as a 16-bit TIFF.")
-    ] = None,
+    save: Annotated[tuple[int, Path] | None, Option(metavar="N OUT.tif", help="Write frame N as 16-bit TIFF.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """List the properties of raw frames as read: number, size, levels, times, missing frames."""
@@ -235,12 +233,8 @@ def inspect(
 @app.command()
 def resolution(
     test: Test,
-    sizes: Annotated[
-        str, Option(help="Element sizes in px, such as 10,16,25,40; else those that suit the speckle.")
-    ] = "",
-    gauges: Annotated[
-        str, Option(help="Lengths of virtual strain gauges in px; else three elements of each size.")
-    ] = "",
+    sizes: Annotated[str, Option(help="Element sizes in px, such as 10,16,25; else those that suit the speckle.")] = "",
+    gauges: Annotated[str, Option(help="Lengths of virtual strain gauges, px; else three elements of each size.")] = "",
     frames: Annotated[str, Option(help="Frames, such as 5,10:20, among which the key frame is; else five.")] = "",
     out: Annotated[Path | None, Option(help="Folder for resolution.csv, .json and .png.")] = None,
     overwrite: Overwrite = False,

@@ -47,9 +47,7 @@ Test = Annotated[Path, Argument(metavar="TEST.toml", help="Settings of the test.
 Workers = Annotated[int, Option(min=0, help="Frames at a time; 0: as many as cores.")]
 
 FRAME_OPTIONS: dict[str, Any] = {
-    "kind": Annotated[
-        str | None, Option(help="bayer, rgb (3-CCD) or monochrome; else as the files state, else bayer.")
-    ],
+    "kind": Annotated[str | None, Option(help="bayer, rgb (3-CCD), monochrome; else as the files state, else bayer.")],
     "cfa": Annotated[str | None, Option(help="Bayer pattern RGGB, BGGR, GRBG or GBRG.")],
     "black_level": Annotated[float | None, Option(help="Grey level of a dark sample, DN.")],
     "white_level": Annotated[float | None, Option(help="Smallest saturated grey level, DN.")],
