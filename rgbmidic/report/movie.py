@@ -21,8 +21,8 @@ from rgbmidic._kernels.picture import paint_field
 from rgbmidic.errors import InputError, ResultError, RgbmidicError
 from rgbmidic.extras import optional
 from rgbmidic.report import style
+from rgbmidic.report.curves import Curve
 from rgbmidic.report.figures import field_colours, picture_limits, spread
-from rgbmidic.report.movie_curve import Curve
 from rgbmidic.report.video import PALETTE, Page, gif, video
 from rgbmidic.results import QUANTITIES, Maps, Quantity, frame_times
 from rgbmidic.results.files import check_file, write_complete
@@ -68,12 +68,12 @@ class MovieConstants:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Panel:
-    """A field, the values of its first and last colour, their name, and whether there are values below or above."""
+    """A field, the values of its first and last colour, their name, and the smallest and largest value."""
 
     field: Quantity
     ends: _Span
     colours: str
-    beyond: tuple[bool, bool]
+    extremes: FloatArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -176,9 +176,9 @@ class Movie:
             known = np.concatenate(ordinary)
             if not known.size:
                 raise InputError(f"{name} is measured in none of the frames of {result.path}")
-            low, high = self.stated.get(name) or field.ends or style.colour_range(known)
-            beyond, colours = (bool(known.min() < low), bool(known.max() > high)), self.colours or field_colours(field)
-            panels.append(_Panel(field=field, ends=(low, high), colours=colours, beyond=beyond))
+            ends, colours = self.stated.get(name) or field.ends or style.colour_range(known), self.colours
+            extremes = np.array([known.min(), known.max()])
+            panels.append(_Panel(field=field, ends=ends, colours=colours or field_colours(field), extremes=extremes))
         return tuple(panels), picture_limits(result, np.concatenate(corners))
 
 
@@ -266,7 +266,7 @@ class _Canvas:
             for axis, panel in zip(axes, panels, strict=False):
                 style.finish_picture(axis, x, y, first=axis is axes[0], unit=unit, factor=factor)
                 axis.set_title(style.literal(panel.field.label))
-                style.add_colour_bar(axis, Normalize(*panel.ends), panel.colours, beyond=panel.beyond)
+                style.add_colour_bar(axis, Normalize(*panel.ends), panel.colours, shown=panel.extremes)
             if (curve := movie.curve) is not None:
                 times, label = style.time_axis(curve.times if curve.timed else None, curve.times)
                 axes[-1].plot(times, curve.values, linewidth=1, color=style.OKABE_ITO["blue"])

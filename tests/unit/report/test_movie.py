@@ -19,8 +19,8 @@ from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.report import movie
+from rgbmidic.report.curves import Curve
 from rgbmidic.report.movie import Movie, MovieConstants, _Canvas, write_movie
-from rgbmidic.report.movie_curve import Curve
 from rgbmidic.results import FrameRecord, Maps
 from rgbmidic.view.picture import RawPictures
 
