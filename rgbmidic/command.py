@@ -18,12 +18,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import wraps
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from typer import Argument, Option
+from typer.core import TyperGroup
 
 from rgbmidic.errors import InputError, RgbmidicError, disk_reason, shortened
 
@@ -33,8 +35,6 @@ if TYPE_CHECKING:
 
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
 REQUIRED = inspect.Parameter.empty
-HELP = {"help_option_names": ["-h", "--help"]}
-"""Context of both commands and of what they consist of."""
 
 messages = Console(stderr=True)
 
@@ -55,6 +55,18 @@ FRAME_OPTIONS: dict[str, Any] = {
     "dtype": Annotated[str | None, Option(help="uint8, uint16 or >u2, of a headerless file.")],
 }
 """Options that state what the files of frames do not, by the keys of ``[frames]``."""
+
+
+def application(name: str, cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
+    """An application whose help is plain text and whose errors `main` reports."""
+    return typer.Typer(
+        name=name,
+        cls=cls,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
 
 
 def main(app: typer.Typer) -> None:
@@ -187,18 +199,13 @@ def read_frames(text: str, option: str = "--frames") -> list[int] | None:
     InputError
         It is something else.
     """
-    chosen = list[int]()
-    for part in text.split(",") if text else ():
-        low, colon, high = (side.strip() for side in part.partition(":"))
-        known = low.isdecimal() and len(low + high) < 16 and (high.isdecimal() if colon else not high)
-        frames = range(int(low), int(high) if colon else int(low) + 1) if known else range(0)
-        if not 0 < len(frames) <= 10**7 - len(chosen):  # more are a slip
-            chosen.clear()
-            break
-        chosen += frames
-    if text and not chosen:
+    if not text:
+        return None
+    parts = [re.fullmatch(r"\s*(\d{1,15})\s*(?::\s*(\d{1,15})\s*)?", part) for part in text.split(",")]
+    ranges = [range(int(part[1]), int(part[2] or int(part[1]) + 1)) for part in parts if part]
+    if len(ranges) < len(parts) or not all(ranges) or sum(map(len, ranges)) > 10**7:  # more are a slip
         raise InputError(f"{option} are indices and ranges such as 0,5,10:20 (10 to 19), not {text!r}")
-    return chosen or None
+    return [*chain(*ranges)]
 
 
 _EXAMPLES = {
