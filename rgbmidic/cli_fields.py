@@ -10,8 +10,7 @@ import typer
 from typer import Option
 
 from rgbmidic import command
-from rgbmidic.errors import InputError
-from rgbmidic.extras import optional
+from rgbmidic.errors import InputError, optional
 
 app = typer.Typer()
 

@@ -119,9 +119,7 @@ def batch(
             note(f"{outcome.name}: {outcome.reason or ('measured' if outcome.measured else 'measured before')}")
     print(f"table: {out / 'summary.csv'}   page: {out / 'summary.html'}")
     if failed := [outcome.name for outcome in outcomes if outcome.reason]:
-        raise typer.Exit(
-            command.fail(f"{len(failed)} of {len(outcomes)} tests failed: {', '.join(failed)}", command.FAILURE)
-        )
+        raise typer.Exit(command.fail(f"{len(failed)} of {len(outcomes)} tests failed: {', '.join(failed)}"))
 
 
 @app.command()
@@ -157,7 +155,7 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
     if len(failed) > len(result.deformed) / 2 or not result.deformed:
         first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}" if failed else "there is none"
         count = f"{len(failed)} of {len(result.deformed)} deformed frames failed or did not converge"
-        raise typer.Exit(command.fail(f"{count}; {first}", command.FAILURE))
+        raise typer.Exit(command.fail(f"{count}; {first}"))
 
 
 @contextmanager

@@ -104,13 +104,13 @@ def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> i
         if (usage := getattr(error, "format_message", None)) is not None:  # typer's own, whichever click it brings
             return fail(usage() or str(error), BAD_INPUT)
         if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
-            return fail(disk_reason(error), FAILURE)
-        return fail(f"{type(error).__name__}: {error} (run again with --debug for the details)", FAILURE)
+            return fail(disk_reason(error))
+        return fail(f"{type(error).__name__}: {error} (run again with --debug for the details)")
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
-def fail(message: str, status: int) -> int:
+def fail(message: str, status: int = FAILURE) -> int:
     """Print an error as one line; gives the status back."""
     print(f"error: {shortened(' '.join(message.split()))}", file=sys.stderr)
     return status

@@ -12,7 +12,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from rgbmidic.extras import optional
+from rgbmidic.errors import optional
 from rgbmidic.report import style
 from rgbmidic.report.document import render
 from rgbmidic.report.figures import spread

@@ -54,8 +54,8 @@ class TimeHistory:
         Times, or numbers of the frames where no time is known, and the label of the axis.
     timed : bool
         Whether the times are known.
-    symbols : dict
-        Symbol of each quantity.
+    fields : dict
+        What each quantity is.
     quantiles : dict
         Of each quantity the 5 %, 50 % and 95 % quantile over the nodes, shape (F, 3); NaN where nothing is measured.
     fractions : ndarray, shape (F, S)
@@ -73,9 +73,7 @@ class TimeHistory:
         self.frames, self.timed, times = tuple(frames), physical.units.timed, physical.times[list(frames)]
         read = ("u", "v", "u_std", "v_std", "exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std", "misfit")
         self.axis = style.time_axis(times if self.timed else None, physical.result.number[list(frames)])
-        self.symbols = {
-            name: entry.symbol for name, entry in Maps(result=physical.result, physical=physical).all.items()
-        }
+        self.fields = Maps(result=physical.result, physical=physical).all
         self.quantiles = {name: np.full((len(times), 3), np.nan) for name in read}
         self.fractions = np.empty((len(times), len(QUANTITIES["node_status"].codes)))
         self.fastest, before = 0.0, np.array(np.nan)
@@ -142,7 +140,13 @@ def medians_figure(
                 look: dict[str, Any] = {"color": style.OKABE_ITO[colour], "linestyle": line}
                 low, median, high = history.quantiles[name].T
                 axis.plot(
-                    times, median, linewidth=1.2, label=history.symbols[name], marker=marker, markersize=2.5, **look
+                    times,
+                    median,
+                    linewidth=1.2,
+                    label=history.fields[name].symbol,
+                    marker=marker,
+                    markersize=2.5,
+                    **look,
                 )
                 if band:
                     axis.fill_between(times, low, high, color=look["color"], alpha=0.18, linewidth=0)

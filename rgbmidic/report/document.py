@@ -229,8 +229,8 @@ def write_report(
         frames = sorted({*measured, history.farthest})
     maps = figures.MapDrawer(Maps(result=result, physical=physical), style.PAGE_DPI)
     exposure, speckle = kept.get("exposure_ns"), speckle_size(result)
-    ends, odd = result.status[list(result.deformed)], [index for index in result.deformed if result.status[index] != 0]
-    odd = [index for index in odd if result.finished[index]]
+    ends = result.status[list(result.deformed)]
+    odd = [index for index in result.deformed if result.status[index] != 0 and result.finished[index]]
     text = render(
         "report.html",
         constants=constants,

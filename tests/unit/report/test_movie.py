@@ -75,6 +75,12 @@ def test_a_page_states_how_its_fields_are_derived(maps: Maps) -> None:
     assert page.y0 <= box.y0 < box.y1 <= page.y1
 
 
+@pytest.mark.parametrize("width", [601, 640, 727])
+def test_panels_have_one_size_however_their_edges_are_rounded(maps: Maps, width: int) -> None:
+    boxes = _Canvas(Movie(maps=maps, fields=("u", "v", "exx"), frames=[5], width=width))._boxes
+    assert len({(rows.stop - rows.start, columns.stop - columns.start) for rows, columns in boxes}) == 1
+
+
 def test_pages_are_the_same_for_any_number_of_processes(maps: Maps, monkeypatch: pytest.MonkeyPatch) -> None:
     start, handlers = SpawnProcess.start, []
 
