@@ -11,7 +11,7 @@ from typer import Argument, Option
 
 from rgbmidic import command
 from rgbmidic._version import __version__
-from rgbmidic.command import Out, Overwrite, Test, explain_first_run, note, print_table, progress_of
+from rgbmidic.command import Out, Overwrite, Test, note, print_table, progress_of
 from rgbmidic.errors import InputError
 
 app = typer.Typer()
@@ -21,7 +21,6 @@ app = typer.Typer()
 def demo(out: Annotated[Path, Option(help="Output folder; must be empty or new.")] = Path("rgbmidic-demo")) -> None:
     """Make a small virtual test, calibrate and measure it, and compare the result with the exact truth."""
     note(f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}")
-    explain_first_run()
     from rgbmidic._kernels.threads import threads
     from rgbmidic.lab.demo import run_demo, run_plate, write_plate
     from rgbmidic.report import write_figures
@@ -103,7 +102,6 @@ def virtual(scene: Annotated[Path, Argument(metavar="SCENE.toml", help="Scene to
     """Render a virtual test: raw frames, calibration captures and the exact truth."""
     from rgbmidic.lab.virtual.dataset import write_dataset
 
-    explain_first_run()
     with progress_of("rendering") as progress:
         write_dataset(scene, out, progress)
 
@@ -203,7 +201,6 @@ def inspect(
             raise InputError("a TEST.toml stands for the frames of its reference: give it alone, or frames and --test")
         test, frames = frames[0], []
     settings = None if test is None else read_test(test)
-    explain_first_run()
     with progress_of("inspecting") as progress:
         inspection = inspect_files(
             frames,
@@ -251,7 +248,6 @@ def resolution(
     chosen = command.read_frames(frames) or []
     lengths = command.read_lengths(gauges, "--gauges")
     asked = command.read_lengths(sizes, "--sizes")
-    explain_first_run()
     with progress_of("resolution") as progress:
         study = study_sizes(settings, asked, gauges=lengths or None, frames=chosen, progress=progress)
     static = f"{study.static} static frames" if study.static else "no static frames: noise is as stated, not measured"

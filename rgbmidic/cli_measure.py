@@ -12,7 +12,7 @@ import typer
 from typer import Argument, Option
 
 from rgbmidic import command
-from rgbmidic.command import Draw, Out, Overwrite, Test, Workers, explain_first_run, note, progress_of
+from rgbmidic.command import Draw, Out, Overwrite, Test, Workers, note, progress_of
 from rgbmidic.errors import InputError
 
 if TYPE_CHECKING:
@@ -44,7 +44,6 @@ def run(
     chosen = read_range(frames, "--frames") if frames else None
     if overwrite and (resume or frames):
         raise InputError("--overwrite begins anew, --resume and --frames go on: state one of them")
-    explain_first_run()
     with progress_of("measuring") as progress, _continuation_hint(test, out, frames, resume=resume):
         result = measure(
             settings,
@@ -101,7 +100,6 @@ def batch(
         if reports and (measured or not (result.path / REPORT).is_file()):
             write_report(result, result.path / REPORT, settings=settings, overwrite=True)
 
-    explain_first_run()
     outcomes = []
     with progress_of("batch") as progress:
         for outcome in series.run_batch(

@@ -338,17 +338,6 @@ def note(text: str) -> None:
     messages.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
-def explain_first_run() -> None:
-    """Print why the first run takes longer."""
-    from rgbmidic._kernels import are_compiled
-
-    if not are_compiled():
-        note(
-            "first run on this machine: kernels are compiled for its processor as they are needed, in all 15 to 40 s; "
-            "later runs take them from a cache"
-        )
-
-
 def print_table(title: str, headings: list[str], rows: list[list[str]], words: Mapping[str, str] | None = None) -> None:
     """Print a table on stdout, and below it what words of its heading mean.
 
@@ -372,10 +361,18 @@ def print_table(title: str, headings: list[str], rows: list[list[str]], words: M
 def progress_of(what: str) -> Iterator[Callable[[int, int, str], None]]:
     """A bar on stderr, and the function that moves it: frames done, their total, a line about the last one.
 
-    Nothing is shown where nobody watches: an error stays one line, a log file stays short.
+    Nothing is shown where nobody watches: an error stays one line, a log file stays short. A first run is told why it
+    takes longer.
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from rgbmidic._kernels import are_compiled
+
+    if not are_compiled():
+        note(
+            "first run on this machine: kernels are compiled for its processor as they are needed, in all 15 to 40 s; "
+            "later runs take them from a cache"
+        )
     rate, last = TextColumn("{task.fields[rate]}"), TextColumn("{task.fields[line]}", markup=False)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), rate, TimeRemainingColumn(), last)
     with Progress(*columns, console=messages, transient=True, disable=not messages.is_terminal) as bar:

@@ -137,7 +137,9 @@ class Movie:
             given = f"{self.width} px and {self.opacity:g}"
             raise InputError(f"a movie has 320 to 7680 px and an opacity of 0 to 1, not {given}")
         result = self.maps.result
-        if beyond := [frame for frame in self.chosen if not 0 <= frame < len(result)] or not self.chosen:
+        if not self.chosen:
+            raise InputError(f"none of the frames of {result.path} is measured")
+        if beyond := [frame for frame in self.chosen if not 0 <= frame < len(result)]:
             raise InputError(f"there is no frame {beyond} in {result.path}, which has {len(result)} frames")
         for low, high in self.stated.values():
             if not low < high:
