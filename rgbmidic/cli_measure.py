@@ -28,7 +28,7 @@ def run(
     out: Out,
     overwrite: Overwrite = False,
     resume: Annotated[bool, Option("--resume", help="Continue the interrupted run in DIR.")] = False,
-    retry_failed: Annotated[bool, Option("--retry-failed", help="With --resume: measure failed frames again.")] = False,
+    retry_failed: Annotated[bool, Option("--retry-failed", help="With --resume: repeat all failed frames.")] = False,
     frames: Annotated[str, Option(help="Only these, such as 1000:2000; end with `rgbmidic finish`.")] = "",
     workers: Workers = 0,
     scheduler: Annotated[str | None, Option(help="Address of a Dask scheduler.")] = None,
