@@ -29,9 +29,8 @@ def stages(work: Callable[[], object], repeats: int) -> tuple[dict[str, float], 
     def counted(*arguments: Any) -> None:
         begin = time.process_time()
         share(*arguments)
-        clock = timing._clock.get()
-        if clock is not None:
-            shared[clock._on] += time.process_time() - begin
+        if (on := timing._on.get()) is not None:
+            shared[on[0]] += time.process_time() - begin
 
     timing.time = SimpleNamespace(perf_counter=time.process_time)  # processor time, whatever else the machine does
     threads._share, best = counted, (float("inf"), {}, {})

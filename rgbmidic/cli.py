@@ -32,14 +32,7 @@ class _Grouped(TyperGroup):
                 formatter.write_dl([(name, self.commands[name].get_short_help_str(limit)) for name in names])
 
 
-app = typer.Typer(
-    name="rgbmidic",
-    cls=_Grouped,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings=command.HELP,
-)
+app = command.application("rgbmidic", _Grouped)
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from typer import Argument, Option
 
 from rgbmidic import command
 from rgbmidic._version import __version__
-from rgbmidic.command import Out, Overwrite, Test, explain_first_run, note, print_table, progress_of
+from rgbmidic.command import Out, Overwrite, Test, note, print_table, progress_of
 from rgbmidic.errors import InputError
 
 app = typer.Typer()
@@ -21,7 +21,6 @@ app = typer.Typer()
 def demo(out: Annotated[Path, Option(help="Output folder; must be empty or new.")] = Path("rgbmidic-demo")) -> None:
     """Make a small virtual test, calibrate and measure it, and compare the result with the exact truth."""
     note(f"rgbmidic {__version__}: a virtual test is made, calibrated, measured and compared in {out}")
-    explain_first_run()
     from rgbmidic._kernels.threads import threads
     from rgbmidic.lab.demo import run_demo, run_plate, write_plate
     from rgbmidic.report import write_figures
@@ -103,7 +102,6 @@ def virtual(scene: Annotated[Path, Argument(metavar="SCENE.toml", help="Scene to
     """Render a virtual test: raw frames, calibration captures and the exact truth."""
     from rgbmidic.lab.virtual.dataset import write_dataset
 
-    explain_first_run()
     with progress_of("rendering") as progress:
         write_dataset(scene, out, progress)
 
@@ -150,9 +148,7 @@ def frames(
     path: Annotated[str, Argument(metavar="PATH", help="A movie, a frame, a folder or a pattern.")] = "",
     formats: Annotated[bool, Option("--formats", help="List the formats that are read.")] = False,
     json: Annotated[bool, Option("--json", help="Print the list as JSON.")] = False,
-    save: Annotated[
-        tuple[int, Path] | None, Option("--save", metavar="N OUT.tif", help="Write frame N as a 16-bit TIFF.")
-    ] = None,
+    save: Annotated[tuple[int, Path] | None, Option(metavar="N OUT.tif", help="Write frame N as 16-bit TIFF.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """List the properties of raw frames as read: number, size, levels, times, missing frames."""
@@ -205,7 +201,6 @@ def inspect(
             raise InputError("a TEST.toml stands for the frames of its reference: give it alone, or frames and --test")
         test, frames = frames[0], []
     settings = None if test is None else read_test(test)
-    explain_first_run()
     with progress_of("inspecting") as progress:
         inspection = inspect_files(
             frames,
@@ -235,12 +230,8 @@ def inspect(
 @app.command()
 def resolution(
     test: Test,
-    sizes: Annotated[
-        str, Option(help="Element sizes in px, such as 10,16,25,40; else those that suit the speckle.")
-    ] = "",
-    gauges: Annotated[
-        str, Option(help="Lengths of virtual strain gauges in px; else three elements of each size.")
-    ] = "",
+    sizes: Annotated[str, Option(help="Element sizes in px, such as 10,16,25; else those that suit the speckle.")] = "",
+    gauges: Annotated[str, Option(help="Lengths of virtual strain gauges, px; else three elements of each size.")] = "",
     frames: Annotated[str, Option(help="Frames, such as 5,10:20, among which the key frame is; else five.")] = "",
     out: Annotated[Path | None, Option(help="Folder for resolution.csv, .json and .png.")] = None,
     overwrite: Overwrite = False,
@@ -257,7 +248,6 @@ def resolution(
     chosen = command.read_frames(frames) or []
     lengths = command.read_lengths(gauges, "--gauges")
     asked = command.read_lengths(sizes, "--sizes")
-    explain_first_run()
     with progress_of("resolution") as progress:
         study = study_sizes(settings, asked, gauges=lengths or None, frames=chosen, progress=progress)
     static = f"{study.static} static frames" if study.static else "no static frames: noise is as stated, not measured"

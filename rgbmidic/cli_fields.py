@@ -10,8 +10,7 @@ import typer
 from typer import Option
 
 from rgbmidic import command
-from rgbmidic.errors import InputError
-from rgbmidic.extras import optional
+from rgbmidic.errors import InputError, optional
 
 app = typer.Typer()
 
@@ -32,9 +31,7 @@ _TIP: dict[str, Any] = {
     "poissons_ratio": Annotated[float | None, Option(help="For --tip.")],
     "plane": Annotated[str | None, Option(help="For --tip: stress or strain.")],
     "terms": Annotated[int | None, Option(help="Highest term of Williams' series; 0: automatic.")],
-    "fit_tip": Annotated[
-        bool | None, Option("--fit-tip/--mesh-tip", help="Fit the position of the tip along the crack.")
-    ],
+    "fit_tip": Annotated[bool | None, Option("--fit-tip/--mesh-tip", help="Fit the tip's position along the crack.")],
 }
 """Keys of ``[probes]`` that are of a crack's tip."""
 _PROBE_OPTIONS: dict[str, Any] = {
@@ -87,9 +84,7 @@ def history(
     opened: command.Opened,
     probes: dict[str, Any],
     channels: dict[str, Any],
-    out: Annotated[
-        Path | None, Option(help="CSV file to write; a picture gets the same name. Else printed only.")
-    ] = None,
+    out: Annotated[Path | None, Option(help="CSV file to write; a picture gets its name. Else printed only.")] = None,
     px: command.Pixels = False,
     overwrite: command.Overwrite = False,
 ) -> None:
@@ -184,9 +179,7 @@ def movie(
     frames: _Frames = "",
     fps: Annotated[float, Option(help="Frames per second of the movie.")] = 15.0,
     over: Annotated[str, Option(help="reference, or frame (the raw frames, deformed).")] = "reference",
-    curve: Annotated[
-        Path | None, Option(help="CSV of `rgbmidic history` or of channels: a curve with a cursor.")
-    ] = None,
+    curve: Annotated[Path | None, Option(help="CSV of `rgbmidic history` or channels: a curve with a cursor.")] = None,
     column: Annotated[str | None, Option(help="Column of --curve; by default the first.")] = None,
     offset: Annotated[float, Option(metavar="S", help="Time added to the channels, s.")] = 0.0,
     colours: Annotated[str | None, Option(help="Name of a matplotlib colour map.")] = None,

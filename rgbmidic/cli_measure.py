@@ -12,7 +12,7 @@ import typer
 from typer import Argument, Option
 
 from rgbmidic import command
-from rgbmidic.command import Draw, Out, Overwrite, Test, Workers, explain_first_run, note, progress_of
+from rgbmidic.command import Draw, Out, Overwrite, Test, Workers, note, progress_of
 from rgbmidic.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,9 +28,7 @@ def run(
     out: Out,
     overwrite: Overwrite = False,
     resume: Annotated[bool, Option("--resume", help="Continue the interrupted run in DIR.")] = False,
-    retry_failed: Annotated[
-        bool, Option("--retry-failed", help="With --resume: measure all failed frames again.")
-    ] = False,
+    retry_failed: Annotated[bool, Option("--retry-failed", help="With --resume: repeat all failed frames.")] = False,
     frames: Annotated[str, Option(help="Only these, such as 1000:2000; end with `rgbmidic finish`.")] = "",
     workers: Workers = 0,
     scheduler: Annotated[str | None, Option(help="Address of a Dask scheduler.")] = None,
@@ -46,7 +44,6 @@ def run(
     chosen = read_range(frames, "--frames") if frames else None
     if overwrite and (resume or frames):
         raise InputError("--overwrite begins anew, --resume and --frames go on: state one of them")
-    explain_first_run()
     with progress_of("measuring") as progress, _continuation_hint(test, out, frames, resume=resume):
         result = measure(
             settings,
@@ -103,7 +100,6 @@ def batch(
         if reports and (measured or not (result.path / REPORT).is_file()):
             write_report(result, result.path / REPORT, settings=settings, overwrite=True)
 
-    explain_first_run()
     outcomes = []
     with progress_of("batch") as progress:
         for outcome in series.run_batch(
@@ -121,9 +117,7 @@ def batch(
             note(f"{outcome.name}: {outcome.reason or ('measured' if outcome.measured else 'measured before')}")
     print(f"table: {out / 'summary.csv'}   page: {out / 'summary.html'}")
     if failed := [outcome.name for outcome in outcomes if outcome.reason]:
-        raise typer.Exit(
-            command.fail(f"{len(failed)} of {len(outcomes)} tests failed: {', '.join(failed)}", command.FAILURE)
-        )
+        raise typer.Exit(command.fail(f"{len(failed)} of {len(outcomes)} tests failed: {', '.join(failed)}"))
 
 
 @app.command()
@@ -159,7 +153,7 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
     if len(failed) > len(result.deformed) / 2 or not result.deformed:
         first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}" if failed else "there is none"
         count = f"{len(failed)} of {len(result.deformed)} deformed frames failed or did not converge"
-        raise typer.Exit(command.fail(f"{count}; {first}", command.FAILURE))
+        raise typer.Exit(command.fail(f"{count}; {first}"))
 
 
 @contextmanager

@@ -9,8 +9,7 @@ import typer
 from typer import Argument, Option
 
 from rgbmidic import command
-from rgbmidic.errors import InputError
-from rgbmidic.extras import optional
+from rgbmidic.errors import InputError, optional
 
 app = typer.Typer()
 
@@ -23,9 +22,7 @@ def figures(
     derived: dict[str, Any],
     out: Annotated[Path | None, Option(help="Folder for the pictures; by default RESULT/figures.")] = None,
     frames: Annotated[str, Option(help="Such as 0,5,10:20; by default three frames.")] = "",
-    fields: Annotated[
-        str, Option("--field", help="Fields to map, with their uncertainty, such as exx,velocity,magnitude.")
-    ] = "",
+    field: Annotated[str, Option(help="Fields to map, with their uncertainty, such as exx,velocity,magnitude.")] = "",
     hatch: Annotated[bool, Option("--hatch", help="Hatch values within 2 standard uncertainties of 0.")] = False,
 ) -> None:
     """Draw a result: maps, masks and reflections of some frames, curves over all frames, or any fields."""
@@ -36,8 +33,8 @@ def figures(
     if derived["measure"] is None and settings is not None:
         derived["measure"] = settings.probes.measure
     maps = opened.maps(derived)
-    if fields:
-        files = write_maps(maps, [name.strip() for name in fields.split(",")], folder, chosen, hatched=hatch)
+    if field:
+        files = write_maps(maps, [name.strip() for name in field.split(",")], folder, chosen, hatched=hatch)
     elif hatch:
         raise InputError("--hatch needs a --field")
     else:
@@ -100,9 +97,7 @@ def view(
 @command.opened_result
 def compare(
     opened: command.Opened,
-    fe: Annotated[
-        Path, Option("--fe", help="Simulation: .vtu, .pvd or a folder of such files, or .csv by node numbers.")
-    ],
+    fe: Annotated[Path, Option(help="Simulation: .vtu, .pvd or a folder of such files, or .csv by node numbers.")],
     out: command.Out,
     mesh: Annotated[Path | None, Option(help="Mesh file with the nodes of a .csv.")] = None,
     points: Annotated[

@@ -18,12 +18,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import wraps
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from typer import Argument, Option
+from typer.core import TyperGroup
 
 from rgbmidic.errors import InputError, RgbmidicError, disk_reason, shortened
 
@@ -33,8 +35,6 @@ if TYPE_CHECKING:
 
 BAD_INPUT, FAILURE, INTERRUPTED = 2, 1, 130
 REQUIRED = inspect.Parameter.empty
-HELP = {"help_option_names": ["-h", "--help"]}
-"""Context of both commands and of what they consist of."""
 
 messages = Console(stderr=True)
 
@@ -47,9 +47,7 @@ Test = Annotated[Path, Argument(metavar="TEST.toml", help="Settings of the test.
 Workers = Annotated[int, Option(min=0, help="Frames at a time; 0: as many as cores.")]
 
 FRAME_OPTIONS: dict[str, Any] = {
-    "kind": Annotated[
-        str | None, Option(help="bayer, rgb (3-CCD) or monochrome; else as the files state, else bayer.")
-    ],
+    "kind": Annotated[str | None, Option(help="bayer, rgb (3-CCD), monochrome; else as the files state, else bayer.")],
     "cfa": Annotated[str | None, Option(help="Bayer pattern RGGB, BGGR, GRBG or GBRG.")],
     "black_level": Annotated[float | None, Option(help="Grey level of a dark sample, DN.")],
     "white_level": Annotated[float | None, Option(help="Smallest saturated grey level, DN.")],
@@ -57,6 +55,18 @@ FRAME_OPTIONS: dict[str, Any] = {
     "dtype": Annotated[str | None, Option(help="uint8, uint16 or >u2, of a headerless file.")],
 }
 """Options that state what the files of frames do not, by the keys of ``[frames]``."""
+
+
+def application(name: str, cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
+    """An application whose help is plain text and whose errors `main` reports."""
+    return typer.Typer(
+        name=name,
+        cls=cls,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
 
 
 def main(app: typer.Typer) -> None:
@@ -94,13 +104,13 @@ def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> i
         if (usage := getattr(error, "format_message", None)) is not None:  # typer's own, whichever click it brings
             return fail(usage() or str(error), BAD_INPUT)
         if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
-            return fail(disk_reason(error), FAILURE)
-        return fail(f"{type(error).__name__}: {error} (run again with --debug for the details)", FAILURE)
+            return fail(disk_reason(error))
+        return fail(f"{type(error).__name__}: {error} (run again with --debug for the details)")
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
-def fail(message: str, status: int) -> int:
+def fail(message: str, status: int = FAILURE) -> int:
     """Print an error as one line; gives the status back."""
     print(f"error: {shortened(' '.join(message.split()))}", file=sys.stderr)
     return status
@@ -189,18 +199,13 @@ def read_frames(text: str, option: str = "--frames") -> list[int] | None:
     InputError
         It is something else.
     """
-    chosen = list[int]()
-    for part in text.split(",") if text else ():
-        low, colon, high = (side.strip() for side in part.partition(":"))
-        known = low.isdecimal() and len(low + high) < 16 and (high.isdecimal() if colon else not high)
-        frames = range(int(low), int(high) if colon else int(low) + 1) if known else range(0)
-        if not 0 < len(frames) <= 10**7 - len(chosen):  # more are a slip
-            chosen.clear()
-            break
-        chosen += frames
-    if text and not chosen:
+    if not text:
+        return None
+    parts = [re.fullmatch(r"\s*(\d{1,15})\s*(?::\s*(\d{1,15})\s*)?", part) for part in text.split(",")]
+    ranges = [range(int(part[1]), int(part[2] or int(part[1]) + 1)) for part in parts if part]
+    if len(ranges) < len(parts) or not all(ranges) or sum(map(len, ranges)) > 10**7:  # more are a slip
         raise InputError(f"{option} are indices and ranges such as 0,5,10:20 (10 to 19), not {text!r}")
-    return chosen or None
+    return [*chain(*ranges)]
 
 
 _EXAMPLES = {
@@ -333,17 +338,6 @@ def note(text: str) -> None:
     messages.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
-def explain_first_run() -> None:
-    """Print why the first run takes longer."""
-    from rgbmidic._kernels import are_compiled
-
-    if not are_compiled():
-        note(
-            "first run on this machine: kernels are compiled for its processor as they are needed, in all 15 to 40 s; "
-            "later runs take them from a cache"
-        )
-
-
 def print_table(title: str, headings: list[str], rows: list[list[str]], words: Mapping[str, str] | None = None) -> None:
     """Print a table on stdout, and below it what words of its heading mean.
 
@@ -367,10 +361,18 @@ def print_table(title: str, headings: list[str], rows: list[list[str]], words: M
 def progress_of(what: str) -> Iterator[Callable[[int, int, str], None]]:
     """A bar on stderr, and the function that moves it: frames done, their total, a line about the last one.
 
-    Nothing is shown where nobody watches: an error stays one line, a log file stays short.
+    Nothing is shown where nobody watches: an error stays one line, a log file stays short. A first run is told why it
+    takes longer.
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from rgbmidic._kernels import are_compiled
+
+    if not are_compiled():
+        note(
+            "first run on this machine: kernels are compiled for its processor as they are needed, in all 15 to 40 s; "
+            "later runs take them from a cache"
+        )
     rate, last = TextColumn("{task.fields[rate]}"), TextColumn("{task.fields[line]}", markup=False)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), rate, TimeRemainingColumn(), last)
     with Progress(*columns, console=messages, transient=True, disable=not messages.is_terminal) as bar:

@@ -8,6 +8,8 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
 
 _LONG_WORD, _LONGEST = re.compile(r"\S{1000,}"), 4000
 """Characters that no name of a file or key has (Linux allows 255 for a name), and a screenful of them."""
@@ -85,3 +87,19 @@ def disk_faults(kind: type[RgbmidicError], what: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise kind(f"{what}: {disk_reason(error)}") from None
+
+
+def optional(module: str, extra: str) -> Any:
+    """A module that needs packages of an extra.
+
+    Raises
+    ------
+    InputError
+        They are not installed.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("rgbmidic"):
+            raise
+        raise InputError(f'this needs the package {error.name}: pip install "rgbmidic[{extra}]"') from None

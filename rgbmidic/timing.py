@@ -18,22 +18,8 @@ STAGES = ("reading", "separation", "preparation", "search", "weights", "equation
 reference and the weights from it; Hessian and factors; Gauss-Newton; the field and its uncertainty; all other work."""
 
 
-class _Clock:
-    """Clock of one frame: every switch adds the time since the last one to the stage that was on."""
-
-    def __init__(self) -> None:
-        self.seconds = dict.fromkeys(STAGES, 0.0)
-        self._on, self._since = "rest", time.perf_counter()
-
-    def switch(self, name: str) -> str:
-        """Switch to a stage and return the one before."""
-        before, now = self._on, time.perf_counter()
-        self.seconds[before] += now - self._since
-        self._on, self._since = name, now
-        return before
-
-
-_clock: ContextVar[_Clock | None] = ContextVar("clock", default=None)
+_on: ContextVar[tuple[str, dict[str, float]] | None] = ContextVar("on", default=None)
+"""Stage that is on, and the seconds of all."""
 
 
 @contextmanager
@@ -42,27 +28,28 @@ def timed(wanted: bool = True) -> Iterator[dict[str, float]]:
     if not wanted:
         yield {}
         return
-    clock = _Clock()
-    token = _clock.set(clock)
+    seconds = dict.fromkeys(STAGES, 0.0)
+    token = _on.set(("rest", seconds))
     try:
-        yield clock.seconds
+        with stage("rest"):
+            yield seconds
     finally:
-        clock.switch("rest")
-        _clock.reset(token)
+        _on.reset(token)
 
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
     """Count the time within the block, or of the function decorated, to a stage of `STAGES`."""
-    clock = _clock.get()
-    if clock is None:
+    if (outer := _on.get()) is None:
         yield
         return
-    before = clock.switch(name)
+    _, seconds = outer
+    token, started, counted = _on.set((name, seconds)), time.perf_counter(), sum(seconds.values())
     try:
         yield
-    finally:
-        clock.switch(before)
+    finally:  # without what the stages within have counted
+        seconds[name] += time.perf_counter() - started - (sum(seconds.values()) - counted)
+        _on.reset(token)
 
 
 def each(name: str, items: Iterable[T]) -> Iterator[T]:

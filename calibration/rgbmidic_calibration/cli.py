@@ -18,13 +18,7 @@ if TYPE_CHECKING:
     from rgbmidic.settings import FrameSettings
     from rgbmidic_calibration.captures import Captures
 
-app = typer.Typer(
-    name="rgbmidic-calibrate",
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings=command.HELP,
-)
+app = command.application("rgbmidic-calibrate")
 
 Out = Annotated[Path, Option(help="Calibration file to write (JSON).")]
 Region = Annotated[str | None, Option(help="x0,y0,x1,y1 in px: region of the speckled target.")]

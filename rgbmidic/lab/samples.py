@@ -15,8 +15,7 @@ from pathlib import Path
 from types import MappingProxyType
 from urllib.parse import quote
 
-from rgbmidic.errors import InputError
-from rgbmidic.extras import optional
+from rgbmidic.errors import InputError, optional
 from rgbmidic.results.files import writing
 
 ADDRESS = "https://raw.githubusercontent.com"

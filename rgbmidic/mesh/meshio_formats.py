@@ -14,8 +14,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from rgbmidic.errors import InputError
-from rgbmidic.extras import optional
+from rgbmidic.errors import InputError, optional
 from rgbmidic.mesh.content import CORNERS, MOST_BYTES, MeshContent, sized, unique
 from rgbmidic.mesh.vtu import NUMBERS, labels_of
 from rgbmidic.typing import IntArray

@@ -12,10 +12,10 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from rgbmidic.extras import optional
+from rgbmidic.errors import optional
 from rgbmidic.report import style
+from rgbmidic.report.document import render
 from rgbmidic.report.figures import spread
-from rgbmidic.report.page import render
 from rgbmidic.results.comparison import QUANTITIES, WAYS, Comparison, FrameComparison
 from rgbmidic.results.files import write_complete, write_table, writing
 from rgbmidic.text import uncertain
@@ -24,8 +24,6 @@ from rgbmidic.typing import FloatArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from rgbmidic.results.comparison import Fit
 
 PAGE, TABLE, SCALE, INDEX = "comparison.html", "comparison.csv", "scale.csv", "comparison.pvd"
 
@@ -114,7 +112,11 @@ def write_comparison(
         for (way, name), one in made.agreement.items():
             what = {"way": way, "quantity": name, "unit": "1" if name[0] == "e" else "mm"}
             tables[TABLE].append(head | what | asdict(one))
-        tables[SCALE].append(head | _scale_columns(made.fit))
+        fit, names = made.fit, ("rigid_u_mm", "rigid_v_mm", "rigid_rotation_deg")
+        rigid = zip(names, fit.rigid.tolist(), fit.rigid_std.tolist(), strict=True)
+        row = head | {"scale": fit.scale, "scale_std": fit.scale_std}
+        row |= {key: number for name, value, std in rigid for key, number in ((name, value), (f"{name}_std", std))}
+        tables[SCALE].append(row | {"chi_square_of_the_rest": fit.chi_square})
         if progress is not None:
             progress(len(done), len(comparison.frames), "frames")
     sets = "".join(f'<DataSet timestep="{one.time:.12g}" file={quoteattr(_state(one.frame))}/>' for one in done)
@@ -124,14 +126,6 @@ def write_comparison(
     for name, text in {INDEX: index, PAGE: _page(comparison, done)}.items():
         write_complete(out / name, methodcaller("write", text.encode()))
     return done
-
-
-def _scale_columns(fit: Fit) -> dict[str, float]:
-    row = {"scale": fit.scale, "scale_std": fit.scale_std}
-    names = ("rigid_u_mm", "rigid_v_mm", "rigid_rotation_deg")
-    for name, value, std in zip(names, fit.rigid.tolist(), fit.rigid_std.tolist(), strict=True):
-        row |= {name: value, f"{name}_std": std}
-    return row | {"chi_square_of_the_rest": fit.chi_square}
 
 
 def _write_state(comparison: Comparison, made: FrameComparison, path: Path) -> None:
@@ -193,8 +187,7 @@ def difference_figure(
             if whole.any():
                 drawn = Triangulation(mesh.points[:, 0], mesh.points[:, 1], mesh.elements, ~whole)
                 axis.tripcolor(drawn, np.where(known, values, 0), cmap="RdBu_r", norm=norm, shading="gouraud")
-            beyond = bool((values[known] < -reach).any()), bool((values[known] > reach).any())
-            style.add_colour_bar(axis, norm, "RdBu_r", beyond=beyond)
+            style.add_colour_bar(axis, norm, "RdBu_r", shown=values[known])
             style.finish_picture(axis, (low[0], high[0]), (high[1], low[1]), first=axis is axes[0], unit="mm")
             axis.set_title(f"{name}{unit}, {_TITLES[way]}")
 

@@ -1,24 +1,30 @@
-"""Figures over time: quantiles of the nodal fields over the frames, and what probes read off a result."""
+"""Curves over time: quantiles of the nodal fields over the frames, what probes read off a result, and channels."""
 
 from __future__ import annotations
 
+import csv
 import logging
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rgbmidic.errors import InputError
 from rgbmidic.report import style
 from rgbmidic.report.figures import field_colours, spread
-from rgbmidic.report.summary import NoiseFloor, TimeHistory
-from rgbmidic.results import QUANTITIES, Histories, History, Profile, Wave
+from rgbmidic.results import QUANTITIES, Channels, Histories, History, Maps, Profile, Wave
 from rgbmidic.text import uncertain
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from rgbmidic.results.physical import Physical
 
 logger = logging.getLogger(__name__)
 
@@ -30,8 +36,96 @@ _KIND = re.compile(
 _KIND_OF_UNIT = {"deg": "rotation", "": "strain", "MPa √m": "K", "MPa": "T-stress"}
 
 
+class TimeHistory:
+    """Quantiles over the nodes of the fields of some frames, read one frame after the other.
+
+    Parameters
+    ----------
+    physical
+        The result in the units of its scale.
+    frames
+        Indices of the frames in the result.
+
+    Attributes
+    ----------
+    frames : tuple of int, length F
+        Indices of the frames in the result.
+    axis : tuple of ndarray, shape (F,), and str
+        Times, or numbers of the frames where no time is known, and the label of the axis.
+    timed : bool
+        Whether the times are known.
+    fields : dict
+        What each quantity is.
+    quantiles : dict
+        Of each quantity the 5 %, 50 % and 95 % quantile over the nodes, shape (F, 3); NaN where nothing is measured.
+    fractions : ndarray, shape (F, S)
+        Fraction of the nodes with each `node_status`.
+    fastest : float
+        Largest velocity of a node between two neighbouring ones of these frames, px per unit of time; 0 where unknown.
+
+    Raises
+    ------
+    ResultError
+        A frame is damaged.
+    """
+
+    def __init__(self, physical: Physical, frames: Sequence[int]) -> None:
+        self.frames, self.timed, times = tuple(frames), physical.units.timed, physical.times[list(frames)]
+        read = ("u", "v", "u_std", "v_std", "exx", "eyy", "exy", "exx_std", "eyy_std", "exy_std", "misfit")
+        self.axis = style.time_axis(times if self.timed else None, physical.result.number[list(frames)])
+        self.fields = Maps(result=physical.result, physical=physical).all
+        self.quantiles = {name: np.full((len(times), 3), np.nan) for name in read}
+        self.fractions = np.empty((len(times), len(QUANTITIES["node_status"].codes)))
+        self.fastest, before = 0.0, np.array(np.nan)
+        for place, frame in enumerate(frames):
+            values = physical.frame(frame)
+            for name, quantiles in self.quantiles.items():
+                if (known := values[name][np.isfinite(values[name])]).size:
+                    quantiles[place] = np.quantile(known, (0.05, 0.5, 0.95))
+            codes = range(self.fractions.shape[1])
+            self.fractions[place] = [(values["node_status"] == code).mean() for code in codes]
+            here = np.stack([values["u"], values["v"]]) / physical.length
+            if place:
+                step = np.hypot(*(here - before)) / (times[place] - times[place - 1])
+                self.fastest = max(self.fastest, float(np.nan_to_num(step).max(initial=0)))
+            before = here
+
+    def typical(self, name: str) -> FloatArray:
+        """Return the quantiles over the nodes of a quantity, medians of the frames (3,); NaN where it is in none."""
+        known = self._known(name)
+        return np.asarray(np.median(known, axis=0)) if len(known) else np.full(3, np.nan)
+
+    def extreme(self, name: str) -> float:
+        """Return the value farthest from 0 of a quantity's median over the nodes; NaN where nothing is measured."""
+        return float(max(self._known(name)[:, 1], key=abs, default=np.nan))
+
+    def _known(self, name: str) -> FloatArray:
+        rows = self.quantiles[name]
+        return np.asarray(rows[np.isfinite(rows).all(axis=1)])
+
+    def key_frames(self, count: int) -> tuple[int, ...]:
+        """Select frames between which the field changes by about as much: its quantiles' path in equal parts."""
+        fields = np.stack([self.quantiles[name] for name in ("u", "v")])
+        seen = np.flatnonzero(np.isfinite(fields).all(axis=(0, 2)))
+        if not len(seen):
+            return ()
+        path = np.cumsum(np.abs(np.diff(fields[:, seen], axis=1, prepend=0)).sum(axis=(0, 2)))  # from rest
+        places = np.searchsorted(path, path[-1] * np.arange(1, count + 1) / count * (1 - 1e-9))
+        return tuple(self.frames[seen[place]] for place in sorted({*places.tolist()}))
+
+    @property
+    def farthest(self) -> int:
+        """The frame whose median displacement is the largest."""
+        length = np.hypot(self.quantiles["u"][:, 1], self.quantiles["v"][:, 1])
+        return self.frames[int(np.nan_to_num(length).argmax())]
+
+
 def medians_figure(
-    history: TimeHistory, panels: Mapping[str, Sequence[str]], *, band: bool = False, floor: NoiseFloor | None = None
+    history: TimeHistory,
+    panels: Mapping[str, Sequence[str]],
+    *,
+    band: bool = False,
+    floor: Mapping[str, float] | None = None,
 ) -> Figure:
     """Draw the median over the nodes of quantities over the frames, a panel for each label.
 
@@ -46,12 +140,18 @@ def medians_figure(
                 look: dict[str, Any] = {"color": style.OKABE_ITO[colour], "linestyle": line}
                 low, median, high = history.quantiles[name].T
                 axis.plot(
-                    times, median, linewidth=1.2, label=history.symbols[name], marker=marker, markersize=2.5, **look
+                    times,
+                    median,
+                    linewidth=1.2,
+                    label=history.fields[name].symbol,
+                    marker=marker,
+                    markersize=2.5,
+                    **look,
                 )
                 if band:
                     axis.fill_between(times, low, high, color=look["color"], alpha=0.18, linewidth=0)
-                if floor is not None:
-                    axis.axhline(floor.measured[name.removesuffix("_std")], linewidth=0.6, **look)
+                if floor:
+                    axis.axhline(floor[name.removesuffix("_std")], linewidth=0.6, **look)
             if not band:
                 axis.set_ylim(bottom=0)
             axis.legend(loc="best")
@@ -188,14 +288,13 @@ def profile_figure(profile: Profile, wave: Wave | None = None, shown: Sequence[i
     rows = list(shown) or _rows_shown(profile.values)
     colours = field_colours(profile.field)
     known = style.ordinary_values(profile.values, profile.std)
-    low, high = profile.field.ends or style.colour_range(known)
+    norm = Normalize(*(profile.field.ends or style.colour_range(known)))
 
     def draw(axes: list[Axes]) -> None:
         above, below = axes
-        norm, beyond = Normalize(low, high), (bool(known.min() < low), bool(known.max() > high))
         look: dict[str, Any] = {"cmap": colours, "norm": norm, "rasterized": True, "shading": "nearest"}
         above.pcolormesh(times, profile.positions, profile.values.T, **look)
-        style.add_colour_bar(above, norm, colours, beyond=beyond)
+        style.add_colour_bar(above, norm, colours, shown=known)
         above.set_title(field)
         if wave is not None:
             used = wave.front.used
@@ -253,3 +352,72 @@ def wave_text(profile: Profile, wave: Wave) -> str:
         speed, std, unit = speed / 1000, std / 1000, "m/s"
     fit = f"chi-square {front.chi_square:.3g} of {front.freedom}"
     return f"{wave.what} of {profile.field.symbol}: {uncertain(speed, std, unit)} ({fit})"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Curve:
+    """A quantity over time that is shown beside the maps.
+
+    Attributes
+    ----------
+    name
+        Label of its axis.
+    times : ndarray, shape (n,)
+        In seconds; indices of frames where `timed` is false.
+    values : ndarray, shape (n,)
+    timed
+        Whether `times` are seconds.
+    """
+
+    name: str
+    times: FloatArray
+    values: FloatArray
+    timed: bool
+
+    @classmethod
+    def read(cls, path: Path | str, column: str | None = None, offset: float = 0.0) -> Curve:
+        """Read a column of a file that ``rgbmidic history`` wrote, or a channel of a file of channels.
+
+        Parameters
+        ----------
+        path
+            CSV file.
+        column
+            Its name; None: the first that holds a quantity.
+        offset
+            Seconds that are added to the times of channels.
+
+        Returns
+        -------
+        Curve
+
+        Raises
+        ------
+        InputError
+            The file is no such table or has no such column, or an offset is stated for a history.
+        """
+        path = Path(path)
+        with suppress(OSError, UnicodeDecodeError), path.open(encoding="utf-8-sig", newline="") as file:
+            rows = csv.reader(file)
+            head = next(rows, [])
+            if head[:3] == ["frame", "number", "status"]:
+                timed = "time_s" in head
+                names = [name for name in head[3:] if name != "time_s" and not name.endswith("_std")]
+                name = _chosen(path, column, names)
+                wanted = [head.index("time_s" if timed else "frame"), head.index(name)]
+                try:
+                    table = np.array([[float(row[at] or "nan") for at in wanted] for row in rows]).reshape(-1, 2)
+                except (ValueError, IndexError):
+                    raise InputError(f"the table {path} is damaged: a row is not numbers") from None
+                if offset:
+                    raise InputError(f"an offset is of channels; {path} is a history, by the frames' own clock")
+                return cls(name=name, times=table[:, 0], values=table[:, 1], timed=timed)
+        channels = Channels.read(path, offset)
+        name = _chosen(path, column, list(channels.values))
+        return cls(name=name, times=channels.times, values=channels.values[name], timed=True)
+
+
+def _chosen(path: Path, column: str | None, names: list[str]) -> str:
+    if column not in (None, *names) or not names:
+        raise InputError(f'{path} has no column "{column}"; it has {", ".join(names) or "none"}')
+    return column or names[0]

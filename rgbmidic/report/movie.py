@@ -9,6 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,11 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.picture import paint_field
-from rgbmidic.errors import InputError, ResultError, RgbmidicError
-from rgbmidic.extras import optional
+from rgbmidic.errors import InputError, ResultError, RgbmidicError, optional
 from rgbmidic.report import style
+from rgbmidic.report.curves import Curve
 from rgbmidic.report.figures import field_colours, picture_limits, spread
-from rgbmidic.report.movie_curve import Curve
 from rgbmidic.report.video import PALETTE, Page, gif, video
 from rgbmidic.results import QUANTITIES, Maps, Quantity, frame_times
 from rgbmidic.results.files import check_file, write_complete
@@ -68,12 +68,20 @@ class MovieConstants:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Panel:
-    """A field, the values of its first and last colour, their name, and whether there are values below or above."""
+    """A field, the values of its first and last colour, their name, and the smallest and largest value."""
 
     field: Quantity
     ends: _Span
     colours: str
-    beyond: tuple[bool, bool]
+    extremes: FloatArray
+
+    def packed(self, solid: int) -> npt.NDArray[np.uint32]:
+        """Return the colours, so many 256ths of each, as `paint_field` takes them."""
+        from matplotlib import colormaps
+
+        shades = colormaps[self.colours](np.arange(PALETTE) / (PALETTE - 1))[:, :3].T
+        red, green, blue = (255 * shades).astype(np.uint32) * np.uint32(solid) >> np.uint32(8)
+        return np.asarray(red | green << 8 | blue << 16 | np.uint32(0xFF000000))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -129,7 +137,9 @@ class Movie:
             given = f"{self.width} px and {self.opacity:g}"
             raise InputError(f"a movie has 320 to 7680 px and an opacity of 0 to 1, not {given}")
         result = self.maps.result
-        if beyond := [frame for frame in self.chosen if not 0 <= frame < len(result)] or not self.chosen:
+        if not self.chosen:
+            raise InputError(f"none of the frames of {result.path} is measured")
+        if beyond := [frame for frame in self.chosen if not 0 <= frame < len(result)]:
             raise InputError(f"there is no frame {beyond} in {result.path}, which has {len(result)} frames")
         for low, high in self.stated.values():
             if not low < high:
@@ -176,9 +186,9 @@ class Movie:
             known = np.concatenate(ordinary)
             if not known.size:
                 raise InputError(f"{name} is measured in none of the frames of {result.path}")
-            low, high = self.stated.get(name) or field.ends or style.colour_range(known)
-            beyond, colours = (bool(known.min() < low), bool(known.max() > high)), self.colours or field_colours(field)
-            panels.append(_Panel(field=field, ends=(low, high), colours=colours, beyond=beyond))
+            ends, colours = self.stated.get(name) or field.ends or style.colour_range(known), self.colours
+            extremes = np.array([known.min(), known.max()])
+            panels.append(_Panel(field=field, ends=ends, colours=colours or field_colours(field), extremes=extremes))
         return tuple(panels), picture_limits(result, np.concatenate(corners))
 
 
@@ -255,7 +265,6 @@ class _Canvas:
     """A page that is drawn once, and the parts of it that change from frame to frame."""
 
     def __init__(self, movie: Movie) -> None:
-        from matplotlib import colormaps
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.colors import Normalize
 
@@ -266,7 +275,7 @@ class _Canvas:
             for axis, panel in zip(axes, panels, strict=False):
                 style.finish_picture(axis, x, y, first=axis is axes[0], unit=unit, factor=factor)
                 axis.set_title(style.literal(panel.field.label))
-                style.add_colour_bar(axis, Normalize(*panel.ends), panel.colours, beyond=panel.beyond)
+                style.add_colour_bar(axis, Normalize(*panel.ends), panel.colours, shown=panel.extremes)
             if (curve := movie.curve) is not None:
                 times, label = style.time_axis(curve.times if curve.timed else None, curve.times)
                 axes[-1].plot(times, curve.values, linewidth=1, color=style.OKABE_ITO["blue"])
@@ -287,37 +296,32 @@ class _Canvas:
         self._bare = canvas.copy_from_bbox(self.figure.bbox)
         boxes = [axis.get_window_extent() for axis in self.figure.axes[: len(panels)]]
         height = self.figure.bbox.height  # boxes are from the bottom of the page
-        self._boxes = []
-        for box in boxes:
-            ends = (height - box.y1, height - box.y0), (box.x0, box.x1)
-            rows, columns = (slice(int(np.ceil(low)) + 1, int(high) - 1) for low, high in ends)
-            self._boxes.append((rows, columns))
-        # px of the image to a pixel of a panel, and the place of its first pixel: in the first one, whose size all have
-        (rows, columns), box = self._boxes[0], boxes[0]
-        across, down = columns.start + 0.5 - box.x0, rows.start + 0.5 - (height - box.y1)
+        starts = np.ceil([(height - box.y1, box.x0) for box in boxes]).astype(int) + 1
+        stops = np.array([(height - box.y0, box.x1) for box in boxes]).astype(int) - 1
+        rows, columns = (stops - starts).min(axis=0).tolist()  # panels of one size, however their edges are rounded
+        self._size = rows, columns
+        self._boxes = [(slice(top, top + rows), slice(left, left + columns)) for top, left in starts.tolist()]
+        # px of the image to a pixel of a panel, and the place of its first pixel, as in the first panel
+        (top, left), box = starts[0].tolist(), boxes[0]
+        across, down = left + 0.5 - box.x0, top + 0.5 - (height - box.y1)
         self._step = step = (x[1] - x[0]) / box.width
         self._first = x[0] + step * across, y[0] + step * down
-        solid = np.uint32(round(256 * movie.opacity))
-        self._grey_part = 256 - int(solid)
-        self._packed = []
-        for panel in panels:
-            shades = colormaps[panel.colours](np.arange(PALETTE) / (PALETTE - 1))[:, :3].T
-            red, green, blue = (255 * shades).astype(np.uint32) * solid >> np.uint32(8)
-            self._packed.append(red | green << 8 | blue << 16 | np.uint32(0xFF000000))
+        solid = round(256 * movie.opacity)
+        self._grey_part, self._packed = 256 - solid, [panel.packed(solid) for panel in panels]
         if self._times is not None:  # as many decimals in all frames: a text that changes its length jumps
             factor, unit = style.time_unit(self._times)
             interval = factor * np.nanmedian(np.diff(self._times)) if len(self._times) > 1 else 1.0
             self._clock = factor, unit, max(0, int(np.ceil(-np.log10(interval) - 1e-9)))
         result = movie.maps.result
-        reference = None if result.reference is None else result.reference.mean(axis=0).astype(np.uint8)
-        self._reference = None if reference is None else self._resampled(reference, result.reference_origin)
+        self._reference = np.full(self._size, movie.constants.around, dtype=np.uint8)
+        if result.reference is not None:
+            reference = result.reference.mean(axis=0).astype(np.uint8)
+            self._reference = self._resampled(reference, result.reference_origin)
 
     def _resampled(self, image: AnyArray, origin: tuple[int, int] = (0, 0)) -> npt.NDArray[np.uint8]:
-        """Resample an image, which begins at `origin`, in the first panel; all have its size."""
-        rows, columns = self._boxes[0]
-        size = rows.stop - rows.start, columns.stop - columns.start
+        """Resample an image, which begins at `origin`, as it lies in the panels."""
         first = self._first[0] - origin[0], self._first[1] - origin[1]
-        return style.resampled(image, (self._step, self._step), first, size, self.movie.constants.around)
+        return style.resampled(image, (self._step, self._step), first, self._size, self.movie.constants.around)
 
     def mixtures(self) -> Iterator[Page]:
         """Yield for each panel its colours over all grey levels, as many pixels as a page has."""
@@ -348,12 +352,11 @@ class _Canvas:
         grey = self._reference if movie.images is None else self._resampled(movie.images(frame))
         for (rows, columns), part, packed in zip(self._boxes, self._panels, self._packed, strict=True):
             read = movie.maps.read(part.field.name, frame)
-            panel = np.empty((rows.stop - rows.start, columns.stop - columns.start), dtype=np.uint32)
-            under = np.full(panel.shape, movie.constants.around, dtype=np.uint8) if grey is None else grey
+            panel = np.empty(self._size, dtype=np.uint32)
             places = ((read.moved if movie.images is not None else result.nodes) - self._first).T / self._step
             x, y = (np.ascontiguousarray(axis, dtype=np.float64) for axis in places)
             paint_field(
-                panel, under, x, y, result.elements, read.values, *map(float, part.ends), packed, self._grey_part,
+                panel, grey, x, y, result.elements, read.values, *map(float, part.ends), packed, self._grey_part,
                 part.field.stepped,
             )  # fmt: skip
             page[rows, columns] = panel
@@ -365,16 +368,17 @@ def _pages(canvas: _Canvas, frames: list[int], processes: int) -> Iterator[Page]
     if processes == 1:
         yield from map(canvas.page, frames)
         return
-    context, started, ends = multiprocessing.get_context("spawn"), [], []
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which they inherit: Ctrl-C reaches all processes
-    try:
+    context, ends = multiprocessing.get_context("spawn"), []
+    with ExitStack() as ended:
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which they inherit: Ctrl-C reaches all processes
         try:
             for part in range(processes):
                 receive, send = context.Pipe(duplex=False)
                 process = context.Process(target=_draw, args=(canvas.movie, frames[part::processes], send), daemon=True)
                 process.start()
+                ended.callback(process.join)
+                ended.callback(process.terminate)
                 send.close()
-                started.append(process)
                 ends.append(receive)
         finally:
             signal.signal(signal.SIGINT, before)
@@ -386,10 +390,6 @@ def _pages(canvas: _Canvas, frames: list[int], processes: int) -> Iterator[Page]
             if isinstance(page, RgbmidicError):
                 raise page
             yield page
-    finally:
-        for process in started:
-            process.terminate()
-            process.join()
 
 
 def _draw(movie: Movie, frames: list[int], send: Any) -> None:

@@ -29,8 +29,6 @@ STYLE: dict[Any, Any] = {
     "axes.linewidth": 0.6,
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
-    "xtick.direction": "out",
-    "ytick.direction": "out",
     "legend.frameon": False,
 }
 LIGHT_COLOURS = {"red": "#c8102e", "green": "#1a7f37", "blue": "#1f5fbf"}
@@ -355,10 +353,10 @@ def add_colour_bar(
     colour_map: str | Colormap,
     *,
     label: str = "",
-    beyond: tuple[bool, bool] = (False, False),
+    shown: FloatArray | None = None,
     names: tuple[str, ...] = (),
 ) -> None:
-    """Add a colour bar beside a panel of `draw_figure`, pointed where there are values below or above its colours.
+    """Add a colour bar beside a panel of `draw_figure`, pointed where values `shown` are below or above its colours.
 
     Where the values are codes, `names` stand in place of the numbers from 0 on.
 
@@ -371,7 +369,10 @@ def add_colour_bar(
 
     width = axis.get_position().width * cast("Figure", axis.figure).get_figwidth()
     left, middle, right = (1 + inches / width for inches in (0.08, 0.14, 0.20))
-    low, high = (0.045 * end for end in beyond)  # of the height are points, as matplotlib's
+    ends = np.asarray([norm.vmin, norm.vmax], dtype=np.float64)
+    scaled = norm(ends if shown is None or not shown.size else shown)
+    pointed = scaled.min() < -1e-9, scaled.max() > 1 + 1e-9  # by more than rounding
+    low, high = (0.045 * end for end in pointed)  # of the height are points, as matplotlib's
     outline = [(left, low), (middle, 0), (right, low), (right, 1 - high), (middle, 1), (left, 1 - high)]
     bar = Polygon(outline, transform=axis.transAxes, fill=False, linewidth=0.6, clip_on=False)
     axis.add_patch(bar)
@@ -380,7 +381,6 @@ def add_colour_bar(
     colours.set_data((np.linspace(-low, 1 - low, 256) / (1 - low - high)).clip(0, 1)[:, None])
     colours.set_clip_path(bar)
     axis.add_artist(colours)
-    ends = np.asarray([norm.vmin, norm.vmax], dtype=np.float64)
     numbers = np.arange(len(names)) if names else MaxNLocator(6).tick_values(*ends)
     numbers = numbers[(numbers >= ends[0]) & (numbers <= ends[1])]
     heights = low + (1 - low - high) * np.asarray(norm(numbers))
@@ -416,13 +416,7 @@ def shade(
 
 
 def finish_picture(
-    axis: Axes,
-    x: tuple[float, float],
-    y: tuple[float, float],
-    *,
-    first: bool,
-    unit: str = "px",
-    factor: float = 1.0,
+    axis: Axes, x: tuple[float, float], y: tuple[float, float], *, first: bool, unit: str = "px", factor: float = 1.0
 ) -> None:
     """Set the limits of axes at one scale in both directions, y down where y[0] < y[1].
 

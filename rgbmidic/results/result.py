@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import InputError, ResultError
-from rgbmidic.extras import optional
+from rgbmidic.errors import InputError, ResultError, optional
 from rgbmidic.results.files import read_arrays, read_json
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK, digest, fingerprint, read_provenance
 from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, STACKED, FrameRecord

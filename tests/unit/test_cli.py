@@ -193,7 +193,7 @@ def test_a_termination_ends_a_run_in_the_background_of_a_script_too(
 def test_run_passes_everything_on_and_tells_what_came_out(
     command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
 ) -> None:
-    monkeypatch.setattr("rgbmidic.report.gallery.save_figure", lambda _, path: path.touch())
+    monkeypatch.setattr("rgbmidic.report.style.save_figure", lambda _, path: path.touch())
     calls: list[dict[str, Any]] = []
 
     def measure(
@@ -298,7 +298,7 @@ def test_figures_of_any_field(command: Run, tmp_path: Path) -> None:
 
 
 def test_figures_later(command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rgbmidic.report.gallery.save_figure", lambda _, path: path.touch())
+    monkeypatch.setattr("rgbmidic.report.style.save_figure", lambda _, path: path.touch())
     result = make_result(tmp_path / "result", frames=4)
     status, printed, _ = command("figures", result.path, "--frames", "0,2")
     assert status == 0

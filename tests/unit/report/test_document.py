@@ -19,7 +19,7 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.report import curves, document, remove_pictures, style, summary, write_batch_page, write_report
+from rgbmidic.report import curves, document, remove_pictures, style, write_batch_page, write_report
 from rgbmidic.results import UNKNOWN_TIME, FrameRecord, Maps, Result, ResultStore, read_profile
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import (
@@ -82,7 +82,7 @@ def settings(**sections: Any) -> TestSettings:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """No pictures: drawing them takes nearly all of the time."""
     monkeypatch.setattr(style, "embedded", lambda _: "data:image/png;base64,")
-    for method in ("_draw", "strip"):
+    for method in ("fields", "strip"):
         monkeypatch.setattr(document.figures.MapDrawer, method, lambda *_, **__: None)
     for module in (curves, document.figures, style):
         for name in [name for name in vars(module) if name.endswith("_figure")]:
@@ -223,7 +223,7 @@ def test_key_frames_share_the_change_of_the_field(tmp_path: Path) -> None:
     """At rest, then a fast event, then slow motion: frames where the path of the field has equal parts."""
     moved = np.r_[np.zeros(10), np.linspace(0, 9, 10), np.linspace(9, 10, 11)[1:]]
     result = make(tmp_path / "r", [still(i, 1e-9, u=np.full(NODES, u)) for i, u in enumerate(moved)])
-    history = summary.TimeHistory(Physical.of(result), range(len(moved)))
+    history = curves.TimeHistory(Physical.of(result), range(len(moved)))
     assert history.key_frames(5) == (12, 14, 16, 18, 29)
 
 
@@ -318,7 +318,7 @@ def test_the_noise_floor_is_what_a_frame_scatters_by_against_the_reference(tmp_p
     frames = FrameSettings(path=("a",), reference=tuple(range(count)))
     stated = TestSettings(frames=frames, region=RegionSettings(rectangle=(0, 0, 9, 9)))
     origin = {"references": range(count), "settings": stated}
-    floor = summary.noise_floor(Physical.of(make(tmp_path / "r", records, **origin), ScaleSettings(mm_per_pixel=0.1)))
+    floor = document.noise_floor(Physical.of(make(tmp_path / "r", records, **origin), ScaleSettings(mm_per_pixel=0.1)))
     assert floor is not None
     assert floor.count == count
     accuracy = 4 / np.sqrt(2 * (count - 1) * NODES)
@@ -329,7 +329,7 @@ def test_the_noise_floor_is_what_a_frame_scatters_by_against_the_reference(tmp_p
 
 
 def test_one_static_frame_tells_no_noise(tmp_path: Path) -> None:
-    assert summary.noise_floor(Physical.of(make(tmp_path / "r", [still(0, 0.0), still(1, 0.1)]))) is None
+    assert document.noise_floor(Physical.of(make(tmp_path / "r", [still(0, 0.0), still(1, 0.1)]))) is None
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
@@ -339,7 +339,7 @@ def test_speckle_size_is_the_width_of_the_autocorrelation(tmp_path: Path, sigma:
     white, more = np.random.default_rng(0).normal(size=(2, 3, 80, 120)).astype(np.float32)
     texture = np.stack([cv2.GaussianBlur(image, (0, 0), sigma) for image in white])
     reference = texture / texture.std() + noise * more
-    size = summary.speckle_size(make(tmp_path / "r", [still(0, 0.01)], reference=reference))
+    size = document.speckle_size(make(tmp_path / "r", [still(0, 0.01)], reference=reference))
     assert size == pytest.approx(2 * np.sqrt(2 * np.log(2)) * np.sqrt(2) * sigma, rel=0.08)
 
 

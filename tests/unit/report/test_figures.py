@@ -18,7 +18,7 @@ from results import LIGHTS, MESH, NODES, make_origin, make_result
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.report import curves, figures, gallery, remove_pictures, save_figure, style, write_figures, write_maps
+from rgbmidic.report import curves, figures, remove_pictures, save_figure, style, write_figures, write_maps
 from rgbmidic.results import QUANTITIES, FrameRecord, Maps, Origin, Result, ResultStore
 from rgbmidic.settings import FrameSettings, RegionSettings, ScaleSettings, TestSettings
 from rgbmidic.typing import AnyArray
@@ -198,7 +198,7 @@ def test_doubtful_nodes_do_not_rule_the_colours(tmp_path: Path) -> None:
 @pytest.fixture
 def unsaved(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures without content: writing them takes most of the time."""
-    monkeypatch.setattr(gallery, "save_figure", lambda _, path: path.touch())
+    monkeypatch.setattr(style, "save_figure", lambda _, path: path.touch())
 
 
 def test_all_figures_can_be_written_by_two_processes(tmp_path: Path) -> None:

@@ -19,8 +19,8 @@ from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.report import movie
+from rgbmidic.report.curves import Curve
 from rgbmidic.report.movie import Movie, MovieConstants, _Canvas, write_movie
-from rgbmidic.report.movie_curve import Curve
 from rgbmidic.results import FrameRecord, Maps
 from rgbmidic.view.picture import RawPictures
 
@@ -73,6 +73,12 @@ def test_a_page_states_how_its_fields_are_derived(maps: Maps) -> None:
     assert how.endswith(", since frame 2")
     page, box = canvas.figure.bbox, canvas._title.get_window_extent()
     assert page.y0 <= box.y0 < box.y1 <= page.y1
+
+
+@pytest.mark.parametrize("width", [601, 640, 727])
+def test_panels_have_one_size_however_their_edges_are_rounded(maps: Maps, width: int) -> None:
+    boxes = _Canvas(Movie(maps=maps, fields=("u", "v", "exx"), frames=[5], width=width))._boxes
+    assert len({(rows.stop - rows.start, columns.stop - columns.start) for rows, columns in boxes}) == 1
 
 
 def test_pages_are_the_same_for_any_number_of_processes(maps: Maps, monkeypatch: pytest.MonkeyPatch) -> None:
