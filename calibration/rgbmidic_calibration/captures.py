@@ -25,6 +25,7 @@ from rgbmidic.errors import CalibrationError, ConfigurationError, FrameError
 from rgbmidic.frames import ChannelFrame, FrameSeries, FrameSource, Mosaic, open_series
 from rgbmidic.frames.data import cfa_channels, planes_of
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.unevenness import unevenness
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -41,11 +42,14 @@ class CaptureFiles:
         Their frames.
     stated
         What the user stated about them.
+    exposure
+        Exposure time of all of them, any unit; None: not stated.
     """
 
     role: str
     series: FrameSeries
     stated: FrameSettings
+    exposure: float | None = None
 
     @classmethod
     def find(
@@ -76,23 +80,25 @@ class CaptureFiles:
             for folder, sources in groups.items()
         ]
 
-    def __len__(self) -> int:
-        return len(self.series)
-
     def frames(self) -> Iterator[Mosaic | ChannelFrame]:
         """The frames one after the other."""
-        return (self.series.read(index)[0] for index in range(len(self)))
+        return (self.series.read(index)[0] for index in range(len(self.series)))
 
-    def stack(self, exposure: float | None = None) -> TemporalStack:
+    def stack(self) -> TemporalStack:
         """Mean and variance of the frames of one exposure; dark frames do not drift."""
         dark = self.role == "dark"
         name = "the dark frames" if dark else self.role
-        return stack_frames(self.frames(), exposure=exposure, drifts=not dark, name=name)
+        return stack_frames(self.frames(), exposure=self.exposure, drifts=not dark, name=name)
+
+    def means(self, block: int = 16) -> list[BlockMeans]:
+        """Block averages of every frame."""
+        named = zip(self.frames(), self.labels, strict=True)
+        return [block_means(frame, block=block, name=name) for frame, name in named]
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Name of every frame, for messages."""
-        return tuple(self.series.name(index) for index in range(len(self)))
+        return tuple(self.series.name(index) for index in range(len(self.series)))
 
     @property
     def fingerprints(self) -> dict[str, str]:
@@ -290,6 +296,8 @@ class TemporalStack:
         Largest fraction of a plane's samples that are 0 (cut off at the bottom).
     piled_at : float or None
         Level below white where samples pile up as at saturation.
+    uneven : float
+        Unevenness of the histogram of the first frame (`unevenness_of`).
     exposure : float or None
         Exposure time, any unit.
     """
@@ -301,6 +309,7 @@ class TemporalStack:
     strength: FloatArray
     zeros: float
     piled_at: float | None
+    uneven: float
     exposure: float | None = None
 
     @property
@@ -339,9 +348,10 @@ def stack_frames(
     strength: list[FloatArray] = []
     zeros, piled_at = 0.0, None
     for frame in frames:
-        planes, black, sampling = np.stack(planes_of(frame)[1]), planes_of(frame)[2], Sampling.of(frame)
+        _, samples, black = planes_of(frame)
+        planes, sampling = np.stack(samples), Sampling.of(frame)
         if camera is None:
-            camera, clipped = sampling, np.zeros(planes.shape, dtype=bool)
+            camera, clipped, uneven = sampling, np.zeros(planes.shape, dtype=bool), unevenness_of(frame)
             mean, squares = np.zeros((2, *planes.shape), dtype=np.float32)
         if replace(sampling, black=camera.black, origins=camera.origins) != camera:
             raise CalibrationError(
@@ -369,6 +379,7 @@ def stack_frames(
         strength=levels,
         zeros=zeros,
         piled_at=piled_at,
+        uneven=uneven,
         exposure=exposure,
     )
 
@@ -438,6 +449,10 @@ class BlockMeans:
         Mean square second difference over the square of the mean, in the brightest plane: how sharp the picture is.
     piled_at : float or None
         Grey level (DN) below the white level at which samples pile up as they do at saturation; None: nowhere.
+    uneven : float
+        Unevenness of its histogram (`unevenness_of`).
+    name : str
+        Of its file, for messages.
     """
 
     planes: FloatArray
@@ -445,7 +460,9 @@ class BlockMeans:
     camera: Sampling
     block: int
     detail: float
-    piled_at: float | None = None
+    piled_at: float | None
+    uneven: float
+    name: str
 
     @property
     def channels(self) -> FloatArray:
@@ -454,8 +471,14 @@ class BlockMeans:
             return self.planes
         return np.stack([self.planes[0], 0.5 * (self.planes[1] + self.planes[2]), self.planes[3]])
 
+    @property
+    def centres(self) -> FloatArray:
+        """Centres (x, y) of the blocks in px, shape (R, S, 2)."""
+        rows, columns = (_starts(side, self.block) + (self.block - 1) / 2 for side in self.camera.shape)
+        return np.stack(np.meshgrid(columns, rows), axis=-1)
 
-def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
+
+def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16, name: str = "") -> BlockMeans:
     """Average every colour plane of a frame in blocks.
 
     Parameters
@@ -464,6 +487,8 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
         Raw frame, Bayer or 3-CCD.
     block
         Side of a block in px; even.
+    name
+        Name of the frame's file, for messages.
 
     Raises
     ------
@@ -505,13 +530,9 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
         block=block,
         detail=float(((picture[:, 2:] - 2 * picture[:, 1:-1] + picture[:, :-2]) ** 2).mean()) / level**2,
         piled_at=saturation_pile(planes[brightest], frame.white_level),
+        uneven=unevenness_of(frame),
+        name=name,
     )
-
-
-def block_centres(shape: tuple[int, int], block: int) -> FloatArray:
-    """Centres (x, y) in px of the blocks of a frame, shape (R, S, 2)."""
-    rows, columns = (_starts(side, block) + (block - 1) / 2 for side in shape)
-    return np.stack(np.meshgrid(columns, rows), axis=-1)
 
 
 def _starts(side: int, block: int) -> npt.NDArray[np.intp]:
@@ -535,3 +556,16 @@ def saturation_pile(plane: npt.NDArray[np.uint16], white: float) -> float | None
         return None
     count, below = int((plane == top).sum()), int(((plane < top) & (plane >= top - 4)).sum())
     return float(top) if count > 20 and count > 2 * below else None
+
+
+def unevenness_of(frame: Mosaic | ChannelFrame, lit: float = 0.1) -> float:
+    """Largest unevenness of the histogram of a lit plane; NaN where it cannot be determined in any.
+
+    Lit are planes whose mean above black exceeds the fraction `lit` of the full scale: in the dark, noise is too little
+    to smooth it. Some cameras apply gains of their own to red and blue, so all planes are looked at.
+    """
+    white, found = frame.white_level, [np.nan]
+    for plane, black in zip(*planes_of(frame)[1:], strict=True):
+        if plane.mean() > black + lit * (white - black):
+            found.append(unevenness(plane[plane < white]))
+    return float(np.fmax.reduce(found))

@@ -27,7 +27,7 @@ from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products
 from rgbmidic.typing import BoolArray, FloatArray
-from rgbmidic_calibration.captures import BlockMeans, block_centres
+from rgbmidic_calibration.captures import BlockMeans
 from rgbmidic_calibration.plausibility import CHECKS, capture_checks, judged
 
 CHANNELS = ("R", "G", "B")
@@ -340,7 +340,6 @@ def estimate_crosstalk(
     *,
     order: int | None = None,
     allow: Sequence[str] = (),
-    labels: Mapping[str, Sequence[str]] | None = None,
 ) -> CrosstalkEstimate:
     """Estimate the crosstalk matrix from block averages of single-light captures.
 
@@ -356,8 +355,6 @@ def estimate_crosstalk(
         unless the variation is both significant and larger than the tolerance.
     allow
         Names of plausibility checks (`CHECKS`) that the user waives.
-    labels
-        File names of the captures, for messages; by light, and ``"dark"``.
 
     Raises
     ------
@@ -369,9 +366,9 @@ def estimate_crosstalk(
         raise CalibrationError(f"unknown check {', '.join(unknown)}; those that can be waived are {', '.join(CHECKS)}")
     if order is not None and not 0 <= order <= LIMITS.largest_order:
         raise CalibrationError(f"the degree of the field is 0 to {LIMITS.largest_order}, not {order}")
-    warnings = judged(capture_checks(lights, dark, labels or {}), allow)
+    warnings = judged(capture_checks(lights, dark), allow)
     like = next(iter(lights.values()))[0]
-    shape, centres = like.camera.shape, block_centres(like.camera.shape, like.block)
+    shape, centres = like.camera.shape, like.centres
     level, of_mean, of_frame = np.zeros_like(like.channels), LIMITS.black_level_std**2 * np.eye(3), np.zeros((3, 3))
     if dark:
         frames = np.stack([frame.channels for frame in dark])

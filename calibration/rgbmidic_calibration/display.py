@@ -138,9 +138,7 @@ def calibration(result: Calibration, path: Path) -> None:
 
 
 def _print(parts: Iterable[str | Table]) -> None:
-    console = Console(highlight=False)
-    for part in parts:
-        console.print(part)
+    Console(highlight=False).print(*parts, sep="\n")
 
 
 def _table(title: str, heads: Sequence[str], justify: Literal["left", "right"] = "right") -> Table:

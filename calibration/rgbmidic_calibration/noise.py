@@ -16,10 +16,11 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.illumination.checks import Check, reported, warning
+from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.linear import CameraNoise, Quantity
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile_means
+from rgbmidic_calibration.plausibility import judged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,7 +154,7 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
         prnu=prnu,
         defects=defects,
     )
-    warnings = [check.text for check in reported(_checks(dark, flats, noise, lines, early))]
+    warnings = judged(_checks(dark, flats, noise, lines, early))
     return NoiseEstimate(camera_noise=noise, warnings=(*warnings, *uneven))
 
 

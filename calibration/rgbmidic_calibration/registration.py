@@ -17,12 +17,13 @@ from scipy import ndimage
 
 from rgbmidic.correlation.solution import NodeStatus, Solution
 from rgbmidic.errors import CalibrationError, RgbmidicError
-from rgbmidic.illumination.checks import Check, reported, warning
+from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.images import PARAMETERS, Registration, frame_geometry, registration_basis
 from rgbmidic.pipeline import correlate
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic_calibration.captures import TemporalStack, same_camera
+from rgbmidic_calibration.plausibility import judged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -219,7 +220,7 @@ def estimate_registration(
     registration = Registration(
         lights=names, parameters=parameters, centre=centre, radius=radius, covariance=covariance
     )
-    warnings = tuple(check.text for check in reported(_checks(lights, dark, motion, matches)))
+    warnings = tuple(judged(_checks(lights, dark, motion, matches)))
     return RegistrationEstimate(registration=registration, matches=tuple(matches), warnings=warnings)
 
 

@@ -17,16 +17,7 @@ from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
-from rgbmidic_calibration.captures import (
-    TILE,
-    BlockMeans,
-    Captures,
-    TemporalStack,
-    block_centres,
-    block_means,
-    same_camera,
-    tile_means,
-)
+from rgbmidic_calibration.captures import TILE, BlockMeans, Captures, TemporalStack, same_camera, tile_means
 from rgbmidic_calibration.registration import estimate_registration
 
 
@@ -93,8 +84,7 @@ def leakage(
             f"the calibration knows the lights {', '.join(crosstalk.lights)}, not {', '.join(unknown)}"
         )
     level = np.mean([frame.channels for frame in dark], axis=0) if dark else np.float64(0)
-    first = next(iter(lights.values()))[0]
-    unmixing = crosstalk.unmixing_at(block_centres(first.camera.shape, first.block))
+    unmixing = crosstalk.unmixing_at(next(iter(lights.values()))[0].centres)
     checks = []
     for name, captures in lights.items():
         clear = ~np.any([frame.saturated for frame in captures], axis=0)
@@ -336,8 +326,8 @@ def check_calibration(
     stacks, dark = captures.stacks()
     if dark is None:
         checks.append(warning("no dark frames: the stated black level is taken for the dark level"))
-    means = {name: [block_means(frame) for frame in files.frames()] for name, files in captures.lights.items()}
-    dark_means = [block_means(frame) for frame in captures.dark.frames()] if captures.dark else []
+    means = {name: files.means() for name, files in captures.lights.items()}
+    dark_means = captures.dark.means() if captures.dark else []
     checks += leakage(calibration.crosstalk, means, dark_means, limits)
     for names, files in captures.together.items():
         singles = {name: stacks[name] for name in names.split("+")}
