@@ -80,25 +80,19 @@ class CaptureFiles:
             for folder, sources in groups.items()
         ]
 
-    def frames(self) -> Iterator[Mosaic | ChannelFrame]:
-        """The frames one after the other."""
-        return (self.series.read(index)[0] for index in range(len(self.series)))
+    def frames(self) -> Iterator[tuple[str, Mosaic | ChannelFrame]]:
+        """Name and frame, one after the other."""
+        return ((self.series.name(index), self.series.read(index)[0]) for index in range(len(self.series)))
 
     def stack(self) -> TemporalStack:
         """Mean and variance of the frames of one exposure; dark frames do not drift."""
-        dark = self.role == "dark"
+        dark, frames = self.role == "dark", (frame for _, frame in self.frames())
         name = "the dark frames" if dark else self.role
-        return stack_frames(self.frames(), exposure=self.exposure, drifts=not dark, name=name)
+        return stack_frames(frames, exposure=self.exposure, drifts=not dark, name=name)
 
     def means(self, block: int = 16) -> list[BlockMeans]:
         """Block averages of every frame."""
-        named = zip(self.frames(), self.labels, strict=True)
-        return [block_means(frame, block=block, name=name) for frame, name in named]
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Name of every frame, for messages."""
-        return tuple(self.series.name(index) for index in range(len(self.series)))
+        return [block_means(frame, block=block, name=name) for name, frame in self.frames()]
 
     @property
     def fingerprints(self) -> dict[str, str]:
@@ -186,42 +180,6 @@ class Captures:
     def stacks(self) -> tuple[dict[str, TemporalStack], TemporalStack | None]:
         """Mean and variance of the captures of every light by its name, and of the dark frames."""
         return {name: files.stack() for name, files in self.lights.items()}, self.dark.stack() if self.dark else None
-
-
-def named_patterns(options: Sequence[str], option: str) -> dict[str, str]:
-    """Split options of the form NAME=FILES.
-
-    Raises
-    ------
-    ConfigurationError
-        An option has another form, or a name occurs twice.
-    """
-    named: dict[str, str] = {}
-    for text in options:
-        name, separator, pattern = text.partition("=")
-        name, pattern = name.strip(), pattern.strip()
-        if not (separator and name and pattern):
-            raise ConfigurationError(f"{option} takes NAME=FILES, as in {option} red='light_red/*.tif', not {text!r}")
-        if name in named:
-            raise ConfigurationError(f"{option} {name} is given twice; one pattern may match many files")
-        named[name] = pattern
-    return named
-
-
-def check_output(path: Path, *, overwrite: bool, option: str = "--out") -> None:
-    """Refuse to write where that would lose something.
-
-    Raises
-    ------
-    ConfigurationError
-        The file exists and may not be overwritten, or its folder does not exist.
-    """
-    if path.is_dir():
-        raise ConfigurationError(f"{option} {path} is a folder; state a file name")
-    if path.exists() and not overwrite:
-        raise ConfigurationError(f"{path} exists already; choose another {option} or add --overwrite")
-    if not path.parent.is_dir():
-        raise ConfigurationError(f"the folder of {option} {path} does not exist")
 
 
 @dataclass(frozen=True, slots=True)

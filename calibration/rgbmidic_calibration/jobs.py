@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +37,7 @@ def calibrate_crosstalk(
     details = {
         "block": block,
         "waived_checks": list(allow),
-        "variation_over_field": {
-            name: {"p_value": found.p_value, "rms": found.rms}
-            for name, found in zip(means, estimate.variations, strict=True)
-        },
+        "variation_over_field": {name: asdict(found) for name, found in zip(means, estimate.variations, strict=True)},
     }
     return _calibration("crosstalk", captures.groups, uneven, details, estimate), estimate
 
@@ -102,7 +99,7 @@ def _calibration(
     The settings are those of the first frame; levels that neither the file nor the user states stay open.
     """
     files, field = groups[0], "camera_noise" if section == "noise" else section
-    header, frame = files.series.lights[0][0].stored(0), next(files.frames())
+    header, (_, frame) = files.series.lights[0][0].stored(0), next(files.frames())
     levels: dict[str, Any] = {"black_level": float(frame.black_level.mean()), "white_level": frame.white_level}
     known = {name for name in levels for source in (header, files.stated) if getattr(source, name) is not None}
     return Calibration(

@@ -297,7 +297,7 @@ def _radius(image: Any, points: FloatArray, pixels: FloatArray) -> float:
 def find_views(files: CaptureFiles, target: Target) -> tuple[list[View], tuple[str, ...]]:
     """Find the target in every photograph; those without it come as reasons."""
     views, reasons = list[View](), list[str]()
-    for frame, name in zip(files.frames(), files.labels, strict=True):
+    for name, frame in files.frames():
         try:
             views.append(find_view(frame, target, name))
         except CalibrationError as error:

@@ -6,7 +6,7 @@ The sub-command `check`: the verdict on a calibration file, from captures that w
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -354,26 +354,3 @@ def check_calibration(
     if not captures.together:
         checks.append(Check("", "additivity was not checked: no captures with lights together (--together)", value=0))
     return checks
-
-
-def read_limits(options: Sequence[str]) -> Limits:
-    """Limits from options of the form NAME=VALUE.
-
-    Raises
-    ------
-    ConfigurationError
-        An unknown name, or a value that is not a positive number.
-    """
-    limits, names = LIMITS, [entry.name for entry in fields(Limits)]
-    for text in options:
-        name, _, value = text.partition("=")
-        try:
-            number = float(value)
-        except ValueError:
-            number = -1.0
-        if name not in names or not number > 0:
-            raise ConfigurationError(
-                f"--limit takes NAME=VALUE with a positive value and one of the names {', '.join(names)}, not {text!r}"
-            )
-        limits = replace(limits, **{name: number})
-    return limits

@@ -13,7 +13,8 @@ from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic_calibration.captures import block_means, stack_frames
-from rgbmidic_calibration.verify import Limits, additivity, leakage, noise_ratio, read_limits, registration_left
+from rgbmidic_calibration.cli import read_limits
+from rgbmidic_calibration.verify import Limits, additivity, leakage, noise_ratio, registration_left
 
 MATRIX = MATRICES[1.5]
 LIGHTS = ("red", "green", "blue")
