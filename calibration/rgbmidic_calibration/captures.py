@@ -12,7 +12,7 @@ the curvature of the picture alike.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -193,9 +193,11 @@ class Sampling:
     shape : tuple of int
         Rows and columns of the frames.
     black : tuple of float, length P
-        Stated black levels (DN).
+        Stated black levels (DN); each frame may state its own.
     white : float
         White level (DN).
+    full_scale : float
+        Grey level of a just saturated sample (DN above black).
     origins : tuple of (int, int), length P
         Row and column of each plane's first sample.
     step : int
@@ -204,8 +206,9 @@ class Sampling:
 
     names: tuple[str, ...]
     shape: tuple[int, int]
-    black: tuple[float, ...]
-    white: float
+    black: tuple[float, ...] = field(compare=False)
+    white: float = field(compare=False)
+    full_scale: float
     origins: tuple[tuple[int, int], ...]
     step: int
 
@@ -218,17 +221,8 @@ class Sampling:
             order = np.argsort(cfa_channels(frame.cfa).ravel(), kind="stable")
             origins, step = tuple((int(position) // 2, int(position) % 2) for position in order), 2
         shape = frame.values.shape[-2], frame.values.shape[-1]
-        return cls(names, shape, tuple(black.tolist()), frame.white_level, origins, step)
-
-    @property
-    def full_scale(self) -> float:
-        """Grey level of a just saturated sample (DN above black)."""
-        return self.white - float(np.mean(self.black))
-
-    def matches(self, other: Sampling) -> bool:
-        """The frames have the same size, planes and range; each may state its own black level."""
-        mine, its = ((one.shape, one.names, one.full_scale) for one in (self, other))
-        return mine == its
+        levels, white = tuple(black.tolist()), frame.white_level
+        return cls(names, shape, levels, white, white - float(np.mean(levels)), origins, step)
 
     def __str__(self) -> str:
         planes = f"{self.shape[1]} x {self.shape[0]} px with planes {' '.join(self.names)}"
@@ -311,19 +305,19 @@ def stack_frames(
         if camera is None:
             camera, clipped, uneven = sampling, np.zeros(planes.shape, dtype=bool), unevenness_of(frame)
             mean, squares = np.zeros((2, *planes.shape), dtype=np.float32)
-        if replace(sampling, black=camera.black, origins=camera.origins) != camera:
+        if sampling != camera:
             raise CalibrationError(
                 f"{name}: a frame is {sampling}, the first {camera}: all must come from the same camera and settings"
             )
         strength.append(np.array([plane.mean(dtype=np.float64) for plane in planes]) - black)
         zeros = max(zeros, *(float((plane == 0).mean()) for plane in planes))
-        piled_at = piled_at or next(filter(None, (saturation_pile(plane, camera.white) for plane in planes)), None)
+        piled_at = piled_at or next(filter(None, (saturation_pile(plane, sampling.white) for plane in planes)), None)
         scale = _ratio(strength[0], strength[-1]) if drifts else np.ones(len(planes))
         values = (planes.astype(np.float32) - _column(black)) * _column(scale)
         step = values - mean
         mean += step / len(strength)
         squares += step * (values - mean)
-        clipped |= planes >= camera.white
+        clipped |= planes >= sampling.white
     if camera is None:
         raise CalibrationError(f"{name}: no frames")
     levels = np.array(strength)

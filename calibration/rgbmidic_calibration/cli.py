@@ -146,7 +146,6 @@ def _writes(name: str, hint: Any, default: str | None = None) -> Callable[[Comma
     """Decorator of a command with a file to write, which may replace another only where that is stated."""
 
     def read(options: Mapping[str, Any]) -> Path | None:
-
         path: Path | None = options[name]
         if path is not None:
             check_output(path, overwrite=options["overwrite"], option=f"--{name}")

@@ -42,8 +42,6 @@ class CrosstalkConstants:
     ----------
     black_level_std
         Standard uncertainty (DN) of a black level that no series of dark frames measured: rounded to whole grey levels.
-    least_blocks
-        Unsaturated blocks per capture at least: as many as the smallest frame has, 3 x 3 (`block_means`).
     automatic_order
         Largest degree that the data may ask for: shading by lens and filters is a slope and a curvature.
     largest_order
@@ -57,7 +55,6 @@ class CrosstalkConstants:
     """
 
     black_level_std: float = 0.3
-    least_blocks: int = 9
     automatic_order: int = 2
     largest_order: int = 4
     significance: float = 1e-3
@@ -86,6 +83,13 @@ class LightSignal:
     values: FloatArray
     valid: BoolArray
     reference: int
+
+    @classmethod
+    def of(cls, name: str, captures: Sequence[BlockMeans], dark: FloatArray) -> LightSignal:
+        """The averages of captures above the dark level."""
+        values = np.stack([frame.channels for frame in captures]) - dark
+        valid = ~np.stack([frame.saturated for frame in captures])
+        return cls(name, values, valid, int(np.median(values.transpose(0, 2, 3, 1)[valid], axis=0).argmax()))
 
     @property
     def base(self) -> FloatArray:
@@ -375,7 +379,7 @@ def estimate_crosstalk(
         level = frames.mean(axis=0)
         of_frame = np.cov(frames.mean(axis=(2, 3)), rowvar=False) if len(frames) > 1 else of_mean
         of_mean = of_frame / len(frames)
-    signals = [_above_dark(name, captures, level) for name, captures in lights.items()]
+    signals = [LightSignal.of(name, captures, level) for name, captures in lights.items()]
     asked = legendre_products(centres, shape, LIMITS.automatic_order)
     needed, variations = zip(*(_needed_degree(signal, asked) for signal in signals), strict=True)
     order = max(needed) if order is None else order
@@ -392,17 +396,6 @@ def estimate_crosstalk(
         matrix=matrices[0], lights=tuple(lights), covariance=covariance[0, :, :, 0].reshape(size, size), field=field
     )
     return CrosstalkEstimate(crosstalk=crosstalk, lights=fits, variations=variations, warnings=tuple(warnings))
-
-
-def _above_dark(name: str, captures: Sequence[BlockMeans], dark: FloatArray) -> LightSignal:
-    values = np.stack([frame.channels for frame in captures]) - dark
-    valid = ~np.stack([frame.saturated for frame in captures])
-    if valid.sum() < LIMITS.least_blocks * len(captures):
-        raise CalibrationError(
-            f"light {name}: {100 * (1 - valid.mean()):.0f} % of the blocks hold saturated samples; "
-            "shorten the exposure until none does"
-        )
-    return LightSignal(name, values, valid, int(np.median(values.transpose(0, 2, 3, 1)[valid], axis=0).argmax()))
 
 
 def _needed_degree(signal: LightSignal, design: FloatArray) -> tuple[int, Variation]:

@@ -63,8 +63,6 @@ class Design:
     ----------
     crosstalk : Crosstalk
         Predicted A.
-    response : ndarray, shape (3, k)
-        Response of every channel to every lamp of unit radiant power.
     power : ndarray, shape (k,)
         Radiant power that every lamp needs for equal grey levels, relative to the largest.
     headroom : float
@@ -73,7 +71,6 @@ class Design:
     """
 
     crosstalk: Crosstalk
-    response: FloatArray
     power: FloatArray
     headroom: float
 
@@ -100,7 +97,6 @@ def design(camera: Sensitivities, lamps: Mapping[str, Lamp]) -> Design:
     crosstalk = Crosstalk(matrix=response / seen, lights=tuple(lamps))
     return Design(
         crosstalk=crosstalk,
-        response=response,
         power=(1 / seen) / (1 / seen).max(),
         headroom=float(1 / crosstalk.matrix.sum(axis=1).max()),
     )

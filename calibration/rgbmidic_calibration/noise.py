@@ -327,7 +327,7 @@ def _checks(
             f"plane {planes[plane]}: the variance breaks down at {knee:.0f} DN above black, below the white level: the "
             f"sensor saturates there (white_level {knee + black[plane]:.0f} in the test)"
         )
-    if not any(clipped.any() for flat in flats for clipped in flat.clipped) and not early.any():
+    if not any(flat.clipped.any() for flat in flats) and not early.any():
         yield warning("no exposure reached saturation: the full well is that of the stated white level")
     text = (
         f"{100 * dark.zeros:.1f} % of the dark samples are 0: the black level is cut off and the read noise comes out "
@@ -338,10 +338,8 @@ def _checks(
     text = f"the lamp's strength differs by {100 * drift:.1f} % within an exposure; it was taken out"
     yield warning(text, drift, above=0.02)
     reach, range_ = max(line.reach for line in lines), dark.camera.white - min(dark.camera.black)
-    if reach < 0.2 * range_:  # the relative error of the gain grows as its inverse
-        yield warning(
-            f"the brightest exposure reaches {reach:.0f} DN only: expose up to 70 % of the range for a good gain"
-        )
+    text = f"the brightest exposure reaches {reach:.0f} DN only: expose up to 70 % of the range for a good gain"
+    yield warning(text, reach < 0.2 * range_)  # the relative error of the gain grows as its inverse
     for name, line in zip(planes, lines, strict=True):
         text = (
             f"plane {name}: the variance does not follow a line (departs by {100 * line.bend:.1f} %, scatters "
@@ -357,9 +355,8 @@ def _checks(
         "exposure times those of the frames, was the lamp steady? Unmixing needs a linear camera"
     )
     yield warning(text, error[worst], above=limit)
-    if np.isnan(noise.linearity_error.value).any() and any(flat.exposure is not None for flat in flats):
-        yield warning(
-            "no linearity error for some plane: it takes three exposure times that reach 5 to 95 % of the range there"
-        )
+    text = "no linearity error for some plane: it takes three exposure times that reach 5 to 95 % of the range there"
+    timed = any(flat.exposure is not None for flat in flats)
+    yield warning(text, timed and float(np.isnan(noise.linearity_error.value).any()))
     text = "the gains of the planes differ: the camera applies digital gain per colour; the mean is used"
     yield warning(text, np.ptp(noise.gain.value) / noise.gain.value.mean(), above=0.05)

@@ -109,31 +109,6 @@ def leakage(
     return checks
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Additivity:
-    """All lights together against the sum of the single ones, ``together - sum = offset + sum of change_j light_j``.
-
-    Attributes
-    ----------
-    mean, spread : float
-        Mean and standard deviation of the difference over all samples, DN.
-    noise : float
-        Standard deviation of the difference that the camera's noise explains, DN; rounding alone where the noise is
-        not known.
-    offset : float
-        DN; what a wrong black level leaves.
-    checks : tuple of Check
-        Rms over tiles of what remains, noise taken out, of the mean signal; then of every light the relative change of
-        its strength between its own and the common capture.
-    """
-
-    mean: float
-    spread: float
-    noise: float
-    offset: float
-    checks: tuple[Check, ...]
-
-
 def additivity(
     together: TemporalStack,
     singles: Mapping[str, TemporalStack],
@@ -141,11 +116,12 @@ def additivity(
     *,
     noise: NoiseModel | None = None,
     limits: Limits = LIMITS,
-) -> Additivity:
+) -> list[Check]:
     """Compare captures of several lights together with the sum of their single captures, sample by sample.
 
     The same scene must be at rest in all of them: a camera that is linear and lamps that do not influence each other
-    give the sum exactly, whatever the crosstalk.
+    give the sum exactly, whatever the crosstalk. Fitted is ``together - sum = offset + sum of change_j light_j``: a
+    wrong black level leaves the offset, a lamp that is weaker when others are on its change.
 
     Parameters
     ----------
@@ -159,6 +135,12 @@ def additivity(
         Camera noise; None: from the captures where each group has two or more, else rounding to grey levels alone.
     limits
         What may be left.
+
+    Returns
+    -------
+    list of Check
+        Rms over tiles of what remains, noise taken out, as a fraction of the mean signal, with a sentence about the
+        difference; then the relative change of every light's strength between its own and the common capture.
     """
     same_camera([together, *singles.values(), *([dark] if dark else [])])
     level = dark.mean if dark else np.float32(0)
@@ -184,18 +166,19 @@ def additivity(
     std = np.sqrt(np.diag(inverse @ (score.T @ score) @ inverse))
     signal = float(of_lights.sum(axis=0).mean())
     left = np.sqrt(max(float((residual**2).mean() - variance.mean()), 0.0)) / max(signal, 1e-9)
-    mean, spread, explained = float(samples[0].mean()), float(samples[0].std()), float(np.sqrt(samples[1].mean()))
     names = "+".join(singles)
     text = (
-        f"{names} minus the sum of the single captures: {mean:+.2f} DN on average, scatter {spread:.2f} DN where noise "
-        f"explains {explained:.2f} DN; offset {solution[0]:+.2f} DN"
+        f"{names} minus the sum of the single captures: {samples[0].mean():+.2f} DN on average, scatter "
+        f"{samples[0].std():.2f} DN where noise explains {np.sqrt(samples[1].mean()):.2f} DN; offset "
+        f"{solution[0]:+.2f} DN"
     )
-    changes = (
-        Check(f"strength of {name} in {names}", "", 100 * change, limits.strength, std=100 * error, unit="%")
-        for name, change, error in zip(singles, solution[1:], std[1:], strict=True)
-    )
-    checks = (Check(f"{names} not the sum", text, 100 * left, limits.additivity, unit="%"), *changes)
-    return Additivity(mean=mean, spread=spread, noise=explained, offset=float(solution[0]), checks=checks)
+    return [
+        Check(f"{names} not the sum", text, 100 * left, limits.additivity, unit="%"),
+        *(
+            Check(f"strength of {name} in {names}", "", 100 * change, limits.strength, std=100 * error, unit="%")
+            for name, change, error in zip(singles, solution[1:], std[1:], strict=True)
+        ),
+    ]
 
 
 def _variance(stack: TemporalStack, noise: NoiseModel | None) -> npt.NDArray[np.floating]:
@@ -331,7 +314,7 @@ def check_calibration(
     checks += leakage(calibration.crosstalk, means, dark_means, limits)
     for names, files in captures.together.items():
         singles = {name: stacks[name] for name in names.split("+")}
-        checks += additivity(files.stack(), singles, dark, noise=calibration.noise, limits=limits).checks
+        checks += additivity(files.stack(), singles, dark, noise=calibration.noise, limits=limits)
 
     def noise() -> Iterator[Check]:
         if calibration.noise is None:

@@ -114,7 +114,7 @@ def rows_by_diagonal(camera):
     """Matrix for LEDs of equal peak power with every row divided by its diagonal."""
     found = design(camera, OHNO)
     peak = np.array([1 / lamp.power(camera.wavelengths).max() for lamp in OHNO.values()])
-    response = found.response * peak
+    response = found.crosstalk.matrix / found.power * peak
     return response / np.diag(response)[:, None]
 
 
