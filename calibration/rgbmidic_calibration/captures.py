@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -52,9 +52,7 @@ class CaptureFiles:
     exposure: float | None = None
 
     @classmethod
-    def find(
-        cls, role: str, pattern: str, stated: FrameSettings, calibration: Calibration | None = None
-    ) -> CaptureFiles:
+    def find(cls, role: str, pattern: str, stated: FrameSettings, calibration: Calibration | None = None) -> Self:
         """Files that a pattern or folder names; `stated` is what the user states of them (its path is not used).
 
         What neither the files nor the user state comes from the `calibration`, which must agree with both.
@@ -103,7 +101,7 @@ class CaptureFiles:
 def provenance(command: str, groups: Sequence[CaptureFiles], details: Mapping[str, Any]) -> dict[str, Any]:
     """Where a calibration comes from: command, date, version, what was stated, input files, and `details`."""
     names = ("kind", "cfa", "black_level", "white_level", "shape", "dtype")
-    stated = {name: getattr(groups[0].stated, name) for name in names} if groups else {}
+    stated = {name: getattr(group.stated, name) for group in groups[:1] for name in names}
     return {
         "command": f"rgbmidic-calibrate {command}",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -459,15 +457,11 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16, name: str = ""
             f"frames of {shape[1]} x {shape[0]} px are too small for calibration in blocks of {block} px "
             f"(at least {3 * block + 4} px on each side)"
         )
-    means = np.stack(
-        [
-            _window(shape[0], len(plane), block, step, row)
-            @ plane
-            @ _window(shape[1], len(plane.T), block, step, col).T
-            - dark
-            for plane, dark, (row, col) in zip(planes, black, camera.origins, strict=True)
-        ]
-    )
+    averages = []
+    for plane, dark, origin in zip(planes, black, camera.origins, strict=True):
+        down, along = (_window(shape[axis], plane.shape[axis], block, step, origin[axis]) for axis in (0, 1))
+        averages.append(down @ plane @ along.T - dark)
+    means = np.stack(averages)
     brightest = int(means.mean(axis=(1, 2)).argmax())
     picture = planes[brightest].astype(np.float32)
     level = max(float(picture.mean()) - float(black[brightest]), 1.0)

@@ -267,7 +267,7 @@ def camera(
     estimate.camera.write(out)
     display.camera(estimate.camera, out)
     if picture is not None:
-        display.draw_camera(estimate, picture)
+        display.draw_camera(estimate.camera, picture, estimate.residuals)
 
 
 @app.command()
@@ -346,13 +346,12 @@ def show(file: Annotated[Path, Argument(help="Calibration file.")], picture: Pat
     from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic_calibration import display
-    from rgbmidic_calibration.camera import CameraEstimate
 
     if CameraCalibration.is_in(file):
         camera = CameraCalibration.read(file)
         display.camera(camera, file, written=False)
         if picture is not None:
-            display.draw_camera(CameraEstimate(camera=camera), picture)
+            display.draw_camera(camera, picture)
         return
     calibration = Calibration.read(file)
     display.calibration(calibration, file)

@@ -20,7 +20,7 @@ from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise
 from rgbmidic.report.style import literal
 from rgbmidic.text import uncertain
-from rgbmidic_calibration.camera import CameraEstimate
+from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
 from rgbmidic_calibration.design import Design, Lamp
 from rgbmidic_calibration.noise import NoiseEstimate
@@ -325,24 +325,32 @@ def draw_design(result: Design, camera: Sensitivities, lamps: Mapping[str, Lamp]
     _save([spectra, lambda axes: _draw_matrix(axes, result.crosstalk)], path)
 
 
-def draw_camera(estimate: CameraEstimate, path: Path) -> None:
+def draw_camera(camera: CameraCalibration, path: Path, residuals: Sequence[tuple[FloatArray, FloatArray]] = ()) -> None:
     """Draw the residuals of all points, the distortion over the frame, and the local scale on the plane.
+
+    Parameters
+    ----------
+    camera
+        Lens and plane, or either.
+    path
+        Picture file.
+    residuals
+        Points of every photograph and their residuals, px; a file has none.
 
     Raises
     ------
     CalibrationError
         The file cannot be written in the format of its ending.
     """
-    camera = estimate.camera
     rows, columns = camera.shape
     y, x = np.mgrid[0 : rows - 1 : 24j, 0 : columns - 1 : 24j]
     grid = np.stack([x.ravel(), y.ravel()], axis=1)  # what is drawn there is rounded: noise of 1e-14 would be contoured
     whole: dict[str, Any] = {"xlim": (-0.5, columns - 0.5), "ylim": (rows - 0.5, -0.5), "aspect": "equal"}
     whole |= {"xlabel": "x (px)", "ylabel": "y (px)"}
 
-    def residuals(axes: Axes) -> None:
-        unit = float(f"{max(1e-6, *(np.abs(residual).max() for _, residual in estimate.residuals)):.0e}")
-        for points, residual in estimate.residuals:
+    def points_off(axes: Axes) -> None:
+        unit = float(f"{max(1e-6, *(np.abs(residual).max() for _, residual in residuals)):.0e}")
+        for points, residual in residuals:
             axes.quiver(*points.T, *residual.T, angles="xy", scale_units="width", scale=10 * unit, width=0.003)
         axes.set(title=f"residuals of the points (a tenth of the width: {unit:g} px)", **whole)
 
@@ -360,4 +368,4 @@ def draw_camera(estimate: CameraEstimate, path: Path) -> None:
             axes.figure.colorbar(filled, ax=axes, shrink=0.8)
         axes.set(title="scale on the plane (% of its mean)" if known else "no plane calibrated", **whole)
 
-    _save([*([residuals] if estimate.residuals else []), distortion, scale], path)  # a file has no residuals
+    _save([*([points_off] if residuals else []), distortion, scale], path)

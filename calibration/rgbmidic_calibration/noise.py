@@ -18,7 +18,7 @@ from scipy import ndimage
 from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.linear import CameraNoise, Quantity
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile_means
 from rgbmidic_calibration.plausibility import judged
 
@@ -126,9 +126,8 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
     lines = [_fit_line(name, mean[:, p], variance[:, p], used[:, p], freedom) for p, name in enumerate(names)]
     drift = dark.strength.var(axis=0, ddof=1)
     rest = np.array([plane.mean(dtype=np.float64) / plane.size for plane in dark.variance])
-    black = Quantity(
-        np.array(dark.camera.black) + dark.strength.mean(axis=0), np.sqrt(np.maximum(drift, rest) / dark.count)
-    )
+    black_std = np.sqrt(np.maximum(drift, rest) / dark.count)
+    black = Quantity(np.array(dark.camera.black) + dark.strength.mean(axis=0), black_std)
     knees = []  # lowest level at which the variance of a plane breaks down
     for plane, line in enumerate(lines):
         ratio = variance[1:, plane] / (line.read_variance + line.slope * np.maximum(mean[1:, plane], 0))
@@ -300,9 +299,7 @@ def _response(
     return _spread(signal / local, temporal / local**2, usable & ~dead), dead
 
 
-def _spread(
-    mean: npt.NDArray[np.floating], temporal: npt.NDArray[np.floating], usable: BoolArray
-) -> tuple[float, float]:
+def _spread(mean: AnyArray, temporal: AnyArray, usable: BoolArray) -> tuple[float, float]:
     """Spatial standard deviation about the neighbourhood's mean, temporal noise taken out, and its uncertainty."""
     window = LIMITS.window
     filled = np.where(usable, mean, np.median(mean[usable]))

@@ -259,11 +259,7 @@ def noise_ratio(stack: TemporalStack, noise: NoiseModel, same_exposure: float = 
 
 
 def check_calibration(
-    calibration: Calibration,
-    captures: Captures,
-    *,
-    limits: Limits = LIMITS,
-    region: Sequence[float] | None = None,
+    calibration: Calibration, captures: Captures, *, limits: Limits = LIMITS, region: Sequence[float] | None = None
 ) -> list[Check]:
     """Check a calibration on captures that were not used to make it.
 

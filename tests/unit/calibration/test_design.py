@@ -94,7 +94,7 @@ def test_tables_that_are_none(tmp_path):
     with pytest.raises(ConfigurationError, match="has no column c; it has a"):
         read_lamp(f"{tmp_path / 'good.csv'}#c")
     with pytest.raises(InputError, match="rising wavelengths"):
-        MeasuredLamp(wavelengths=[2, 1], values=[1, 1])
+        MeasuredLamp(wavelengths=np.array([2.0, 1.0]), values=np.ones(2))
 
 
 def test_picture(tmp_path):
