@@ -71,6 +71,8 @@ def test_lamps_and_cameras_from_text(tmp_path):
     assert other.power(wavelengths) == pytest.approx(np.full(5, 0.2))
     (tmp_path / "camera.csv").write_text("nm,x R,x G,x B\n400,0,0,1\n500,0,1,-1e-19\n600,1,0,0\n")
     assert read_camera(f"{tmp_path / 'camera.csv'}#x").values.min() == 0
+    np.savetxt(tmp_path / "plain.csv", np.array([[400, 0, 0, 1], [500, 0, 1, 0], [600, 1, 0, 0]]), delimiter=",")
+    assert len(read_camera(str(tmp_path / "plain.csv")).wavelengths) == 3  # 4.0e+02 is no heading
 
 
 @pytest.mark.parametrize(
