@@ -142,13 +142,8 @@ class _Fit:
     def image(self, places: FloatArray, turn: FloatArray, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Where places (m, 2) of the target, mm, are in the frame, px, in one pose; its derivatives by OpenCV."""
         matrix = np.array([[self.lens[0], 0, self.lens[1]], [0, self.lens[0], self.lens[2]], [0, 0, 1.0]])
-        points, slopes = cv2.projectPoints(_flat(places), turn, shift, matrix, self.lens[3:])[:2]
+        points, slopes = cv2.projectPoints(np.pad(places, ((0, 0), (0, 1))), turn, shift, matrix, self.lens[3:])[:2]
         return np.asarray(points[:, 0]), np.asarray(slopes)
-
-
-def _flat(places: FloatArray) -> FloatArray:
-    """Places (m, 2) of the target as points of space, (m, 3)."""
-    return np.pad(places, ((0, 0), (0, 1)))
 
 
 def _fit(views: Sequence[View], radial: int, tangential: int) -> _Fit:
@@ -156,7 +151,7 @@ def _fit(views: Sequence[View], radial: int, tangential: int) -> _Fit:
     for flag in (cv2.CALIB_FIX_K1, cv2.CALIB_FIX_K2, cv2.CALIB_FIX_K3)[radial:]:
         flags |= flag
     rms, matrix, distortion, turns, shifts = cv2.calibrateCamera(
-        [_flat(view.points).astype(np.float32) for view in views],
+        [np.pad(view.points, ((0, 0), (0, 1))).astype(np.float32) for view in views],
         [view.pixels.astype(np.float32)[:, None] for view in views],
         views[0].shape[::-1],
         np.eye(3),

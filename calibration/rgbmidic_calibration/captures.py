@@ -12,10 +12,10 @@ the curvature of the picture alike.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,7 @@ from rgbmidic.errors import CalibrationError, ConfigurationError, FrameError
 from rgbmidic.frames import ChannelFrame, FrameSeries, FrameSource, Mosaic, open_series
 from rgbmidic.frames.data import cfa_channels, planes_of
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.unevenness import unevenness
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -41,16 +42,17 @@ class CaptureFiles:
         Their frames.
     stated
         What the user stated about them.
+    exposure
+        Exposure time of all of them, any unit; None: not stated.
     """
 
     role: str
     series: FrameSeries
     stated: FrameSettings
+    exposure: float | None = None
 
     @classmethod
-    def find(
-        cls, role: str, pattern: str, stated: FrameSettings, calibration: Calibration | None = None
-    ) -> CaptureFiles:
+    def find(cls, role: str, pattern: str, stated: FrameSettings, calibration: Calibration | None = None) -> Self:
         """Files that a pattern or folder names; `stated` is what the user states of them (its path is not used).
 
         What neither the files nor the user state comes from the `calibration`, which must agree with both.
@@ -76,23 +78,19 @@ class CaptureFiles:
             for folder, sources in groups.items()
         ]
 
-    def __len__(self) -> int:
-        return len(self.series)
+    def frames(self) -> Iterator[tuple[str, Mosaic | ChannelFrame]]:
+        """Name and frame, one after the other."""
+        return ((self.series.name(index), self.series.read(index)[0]) for index in range(len(self.series)))
 
-    def frames(self) -> Iterator[Mosaic | ChannelFrame]:
-        """The frames one after the other."""
-        return (self.series.read(index)[0] for index in range(len(self)))
-
-    def stack(self, exposure: float | None = None) -> TemporalStack:
+    def stack(self) -> TemporalStack:
         """Mean and variance of the frames of one exposure; dark frames do not drift."""
-        dark = self.role == "dark"
+        dark, frames = self.role == "dark", (frame for _, frame in self.frames())
         name = "the dark frames" if dark else self.role
-        return stack_frames(self.frames(), exposure=exposure, drifts=not dark, name=name)
+        return stack_frames(frames, exposure=self.exposure, drifts=not dark, name=name)
 
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Name of every frame, for messages."""
-        return tuple(self.series.name(index) for index in range(len(self)))
+    def means(self, block: int = 16) -> list[BlockMeans]:
+        """Block averages of every frame."""
+        return [block_means(frame, block=block, name=name) for name, frame in self.frames()]
 
     @property
     def fingerprints(self) -> dict[str, str]:
@@ -103,7 +101,7 @@ class CaptureFiles:
 def provenance(command: str, groups: Sequence[CaptureFiles], details: Mapping[str, Any]) -> dict[str, Any]:
     """Where a calibration comes from: command, date, version, what was stated, input files, and `details`."""
     names = ("kind", "cfa", "black_level", "white_level", "shape", "dtype")
-    stated = {name: getattr(groups[0].stated, name) for name in names} if groups else {}
+    stated = {name: getattr(group.stated, name) for group in groups[:1] for name in names}
     return {
         "command": f"rgbmidic-calibrate {command}",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -182,42 +180,6 @@ class Captures:
         return {name: files.stack() for name, files in self.lights.items()}, self.dark.stack() if self.dark else None
 
 
-def named_patterns(options: Sequence[str], option: str) -> dict[str, str]:
-    """Split options of the form NAME=FILES.
-
-    Raises
-    ------
-    ConfigurationError
-        An option has another form, or a name occurs twice.
-    """
-    named: dict[str, str] = {}
-    for text in options:
-        name, separator, pattern = text.partition("=")
-        name, pattern = name.strip(), pattern.strip()
-        if not (separator and name and pattern):
-            raise ConfigurationError(f"{option} takes NAME=FILES, as in {option} red='light_red/*.tif', not {text!r}")
-        if name in named:
-            raise ConfigurationError(f"{option} {name} is given twice; one pattern may match many files")
-        named[name] = pattern
-    return named
-
-
-def check_output(path: Path, *, overwrite: bool, option: str = "--out") -> None:
-    """Refuse to write where that would lose something.
-
-    Raises
-    ------
-    ConfigurationError
-        The file exists and may not be overwritten, or its folder does not exist.
-    """
-    if path.is_dir():
-        raise ConfigurationError(f"{option} {path} is a folder; state a file name")
-    if path.exists() and not overwrite:
-        raise ConfigurationError(f"{path} exists already; choose another {option} or add --overwrite")
-    if not path.parent.is_dir():
-        raise ConfigurationError(f"the folder of {option} {path} does not exist")
-
-
 @dataclass(frozen=True, slots=True)
 class Sampling:
     """How a camera samples its frames.
@@ -229,9 +191,11 @@ class Sampling:
     shape : tuple of int
         Rows and columns of the frames.
     black : tuple of float, length P
-        Stated black levels (DN).
+        Stated black levels (DN); each frame may state its own.
     white : float
         White level (DN).
+    full_scale : float
+        Grey level of a just saturated sample (DN above black).
     origins : tuple of (int, int), length P
         Row and column of each plane's first sample.
     step : int
@@ -240,8 +204,9 @@ class Sampling:
 
     names: tuple[str, ...]
     shape: tuple[int, int]
-    black: tuple[float, ...]
-    white: float
+    black: tuple[float, ...] = field(compare=False)
+    white: float = field(compare=False)
+    full_scale: float
     origins: tuple[tuple[int, int], ...]
     step: int
 
@@ -254,17 +219,8 @@ class Sampling:
             order = np.argsort(cfa_channels(frame.cfa).ravel(), kind="stable")
             origins, step = tuple((int(position) // 2, int(position) % 2) for position in order), 2
         shape = frame.values.shape[-2], frame.values.shape[-1]
-        return cls(names, shape, tuple(black.tolist()), frame.white_level, origins, step)
-
-    @property
-    def full_scale(self) -> float:
-        """Grey level of a just saturated sample (DN above black)."""
-        return self.white - float(np.mean(self.black))
-
-    def matches(self, other: Sampling) -> bool:
-        """The frames have the same size, planes and range; each may state its own black level."""
-        mine, its = ((one.shape, one.names, one.full_scale) for one in (self, other))
-        return mine == its
+        levels, white = tuple(black.tolist()), frame.white_level
+        return cls(names, shape, levels, white, white - float(np.mean(levels)), origins, step)
 
     def __str__(self) -> str:
         planes = f"{self.shape[1]} x {self.shape[0]} px with planes {' '.join(self.names)}"
@@ -290,6 +246,8 @@ class TemporalStack:
         Largest fraction of a plane's samples that are 0 (cut off at the bottom).
     piled_at : float or None
         Level below white where samples pile up as at saturation.
+    uneven : float
+        Unevenness of the histogram of the first frame (`unevenness_of`).
     exposure : float or None
         Exposure time, any unit.
     """
@@ -301,6 +259,7 @@ class TemporalStack:
     strength: FloatArray
     zeros: float
     piled_at: float | None
+    uneven: float
     exposure: float | None = None
 
     @property
@@ -339,23 +298,24 @@ def stack_frames(
     strength: list[FloatArray] = []
     zeros, piled_at = 0.0, None
     for frame in frames:
-        planes, black, sampling = np.stack(planes_of(frame)[1]), planes_of(frame)[2], Sampling.of(frame)
+        _, samples, black = planes_of(frame)
+        planes, sampling = np.stack(samples), Sampling.of(frame)
         if camera is None:
-            camera, clipped = sampling, np.zeros(planes.shape, dtype=bool)
+            camera, clipped, uneven = sampling, np.zeros(planes.shape, dtype=bool), unevenness_of(frame)
             mean, squares = np.zeros((2, *planes.shape), dtype=np.float32)
-        if replace(sampling, black=camera.black, origins=camera.origins) != camera:
+        if sampling != camera:
             raise CalibrationError(
                 f"{name}: a frame is {sampling}, the first {camera}: all must come from the same camera and settings"
             )
         strength.append(np.array([plane.mean(dtype=np.float64) for plane in planes]) - black)
         zeros = max(zeros, *(float((plane == 0).mean()) for plane in planes))
-        piled_at = piled_at or next(filter(None, (saturation_pile(plane, camera.white) for plane in planes)), None)
+        piled_at = piled_at or next(filter(None, (saturation_pile(plane, sampling.white) for plane in planes)), None)
         scale = _ratio(strength[0], strength[-1]) if drifts else np.ones(len(planes))
         values = (planes.astype(np.float32) - _column(black)) * _column(scale)
         step = values - mean
         mean += step / len(strength)
         squares += step * (values - mean)
-        clipped |= planes >= camera.white
+        clipped |= planes >= sampling.white
     if camera is None:
         raise CalibrationError(f"{name}: no frames")
     levels = np.array(strength)
@@ -369,6 +329,7 @@ def stack_frames(
         strength=levels,
         zeros=zeros,
         piled_at=piled_at,
+        uneven=uneven,
         exposure=exposure,
     )
 
@@ -438,6 +399,10 @@ class BlockMeans:
         Mean square second difference over the square of the mean, in the brightest plane: how sharp the picture is.
     piled_at : float or None
         Grey level (DN) below the white level at which samples pile up as they do at saturation; None: nowhere.
+    uneven : float
+        Unevenness of its histogram (`unevenness_of`).
+    name : str
+        Of its file, for messages.
     """
 
     planes: FloatArray
@@ -445,7 +410,9 @@ class BlockMeans:
     camera: Sampling
     block: int
     detail: float
-    piled_at: float | None = None
+    piled_at: float | None
+    uneven: float
+    name: str
 
     @property
     def channels(self) -> FloatArray:
@@ -454,8 +421,14 @@ class BlockMeans:
             return self.planes
         return np.stack([self.planes[0], 0.5 * (self.planes[1] + self.planes[2]), self.planes[3]])
 
+    @property
+    def centres(self) -> FloatArray:
+        """Centres (x, y) of the blocks in px, shape (R, S, 2)."""
+        rows, columns = (_starts(side, self.block) + (self.block - 1) / 2 for side in self.camera.shape)
+        return np.stack(np.meshgrid(columns, rows), axis=-1)
 
-def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
+
+def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16, name: str = "") -> BlockMeans:
     """Average every colour plane of a frame in blocks.
 
     Parameters
@@ -464,6 +437,8 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
         Raw frame, Bayer or 3-CCD.
     block
         Side of a block in px; even.
+    name
+        Name of the frame's file, for messages.
 
     Raises
     ------
@@ -482,15 +457,11 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
             f"frames of {shape[1]} x {shape[0]} px are too small for calibration in blocks of {block} px "
             f"(at least {3 * block + 4} px on each side)"
         )
-    means = np.stack(
-        [
-            _window(shape[0], len(plane), block, step, row)
-            @ plane
-            @ _window(shape[1], len(plane.T), block, step, col).T
-            - dark
-            for plane, dark, (row, col) in zip(planes, black, camera.origins, strict=True)
-        ]
-    )
+    averages = []
+    for plane, dark, origin in zip(planes, black, camera.origins, strict=True):
+        down, along = (_window(shape[axis], plane.shape[axis], block, step, origin[axis]) for axis in (0, 1))
+        averages.append(down @ plane @ along.T - dark)
+    means = np.stack(averages)
     brightest = int(means.mean(axis=(1, 2)).argmax())
     picture = planes[brightest].astype(np.float32)
     level = max(float(picture.mean()) - float(black[brightest]), 1.0)
@@ -505,13 +476,9 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16) -> BlockMeans:
         block=block,
         detail=float(((picture[:, 2:] - 2 * picture[:, 1:-1] + picture[:, :-2]) ** 2).mean()) / level**2,
         piled_at=saturation_pile(planes[brightest], frame.white_level),
+        uneven=unevenness_of(frame),
+        name=name,
     )
-
-
-def block_centres(shape: tuple[int, int], block: int) -> FloatArray:
-    """Centres (x, y) in px of the blocks of a frame, shape (R, S, 2)."""
-    rows, columns = (_starts(side, block) + (block - 1) / 2 for side in shape)
-    return np.stack(np.meshgrid(columns, rows), axis=-1)
 
 
 def _starts(side: int, block: int) -> npt.NDArray[np.intp]:
@@ -535,3 +502,16 @@ def saturation_pile(plane: npt.NDArray[np.uint16], white: float) -> float | None
         return None
     count, below = int((plane == top).sum()), int(((plane < top) & (plane >= top - 4)).sum())
     return float(top) if count > 20 and count > 2 * below else None
+
+
+def unevenness_of(frame: Mosaic | ChannelFrame, lit: float = 0.1) -> float:
+    """Largest unevenness of the histogram of a lit plane; NaN where it cannot be determined in any.
+
+    Lit are planes whose mean above black exceeds the fraction `lit` of the full scale: in the dark, noise is too little
+    to smooth it. Some cameras apply gains of their own to red and blue, so all planes are looked at.
+    """
+    white, found = frame.white_level, [np.nan]
+    for plane, black in zip(*planes_of(frame)[1:], strict=True):
+        if plane.mean() > black + lit * (white - black):
+            found.append(unevenness(plane[plane < white]))
+    return float(np.fmax.reduce(found))

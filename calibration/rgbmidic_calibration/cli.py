@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,6 +18,7 @@ from rgbmidic.errors import ConfigurationError
 if TYPE_CHECKING:
     from rgbmidic.settings import FrameSettings
     from rgbmidic_calibration.captures import Captures
+    from rgbmidic_calibration.verify import Limits
 
 app = command.application("rgbmidic-calibrate")
 
@@ -60,10 +62,71 @@ def _frames(options: Mapping[str, Any]) -> FrameSettings:
 
 def _captures(options: dict[str, Any]) -> partial[Captures]:
     """How the captures that options name are found, by a call."""
-    from rgbmidic_calibration.captures import Captures, named_patterns
+    from rgbmidic_calibration.captures import Captures
 
-    lights, dark = named_patterns(options.pop("light"), "--light"), options.pop("dark")
+    lights, dark = read_named(options.pop("light"), "--light"), options.pop("dark")
     return partial(Captures.find, lights, dark, _frames(options))
+
+
+def read_named(options: Sequence[str], option: str) -> dict[str, str]:
+    """Split options of the form NAME=FILES.
+
+    Raises
+    ------
+    ConfigurationError
+        An option has another form, or a name occurs twice.
+    """
+    named: dict[str, str] = {}
+    for text in options:
+        name, separator, pattern = text.partition("=")
+        name, pattern = name.strip(), pattern.strip()
+        if not (separator and name and pattern):
+            raise ConfigurationError(f"{option} takes NAME=FILES, as in {option} red='light_red/*.tif', not {text!r}")
+        if name in named:
+            raise ConfigurationError(f"{option} {name} is given twice; one pattern may match many files")
+        named[name] = pattern
+    return named
+
+
+def check_output(path: Path, *, overwrite: bool, option: str = "--out") -> None:
+    """Refuse to write where that would lose something.
+
+    Raises
+    ------
+    ConfigurationError
+        The file exists and may not be overwritten, or its folder does not exist.
+    """
+    if path.is_dir():
+        raise ConfigurationError(f"{option} {path} is a folder; state a file name")
+    if path.exists() and not overwrite:
+        raise ConfigurationError(f"{path} exists already; choose another {option} or add --overwrite")
+    if not path.parent.is_dir():
+        raise ConfigurationError(f"the folder of {option} {path} does not exist")
+
+
+def read_limits(options: Sequence[str]) -> Limits:
+    """Limits from options of the form NAME=VALUE.
+
+    Raises
+    ------
+    ConfigurationError
+        An unknown name, or a value that is not a positive number.
+    """
+    from rgbmidic_calibration.verify import LIMITS
+
+    limits, names = LIMITS, [entry.name for entry in fields(LIMITS)]
+    for text in options:
+        name, _, value = text.partition("=")
+        try:
+            number = float(value)
+        except ValueError:
+            number = -1.0
+        if name not in names or not number > 0:
+            raise ConfigurationError(
+                f"--limit takes NAME=VALUE with a positive value and one of the names {', '.join(names)}, not {text!r}"
+            )
+        limits = replace(limits, **{name: number})
+    return limits
 
 
 def _region(text: str | None) -> tuple[float, ...] | None:
@@ -77,8 +140,6 @@ def _writes(name: str, hint: Any, default: str | None = None) -> Callable[[Comma
     """Decorator of a command with a file to write, which may replace another only where that is stated."""
 
     def read(options: Mapping[str, Any]) -> Path | None:
-        from rgbmidic_calibration.captures import check_output
-
         path: Path | None = options[name]
         if path is not None:
             check_output(path, overwrite=options["overwrite"], option=f"--{name}")
@@ -182,8 +243,6 @@ def camera(
     """Calibrate lens distortion and the plane of the specimen, from photographs of a target: px to mm."""
     from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic_calibration import display, jobs
-    from rgbmidic_calibration.captures import check_output
-    from rgbmidic_calibration.pictures import draw_camera
     from rgbmidic_calibration.target import Target
 
     check_output(out, overwrite=overwrite)
@@ -202,7 +261,7 @@ def camera(
     estimate.camera.write(out)
     display.camera(estimate.camera, out)
     if picture is not None:
-        draw_camera(estimate, picture)
+        display.draw_camera(estimate.camera, picture, estimate.residuals)
 
 
 @app.command()
@@ -221,11 +280,10 @@ def check(
     """Check a calibration on captures that were not used to make it; exit status 1 if a limit is exceeded."""
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic_calibration import display
-    from rgbmidic_calibration.captures import named_patterns
-    from rgbmidic_calibration.verify import check_calibration, read_limits
+    from rgbmidic_calibration.verify import check_calibration
 
     limits, calibration = read_limits(limit or ()), Calibration.read(file)
-    found = captures(calibration=calibration, together=named_patterns(together or (), "--together"))
+    found = captures(calibration=calibration, together=read_named(together or (), "--together"))
     checks = check_calibration(calibration, found, limits=limits, region=_region(region))
     display.verdict(checks)
     if not all(one.passed for one in checks):
@@ -252,15 +310,13 @@ def design(
     """Predict crosstalk, condition number and noise from spectra, and find the best set of lamps to buy."""
     from rgbmidic_calibration import design as designs
     from rgbmidic_calibration import display
-    from rgbmidic_calibration.captures import named_patterns
-    from rgbmidic_calibration.pictures import draw_design
 
-    lamps = {name: designs.read_lamp(text) for name, text in named_patterns(light, "--light").items()}
+    lamps = {name: designs.read_lamp(text) for name, text in read_named(light, "--light").items()}
     sensitivities = designs.read_camera(camera)
     found = designs.best_sets(sensitivities, lamps, min(choose, len(lamps)))
     display.designs(found[:show_sets])
     if picture is not None:
-        draw_design(found[0], sensitivities, lamps, picture)
+        display.draw_design(found[0], sensitivities, lamps, picture)
 
 
 @app.command()
@@ -284,16 +340,14 @@ def show(file: Annotated[Path, Argument(help="Calibration file.")], picture: Pat
     from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic_calibration import display
-    from rgbmidic_calibration.camera import CameraEstimate
-    from rgbmidic_calibration.pictures import draw_calibration, draw_camera
 
     if CameraCalibration.is_in(file):
         camera = CameraCalibration.read(file)
         display.camera(camera, file, written=False)
         if picture is not None:
-            draw_camera(CameraEstimate(camera=camera), picture)
+            display.draw_camera(camera, picture)
         return
     calibration = Calibration.read(file)
     display.calibration(calibration, file)
     if picture is not None:
-        draw_calibration(calibration, picture)
+        display.draw_calibration(calibration, picture)

@@ -27,7 +27,7 @@ from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products
 from rgbmidic.typing import BoolArray, FloatArray
-from rgbmidic_calibration.captures import BlockMeans, block_centres
+from rgbmidic_calibration.captures import BlockMeans
 from rgbmidic_calibration.plausibility import CHECKS, capture_checks, judged
 
 CHANNELS = ("R", "G", "B")
@@ -42,8 +42,6 @@ class CrosstalkConstants:
     ----------
     black_level_std
         Standard uncertainty (DN) of a black level that no series of dark frames measured: rounded to whole grey levels.
-    least_blocks
-        Unsaturated blocks per capture at least: as many as the smallest frame has, 3 x 3 (`block_means`).
     automatic_order
         Largest degree that the data may ask for: shading by lens and filters is a slope and a curvature.
     largest_order
@@ -57,7 +55,6 @@ class CrosstalkConstants:
     """
 
     black_level_std: float = 0.3
-    least_blocks: int = 9
     automatic_order: int = 2
     largest_order: int = 4
     significance: float = 1e-3
@@ -86,6 +83,13 @@ class LightSignal:
     values: FloatArray
     valid: BoolArray
     reference: int
+
+    @classmethod
+    def of(cls, name: str, captures: Sequence[BlockMeans], dark: FloatArray) -> LightSignal:
+        """The averages of captures above the dark level."""
+        values = np.stack([frame.channels for frame in captures]) - dark
+        valid = ~np.stack([frame.saturated for frame in captures])
+        return cls(name, values, valid, int(np.median(values.transpose(0, 2, 3, 1)[valid], axis=0).argmax()))
 
     @property
     def base(self) -> FloatArray:
@@ -340,7 +344,6 @@ def estimate_crosstalk(
     *,
     order: int | None = None,
     allow: Sequence[str] = (),
-    labels: Mapping[str, Sequence[str]] | None = None,
 ) -> CrosstalkEstimate:
     """Estimate the crosstalk matrix from block averages of single-light captures.
 
@@ -356,8 +359,6 @@ def estimate_crosstalk(
         unless the variation is both significant and larger than the tolerance.
     allow
         Names of plausibility checks (`CHECKS`) that the user waives.
-    labels
-        File names of the captures, for messages; by light, and ``"dark"``.
 
     Raises
     ------
@@ -369,16 +370,16 @@ def estimate_crosstalk(
         raise CalibrationError(f"unknown check {', '.join(unknown)}; those that can be waived are {', '.join(CHECKS)}")
     if order is not None and not 0 <= order <= LIMITS.largest_order:
         raise CalibrationError(f"the degree of the field is 0 to {LIMITS.largest_order}, not {order}")
-    warnings = judged(capture_checks(lights, dark, labels or {}), allow)
+    warnings = judged(capture_checks(lights, dark), allow)
     like = next(iter(lights.values()))[0]
-    shape, centres = like.camera.shape, block_centres(like.camera.shape, like.block)
+    shape, centres = like.camera.shape, like.centres
     level, of_mean, of_frame = np.zeros_like(like.channels), LIMITS.black_level_std**2 * np.eye(3), np.zeros((3, 3))
     if dark:
         frames = np.stack([frame.channels for frame in dark])
         level = frames.mean(axis=0)
         of_frame = np.cov(frames.mean(axis=(2, 3)), rowvar=False) if len(frames) > 1 else of_mean
         of_mean = of_frame / len(frames)
-    signals = [_above_dark(name, captures, level) for name, captures in lights.items()]
+    signals = [LightSignal.of(name, captures, level) for name, captures in lights.items()]
     asked = legendre_products(centres, shape, LIMITS.automatic_order)
     needed, variations = zip(*(_needed_degree(signal, asked) for signal in signals), strict=True)
     order = max(needed) if order is None else order
@@ -395,17 +396,6 @@ def estimate_crosstalk(
         matrix=matrices[0], lights=tuple(lights), covariance=covariance[0, :, :, 0].reshape(size, size), field=field
     )
     return CrosstalkEstimate(crosstalk=crosstalk, lights=fits, variations=variations, warnings=tuple(warnings))
-
-
-def _above_dark(name: str, captures: Sequence[BlockMeans], dark: FloatArray) -> LightSignal:
-    values = np.stack([frame.channels for frame in captures]) - dark
-    valid = ~np.stack([frame.saturated for frame in captures])
-    if valid.sum() < LIMITS.least_blocks * len(captures):
-        raise CalibrationError(
-            f"light {name}: {100 * (1 - valid.mean()):.0f} % of the blocks hold saturated samples; "
-            "shorten the exposure until none does"
-        )
-    return LightSignal(name, values, valid, int(np.median(values.transpose(0, 2, 3, 1)[valid], axis=0).argmax()))
 
 
 def _needed_degree(signal: LightSignal, design: FloatArray) -> tuple[int, Variation]:

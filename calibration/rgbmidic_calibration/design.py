@@ -6,7 +6,6 @@ the predicted A. Paint and specimen are taken as grey.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -15,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
-from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities
-from rgbmidic.settings import regular
+from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities, read_columns
 from rgbmidic.typing import FloatArray
 
 
@@ -36,17 +34,14 @@ class MeasuredLamp:
     values: FloatArray
 
     def __post_init__(self) -> None:
-        wavelengths = np.asarray(self.wavelengths, dtype=np.float64)
-        values = np.maximum(np.asarray(self.values, dtype=np.float64), 0)
-        rising = wavelengths.ndim == 1 and wavelengths.size > 1 and (np.diff(wavelengths) > 0).all()
-        if not (rising and values.shape == wavelengths.shape and np.isfinite(values).all() and values.max() > 0):
+        places, values = self.wavelengths, self.values
+        rising = places.ndim == 1 and places.size > 1 and (np.diff(places) > 0).all()
+        if not (rising and values.shape == places.shape and np.isfinite(values).all() and values.max() > 0):
             raise InputError("a spectrum needs rising wavelengths and as many finite values, not all zero")
-        object.__setattr__(self, "wavelengths", wavelengths)
-        object.__setattr__(self, "values", values)
 
     def power(self, wavelengths: FloatArray) -> FloatArray:
         """Spectral power at equally spaced wavelengths (nm), of unit sum; zero outside the measured range."""
-        values = np.interp(wavelengths, self.wavelengths, self.values, left=0.0, right=0.0)
+        values = np.interp(wavelengths, self.wavelengths, np.maximum(self.values, 0), left=0.0, right=0.0)
         if not values.sum() > 0:
             raise InputError(f"the lamp emits nothing within {wavelengths[0]:g} to {wavelengths[-1]:g} nm")
         return np.asarray(values / values.sum())
@@ -63,8 +58,6 @@ class Design:
     ----------
     crosstalk : Crosstalk
         Predicted A.
-    response : ndarray, shape (3, k)
-        Response of every channel to every lamp of unit radiant power.
     power : ndarray, shape (k,)
         Radiant power that every lamp needs for equal grey levels, relative to the largest.
     headroom : float
@@ -73,7 +66,6 @@ class Design:
     """
 
     crosstalk: Crosstalk
-    response: FloatArray
     power: FloatArray
     headroom: float
 
@@ -99,10 +91,7 @@ def design(camera: Sensitivities, lamps: Mapping[str, Lamp]) -> Design:
         raise CalibrationError(f"the camera does not see {', '.join(unseen)}")
     crosstalk = Crosstalk(matrix=response / seen, lights=tuple(lamps))
     return Design(
-        crosstalk=crosstalk,
-        response=response,
-        power=(1 / seen) / (1 / seen).max(),
-        headroom=float(1 / crosstalk.matrix.sum(axis=1).max()),
+        crosstalk=crosstalk, power=(1 / seen) / (1 / seen).max(), headroom=float(1 / crosstalk.matrix.sum(axis=1).max())
     )
 
 
@@ -175,14 +164,7 @@ def _read_table(text: str, endings: Sequence[str] = ("",)) -> tuple[FloatArray, 
     """Wavelengths and the columns that a text FILE.csv#NAME means, shape (columns, n)."""
     file, _, column = text.partition("#")
     try:
-        with regular(Path(file)).open(newline="", encoding="utf-8") as stream:
-            rows = [row for row in csv.reader(stream) if row]
-        try:
-            float(rows[0][0])
-            head = []
-        except ValueError:
-            head = [cell.strip() for cell in rows.pop(0)]
-        table = np.array(rows, dtype=np.float64).T
+        head, table = read_columns(Path(file))
     except FileNotFoundError:
         raise ConfigurationError(f"file of spectra not found: {file}") from None
     except (OSError, ValueError, IndexError) as error:

@@ -6,8 +6,8 @@ Noise, crosstalk and registration are often measured on different days, hence th
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,11 @@ import numpy as np
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.fields.plane import CameraCalibration
-from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
+from rgbmidic.frames.data import Mosaic
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.unevenness import unevenness
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings
 from rgbmidic_calibration.camera import LIMITS, CameraEstimate, estimate_lens, estimate_plane
-from rgbmidic_calibration.captures import BlockMeans, CaptureFiles, Captures, block_means, provenance
+from rgbmidic_calibration.captures import CaptureFiles, Captures, provenance
 from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk
 from rgbmidic_calibration.noise import NoiseEstimate, photon_transfer
 from rgbmidic_calibration.registration import RegistrationEstimate, estimate_registration
@@ -31,25 +30,14 @@ def calibrate_crosstalk(
     captures: Captures, *, block: int = 16, order: int | None = None, allow: Sequence[str] = ()
 ) -> tuple[Calibration, CrosstalkEstimate]:
     """Crosstalk section from capture files; `order` and `allow` as in `estimate_crosstalk`, blocks of `block` px."""
-    uneven: list[float] = []
-
-    def reduced(files: CaptureFiles | None) -> list[BlockMeans]:
-        means = []
-        for frame in files.frames() if files else ():
-            uneven.extend(_unevenness(frame))
-            means.append(block_means(frame, block=block))
-        return means
-
-    means = {name: reduced(files) for name, files in captures.lights.items()}
-    labels = {group.role.removeprefix("light "): group.labels for group in captures.groups}
-    estimate = estimate_crosstalk(means, reduced(captures.dark), order=order, allow=allow, labels=labels)
+    means = {name: files.means(block) for name, files in captures.lights.items()}
+    dark = captures.dark.means(block) if captures.dark else []
+    estimate = estimate_crosstalk(means, dark, order=order, allow=allow)
+    uneven = [frame.uneven for frames in (*means.values(), dark) for frame in frames]
     details = {
         "block": block,
         "waived_checks": list(allow),
-        "variation_over_field": {
-            name: {"p_value": found.p_value, "rms": found.rms}
-            for name, found in zip(means, estimate.variations, strict=True)
-        },
+        "variation_over_field": {name: asdict(found) for name, found in zip(means, estimate.variations, strict=True)},
     }
     return _calibration("crosstalk", captures.groups, uneven, details, estimate), estimate
 
@@ -67,56 +55,36 @@ def calibrate_noise(dark: str, flats: Sequence[str], stated: FrameSettings) -> t
     stated
         What is stated of the files.
     """
-    dark_files = CaptureFiles.find("dark", dark, stated)
-    exposures: list[tuple[CaptureFiles, float | None]] = []
+    groups = [CaptureFiles.find("dark", dark, stated)]
     for text in flats:
         time, separator, pattern = text.partition("=")
         if not separator:
-            exposures += [(files, None) for files in CaptureFiles.find(f"flat {text}", text, stated).by_folder()]
+            groups += CaptureFiles.find(f"flat {text}", text, stated).by_folder()
             continue
         try:
             seconds = float(time)
         except ValueError:
             raise ConfigurationError(f"--flat takes FILES or TIME=FILES with a number as time, not {text!r}") from None
-        exposures.append((CaptureFiles.find(f"flat exposure {time}", pattern, stated), seconds))
-    estimate = photon_transfer(dark_files.stack(), [files.stack(time) for files, time in exposures])
-    groups = [dark_files, *(files for files, _ in exposures)]
-    details = {"exposures": [time for _, time in exposures]}
-    return _calibration("noise", groups, _unevenness_of(groups[1:]), details, estimate), estimate
+        groups.append(replace(CaptureFiles.find(f"flat exposure {time}", pattern, stated), exposure=seconds))
+    dark_frames, *lit = [files.stack() for files in groups]
+    estimate = photon_transfer(dark_frames, lit)
+    details = {"exposures": [stack.exposure for stack in lit]}
+    return _calibration("noise", groups, [stack.uneven for stack in lit], details, estimate), estimate
 
 
 def calibrate_registration(
     captures: Captures, *, region: Sequence[float] | None = None, element_size: float = ELEMENT_SIZE
 ) -> tuple[Calibration, RegistrationEstimate]:
     """Registration section from captures of a speckled target; the first light is the reference."""
-    estimate = estimate_registration(*captures.stacks(), region=region, element_size=element_size)
-    uneven = _unevenness_of(captures.lights.values())
+    lights, dark = captures.stacks()
+    estimate = estimate_registration(lights, dark, region=region, element_size=element_size)
+    uneven = [stack.uneven for stack in lights.values()]
     details = {
         "region": None if region is None else list(region),
         "element_size": element_size,
         "residual_rms_px": {match.name: match.rms for match in estimate.matches},
     }
     return _calibration("registration", captures.groups, uneven, details, estimate), estimate
-
-
-def _unevenness_of(groups: Iterable[CaptureFiles]) -> list[float]:
-    """Of the first frame of every group."""
-    return [value for files in groups for value in _unevenness(next(files.frames()))]
-
-
-def _unevenness(capture: Mosaic | ChannelFrame, lit: float = 0.1) -> list[float]:
-    """Unevenness of the histogram of every lit plane, where it can be determined.
-
-    Lit are planes whose mean above black exceeds the fraction `lit` of the full scale: in the dark, noise is too little
-    to smooth it. Some cameras apply gains of their own to red and blue, so all planes are looked at.
-    """
-    white = capture.white_level
-    found = [
-        unevenness(plane[plane < white])
-        for plane, black in zip(*planes_of(capture)[1:], strict=True)
-        if plane.mean() > black + lit * (white - black)
-    ]
-    return [value for value in found if np.isfinite(value)]
 
 
 def _calibration(
@@ -131,7 +99,7 @@ def _calibration(
     The settings are those of the first frame; levels that neither the file nor the user states stay open.
     """
     files, field = groups[0], "camera_noise" if section == "noise" else section
-    header, frame = files.series.lights[0][0].stored(0), next(files.frames())
+    header, (_, frame) = files.series.lights[0][0].stored(0), next(files.frames())
     levels: dict[str, Any] = {"black_level": float(frame.black_level.mean()), "white_level": frame.white_level}
     known = {name for name in levels for source in (header, files.stated) if getattr(source, name) is not None}
     return Calibration(
@@ -140,7 +108,7 @@ def _calibration(
         kind="bayer" if isinstance(frame, Mosaic) else "rgb" if len(frame.values) == 3 else "monochrome",
         cfa=frame.cfa if isinstance(frame, Mosaic) else None,
         shape=(frame.values.shape[-2], frame.values.shape[-1]),
-        unevenness=max(uneven, default=None),
+        unevenness=max(filter(np.isfinite, uneven), default=None),
         **{name: level for name, level in levels.items() if name in known},
     )
 

@@ -16,10 +16,11 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from rgbmidic.errors import CalibrationError
-from rgbmidic.illumination.checks import Check, reported, warning
+from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.linear import CameraNoise, Quantity
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile_means
+from rgbmidic_calibration.plausibility import judged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,9 +126,8 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
     lines = [_fit_line(name, mean[:, p], variance[:, p], used[:, p], freedom) for p, name in enumerate(names)]
     drift = dark.strength.var(axis=0, ddof=1)
     rest = np.array([plane.mean(dtype=np.float64) / plane.size for plane in dark.variance])
-    black = Quantity(
-        np.array(dark.camera.black) + dark.strength.mean(axis=0), np.sqrt(np.maximum(drift, rest) / dark.count)
-    )
+    black_std = np.sqrt(np.maximum(drift, rest) / dark.count)
+    black = Quantity(np.array(dark.camera.black) + dark.strength.mean(axis=0), black_std)
     knees = []  # lowest level at which the variance of a plane breaks down
     for plane, line in enumerate(lines):
         ratio = variance[1:, plane] / (line.read_variance + line.slope * np.maximum(mean[1:, plane], 0))
@@ -153,7 +153,7 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
         prnu=prnu,
         defects=defects,
     )
-    warnings = [check.text for check in reported(_checks(dark, flats, noise, lines, early))]
+    warnings = judged(_checks(dark, flats, noise, lines, early))
     return NoiseEstimate(camera_noise=noise, warnings=(*warnings, *uneven))
 
 
@@ -299,9 +299,7 @@ def _response(
     return _spread(signal / local, temporal / local**2, usable & ~dead), dead
 
 
-def _spread(
-    mean: npt.NDArray[np.floating], temporal: npt.NDArray[np.floating], usable: BoolArray
-) -> tuple[float, float]:
+def _spread(mean: AnyArray, temporal: AnyArray, usable: BoolArray) -> tuple[float, float]:
     """Spatial standard deviation about the neighbourhood's mean, temporal noise taken out, and its uncertainty."""
     window = LIMITS.window
     filled = np.where(usable, mean, np.median(mean[usable]))
@@ -326,7 +324,7 @@ def _checks(
             f"plane {planes[plane]}: the variance breaks down at {knee:.0f} DN above black, below the white level: the "
             f"sensor saturates there (white_level {knee + black[plane]:.0f} in the test)"
         )
-    if not any(clipped.any() for flat in flats for clipped in flat.clipped) and not early.any():
+    if not any(flat.clipped.any() for flat in flats) and not early.any():
         yield warning("no exposure reached saturation: the full well is that of the stated white level")
     text = (
         f"{100 * dark.zeros:.1f} % of the dark samples are 0: the black level is cut off and the read noise comes out "
@@ -337,10 +335,8 @@ def _checks(
     text = f"the lamp's strength differs by {100 * drift:.1f} % within an exposure; it was taken out"
     yield warning(text, drift, above=0.02)
     reach, range_ = max(line.reach for line in lines), dark.camera.white - min(dark.camera.black)
-    if reach < 0.2 * range_:  # the relative error of the gain grows as its inverse
-        yield warning(
-            f"the brightest exposure reaches {reach:.0f} DN only: expose up to 70 % of the range for a good gain"
-        )
+    text = f"the brightest exposure reaches {reach:.0f} DN only: expose up to 70 % of the range for a good gain"
+    yield warning(text, reach < 0.2 * range_)  # the relative error of the gain grows as its inverse
     for name, line in zip(planes, lines, strict=True):
         text = (
             f"plane {name}: the variance does not follow a line (departs by {100 * line.bend:.1f} %, scatters "
@@ -356,9 +352,8 @@ def _checks(
         "exposure times those of the frames, was the lamp steady? Unmixing needs a linear camera"
     )
     yield warning(text, error[worst], above=limit)
-    if np.isnan(noise.linearity_error.value).any() and any(flat.exposure is not None for flat in flats):
-        yield warning(
-            "no linearity error for some plane: it takes three exposure times that reach 5 to 95 % of the range there"
-        )
+    text = "no linearity error for some plane: it takes three exposure times that reach 5 to 95 % of the range there"
+    timed = any(flat.exposure is not None for flat in flats)
+    yield warning(text, timed and float(np.isnan(noise.linearity_error.value).any()))
     text = "the gains of the planes differ: the camera applies digital gain per colour; the mean is used"
     yield warning(text, np.ptp(noise.gain.value) / noise.gain.value.mean(), above=0.05)

@@ -22,7 +22,7 @@ enough signal; the captures of one light agree in colour; the dark frames agree 
 below the white level."""
 
 
-def judged(checks: Iterable[Check], allow: Collection[str]) -> list[str]:
+def judged(checks: Iterable[Check], allow: Collection[str] = ()) -> list[str]:
     """Warnings that checks give rise to, those among them that fail and are waived.
 
     Raises
@@ -36,10 +36,8 @@ def judged(checks: Iterable[Check], allow: Collection[str]) -> list[str]:
     return [check.text for check in found]
 
 
-def capture_checks(
-    lights: Mapping[str, Sequence[BlockMeans]], dark: Sequence[BlockMeans], labels: Mapping[str, Sequence[str]]
-) -> Iterator[Check]:
-    """Check the captures of the lights and the dark frames; `labels` are their files' names, for messages.
+def capture_checks(lights: Mapping[str, Sequence[BlockMeans]], dark: Sequence[BlockMeans]) -> Iterator[Check]:
+    """Check the captures of the lights and the dark frames.
 
     Raises
     ------
@@ -53,25 +51,25 @@ def capture_checks(
     for name in [name for name, captures in lights.items() if not captures]:
         raise CalibrationError(f"light {name} has no captures")
 
-    def label(name: str, index: int) -> str:
-        file = f" ({labels[name][index]})" if index < len(labels.get(name, ())) else ""
-        return f"capture {index + 1} of {'the dark frames' if name == 'dark' else 'light ' + name}{file}"
-
+    labels: dict[str, list[str]] = {}
     first = next(iter(lights.values()))[0].camera
     for name, captures in {**lights, "dark": dark}.items():
-        for index, frame in enumerate(captures):
-            if not frame.camera.matches(first):
+        whose = "the dark frames" if name == "dark" else f"light {name}"
+        files = [f" ({frame.name})" if frame.name else "" for frame in captures]
+        labels[name] = [f"capture {index} of {whose}{file}" for index, file in enumerate(files, start=1)]
+        for frame, label in zip(captures, labels[name], strict=True):
+            if frame.camera != first:
                 raise CalibrationError(
-                    f"{label(name, index)} is {frame.camera}, the first capture is {first}: all captures must come "
-                    "from the same camera with the same settings"
+                    f"{label} is {frame.camera}, the first capture is {first}: all captures must come from the same "
+                    "camera with the same settings"
                 )
-    yield from _dark_checks(lights, dark, [label("dark", index) for index in range(len(dark))])
+    yield from _dark_checks(lights, dark, labels["dark"])
     level = np.mean([frame.channels for frame in dark], axis=0) if dark else np.float64(0)
     for name, captures in lights.items():
         signals = [frame.channels - level for frame in captures]
         yield from _signal_checks(name, captures, signals)
         if len(captures) > 1:
-            yield from _agreement_checks(captures, signals, [label(name, index) for index in range(len(captures))])
+            yield from _agreement_checks(captures, signals, labels[name])
 
 
 def _dark_checks(
@@ -111,9 +109,10 @@ def _dark_checks(
 def _signal_checks(name: str, captures: Sequence[BlockMeans], signals: Sequence[FloatArray]) -> Iterator[Check]:
     clear = [~frame.saturated for frame in captures]
     clipped = 1 - float(np.mean(clear))
-    if clipped == 1:
+    if np.sum(clear) < 9 * len(captures):  # as many blocks as the smallest frame has, 3 x 3 (`block_means`)
         raise CalibrationError(
-            f"light {name}: every block of every capture holds saturated samples; shorten the exposure until none does"
+            f"light {name}: {100 * clipped:.0f} % of the blocks hold saturated samples; shorten the exposure until "
+            "none does"
         )
     for piled in [frame.piled_at for frame in captures if frame.piled_at is not None][:1]:
         text = (

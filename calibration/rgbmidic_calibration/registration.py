@@ -17,12 +17,13 @@ from scipy import ndimage
 
 from rgbmidic.correlation.solution import NodeStatus, Solution
 from rgbmidic.errors import CalibrationError, RgbmidicError
-from rgbmidic.illumination.checks import Check, reported, warning
+from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.images import PARAMETERS, Registration, frame_geometry, registration_basis
 from rgbmidic.pipeline import correlate
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 from rgbmidic_calibration.captures import TemporalStack, same_camera
+from rgbmidic_calibration.plausibility import judged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,17 +128,13 @@ def light_picture(stack: TemporalStack, dark: TemporalStack | None = None) -> Fl
         brightest = int(np.argmax(levels))
         return _relative(signals[brightest], stack.clipped[brightest], LIMITS.local)
 
-    def clear(plane: int) -> bool:
-        """Whether a plane exceeds its noise; of a single frame, a tenth of the brightest plane."""
-        known = [one for one in (stack, dark) if one is not None and (one is stack or one.count > 1)]
-        noise = sum(float(one.variance[plane].mean(dtype=np.float64)) / one.count for one in known)
-        faint = stack.count < 2 and levels[plane] < 0.1 * max(levels)
-        return not faint and levels[plane] > LIMITS.clear * float(np.sqrt(noise))
-
     picture = np.full(stack.camera.shape, np.nan, dtype=np.float32)
-    used = np.zeros_like(picture)
+    used, measured = np.zeros_like(picture), [stack, *([dark] if dark is not None and dark.count > 1 else [])]
     for plane, (signal, (row, column)) in enumerate(zip(signals, stack.camera.origins, strict=True)):
-        if clear(plane):
+        noise = sum(float(one.variance[plane].mean(dtype=np.float64)) / one.count for one in measured)
+        # a plane that does not exceed its noise is not used; of a single frame, a tenth of the brightest plane
+        faint = stack.count < 2 and levels[plane] < 0.1 * max(levels)
+        if not faint and levels[plane] > LIMITS.clear * float(np.sqrt(noise)):
             place = (slice(row, 2 * signal.shape[0], 2), slice(column, 2 * signal.shape[1], 2))
             picture[place] = _relative(signal, stack.clipped[plane], LIMITS.local / 2)
             used[place] = 1
@@ -199,12 +196,10 @@ def estimate_registration(
     for name, stack in lights.items():
         try:
             pictures[name] = light_picture(stack, dark)
+            if (saturated := float(np.isnan(pictures[name]).mean())) > 1 - LIMITS.measured:
+                raise CalibrationError(f"{100 * saturated:.0f} % of the picture is saturated; shorten the exposure")
         except CalibrationError as error:
             raise CalibrationError(f"light {name}: {error}") from None
-        if (saturated := float(np.isnan(pictures[name]).mean())) > 1 - LIMITS.measured:
-            raise CalibrationError(
-                f"light {name}: {100 * saturated:.0f} % of the picture is saturated; shorten the exposure"
-            )
     names = tuple(lights)
     motion = {name: np.nan_to_num(jitter(stack, pictures[name]) ** 2 / stack.count) for name, stack in lights.items()}
     parameters = np.zeros((len(names), len(PARAMETERS)))
@@ -219,7 +214,7 @@ def estimate_registration(
     registration = Registration(
         lights=names, parameters=parameters, centre=centre, radius=radius, covariance=covariance
     )
-    warnings = tuple(check.text for check in reported(_checks(lights, dark, motion, matches)))
+    warnings = tuple(judged(_checks(lights, dark, motion, matches)))
     return RegistrationEstimate(registration=registration, matches=tuple(matches), warnings=warnings)
 
 

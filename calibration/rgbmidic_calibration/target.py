@@ -157,19 +157,21 @@ def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, r
 
     def model(state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Grey levels (m, p) and their derivatives (m, p, 7)."""
-        dx, dy = x - state[:, :1], y - state[:, 1:2]
-        width, step = np.exp(state[:, 4:5]), state[:, 6:7]
-        (e, f), (de, df), (along_e, along_f), (across_e, across_f) = zip(
-            *(_edge(dx, dy, state[:, 2 + edge : 3 + edge], width) for edge in (0, 1)), strict=True
-        )
+        dx, dy = (x - state[:, :1])[:, None], (y - state[:, 1:2])[:, None]
+        width, step = np.exp(state[:, 4:5, None]), state[:, 6:7]
+        # of both edges: coordinates along and across, the profile of a blurred edge and its derivative by the distance
         sines, cosines = np.sin(state[:, 2:4, None]), np.cos(state[:, 2:4, None])
+        along, across = dx * cosines + dy * sines, dy * cosines - dx * sines
+        profile = special.erf(across / width)
+        e, f = profile[:, 0], profile[:, 1]
+        de, df = np.moveaxis(2 / np.sqrt(np.pi) * np.exp(-((across / width) ** 2)) / width, 1, 0)
         left, right = step * de * f, step * e * df
         slopes = (
             left * sines[:, 0] + right * sines[:, 1],
             -left * cosines[:, 0] - right * cosines[:, 1],
-            -left * along_e,
-            -right * along_f,
-            -left * across_e - right * across_f,
+            -left * along[:, 0],
+            -right * along[:, 1],
+            -left * across[:, 0] - right * across[:, 1],
             np.ones_like(e),
             e * f,
         )
@@ -192,13 +194,6 @@ def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, r
     found = corner + state[:, :2]
     sure = inside & (np.abs(found - pixels) < half / 2).all(axis=1) & np.isfinite(state).all(axis=1)
     return np.where(sure[:, None], found, pixels)
-
-
-def _edge(dx: FloatArray, dy: FloatArray, angle: FloatArray, width: FloatArray) -> tuple[FloatArray, ...]:
-    """Profile of a blurred edge, its derivative by the distance, and the coordinates along and across the edge."""
-    along, across = dx * np.cos(angle) + dy * np.sin(angle), dy * np.cos(angle) - dx * np.sin(angle)
-    slope = 2 / np.sqrt(np.pi) * np.exp(-((across / width) ** 2)) / width
-    return special.erf(across / width), slope, along, across
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -297,7 +292,7 @@ def _radius(image: Any, points: FloatArray, pixels: FloatArray) -> float:
 def find_views(files: CaptureFiles, target: Target) -> tuple[list[View], tuple[str, ...]]:
     """Find the target in every photograph; those without it come as reasons."""
     views, reasons = list[View](), list[str]()
-    for frame, name in zip(files.frames(), files.labels, strict=True):
+    for name, frame in files.frames():
         try:
             views.append(find_view(frame, target, name))
         except CalibrationError as error:

@@ -6,7 +6,7 @@ The sub-command `check`: the verdict on a calibration file, from captures that w
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -17,16 +17,7 @@ from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
-from rgbmidic_calibration.captures import (
-    TILE,
-    BlockMeans,
-    Captures,
-    TemporalStack,
-    block_centres,
-    block_means,
-    same_camera,
-    tile_means,
-)
+from rgbmidic_calibration.captures import TILE, BlockMeans, Captures, TemporalStack, same_camera, tile_means
 from rgbmidic_calibration.registration import estimate_registration
 
 
@@ -93,8 +84,7 @@ def leakage(
             f"the calibration knows the lights {', '.join(crosstalk.lights)}, not {', '.join(unknown)}"
         )
     level = np.mean([frame.channels for frame in dark], axis=0) if dark else np.float64(0)
-    first = next(iter(lights.values()))[0]
-    unmixing = crosstalk.unmixing_at(block_centres(first.camera.shape, first.block))
+    unmixing = crosstalk.unmixing_at(next(iter(lights.values()))[0].centres)
     checks = []
     for name, captures in lights.items():
         clear = ~np.any([frame.saturated for frame in captures], axis=0)
@@ -119,31 +109,6 @@ def leakage(
     return checks
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Additivity:
-    """All lights together against the sum of the single ones, ``together - sum = offset + sum of change_j light_j``.
-
-    Attributes
-    ----------
-    mean, spread : float
-        Mean and standard deviation of the difference over all samples, DN.
-    noise : float
-        Standard deviation of the difference that the camera's noise explains, DN; rounding alone where the noise is
-        not known.
-    offset : float
-        DN; what a wrong black level leaves.
-    checks : tuple of Check
-        Rms over tiles of what remains, noise taken out, of the mean signal; then of every light the relative change of
-        its strength between its own and the common capture.
-    """
-
-    mean: float
-    spread: float
-    noise: float
-    offset: float
-    checks: tuple[Check, ...]
-
-
 def additivity(
     together: TemporalStack,
     singles: Mapping[str, TemporalStack],
@@ -151,11 +116,12 @@ def additivity(
     *,
     noise: NoiseModel | None = None,
     limits: Limits = LIMITS,
-) -> Additivity:
+) -> list[Check]:
     """Compare captures of several lights together with the sum of their single captures, sample by sample.
 
     The same scene must be at rest in all of them: a camera that is linear and lamps that do not influence each other
-    give the sum exactly, whatever the crosstalk.
+    give the sum exactly, whatever the crosstalk. Fitted is ``together - sum = offset + sum of change_j light_j``: a
+    wrong black level leaves the offset, a lamp that is weaker when others are on its change.
 
     Parameters
     ----------
@@ -169,6 +135,12 @@ def additivity(
         Camera noise; None: from the captures where each group has two or more, else rounding to grey levels alone.
     limits
         What may be left.
+
+    Returns
+    -------
+    list of Check
+        Rms over tiles of what remains, noise taken out, as a fraction of the mean signal, with a sentence about the
+        difference; then the relative change of every light's strength between its own and the common capture.
     """
     same_camera([together, *singles.values(), *([dark] if dark else [])])
     level = dark.mean if dark else np.float32(0)
@@ -194,18 +166,19 @@ def additivity(
     std = np.sqrt(np.diag(inverse @ (score.T @ score) @ inverse))
     signal = float(of_lights.sum(axis=0).mean())
     left = np.sqrt(max(float((residual**2).mean() - variance.mean()), 0.0)) / max(signal, 1e-9)
-    mean, spread, explained = float(samples[0].mean()), float(samples[0].std()), float(np.sqrt(samples[1].mean()))
     names = "+".join(singles)
     text = (
-        f"{names} minus the sum of the single captures: {mean:+.2f} DN on average, scatter {spread:.2f} DN where noise "
-        f"explains {explained:.2f} DN; offset {solution[0]:+.2f} DN"
+        f"{names} minus the sum of the single captures: {samples[0].mean():+.2f} DN on average, scatter "
+        f"{samples[0].std():.2f} DN where noise explains {np.sqrt(samples[1].mean()):.2f} DN; offset "
+        f"{solution[0]:+.2f} DN"
     )
-    changes = (
-        Check(f"strength of {name} in {names}", "", 100 * change, limits.strength, std=100 * error, unit="%")
-        for name, change, error in zip(singles, solution[1:], std[1:], strict=True)
-    )
-    checks = (Check(f"{names} not the sum", text, 100 * left, limits.additivity, unit="%"), *changes)
-    return Additivity(mean=mean, spread=spread, noise=explained, offset=float(solution[0]), checks=checks)
+    return [
+        Check(f"{names} not the sum", text, 100 * left, limits.additivity, unit="%"),
+        *(
+            Check(f"strength of {name} in {names}", "", 100 * change, limits.strength, std=100 * error, unit="%")
+            for name, change, error in zip(singles, solution[1:], std[1:], strict=True)
+        ),
+    ]
 
 
 def _variance(stack: TemporalStack, noise: NoiseModel | None) -> npt.NDArray[np.floating]:
@@ -286,11 +259,7 @@ def noise_ratio(stack: TemporalStack, noise: NoiseModel, same_exposure: float = 
 
 
 def check_calibration(
-    calibration: Calibration,
-    captures: Captures,
-    *,
-    limits: Limits = LIMITS,
-    region: Sequence[float] | None = None,
+    calibration: Calibration, captures: Captures, *, limits: Limits = LIMITS, region: Sequence[float] | None = None
 ) -> list[Check]:
     """Check a calibration on captures that were not used to make it.
 
@@ -336,12 +305,12 @@ def check_calibration(
     stacks, dark = captures.stacks()
     if dark is None:
         checks.append(warning("no dark frames: the stated black level is taken for the dark level"))
-    means = {name: [block_means(frame) for frame in files.frames()] for name, files in captures.lights.items()}
-    dark_means = [block_means(frame) for frame in captures.dark.frames()] if captures.dark else []
+    means = {name: files.means() for name, files in captures.lights.items()}
+    dark_means = captures.dark.means() if captures.dark else []
     checks += leakage(calibration.crosstalk, means, dark_means, limits)
     for names, files in captures.together.items():
         singles = {name: stacks[name] for name in names.split("+")}
-        checks += additivity(files.stack(), singles, dark, noise=calibration.noise, limits=limits).checks
+        checks += additivity(files.stack(), singles, dark, noise=calibration.noise, limits=limits)
 
     def noise() -> Iterator[Check]:
         if calibration.noise is None:
@@ -364,26 +333,3 @@ def check_calibration(
     if not captures.together:
         checks.append(Check("", "additivity was not checked: no captures with lights together (--together)", value=0))
     return checks
-
-
-def read_limits(options: Sequence[str]) -> Limits:
-    """Limits from options of the form NAME=VALUE.
-
-    Raises
-    ------
-    ConfigurationError
-        An unknown name, or a value that is not a positive number.
-    """
-    limits, names = LIMITS, [entry.name for entry in fields(Limits)]
-    for text in options:
-        name, _, value = text.partition("=")
-        try:
-            number = float(value)
-        except ValueError:
-            number = -1.0
-        if name not in names or not number > 0:
-            raise ConfigurationError(
-                f"--limit takes NAME=VALUE with a positive value and one of the names {', '.join(names)}, not {text!r}"
-            )
-        limits = replace(limits, **{name: number})
-    return limits

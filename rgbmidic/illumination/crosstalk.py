@@ -356,15 +356,37 @@ class Sensitivities:
                 rows = [[float(key), *values] for key, values in spectra.items()]
                 table = np.array(sorted(rows), dtype=float)
             else:
-                with regular(path).open(newline="", encoding="utf-8") as stream:
-                    cells = [row[:4] for row in csv.reader(stream) if row]
-                start = 0 if cells[0][0].replace(".", "", 1).isdigit() else 1
-                table = np.array(cells[start:], dtype=float)
+                table = read_columns(path, 4)[1].T
             return cls(wavelengths=table[:, 0], values=table[:, 1:4].T)
         except FileNotFoundError:
             raise InputError(f"sensitivities file not found: {path}") from None
         except (OSError, KeyError, IndexError, TypeError, ValueError) as error:
             raise InputError(f"{path} is not a file of camera sensitivities: {error}") from None
+
+
+def read_columns(path: Path, count: int | None = None) -> tuple[list[str], FloatArray]:
+    """Return the heading, empty where there is none, and the first `count` columns of a CSV file of numbers.
+
+    Parameters
+    ----------
+    path
+        The file.
+    count
+        Columns that are read; None: all.
+
+    Returns
+    -------
+    heading : list of str
+    table : ndarray, shape (columns, n)
+    """
+    with regular(path).open(newline="", encoding="utf-8") as stream:
+        rows = [row[:count] for row in csv.reader(stream) if row]
+    try:
+        float(rows[0][0])
+        heading = []
+    except ValueError:
+        heading = [cell.strip() for cell in rows.pop(0)]
+    return heading, np.array(rows, dtype=np.float64).T
 
 
 def spectral_response(sensitivities: Sensitivities, lights: tuple[Led, ...]) -> FloatArray:

@@ -9,7 +9,7 @@ from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import HALF_MAXIMUM, Led, Sensitivities
 from rgbmidic.scene.camera import MEASURED_CROSSTALK
 from rgbmidic_calibration.design import MeasuredLamp, best_sets, design, read_camera, read_lamp
-from rgbmidic_calibration.pictures import draw_design
+from rgbmidic_calibration.display import draw_design
 
 LEDS = {"red": Led(centre=630, width=18), "green": Led(centre=525, width=30), "blue": Led(centre=465, width=20)}
 OHNO = {name: Led(centre=lamp.centre, width=HALF_MAXIMUM * lamp.width) for name, lamp in LEDS.items()}
@@ -71,6 +71,8 @@ def test_lamps_and_cameras_from_text(tmp_path):
     assert other.power(wavelengths) == pytest.approx(np.full(5, 0.2))
     (tmp_path / "camera.csv").write_text("nm,x R,x G,x B\n400,0,0,1\n500,0,1,-1e-19\n600,1,0,0\n")
     assert read_camera(f"{tmp_path / 'camera.csv'}#x").values.min() == 0
+    np.savetxt(tmp_path / "plain.csv", np.array([[400, 0, 0, 1], [500, 0, 1, 0], [600, 1, 0, 0]]), delimiter=",")
+    assert len(read_camera(str(tmp_path / "plain.csv")).wavelengths) == 3  # 4.0e+02 is no heading
 
 
 @pytest.mark.parametrize(
@@ -94,7 +96,7 @@ def test_tables_that_are_none(tmp_path):
     with pytest.raises(ConfigurationError, match="has no column c; it has a"):
         read_lamp(f"{tmp_path / 'good.csv'}#c")
     with pytest.raises(InputError, match="rising wavelengths"):
-        MeasuredLamp(wavelengths=[2, 1], values=[1, 1])
+        MeasuredLamp(wavelengths=np.array([2.0, 1.0]), values=np.ones(2))
 
 
 def test_picture(tmp_path):
@@ -114,7 +116,7 @@ def rows_by_diagonal(camera):
     """Matrix for LEDs of equal peak power with every row divided by its diagonal."""
     found = design(camera, OHNO)
     peak = np.array([1 / lamp.power(camera.wavelengths).max() for lamp in OHNO.values()])
-    response = found.response * peak
+    response = found.crosstalk.matrix / found.power * peak
     return response / np.diag(response)[:, None]
 
 

@@ -174,6 +174,9 @@ def test_mistakes_are_errors():
         photon_transfer(dark, [stack_frames(flat_frames(picture * 0 + 1, 20000, rng))])
     with pytest.raises(CalibrationError, match="192 x 96 px"):
         photon_transfer(dark, [stack_frames(flat_frames(picture[:96], 2000, rng))])
+    turned = Mosaic(values=without_shot_noise(picture).values, cfa="BGGR", black_level=BLACK, white_level=WHITE)
+    with pytest.raises(CalibrationError, match="all must come from the same camera"):
+        stack_frames([without_shot_noise(picture), turned])
     with pytest.raises(CalibrationError, match="variance does not grow"):
         photon_transfer(dark, [stack_frames([without_shot_noise(picture) for _ in range(2)])])
 
