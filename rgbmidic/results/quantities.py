@@ -1,6 +1,6 @@
-"""The table of numbers of a result: what a quantity is, every quantity that is kept, and the record of one frame.
+"""The table of numbers of a result: what a quantity is, every quantity that is kept, and those that follow from them.
 
-Each is declared once, here or in `rgbmidic.results.derived`; record, store, exports, maps and documents read that.
+Each is declared once, here; records, store, exports, maps and documents read that.
 """
 
 from __future__ import annotations
@@ -8,18 +8,15 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.fields.units import Units
-from rgbmidic.text import Described, rounded, uncertain
+from rgbmidic.text import rounded, uncertain
 from rgbmidic.timing import STAGES
-
-if TYPE_CHECKING:
-    from rgbmidic.correlation.solution import Solution
-
 
 Kind = Literal["displacement", "strain", "positive", "fraction", "angle", "codes"]
 
@@ -52,7 +49,8 @@ class Quantity:
     symbol
         How formulas and pictures write it; empty for what maps do not show.
     parts, order
-        Quantities from which it follows: their length where there are two, their derivative by time of an order.
+        Quantities from which it follows: their length where there are two, their derivative by time of an order, a
+        strain or a discretisation error.
     group
         Heading under which maps list it.
     kind
@@ -367,109 +365,100 @@ SHARED: dict[str, Quantity] = {
 FINITE_ELEMENTS = ("node_number", "element_number", "node_mm")
 """Those of them that only a mesh of ``mesh.file`` has."""
 
+UV = ("u", "v")
+DERIVED = {
+    name: Quantity(
+        name, _NODE, unit, "", meaning, symbol=symbol, parts=parts, order=order,
+        group="Rates" if order else "Displacement",
+        kind="strain" if not unit else "positive" if parts == UV else "displacement",
+    )
+    for name, unit, symbol, meaning, parts, order in (
+        ("u", "px", "u", "displacement in x", ("u",), 0),
+        ("v", "px", "v", "displacement in y", ("v",), 0),
+        ("magnitude", "px", "|u|", "length of the displacement", UV, 0),
+        ("u_velocity", "px", "du/dt", "velocity in x", ("u",), 1),
+        ("v_velocity", "px", "dv/dt", "velocity in y", ("v",), 1),
+        ("velocity", "px", "|du/dt|", "magnitude of the velocity", UV, 1),
+        ("u_acceleration", "px", "d²u/dt²", "acceleration in x", ("u",), 2),
+        ("v_acceleration", "px", "d²v/dt²", "acceleration in y", ("v",), 2),
+        ("acceleration", "px", "|d²u/dt²|", "magnitude of the acceleration", UV, 2),
+        ("exx_rate", "", "dεxx/dt", "rate of the strain in x", ("exx",), 1),
+        ("eyy_rate", "", "dεyy/dt", "rate of the strain in y", ("eyy",), 1),
+        ("exy_rate", "", "dεxy/dt", "rate of the tensor shear", ("exy",), 1),
+        ("equivalent_rate", "", "dεeq/dt", "rate of the von Mises equivalent strain", ("equivalent",), 1),
+    )
+}  # fmt: skip
+"""Displacement, rates of displacement and strain, and strain itself, by name."""
+_POSITIVE: dict[str, Any] = {"group": "Strain", "kind": "positive"}
+_ANGLE: dict[str, Any] = {"group": "Strain", "kind": "angle"}
+_TOWARDS, _LARGEST = "direction of e1, from x towards y", "largest engineering shear in the plane, e1 - e2"
+STRAIN = (
+    *with_uncertainty(
+        Quantity("exx", _NODE, "", "components.0", "strain in x", symbol="εxx", group="Strain"),
+        Quantity("eyy", _NODE, "", "components.1", "strain in y", symbol="εyy", group="Strain"),
+        Quantity("exy", _NODE, "", "components.2", "strain, tensor shear", symbol="εxy", group="Strain"),
+    ),
+    *with_uncertainty(
+        Quantity("e1", _NODE, "", "principal.0", "larger principal strain in the plane", symbol="ε₁", group="Strain"),
+        Quantity("e2", _NODE, "", "principal.1", "smaller principal strain in the plane", symbol="ε₂", group="Strain"),
+    ),
+    *with_uncertainty(Quantity("direction", _NODE, "deg", "direction_deg", _TOWARDS, symbol="θ₁", **_ANGLE)),
+    *with_uncertainty(Quantity("shear", _NODE, "", "shear", _LARGEST, symbol="γmax", **_POSITIVE)),
+    *with_uncertainty(Quantity("equivalent", _NODE, "", "equivalent", EQUIVALENT, symbol="εeq (Hencky)", **_POSITIVE)),
+)
+"""Strain of a frame over a gauge, in the order of exports."""
+DERIVED |= {entry.name: entry for entry in STRAIN if entry.group == "Strain"}
+ELEMENT_STRAIN = tuple(
+    replace(entry, name=f"{name}_element", axes=("element",), meaning=f"{entry.meaning}, constant in an element")
+    for name, entry in DERIVED.items()
+    if name in ("exx", "eyy", "exy")
+)
+COMPONENTS = ("u", "v", "exx", "eyy", "exy")
+WITH_ERROR = {
+    f"{name}_{end}": Quantity(
+        f"{name}_{end}", _NODE, "px" if name in UV else "", "",
+        meaning.format(name if name in UV else f"the small strain {name} of the nodes"),
+        symbol=f"{name}_{end}", parts=(name,), group="Uncertainty", kind="positive",
+    )
+    for end, meaning in (
+        ("mesh_error", "discretisation error of {}: what mesh and recovery leave out"),
+        ("total", "noise and discretisation error of {} together"),
+    )
+    for name in COMPONENTS
+}  # fmt: skip
+_FINER_MESH = "largest discretisation error over the noise of u, v, exx, eyy, exy: above 1 a finer mesh is needed"
+WITH_ERROR["finer_mesh"] = Quantity(
+    "finer_mesh", _NODE, "", "", _FINER_MESH, symbol="finer_mesh", parts=COMPONENTS, kind="positive"
+)
+"""Quantities of results whose ``mesh.error`` asks for the discretisation error."""
+_GROUPS = ("Displacement", "Strain", "Rates", "Quality", "Uncertainty")
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameRecord(Described):
-    """The result of one frame; every quantity of `rgbmidic.results.QUANTITIES` is an attribute, such as ``record.u``.
 
-    Attributes
+def map_quantities(units: Units, lights: tuple[str, ...], *, with_error: bool) -> dict[str, Quantity]:
+    """Return what maps show by its name, group by group; each that has an uncertainty is followed by it further down.
+
+    Parameters
     ----------
-    values
-        Every quantity by its name, in the shape and type of the table: an array, or a plain number or text.
-    sizes
-        Number of nodes (``"node"``) and of lights (``"light"``).
+    units
+        Units of the reader, that of time included.
+    lights
+        Their names.
+    with_error
+        Whether the discretisation error is known.
 
-    Raises
-    ------
-    InputError
-        A quantity is missing, unknown or has another shape.
+    Returns
+    -------
+    dict of str to Quantity
     """
-
-    values: Mapping[str, Any]
-    sizes: Mapping[str, int]
-
-    def __post_init__(self) -> None:
-        """Check names and shapes, and take over the types of the table."""
-        if odd := self.values.keys() ^ QUANTITIES.keys():
-            raise InputError(f"a frame record holds {', '.join(QUANTITIES)}; missing or unknown: {', '.join(odd)}")
-        values = {name: entry.convert(self.values[name], self.sizes) for name, entry in QUANTITIES.items()}
-        object.__setattr__(self, "values", values)
-
-    @classmethod
-    def of(cls, *, nodes: int, lights: int, **values: Any) -> FrameRecord:
-        """Make a record of some quantities; the others have the value of a frame that could not be measured.
-
-        Parameters
-        ----------
-        nodes, lights
-            Their numbers N and k.
-        **values
-            Quantities by name; None where not known. `inputs` may be the SHA-256 of each file by its path.
-
-        Returns
-        -------
-        FrameRecord
-        """
-        sizes = {"node": nodes, "light": lights}
-        blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items()}
-        given = {name: value for name, value in values.items() if value is not None}
-        if isinstance(files := given.get("inputs"), Mapping):
-            given["inputs"] = np.array(list(files.items()), dtype=np.str_).reshape(-1, 2)
-        return cls(values=blank | given, sizes=sizes)
-
-    @classmethod
-    def from_solution(cls, solution: Solution, **given: Any) -> FrameRecord:
-        """Make the record of a solved frame.
-
-        Parameters
-        ----------
-        solution
-            Provides the quantities that have a `Quantity.source`.
-        **given
-            The others, such as `number`, `time_ns`, `inputs`, `brightness` and `weights_thumbnail`, as of `of`.
-
-        Returns
-        -------
-        FrameRecord
-        """
-        nodes, lights = np.shape(solution.light_fraction)
-        known = [entry for entry in QUANTITIES.values() if entry.source]
-        if not np.isfinite(solution.displacement_error).any():
-            known = [entry for entry in known if not entry.estimated]
-        return cls.of(nodes=nodes, lights=lights, **{entry.name: entry.of(solution) for entry in known}, **given)
-
-    @classmethod
-    def failed(cls, reason: str, *, nodes: int, lights: int, **given: Any) -> FrameRecord:
-        """Make the record of a frame that could not be measured at all: NaN everywhere, and the reason.
-
-        Parameters
-        ----------
-        reason
-            Why nothing could be measured.
-        nodes, lights
-            Their numbers N and k.
-        **given
-            Other quantities, as of `of`.
-
-        Returns
-        -------
-        FrameRecord
-        """
-        return cls.of(nodes=nodes, lights=lights, reason=reason, **given)
-
-    def __repr__(self) -> str:
-        """Return number, status and size of the frame, and the names of its quantities."""
-        end = QUANTITIES["status"].codes[self.values["status"]]
-        told = f": {self.values['reason']}" if self.values["reason"] else ""
-        about = f"<rgbmidic frame {self.values['number']}, {end}{told}; {self.sizes['node']} nodes>"
-        return f"{about}\nquantities: {', '.join(QUANTITIES)}"
-
-    def __getattr__(self, name: str, /) -> Any:
-        """Return a quantity of the table."""
-        if name not in QUANTITIES:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
-        return self.values[name]
-
-    def __dir__(self) -> list[str]:
-        """Return the names of all attributes, quantities included."""
-        return [*object.__dir__(self), *QUANTITIES]
+    derived = [*DERIVED.values()]
+    spread = [entry.uncertainty for entry in derived]
+    taken = {entry.name for entry in (*derived, *spread)}
+    kept = [
+        replace(entry, symbol=name, meaning=", ".join(entry.codes) or entry.meaning)
+        for name, entry in QUANTITIES.items()
+        if entry.axes == _NODE and name not in taken
+    ]
+    meaning, names = QUANTITIES["light_fraction"].meaning, [f"fraction of {light}" for light in lights]
+    fractions = [Quantity(name, _NODE, "", "", meaning, symbol=name, kind="fraction") for name in names]
+    every = [*derived, *kept, *(WITH_ERROR.values() if with_error else ()), *fractions, *spread]
+    return {entry.name: entry.in_units(units) for entry in sorted(every, key=lambda one: _GROUPS.index(one.group))}

@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.extras import optional
-from rgbmidic.results.files import read_arrays, read_json
-from rgbmidic.results.provenance import PROVENANCE, PUT_BACK, digest, fingerprint, read_provenance
-from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, STACKED, FrameRecord
-from rgbmidic.results.records import FrameTable
+from rgbmidic.results.files import read_arrays, read_json, write_json
+from rgbmidic.results.provenance import PROVENANCE, PUT_BACK, digest, fingerprint, now, read_provenance, sealed
+from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, STACKED
+from rgbmidic.results.records import FrameRecord, FrameTable
 from rgbmidic.settings import read_section
 from rgbmidic.settings.schema import section_kinds
 from rgbmidic.text import Described
@@ -128,10 +128,10 @@ class Result(Portable, Described):
         """
         path = Path(path)
         provenance = read_provenance(path)
-        names, mesh, lights = read_names(path, provenance), read_mesh(path, provenance), tuple(provenance["lights"])
-        sizes, ended = {"node": len(mesh["nodes"]), "light": len(lights)}, "finished" in provenance
-        table = FrameTable.load(path, sizes, len(names), fingerprint(provenance))
-        made = cls(path=path, table=table, names=names, lights=lights, provenance=provenance, **mesh)
+        shared, lights, ended = read_shared(path, provenance), tuple(provenance["lights"]), "finished" in provenance
+        sizes = {"node": len(shared["nodes"]), "light": len(lights)}
+        table = FrameTable.load(path, sizes, len(shared["names"]), fingerprint(provenance))
+        made = cls(path=path, table=table, lights=lights, provenance=provenance, **shared)
         if not partial:
             check_complete(made, ended=ended)
         elif check:
@@ -384,6 +384,26 @@ class Result(Portable, Described):
         return shape and (shape[0], shape[1])
 
 
+def finish_result(path: Path | str) -> None:
+    """Put the date of its end into the provenance of a result, once every record is read and found whole.
+
+    Parameters
+    ----------
+    path
+        The folder.
+
+    Raises
+    ------
+    ResultError
+        The folder is no result, a frame is missing or damaged, or it cannot be written.
+    """
+    result = Result.open(path, partial=True, check=False)
+    ended = "finished" in result.provenance
+    check_complete(replace(result, table=result.table.without_damaged(ended=ended)), ended=ended)
+    if not ended:
+        write_json(result.path / PROVENANCE, sealed({**result.provenance, "finished": now()}))
+
+
 def check_complete(result: Result, *, ended: bool) -> None:
     """Raise a `ResultError` that names the frames that are missing, or lost to damage where the result had `ended`."""
     missing, path, count = np.flatnonzero(~result.finished).tolist(), result.path, len(result)
@@ -406,8 +426,14 @@ def listed(frames: Sequence[int], names: Sequence[str], most: int = 5) -> str:
     return ", ".join(f"{frame} ({names[frame]})" for frame in frames[:most]) + more
 
 
-def read_names(path: Path, provenance: Mapping[str, Any]) -> tuple[str, ...]:
-    """Read the frames' names; a `ResultError` where they are not those of the provenance."""
+def read_shared(path: Path, provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Read ``names`` of the frames, ``nodes`` (N, 2), ``elements`` (E, 3) and, of a mesh file, `FINITE_ELEMENTS`.
+
+    Raises
+    ------
+    ResultError
+        They are not those of the provenance.
+    """
     try:
         names = read_json(path / NAMES)
     except FileNotFoundError:
@@ -415,22 +441,11 @@ def read_names(path: Path, provenance: Mapping[str, Any]) -> tuple[str, ...]:
     texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
     if not texts or {"count": len(names), "sha256": digest(names)} != provenance["frames"]:
         raise ResultError(f"{path / NAMES} is damaged: it does not hold the names of the frames")
-    return tuple(names)
-
-
-def read_mesh(path: Path, provenance: Mapping[str, Any]) -> dict[str, AnyArray]:
-    """Read ``nodes`` (N, 2), ``elements`` (E, 3) and, of a mesh file, `FINITE_ELEMENTS`.
-
-    Raises
-    ------
-    ResultError
-        They are not those of the provenance.
-    """
     stated = FINITE_ELEMENTS if "finite_elements" in provenance else ()
     mesh = _read(path / MESH, ["nodes", "elements", *stated], {})
     if digest(mesh) != provenance["mesh"]:
         raise ResultError(f"{path / MESH} is damaged or of another result")
-    return mesh
+    return {"names": tuple(names), **mesh}
 
 
 def read_reference(path: Path, sizes: Mapping[str, int], run: bytes) -> npt.NDArray[np.uint8] | None:
