@@ -252,61 +252,35 @@ _NODE, _LIGHT, _PICTURE = ("node",), ("light",), ("light", "row", "column")
 _TEXT: dict[str, Any] = {"dtype": np.str_, "blank": ""}
 _BYTE: dict[str, Any] = {"dtype": np.uint8, "blank": 0}
 _EXACT: dict[str, Any] = {"dtype": np.float64}
-_NUMBER = "number of the frame; missing frames leave gaps"
-_INPUTS = "path and SHA-256 of each file that the frame was read from"
-_MACHINE = "processor and BLAS library that it was measured with, on which the last bits depend; empty if it failed"
-_CHECKSUM = "CRC-32 of the frame's samples where the reference was read; -1 if it failed. Noise makes all differ"
 _AT_NODE = "relative to the reference, at the node"
 _NOT_FIT = "(not the best linear fit's nodal value)"
-_FRACTION = "fraction of each light in the information that determines a node"
 _AROUND = "slope of the quadratic through the neighbouring nodes; NaN also next to a node that is not measured"
-_TIME = "time of the frame after the trigger; the smallest 64-bit integer if it is not known"
-_MISFIT = "weighted rms residual around a node over its median: 1 is typical, 3 is suspicious"
-_RESIDUAL = (
-    "weighted rms of `f - g(x + u)`, in the unit of the correlated images: none if these are divided by their "
-    "local mean (the default), else DN"
-)
-_WEIGHT = "mean fraction of each light in the weights; their sum is the part of the region that any light sees"
-_BRIGHTNESS = (
-    "gain and offset (DN) of each light relative to the reference, from contrast and mean of the speckle, medians over "
-    "the elements; reported, not used"
-)
-_MATCH = (
-    "median correlation coefficient of the elements with their reference, for the light that matches best; NaN without "
-    "`frames.update_reference`"
-)
-_BEST = "largest `match` of the frames compared with the same reference, up to this one"
-_UPDATES = (
-    "indices in the result of the frames that became the reference, up to this one: this frame was compared with the "
-    "last one before it, or with the test's reference"
-)
-_RIGID = (
-    "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad); 0 for the first, NaN for a "
-    "light that sees nothing"
-)
-_UNREAD = "1 if the frame failed because it could not be read (`--resume` tries again), else 0"
-_TRIES = "2 for a key frame that was also measured from the frame just before it, else 1"
-_REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty if the separation does not give it"
-_SECONDS = f"time of each of the stages {', '.join(STAGES)}; NaN without `--timings`"
 _LEFT_OUT = "discretisation error of {}, caused by mesh and recovery, one sigma; empty unless `mesh.error` requests it"
 _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
 
 _TABLE = (
-    Quantity("number", (), "", "", _NUMBER, dtype=np.int64, blank=-1),
-    Quantity("time_ns", (), "ns", "", _TIME, dtype=np.int64, blank=UNKNOWN_TIME),
+    Quantity("number", (), "", "", "number of the frame; missing frames leave gaps", dtype=np.int64, blank=-1),
+    Quantity("time_ns", (), "ns", "",
+        "time of the frame after the trigger; the smallest 64-bit integer if it is not "
+        "known", dtype=np.int64, blank=UNKNOWN_TIME),
     Quantity("status", (), "", "status", "status of the frame, see below", dtype=np.int64, blank=2, codes=_ENDS),
     Quantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
-    Quantity("unread", (), "", "", _UNREAD, dtype=np.int64, blank=0),
-    Quantity("tries", (), "", "", _TRIES, dtype=np.int64, blank=1),
+    Quantity("unread", (), "", "",
+        "1 if the frame failed because it could not be read (`--resume` tries again), else 0", dtype=np.int64, blank=0),
+    Quantity("tries", (), "", "",
+        "2 for a key frame that was also measured from the frame just before it, else 1", dtype=np.int64, blank=1),
     Quantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
     Quantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
-    Quantity("inputs", ("file", 2), "", "", _INPUTS, **_TEXT),
-    Quantity("machine", (), "", "", _MACHINE, **_TEXT),
-    Quantity("checksum", (), "", "", _CHECKSUM, dtype=np.int64, blank=NO_CHECKSUM),
-    Quantity(
-        "node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS, kind="codes"
-    ),
+    Quantity("inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT),
+    Quantity("machine", (), "", "",
+        "processor and BLAS library that it was measured with, on which the last bits "
+        "depend; empty if it failed", **_TEXT),
+    Quantity("checksum", (), "", "",
+        "CRC-32 of the frame's samples where the reference was read; -1 if it failed. "
+        "Noise makes all differ", dtype=np.int64, blank=NO_CHECKSUM),
+    Quantity("node_status", _NODE, "", "node_status",
+        "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS, kind="codes"),
     Quantity("u", _NODE, "px", "displacement.0", f"displacement in x {_AT_NODE} {_NOT_FIT}", **_EXACT),
     Quantity("v", _NODE, "px", "displacement.1", f"displacement in y {_AT_NODE}", **_EXACT),
     Quantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
@@ -316,29 +290,41 @@ _TABLE = (
         Quantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
         Quantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_AROUND}"),
     ),
-    *(
-        Quantity(f"{name}_mesh_error", _ESTIMATED, unit, source, _LEFT_OUT.format(name))
-        for name, unit, source in (
-            ("u", "px", "displacement_error.0"),
-            ("v", "px", "displacement_error.1"),
-            ("exx", "", "strain_error.0"),
-            ("eyy", "", "strain_error.1"),
-            ("exy", "", "strain_error.2"),
-        )
-    ),
-    Quantity("match", (), "", "", _MATCH),
-    Quantity("best_match", (), "", "", _BEST, blank=0),
-    Quantity("reference_updates", ("reference_update",), "", "", _UPDATES, dtype=np.int64, blank=0),
-    Quantity("misfit", _NODE, "", "misfit", _MISFIT, kind="positive"),
-    Quantity("light_fraction", ("node", "light"), "", "light_fraction", _FRACTION, blank=0),
-    Quantity("residual", _LIGHT, "", "residual", _RESIDUAL),
-    Quantity("weight_fraction", _LIGHT, "", "weight_fraction", _WEIGHT),
-    Quantity("brightness", ("light", 2), "", "", _BRIGHTNESS),
-    Quantity("rigid", ("light", "function"), "", "rigid", _RIGID),
-    Quantity("seconds", (len(STAGES),), "s", "", _SECONDS),
+    Quantity("u_mesh_error", _ESTIMATED, "px", "displacement_error.0", _LEFT_OUT.format("u")),
+    Quantity("v_mesh_error", _ESTIMATED, "px", "displacement_error.1", _LEFT_OUT.format("v")),
+    Quantity("exx_mesh_error", _ESTIMATED, "", "strain_error.0", _LEFT_OUT.format("exx")),
+    Quantity("eyy_mesh_error", _ESTIMATED, "", "strain_error.1", _LEFT_OUT.format("eyy")),
+    Quantity("exy_mesh_error", _ESTIMATED, "", "strain_error.2", _LEFT_OUT.format("exy")),
+    Quantity("match", (), "", "",
+        "median correlation coefficient of the elements with their reference, for the light that matches best; NaN "
+        "without `frames.update_reference`"),
+    Quantity("best_match", (), "", "",
+        "largest `match` of the frames compared with the same reference, up to this one", blank=0),
+    Quantity("reference_updates", ("reference_update",), "", "",
+        "indices in the result of the frames that became the reference, up to this one: this frame was compared with "
+        "the last one before it, or with the test's reference", dtype=np.int64, blank=0),
+    Quantity("misfit", _NODE, "", "misfit",
+        "weighted rms residual around a node over its median: 1 is typical, 3 is suspicious", kind="positive"),
+    Quantity("light_fraction", ("node", "light"), "", "light_fraction",
+        "fraction of each light in the information that determines a node", blank=0),
+    Quantity("residual", _LIGHT, "", "residual",
+        "weighted rms of `f - g(x + u)`, in the unit of the correlated images: none if these are divided by their "
+        "local mean (the default), else DN"),
+    Quantity("weight_fraction", _LIGHT, "", "weight_fraction",
+        "mean fraction of each light in the weights; their sum is the part of the region that any light sees"),
+    Quantity("brightness", ("light", 2), "", "",
+        "gain and offset (DN) of each light relative to the reference, from contrast and mean of the speckle, medians "
+        "over the elements; reported, not used"),
+    Quantity("rigid", ("light", "function"), "", "rigid",
+        "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad); 0 for the first, NaN for "
+        "a light that sees nothing"),
+    Quantity("seconds", (len(STAGES),), "s", "",
+        f"time of each of the stages {', '.join(STAGES)}; NaN without `--timings`"),
     Quantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
-    Quantity("reflection_thumbnail", _PICTURE, "", "", _REFLECTION, **_BYTE),
-)
+    Quantity("reflection_thumbnail", _PICTURE, "", "",
+        "reduced picture of each light's reflection index, 255 for 1; empty if the "
+        "separation does not give it", **_BYTE),
+)  # fmt: skip
 
 QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _TABLE}
 """Every quantity by its name, in the order of the documents."""
