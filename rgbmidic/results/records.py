@@ -312,16 +312,6 @@ class FrameTable:
                 damaged[frame] = True
         return replace(self, damaged=damaged)
 
-    def read(self, frame: int) -> FrameRecord:
-        """Read all of one frame; a frame that is not measured yet gives a blank record with that as its reason.
-
-        Raises
-        ------
-        ResultError
-            It is damaged.
-        """
-        return FrameRecord(values=next(self.each(None, [frame])), sizes=self.sizes)
-
     def each(self, names: Sequence[str] | None, frames: Iterable[int]) -> Iterator[dict[str, Any]]:
         """Read some quantities of one frame after the other.
 

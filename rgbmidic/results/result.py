@@ -128,14 +128,14 @@ class Result(Portable, Described):
         """
         path = Path(path)
         provenance = read_provenance(path)
-        shared, lights, ended = read_shared(path, provenance), tuple(provenance["lights"]), "finished" in provenance
+        shared, lights = read_shared(path, provenance), tuple(provenance["lights"])
         sizes = {"node": len(shared["nodes"]), "light": len(lights)}
         table = FrameTable.load(path, sizes, len(shared["names"]), fingerprint(provenance))
         made = cls(path=path, table=table, lights=lights, provenance=provenance, **shared)
         if not partial:
-            check_complete(made, ended=ended)
+            made._check_complete()
         elif check:
-            made = replace(made, table=made.table.without_damaged(ended=ended))
+            made = made.without_damaged()
             if lost := np.flatnonzero(made.table.damaged).tolist():
                 logger.warning("%s is damaged: frames lost: %s", path, listed(lost, made.names))
         return made
@@ -156,9 +156,32 @@ class Result(Portable, Described):
         if {**provenance, "finished": ""} != {**self.provenance, "finished": ""}:
             raise ResultError(f"{self.path} now holds another result; open it again")
         table = FrameTable.load(self.path, self.table.sizes, len(self), fingerprint(provenance))
-        if self.table.damaged.any():
-            table = table.without_damaged(ended="finished" in provenance)
-        return replace(self, table=table, provenance=provenance)
+        now = replace(self, table=table, provenance=provenance)
+        return now.without_damaged() if self.table.damaged.any() else now
+
+    def without_damaged(self) -> Self:
+        """Read every record once and return the result without the damaged ones; once ended it misses none.
+
+        Returns
+        -------
+        Result
+        """
+        return replace(self, table=self.table.without_damaged(ended="finished" in self.provenance))
+
+    def _check_complete(self) -> None:
+        """Raise a `ResultError` that names the frames that are missing, or lost to damage where all were there once."""
+        missing, path, count = np.flatnonzero(~self.finished).tolist(), self.path, len(self)
+        if not missing:
+            return
+        frames = listed(missing, self.names)
+        if "finished" in self.provenance or self.table.damaged.any():
+            raise ResultError(
+                f"{path} is damaged: of {count} frames are lost {frames}; `rgbmidic run TEST.toml --out {path} "
+                "--resume` measures them again, --partial (partial=True) reads the rest"
+            )
+        raise ResultError(
+            f"{path} is incomplete: of {count} frames are missing {frames}; was the run interrupted, or does it go on?"
+        )
 
     def __repr__(self) -> str:
         """Return what the result is of, in a few lines; values are not read."""
@@ -248,7 +271,8 @@ class Result(Portable, Described):
         """
         if not isinstance(index, int | np.integer) or not -len(self) <= index < len(self):
             raise InputError(f"there is no frame {index!r} in a result of {len(self)} frames (0 to {len(self) - 1})")
-        return self.table.read(int(index) % len(self))
+        values = next(self.table.each(None, [int(index) % len(self)]))
+        return FrameRecord(values=values, sizes=self.table.sizes)
 
     def each(self, name: str, frames: Iterable[int] | None = None) -> Iterator[Any]:
         """Read one quantity, frame after frame (None: all); yields arrays, or plain numbers or texts.
@@ -398,26 +422,9 @@ def finish_result(path: Path | str) -> None:
         The folder is no result, a frame is missing or damaged, or it cannot be written.
     """
     result = Result.open(path, partial=True, check=False)
-    ended = "finished" in result.provenance
-    check_complete(replace(result, table=result.table.without_damaged(ended=ended)), ended=ended)
-    if not ended:
+    result.without_damaged()._check_complete()
+    if "finished" not in result.provenance:
         write_json(result.path / PROVENANCE, sealed({**result.provenance, "finished": now()}))
-
-
-def check_complete(result: Result, *, ended: bool) -> None:
-    """Raise a `ResultError` that names the frames that are missing, or lost to damage where the result had `ended`."""
-    missing, path, count = np.flatnonzero(~result.finished).tolist(), result.path, len(result)
-    if not missing:
-        return
-    frames = listed(missing, result.names)
-    if ended or result.table.damaged.any():
-        raise ResultError(
-            f"{path} is damaged: of {count} frames are lost {frames}; `rgbmidic run TEST.toml --out {path} "
-            "--resume` measures them again, --partial (partial=True) reads the rest"
-        )
-    raise ResultError(
-        f"{path} is incomplete: of {count} frames are missing {frames}; was the run interrupted, or does it go on?"
-    )
 
 
 def listed(frames: Sequence[int], names: Sequence[str], most: int = 5) -> str:
