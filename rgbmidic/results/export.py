@@ -95,17 +95,13 @@ def _write_shared(out: h5py.File, physical: Physical) -> None:
     out.attrs.update({**physical.facts, "axes": _AXES})
     out.create_dataset("provenance", data=json.dumps(dict(result.provenance)), dtype=text)
     meaning = "time of the frame" if units.timed else "place of the frame, counted from 0"
-    scales: dict[str, tuple[AnyArray, str, str]] = {
-        "time": (physical.times, units.time, meaning),
-        "node": (np.arange(len(mesh.nodes), dtype=np.int32), "", "index of the node, as in elements"),
-        "element": (np.arange(len(mesh.elements), dtype=np.int32), "", "index of the element"),
-        "corner": (np.arange(3, dtype=np.int32), "", "corner of the element"),
-        "light": (np.array(result.lights, dtype=text), "", "name of the light"),
-    }
-    for name, (values, unit, meaning) in scales.items():
-        _add(out, Quantity(name, (), unit, "", meaning), (), data=values).make_scale(name)
     (x, y), element = physical.length * mesh.nodes[mesh.elements].mean(axis=1).T, ("element",)
     shared: list[tuple[Quantity, AnyArray | None]] = [
+        (Quantity("time", (), units.time, "", meaning), physical.times),
+        (Quantity("node", (), "", "", "index of the node, as in elements"), np.arange(len(mesh.nodes), dtype=np.int32)),
+        (Quantity("element", (), "", "", "index of the element"), np.arange(len(mesh.elements), dtype=np.int32)),
+        (Quantity("corner", (), "", "", "corner of the element"), np.arange(3, dtype=np.int32)),
+        (Quantity("light", (), "", "", "name of the light"), np.array(result.lights, dtype=text)),
         (Quantity("name", ("time",), "", "", "name of the frame"), np.array(result.names, dtype=text)),
         *physical.places,
         *((SHARED[name], getattr(result, name)) for name in ("node_number", "element_number")),
@@ -120,11 +116,13 @@ def _write_shared(out: h5py.File, physical: Physical) -> None:
 
 
 def _add(out: h5py.File, entry: Quantity, axes: Sequence[str | int], **content: Any) -> h5py.Dataset:
-    """Create the array of a quantity along axes whose scales are there."""
+    """Create the array of a quantity along axes whose scales are there; without axes it is itself the scale of one."""
     dataset = out.create_dataset(entry.name, **content)
     dataset.attrs.update(entry.attributes)
     for axis, name in zip(dataset.dims, axes, strict=False):
         axis.attach_scale(out[name])
+    if not axes:
+        dataset.make_scale(entry.name)
     return dataset
 
 
@@ -133,9 +131,7 @@ def _declare(out: h5py.File, physical: Physical, entry: Quantity) -> None:
     axes = tuple(axis if isinstance(axis, str) else f"part_of_{axis}" for axis in entry.axes)
     for name, axis in zip(axes, entry.axes, strict=True):
         if name not in out:  # an axis of a fixed length gets its scale when it is first met
-            _add(out, Quantity(name, (), "", "", "index"), (), data=np.arange(int(axis), dtype=np.int32)).make_scale(
-                name
-            )
+            _add(out, Quantity(name, (), "", "", "index"), (), data=np.arange(int(axis), dtype=np.int32))
     shape = (len(physical.result), *(len(out[axis]) for axis in axes))
     dataset = _add(out, entry, ("time", *axes), shape=shape, dtype=np.dtype(entry.dtype).newbyteorder("<"))
     if physical.is_strain(entry.name):

@@ -69,10 +69,8 @@ def rectification_of(
 
 
 def _kept_camera(result: Result) -> CameraCalibration | None:
-    document = result.provenance.get("camera")
-    if document is None:
-        return None
-    return CameraCalibration.from_document(document, str(result.section(ScaleSettings).camera))
+    kept = result.provenance.get("camera")
+    return None if kept is None else CameraCalibration.from_document(kept, str(result.section(ScaleSettings).camera))
 
 
 def placement_of(result: Result) -> Placement | None:

@@ -262,8 +262,8 @@ _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
 _TABLE = (
     Quantity("number", (), "", "", "number of the frame; missing frames leave gaps", dtype=np.int64, blank=-1),
     Quantity("time_ns", (), "ns", "",
-        "time of the frame after the trigger; the smallest 64-bit integer if it is not "
-        "known", dtype=np.int64, blank=UNKNOWN_TIME),
+        "time of the frame after the trigger; the smallest 64-bit integer if it is not known",
+        dtype=np.int64, blank=UNKNOWN_TIME),
     Quantity("status", (), "", "status", "status of the frame, see below", dtype=np.int64, blank=2, codes=_ENDS),
     Quantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
     Quantity("unread", (), "", "",
@@ -274,11 +274,11 @@ _TABLE = (
     Quantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
     Quantity("inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT),
     Quantity("machine", (), "", "",
-        "processor and BLAS library that it was measured with, on which the last bits "
-        "depend; empty if it failed", **_TEXT),
+        "processor and BLAS library that it was measured with, on which the last bits depend; empty if it failed",
+        **_TEXT),
     Quantity("checksum", (), "", "",
-        "CRC-32 of the frame's samples where the reference was read; -1 if it failed. "
-        "Noise makes all differ", dtype=np.int64, blank=NO_CHECKSUM),
+        "CRC-32 of the frame's samples where the reference was read; -1 if it failed. Noise makes all differ",
+        dtype=np.int64, blank=NO_CHECKSUM),
     Quantity("node_status", _NODE, "", "node_status",
         "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS, kind="codes"),
     Quantity("u", _NODE, "px", "displacement.0", f"displacement in x {_AT_NODE} {_NOT_FIT}", **_EXACT),
@@ -322,8 +322,8 @@ _TABLE = (
         f"time of each of the stages {', '.join(STAGES)}; NaN without `--timings`"),
     Quantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
     Quantity("reflection_thumbnail", _PICTURE, "", "",
-        "reduced picture of each light's reflection index, 255 for 1; empty if the "
-        "separation does not give it", **_BYTE),
+        "reduced picture of each light's reflection index, 255 for 1; empty if the separation does not give it",
+        **_BYTE),
 )  # fmt: skip
 
 QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _TABLE}
@@ -395,9 +395,8 @@ STRAIN = (
 """Strain of a frame over a gauge, in the order of exports."""
 DERIVED |= {entry.name: entry for entry in STRAIN if entry.group == "Strain"}
 ELEMENT_STRAIN = tuple(
-    replace(entry, name=f"{name}_element", axes=("element",), meaning=f"{entry.meaning}, constant in an element")
-    for name, entry in DERIVED.items()
-    if name in ("exx", "eyy", "exy")
+    replace(entry, name=f"{entry.name}_element", axes=("element",), meaning=f"{entry.meaning}, constant in an element")
+    for entry in STRAIN[:3]
 )
 COMPONENTS = ("u", "v", "exx", "eyy", "exy")
 WITH_ERROR = {

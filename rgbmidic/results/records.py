@@ -16,7 +16,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -213,10 +213,10 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes) -> N
     write_complete(record_file(folder, frame), lambda file: file.write(content))
 
 
-def _read_record(folder: Path, frame: int, names: Iterable[str], run: bytes) -> dict[str, Any]:
+def _read_record(path: Path, frame: int, names: Iterable[str], run: bytes) -> dict[str, Any]:
     """Read some quantities of a frame and verify their checksums; what is of this run has its shapes."""
     files, directory, read = _layout(tuple(QUANTITIES))
-    with regular(record_file(folder, frame)).open("rb") as file:
+    with regular(path).open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - directory.size - _CHECK.size, 0))
         tail = file.read()
@@ -224,7 +224,7 @@ def _read_record(folder: Path, frame: int, names: Iterable[str], run: bytes) -> 
             raise ResultError("its directory is damaged or cut off")
         *places, owner, number = read.unpack(tail[: directory.size])
         if owner != run:
-            raise AnotherTestError(f"{file.name} is of another run than {folder.parent / PROVENANCE}: {PUT_BACK}")
+            raise AnotherTestError(f"{path} is of another run than {path.parents[1] / PROVENANCE}: {PUT_BACK}")
         if number != frame:
             raise ResultError(f"it holds frame {number}")
         each = iter(places)
@@ -333,23 +333,18 @@ class FrameTable:
             A record is damaged, or of another run; the message names file and frame.
         """
         chosen, finished = tuple(QUANTITIES if names is None else names), self.finished
-        blanks = dict[str, Mapping[str, Any]]()
+        blank = cache(partial(FrameRecord.failed, nodes=self.sizes["node"], lights=self.sizes["light"]))
         for frame in frames:
             if not finished[frame]:
-                reason = _DAMAGED if self.damaged[frame] else _NOT_YET
-                if reason not in blanks:
-                    blank = FrameRecord.failed(reason, nodes=self.sizes["node"], lights=self.sizes["light"])
-                    blanks[reason] = blank.values
-                yield {name: blanks[reason][name] for name in chosen}
+                values = blank(_DAMAGED if self.damaged[frame] else _NOT_YET).values
+                yield {name: values[name] for name in chosen}
                 continue
+            file = record_file(self.folder, frame)
             try:
-                values = _read_record(self.folder, frame, chosen, self.run)
+                yield _read_record(file, frame, chosen, self.run)
             except OSError as error:
-                reason = error.strerror or str(error)
-                raise ResultError(f"{record_file(self.folder, frame)} cannot be read: {reason}") from None
+                raise ResultError(f"{file} cannot be read: {error.strerror or error}") from None
             except (AnotherTestError, KeyError):  # KeyError: there is no quantity of this name
                 raise
             except Exception as error:  # numpy and zlib raise a dozen kinds on damaged files
-                file = record_file(self.folder, frame)
                 raise ResultError(f"{file} is damaged in frame {frame}: {error}; {_REMEDY}") from None
-            yield values
