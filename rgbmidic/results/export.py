@@ -15,6 +15,7 @@ import re
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -308,13 +309,9 @@ def _write_nodemaps(physical: Physical, folder: Path, *, overwrite: bool) -> Non
         title = f"rgbmidic {__version__}, {stem}, {result.names[index]}; {physical.measure} strain"
         # CrackPy looks for "# time" and such at the beginning of a line, and for the number behind its colon
         lines = [title, *([f"time : {physical.times[index]:.12g}"] if physical.units.timed else []), ";".join(_NODEMAP)]
-        header = "".join(f"# {line}\n" for line in lines).encode("ascii", "backslashreplace")
-
-        def write(file: BinaryIO, header: bytes = header, table: list[AnyArray] = table) -> None:
-            file.write(header)
-            np.savetxt(file, np.column_stack(table), fmt="%.9g", delimiter=";")
-
-        write_complete(folder / f"{stem}_{values['number']}.txt", write)
+        header = "\n".join(lines).encode("ascii", "backslashreplace").decode()
+        save = partial(np.savetxt, X=np.column_stack(table), fmt="%.9g", delimiter=";", header=header)
+        write_complete(folder / f"{stem}_{values['number']}.txt", save)
 
 
 _WRITERS: dict[str, Callable[[Physical, BinaryIO], None]] = {"npz": _write_npz, "csv": _write_csv, "hdf5": write_hdf5}

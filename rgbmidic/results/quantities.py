@@ -201,8 +201,7 @@ class Quantity:
             It has another shape.
         """
         array, shape = np.asarray(value, dtype=self.dtype), self.shape(sizes)
-        fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
-        if not fits:
+        if array.ndim != len(shape) or any(a not in (None, b) for a, b in zip(shape, array.shape, strict=True)):
             raise InputError(f"{self.name} of a result has the shape {shape} (None: any), not {array.shape}")
         return array if self.axes else array.item()
 
@@ -435,9 +434,8 @@ def map_quantities(units: Units, lights: tuple[str, ...], *, with_error: bool) -
     -------
     dict of str to Quantity
     """
-    derived = [*DERIVED.values()]
-    spread = [entry.uncertainty for entry in derived]
-    taken = {entry.name for entry in (*derived, *spread)}
+    spread = [entry.uncertainty for entry in DERIVED.values()]
+    taken = {entry.name for entry in (*DERIVED.values(), *spread)}
     kept = [
         replace(entry, symbol=name, meaning=", ".join(entry.codes) or entry.meaning)
         for name, entry in QUANTITIES.items()
@@ -445,5 +443,5 @@ def map_quantities(units: Units, lights: tuple[str, ...], *, with_error: bool) -
     ]
     meaning, names = QUANTITIES["light_fraction"].meaning, [f"fraction of {light}" for light in lights]
     fractions = [Quantity(name, _NODE, "", "", meaning, symbol=name, kind="fraction") for name in names]
-    every = [*derived, *kept, *(WITH_ERROR.values() if with_error else ()), *fractions, *spread]
+    every = [*DERIVED.values(), *kept, *(WITH_ERROR.values() if with_error else ()), *fractions, *spread]
     return {entry.name: entry.in_units(units) for entry in sorted(every, key=lambda one: _GROUPS.index(one.group))}
