@@ -24,7 +24,7 @@ from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.fields.units import Units
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.files import check_file, write_complete, write_table
-from rgbmidic.results.physical import MOVED, Physical, frame_times, reference_frames, shared_part
+from rgbmidic.results.physical import MOVED, Physical, displacements, frame_times, reference_frames, shared_part
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.text import rounded
@@ -220,7 +220,7 @@ def _read(
     kept: list[list[FloatArray]] = [[] for _ in probes]
     motions = np.full((len(clock), 3, 2), np.nan)
     speed, before = np.full(len(clock), np.nan), np.full((2, len(physical.mesh.nodes)), np.nan)
-    for row, field in enumerate(physical.displacements(frames.tolist())):
+    for row, field in enumerate(displacements(physical.result, physical.rectified, frames.tolist())):
         moved = np.hypot(*(field[:2] - before))
         if row and np.isfinite(moved).any():
             # of the fast nodes: single outliers do not count

@@ -6,7 +6,7 @@ accelerations and strain rates are those of `rgbmidic.fields.rates` at every nod
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, Self
@@ -20,7 +20,7 @@ from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.results.physical import MOVED, Physical, frame_times, named, reference_frames, shared_part
+from rgbmidic.results.physical import MOVED, Physical, displacements, frame_times, named, reference_frames, shared_part
 from rgbmidic.results.quantities import DERIVED, UNKNOWN_TIME, UV, WITH_ERROR, Quantity, map_quantities
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import MeshSettings, ProbeSettings, ScaleSettings
@@ -337,9 +337,12 @@ class Maps(Portable):
             lambda x, y, length: StrainGauges.at_points(self.physical.covariance, np.array([[x, y]]), length)
         )
 
+    def _displacements(self, frames: Iterable[int]) -> Iterator[FloatArray]:
+        return displacements(self.result, self.physical.rectified, frames)  # `physical` may be of an earlier state
+
     def _since(self, frame: int) -> FloatArray:
         """Return u, v and their uncertainties (4, N) since the frame that is the reference here."""
-        moved = next(self.physical.displacements([frame]))
+        moved = next(self._displacements([frame]))
         if self.since is None:
             return moved
         first, factor = self._first, self._common(frame)
@@ -348,7 +351,7 @@ class Maps(Portable):
 
     @cached_property
     def _first(self) -> FloatArray:
-        return next(self.physical.displacements([self.since or 0]))
+        return next(self._displacements([self.since or 0]))
 
     def _common(self, frame: int) -> float:
         """Return the fraction of the smaller variance that a frame has in common with the one of `since`."""
@@ -377,7 +380,7 @@ class Maps(Portable):
         return lru_cache(2)(lambda frame: named(self._strain_of(frame, self.physical.gauges)))
 
     def _strain_of(self, frame: int, gauges: StrainGauges) -> Strain:
-        moved = next(self.physical.displacements([frame]))
+        moved = next(self._displacements([frame]))
         if self.since is None:
             gradient, covariance = gauges.gradient(*moved)
         else:  # both gradients of the same nodes, which have data in both frames
@@ -437,7 +440,7 @@ class Maps(Portable):
         frames, clock = self._there[outer], self._clock[outer]
         plain = replace(self, since=None, rigid_removed=False)
         if name in UV:
-            each = (moved[UV.index(name) :: 2] for moved in self.physical.displacements(frames.tolist()))
+            each = (moved[UV.index(name) :: 2] for moved in self._displacements(frames.tolist()))
         else:
             each = (np.stack(plain._derived(name, frame)) for frame in frames.tolist())
         series = np.stack([*each], axis=1)

@@ -157,6 +157,12 @@ def shared_part(result: Result) -> float:
     return reference_fraction(len(result.setting("frames", "reference", [0])))
 
 
+def displacements(result: Result, rectified: Rectification, frames: Iterable[int]) -> Iterator[FloatArray]:
+    """Read u, v and their uncertainties (4, N) in some frames, in rectified px."""
+    for read in result.table.each(MOVED, frames):
+        yield np.stack(rectified.displacement(*(np.asarray(read[name], np.float64) for name in MOVED)))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Physical(Portable):
     """A result with its units.
@@ -232,11 +238,6 @@ class Physical(Portable):
         if (camera := self.rectified.camera) is not None:
             facts["camera"] = f"{camera.name}: {camera.summary()}"
         return facts
-
-    def displacements(self, frames: Iterable[int]) -> Iterator[FloatArray]:
-        """Read u, v and their uncertainties (4, N) in some frames, in rectified px."""
-        for read in self.result.table.each(MOVED, frames):
-            yield np.stack(self.rectified.displacement(*(np.asarray(read[name], np.float64) for name in MOVED)))
 
     @cached_property
     def covariance(self) -> NodalCovariance:
