@@ -27,7 +27,7 @@ from rgbmidic.pipeline.suitability import light_levels
 from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
-from rgbmidic.results.result import listed, read_mesh
+from rgbmidic.results.result import listed, read_shared
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.weights import LightWeights
 
@@ -135,7 +135,7 @@ def measure(
     sized = settings.mesh if choice is None else replace(settings.mesh, element_size=choice.element_size)
     plan = Plan.from_settings(replace(settings, mesh=replace(sized, refine=False)), **given)
     if refines and "refinement" in kept:
-        stored = read_mesh(Path(out), kept)
+        stored = read_shared(Path(out), kept)
         finer = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
         plan = replace(plan.on_mesh(finer), refinement=kept["refinement"])
     elif refines:

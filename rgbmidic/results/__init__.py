@@ -10,9 +10,10 @@ from rgbmidic.results.maps import Maps, MapValues
 from rgbmidic.results.physical import frame_times, placement_of, shared_part
 from rgbmidic.results.profiles import Profile, Wave, read_profile, write_profile
 from rgbmidic.results.provenance import Origin
-from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, FrameRecord, Quantity
-from rgbmidic.results.result import Result
-from rgbmidic.results.store import ResultStore, finish_result
+from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, Quantity
+from rgbmidic.results.records import FrameRecord
+from rgbmidic.results.result import Result, finish_result
+from rgbmidic.results.store import ResultStore
 
 __all__ = [
     "EXPORT_FORMATS",

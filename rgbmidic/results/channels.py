@@ -112,12 +112,8 @@ class Channels:
             if not len(crossed):
                 raise InputError(f"the trigger {trigger} of the channels {path} is constant: it marks no time")
             if len(crossed) > 1:
-                logger.warning(
-                    "the trigger %s of %s crosses the middle of its range %d times: the first counts",
-                    trigger,
-                    path,
-                    len(crossed),
-                )
+                text = "the trigger %s of %s crosses the middle of its range %d times: the first counts"
+                logger.warning(text, trigger, path, len(crossed))
             i = int(crossed[0])
             offset = -float(times[i] + (middle - signal[i]) / (signal[i + 1] - signal[i]) * (times[i + 1] - times[i]))
         return channels.shifted(offset)

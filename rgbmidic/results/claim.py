@@ -86,10 +86,8 @@ def _others(mine: Path, frames: range) -> Iterator[tuple[Path, dict[str, Any]]]:
         except ResultError:
             document = {}
         holder = document if isinstance(document, dict) else {}
-        first, stop = holder.get("first"), holder.get("stop")
+        first, end = holder.get("first"), holder.get("stop")
         if not may_live(holder):
             file.unlink(missing_ok=True)
-        elif not (isinstance(first, int) and isinstance(stop, int)) or (
-            max(first, frames.start) < min(stop, frames.stop)
-        ):
+        elif not (isinstance(first, int) and isinstance(end, int)) or max(first, frames.start) < min(end, frames.stop):
             yield file, holder

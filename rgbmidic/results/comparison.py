@@ -27,11 +27,10 @@ from rgbmidic.correlation.constants import USUAL
 from rgbmidic.errors import InputError
 from rgbmidic.fields import NodalCovariance, StrainGauges, strain_of_gradient
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh
-from rgbmidic.results.levelling import Levelling, reading
 from rgbmidic.results.physical import frame_times, rectification_of, shared_part
 from rgbmidic.results.quantities import FAILED
 from rgbmidic.results.result import Result
-from rgbmidic.results.simulation import Simulation, places_among
+from rgbmidic.results.simulation import Levelling, Simulation, places_among, reading
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 

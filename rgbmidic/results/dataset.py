@@ -43,9 +43,9 @@ class _Frames(BackendArray):
 
     def __init__(self, result: Result, names: tuple[str, ...], maps: Maps | None = None) -> None:
         self.result, self.names, self.maps = result, names, maps
-        blank = QUANTITIES[names[0]].unmeasured(result.table.sizes)
-        self.dtype = blank.dtype
-        self.shape = (len(result), *blank.shape, *([len(names)] if len(names) > 1 else []))
+        self.blank = QUANTITIES[names[0]].unmeasured(result.table.sizes)
+        self.dtype = self.blank.dtype
+        self.shape = (len(result), *self.blank.shape, *([len(names)] if len(names) > 1 else []))
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._read)
@@ -61,16 +61,15 @@ class _Frames(BackendArray):
                 array = array[(slice(None),) * axis + (index,)]
             return array
 
-        blank = QUANTITIES[self.names[0]].unmeasured(self.result.table.sizes)
-        read = np.empty((frames.size, *part(dict.fromkeys(self.names, blank)).shape), dtype=self.dtype)
-        for row, values in enumerate(self._each(frames.reshape(-1).tolist(), blank)):
+        read = np.empty((frames.size, *part(dict.fromkeys(self.names, self.blank)).shape), dtype=self.dtype)
+        for row, values in enumerate(self._each(frames.reshape(-1).tolist())):
             read[row] = part(values)
         return read.reshape((*frames.shape, *read.shape[1:]))
 
-    def _each(self, frames: list[int], blank: Any) -> Iterable[Mapping[str, Any]]:
+    def _each(self, frames: list[int]) -> Iterable[Mapping[str, Any]]:
         if self.maps is None:
             return self.result.table.each(self.names, frames)
-        read, nothing, there = self.maps.read, dict.fromkeys(self.names, blank), self.result.finished
+        read, nothing, there = self.maps.read, dict.fromkeys(self.names, self.blank), self.result.finished
         return ({name: read(name, at).values for name in self.names} if there[at] else nothing for at in frames)
 
 

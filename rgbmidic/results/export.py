@@ -15,6 +15,7 @@ import re
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -95,17 +96,13 @@ def _write_shared(out: h5py.File, physical: Physical) -> None:
     out.attrs.update({**physical.facts, "axes": _AXES})
     out.create_dataset("provenance", data=json.dumps(dict(result.provenance)), dtype=text)
     meaning = "time of the frame" if units.timed else "place of the frame, counted from 0"
-    scales: dict[str, tuple[AnyArray, str, str]] = {
-        "time": (physical.times, units.time, meaning),
-        "node": (np.arange(len(mesh.nodes), dtype=np.int32), "", "index of the node, as in elements"),
-        "element": (np.arange(len(mesh.elements), dtype=np.int32), "", "index of the element"),
-        "corner": (np.arange(3, dtype=np.int32), "", "corner of the element"),
-        "light": (np.array(result.lights, dtype=text), "", "name of the light"),
-    }
-    for name, (values, unit, meaning) in scales.items():
-        _add(out, Quantity(name, (), unit, "", meaning), (), data=values).make_scale(name)
     (x, y), element = physical.length * mesh.centres.T, ("element",)
     shared: list[tuple[Quantity, AnyArray | None]] = [
+        (Quantity("time", (), units.time, "", meaning), physical.times),
+        (Quantity("node", (), "", "", "index of the node, as in elements"), np.arange(len(mesh.nodes), dtype=np.int32)),
+        (Quantity("element", (), "", "", "index of the element"), np.arange(len(mesh.elements), dtype=np.int32)),
+        (Quantity("corner", (), "", "", "corner of the element"), np.arange(3, dtype=np.int32)),
+        (Quantity("light", (), "", "", "name of the light"), np.array(result.lights, dtype=text)),
         (Quantity("name", ("time",), "", "", "name of the frame"), np.array(result.names, dtype=text)),
         *physical.places,
         *((SHARED[name], getattr(result, name)) for name in ("node_number", "element_number")),
@@ -120,11 +117,13 @@ def _write_shared(out: h5py.File, physical: Physical) -> None:
 
 
 def _add(out: h5py.File, entry: Quantity, axes: Sequence[str | int], **content: Any) -> h5py.Dataset:
-    """Create the array of a quantity along axes whose scales are there."""
+    """Create the array of a quantity along axes whose scales are there; without axes it is itself the scale of one."""
     dataset = out.create_dataset(entry.name, **content)
     dataset.attrs.update(entry.attributes)
     for axis, name in zip(dataset.dims, axes, strict=False):
         axis.attach_scale(out[name])
+    if not axes:
+        dataset.make_scale(entry.name)
     return dataset
 
 
@@ -133,9 +132,7 @@ def _declare(out: h5py.File, physical: Physical, entry: Quantity) -> None:
     axes = tuple(axis if isinstance(axis, str) else f"part_of_{axis}" for axis in entry.axes)
     for name, axis in zip(axes, entry.axes, strict=True):
         if name not in out:  # an axis of a fixed length gets its scale when it is first met
-            _add(out, Quantity(name, (), "", "", "index"), (), data=np.arange(int(axis), dtype=np.int32)).make_scale(
-                name
-            )
+            _add(out, Quantity(name, (), "", "", "index"), (), data=np.arange(int(axis), dtype=np.int32))
     shape = (len(physical.result), *(len(out[axis]) for axis in axes))
     dataset = _add(out, entry, ("time", *axes), shape=shape, dtype=np.dtype(entry.dtype).newbyteorder("<"))
     if physical.is_strain(entry.name):
@@ -312,13 +309,9 @@ def _write_nodemaps(physical: Physical, folder: Path, *, overwrite: bool) -> Non
         title = f"rgbmidic {__version__}, {stem}, {result.names[index]}; {physical.measure} strain"
         # CrackPy looks for "# time" and such at the beginning of a line, and for the number behind its colon
         lines = [title, *([f"time : {physical.times[index]:.12g}"] if physical.units.timed else []), ";".join(_NODEMAP)]
-        header = "".join(f"# {line}\n" for line in lines).encode("ascii", "backslashreplace")
-
-        def write(file: BinaryIO, header: bytes = header, table: list[AnyArray] = table) -> None:
-            file.write(header)
-            np.savetxt(file, np.column_stack(table), fmt="%.9g", delimiter=";")
-
-        write_complete(folder / f"{stem}_{values['number']}.txt", write)
+        header = "\n".join(lines).encode("ascii", "backslashreplace").decode()
+        save = partial(np.savetxt, X=np.column_stack(table), fmt="%.9g", delimiter=";", header=header)
+        write_complete(folder / f"{stem}_{values['number']}.txt", save)
 
 
 _WRITERS: dict[str, Callable[[Physical, BinaryIO], None]] = {"npz": _write_npz, "csv": _write_csv, "hdf5": write_hdf5}

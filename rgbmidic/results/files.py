@@ -131,12 +131,10 @@ def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool
             if new:
                 try:
                     path.hardlink_to(temporary)
-                    return
-                except FileExistsError:
-                    return
-                except OSError:  # a disk without links, where nobody else starts in the same millisecond
-                    if path.exists():
-                        return
+                except OSError:  # it is there; or the disk has no links, where nobody else starts at the same time
+                    if not path.exists():
+                        temporary.replace(path)
+                return
             temporary.replace(path)
     finally:
         with suppress(OSError):  # a read-only disk refuses even to remove what is not there

@@ -19,13 +19,12 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.fields.history import History, Nodal, Probe, Rates, rate_frames, rate_words, rates
 from rgbmidic.fields.nodal import RigidMotion
-from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.probes import make_probe
 from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.fields.units import Units
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.files import check_file, write_complete, write_table
-from rgbmidic.results.physical import MOVED, Physical, frame_times, reference_frames, shared_part
+from rgbmidic.results.physical import MOVED, Physical, displacements, frame_times, reference_frames, shared_part
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.text import rounded
@@ -192,7 +191,7 @@ def read_histories(
     rate = partial(rates, clock, window=span, common_fraction=common, references=references) if window else None
     read = [*rigid, *(history for part in by_probe.values() for history in part)]
     quantities = tuple(quantity for history in read for quantity in in_units(history, units, rate))
-    remarks = [*_remarks(rectified, speed, result.provenance.get("exposure_ns"), there, by_probe)]
+    remarks = [*_remarks(physical, alone, speed, by_probe)]
     if any(one.name.endswith("_exx") for one in quantities):
         remarks.append(f"exx, eyy, exy, e1, e2: {probes.measure.title()} strain")
     if window:
@@ -221,7 +220,7 @@ def _read(
     kept: list[list[FloatArray]] = [[] for _ in probes]
     motions = np.full((len(clock), 3, 2), np.nan)
     speed, before = np.full(len(clock), np.nan), np.full((2, len(physical.mesh.nodes)), np.nan)
-    for row, field in enumerate(physical.displacements(frames.tolist())):
+    for row, field in enumerate(displacements(physical.result, physical.rectified, frames.tolist())):
         moved = np.hypot(*(field[:2] - before))
         if row and np.isfinite(moved).any():
             # of the fast nodes: single outliers do not count
@@ -290,7 +289,7 @@ def with_channels(histories: Histories, stated: ChannelSettings) -> Histories:
             f"the channels {stated.file} cannot be brought to the frames, whose times are not known: state "
             "frame_rate in [scale]"
         )
-    channels, remarks = Channels.read(stated.file, stated.offset, stated.trigger), []
+    channels, remarks, shifted = Channels.read(stated.file, stated.offset, stated.trigger), list[str](), ""
     if stated.align is not None:
         name, wanted = stated.align
         column = next((one for one in histories.quantities if wanted in (one.name, one.column)), None)
@@ -298,24 +297,19 @@ def with_channels(histories: Histories, stated: ChannelSettings) -> Histories:
             known = ", ".join(one.name for one in histories.quantities)
             raise InputError(f'channels.align names the history "{wanted}", which is not one of {known or "none"}')
         channels, std, coefficient = channels.aligned(name, times, column.values)
-        remarks.append(
-            f"the times of the channels were shifted by {channels.offset:.6g} s ({std:.2g} s standard uncertainty), "
-            f"where {name} and {column.name} correlate by {coefficient:.3f}"
-        )
+        shifted = f" ({std:.2g} s standard uncertainty), where {name} and {column.name} correlate by {coefficient:.3f}"
     elif stated.trigger is not None:
-        remarks.append(
-            f"the times of the channels were shifted by {channels.offset:.6g} s: {stated.trigger} rises at 0"
-        )
+        shifted = f": {stated.trigger} rises at 0"
+    if shifted:
+        remarks.append(f"the times of the channels were shifted by {channels.offset:.6g} s{shifted}")
     elif not stated.offset:
-        remarks.append(
-            "the clocks of channels and frames are taken as equal: channels.offset, .trigger or .align relates them"
-        )
+        equal = "the clocks of channels and frames are taken as equal"
+        remarks.append(f"{equal}: channels.offset, .trigger or .align relates them")
     first, last = channels.times[[0, -1]]
     covered = float(np.nanmax(times) - np.nanmin(times)) / (last - first)
     if covered < 0.01:  # a factor of 1,000 is far below
-        remarks.append(
-            f"the frames cover {covered:.2%} of the time of the channels: is the unit of {stated.file} right?"
-        )
+        part = f"the frames cover {covered:.2%} of the time of the channels"
+        remarks.append(f"{part}: is the unit of {stated.file} right?")
     read = channels.at(times)
     taken = {"frame", "number", "status", "time_s"} | ({"stress", "stress_MPa"} if stated.area is not None else set())
     taken.update(*({one.name, one.column, f"{one.column}_std"} for one in histories.quantities))
@@ -343,14 +337,10 @@ def with_channels(histories: Histories, stated: ChannelSettings) -> Histories:
 
 
 def _remarks(
-    rectified: Rectification,
-    speed: FloatArray,
-    exposure_ns: float | None,
-    frames: IntArray,
-    read: Mapping[str, list[History]],
+    physical: Physical, alone: Histories, speed: FloatArray, read: Mapping[str, list[History]]
 ) -> Iterator[str]:
-    camera, units, exposed = rectified.camera, rectified.units, (exposure_ns or 0) * 1e-9
-    if camera is not None:
+    units, frames, exposed = alone.units, alone.frames, (physical.result.provenance.get("exposure_ns") or 0) * 1e-9
+    if (camera := physical.rectified.camera) is not None:
         yield f"lengths and strains are those on the plane of {camera.name}: {camera.summary()}"
     if units.mm_per_pixel is None:
         yield "no scale is known: lengths are in px (mm_per_pixel in [scale]; `rgbmidic scale` finds it)"

@@ -6,7 +6,7 @@ accelerations and strain rates are those of `rgbmidic.fields.rates` at every nod
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, Self
@@ -20,9 +20,8 @@ from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.results.derived import COMPONENTS, DERIVED, FINER, STRAINS, UV, WITH_ERROR, map_quantities
-from rgbmidic.results.physical import MOVED, Physical, frame_times, named, reference_frames, shared_part
-from rgbmidic.results.quantities import UNKNOWN_TIME, Quantity
+from rgbmidic.results.physical import MOVED, Physical, displacements, frame_times, named, reference_frames, shared_part
+from rgbmidic.results.quantities import DERIVED, UNKNOWN_TIME, UV, WITH_ERROR, Quantity, map_quantities
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import MeshSettings, ProbeSettings, ScaleSettings
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
@@ -237,12 +236,12 @@ class Maps(Portable):
         if not 0 <= frame < len(self.result):
             raise InputError(f"there is no frame {frame} in a result of {len(self.result)} frames")
         base = name.removesuffix("_std")
-        derived = base in DERIVED | STRAINS or name in WITH_ERROR
+        derived = base in DERIVED or name in WITH_ERROR
         stored = ("light_fraction",) if kind == "fraction" else () if derived else (base,)
         read = next(self.result.table.each([*MOVED, "node_status", *stored], [frame]))
         nothing = np.full(len(self.result.nodes), np.nan)
         if name in WITH_ERROR:
-            values, std = self._with_error(name, frame), nothing
+            values, std = self._with_error(WITH_ERROR[name], frame), nothing
         elif derived:
             values, std = self._derived(base, frame)
             values, std = (std, nothing) if base != name else (values, std)
@@ -258,30 +257,29 @@ class Maps(Portable):
             status=read["node_status"],
         )
 
-    def _with_error(self, name: str, frame: int) -> FloatArray:
+    def _with_error(self, entry: Quantity, frame: int) -> FloatArray:
         """Compute a field of `WITH_ERROR` (N,) against the test's reference; NaN in frames without."""
-        names = [f"{one}{end}" for one in COMPONENTS for end in ("_std", "_mesh_error")]
-        read = next(self.result.table.each([*names, "u", "v"], [frame]))
+        names = {f"{one}{end}": None for one in (*UV, *entry.parts) for end in ("", "_std", "_mesh_error")}
+        read = next(self.result.table.each([*names], [frame]))
         if not read["u_mesh_error"].size:
             return np.full(len(self.result.nodes), np.nan)
         double = {key: np.asarray(values, dtype=np.float64) for key, values in read.items()}
-        if name == FINER:
-            ratios = [double[f"{one}_mesh_error"] / double[f"{one}_std"] for one in COMPONENTS]
-            return np.asarray(np.fmax.reduce(ratios))
-        one = name.removesuffix("_total").removesuffix("_mesh_error")
-        if one in UV:
-            for end in ("_std", "_mesh_error"):
-                parts = (double[key] for key in ("u", "v", f"u{end}", f"v{end}"))
-                moved = self.physical.rectified.displacement(*parts)[2:]
-                double[f"{one}{end}"] = self.physical.length * moved[UV.index(one)]
-        error = double[f"{one}_mesh_error"]
-        return error if name.endswith("_error") else np.hypot(error, double[f"{one}_std"])
+        pairs = [(double[f"{one}_std"], double[f"{one}_mesh_error"]) for one in entry.parts]
+        if len(pairs) > 1:
+            return np.asarray(np.fmax.reduce([error / std for std, error in pairs]))
+        std, error = pairs[0]
+        if (one := entry.parts[0]) in UV:
+            ends = ("_std", "_mesh_error")
+            moved = ([double[f"{name}{part}"] for part in ("", end) for name in UV] for end in ends)
+            rectified = (self.physical.rectified.displacement(*parts)[2 + UV.index(one)] for parts in moved)
+            std, error = (self.physical.length * part for part in rectified)
+        return error if entry.name.endswith("_error") else np.hypot(error, std)
 
     def _derived(self, name: str, frame: int) -> tuple[FloatArray, FloatArray]:
         """Compute a length, a strain or a rate, and its uncertainty, each (N,)."""
-        if name in STRAINS:
-            return self._strain(frame)[name], self._strain(frame)[f"{name}_std"]
         entry = DERIVED[name]
+        if entry.group == "Strain":
+            return self._strain(frame)[name], self._strain(frame)[f"{name}_std"]
         if entry.order:
             parts = [self._rates(part, frame, entry.order) for part in entry.parts]
         else:
@@ -339,9 +337,12 @@ class Maps(Portable):
             lambda x, y, length: StrainGauges.at_points(self.physical.covariance, np.array([[x, y]]), length)
         )
 
+    def _displacements(self, frames: Iterable[int]) -> Iterator[FloatArray]:
+        return displacements(self.result, self.physical.rectified, frames)  # `physical` may be of an earlier state
+
     def _since(self, frame: int) -> FloatArray:
         """Return u, v and their uncertainties (4, N) since the frame that is the reference here."""
-        moved = next(self.physical.displacements([frame]))
+        moved = next(self._displacements([frame]))
         if self.since is None:
             return moved
         first, factor = self._first, self._common(frame)
@@ -350,7 +351,7 @@ class Maps(Portable):
 
     @cached_property
     def _first(self) -> FloatArray:
-        return next(self.physical.displacements([self.since or 0]))
+        return next(self._displacements([self.since or 0]))
 
     def _common(self, frame: int) -> float:
         """Return the fraction of the smaller variance that a frame has in common with the one of `since`."""
@@ -379,7 +380,7 @@ class Maps(Portable):
         return lru_cache(2)(lambda frame: named(self._strain_of(frame, self.physical.gauges)))
 
     def _strain_of(self, frame: int, gauges: StrainGauges) -> Strain:
-        moved = next(self.physical.displacements([frame]))
+        moved = next(self._displacements([frame]))
         if self.since is None:
             gradient, covariance = gauges.gradient(*moved)
         else:  # both gradients of the same nodes, which have data in both frames
@@ -439,7 +440,7 @@ class Maps(Portable):
         frames, clock = self._there[outer], self._clock[outer]
         plain = replace(self, since=None, rigid_removed=False)
         if name in UV:
-            each = (moved[UV.index(name) :: 2] for moved in self.physical.displacements(frames.tolist()))
+            each = (moved[UV.index(name) :: 2] for moved in self._displacements(frames.tolist()))
         else:
             each = (np.stack(plain._derived(name, frame)) for frame in frames.tolist())
         series = np.stack([*each], axis=1)

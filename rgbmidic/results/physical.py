@@ -21,8 +21,7 @@ from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Placement, Tri3Mesh
-from rgbmidic.results.derived import ELEMENT_STRAIN, STRAIN
-from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, Quantity
+from rgbmidic.results.quantities import ELEMENT_STRAIN, QUANTITIES, STRAIN, UNKNOWN_TIME, Quantity
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
@@ -70,10 +69,8 @@ def rectification_of(
 
 
 def _kept_camera(result: Result) -> CameraCalibration | None:
-    document = result.provenance.get("camera")
-    if document is None:
-        return None
-    return CameraCalibration.from_document(document, str(result.section(ScaleSettings).camera))
+    kept = result.provenance.get("camera")
+    return None if kept is None else CameraCalibration.from_document(kept, str(result.section(ScaleSettings).camera))
 
 
 def placement_of(result: Result) -> Placement | None:
@@ -160,6 +157,12 @@ def shared_part(result: Result) -> float:
     return reference_fraction(len(result.setting("frames", "reference", [0])))
 
 
+def displacements(result: Result, rectified: Rectification, frames: Iterable[int]) -> Iterator[FloatArray]:
+    """Read u, v and their uncertainties (4, N) in some frames, in rectified px."""
+    for read in result.table.each(MOVED, frames):
+        yield np.stack(rectified.displacement(*(np.asarray(read[name], np.float64) for name in MOVED)))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Physical(Portable):
     """A result with its units.
@@ -235,11 +238,6 @@ class Physical(Portable):
         if (camera := self.rectified.camera) is not None:
             facts["camera"] = f"{camera.name}: {camera.summary()}"
         return facts
-
-    def displacements(self, frames: Iterable[int]) -> Iterator[FloatArray]:
-        """Read u, v and their uncertainties (4, N) in some frames, in rectified px."""
-        for read in self.result.table.each(MOVED, frames):
-            yield np.stack(self.rectified.displacement(*(np.asarray(read[name], np.float64) for name in MOVED)))
 
     @cached_property
     def covariance(self) -> NodalCovariance:

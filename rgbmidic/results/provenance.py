@@ -119,8 +119,7 @@ class Origin:
         document |= {**self.notes, "lights": list(self.lights), "references": list(self.references)}
         document["frames"] = {"count": len(self.names), "sha256": digest(list(self.names))}
         document |= {"mesh": digest(self.mesh), "inputs": dict(self.inputs)}
-        plain: dict[str, Any] = json.loads(json.dumps(document))
-        return plain
+        return dict(json.loads(json.dumps(document)))
 
 
 def digest(content: Mapping[str, AnyArray] | list[str]) -> str:
@@ -156,9 +155,8 @@ def check_same(path: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> No
 def _compared(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield what decides on the bits of a result, each under a name for messages."""
     for section, keys in document.get("settings", {}).items():
-        if section in READING:
-            continue
-        yield from ((f"{section}.{key}", value) for key, value in keys.items())
+        if section not in READING:
+            yield from ((f"{section}.{key}", value) for key, value in keys.items())
     yield "the calibration", document.get("calibration", {}).get("sha256")
     yield from ((f"the input {name}", text) for name, text in document["inputs"].items())
     yield "the mesh", document["mesh"]

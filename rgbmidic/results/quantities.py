@@ -1,6 +1,6 @@
-"""The table of numbers of a result: what a quantity is, every quantity that is kept, and the record of one frame.
+"""The table of numbers of a result: what a quantity is, every quantity that is kept, and those that follow from them.
 
-Each is declared once, here or in `rgbmidic.results.derived`; record, store, exports, maps and documents read that.
+Each is declared once, here; records, store, exports, maps and documents read that.
 """
 
 from __future__ import annotations
@@ -8,18 +8,15 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.fields.units import Units
-from rgbmidic.text import Described, rounded, uncertain
+from rgbmidic.text import rounded, uncertain
 from rgbmidic.timing import STAGES
-
-if TYPE_CHECKING:
-    from rgbmidic.correlation.solution import Solution
-
 
 Kind = Literal["displacement", "strain", "positive", "fraction", "angle", "codes"]
 
@@ -52,7 +49,8 @@ class Quantity:
     symbol
         How formulas and pictures write it; empty for what maps do not show.
     parts, order
-        Quantities from which it follows: their length where there are two, their derivative by time of an order.
+        Quantities from which it follows: their length where there are two, their derivative by time of an order, a
+        strain or a discretisation error.
     group
         Heading under which maps list it.
     kind
@@ -203,8 +201,7 @@ class Quantity:
             It has another shape.
         """
         array, shape = np.asarray(value, dtype=self.dtype), self.shape(sizes)
-        fits = array.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, array.shape, strict=True))
-        if not fits:
+        if array.ndim != len(shape) or any(a not in (None, b) for a, b in zip(shape, array.shape, strict=True)):
             raise InputError(f"{self.name} of a result has the shape {shape} (None: any), not {array.shape}")
         return array if self.axes else array.item()
 
@@ -254,61 +251,35 @@ _NODE, _LIGHT, _PICTURE = ("node",), ("light",), ("light", "row", "column")
 _TEXT: dict[str, Any] = {"dtype": np.str_, "blank": ""}
 _BYTE: dict[str, Any] = {"dtype": np.uint8, "blank": 0}
 _EXACT: dict[str, Any] = {"dtype": np.float64}
-_NUMBER = "number of the frame; missing frames leave gaps"
-_INPUTS = "path and SHA-256 of each file that the frame was read from"
-_MACHINE = "processor and BLAS library that it was measured with, on which the last bits depend; empty if it failed"
-_CHECKSUM = "CRC-32 of the frame's samples where the reference was read; -1 if it failed. Noise makes all differ"
 _AT_NODE = "relative to the reference, at the node"
 _NOT_FIT = "(not the best linear fit's nodal value)"
-_FRACTION = "fraction of each light in the information that determines a node"
 _AROUND = "slope of the quadratic through the neighbouring nodes; NaN also next to a node that is not measured"
-_TIME = "time of the frame after the trigger; the smallest 64-bit integer if it is not known"
-_MISFIT = "weighted rms residual around a node over its median: 1 is typical, 3 is suspicious"
-_RESIDUAL = (
-    "weighted rms of `f - g(x + u)`, in the unit of the correlated images: none if these are divided by their "
-    "local mean (the default), else DN"
-)
-_WEIGHT = "mean fraction of each light in the weights; their sum is the part of the region that any light sees"
-_BRIGHTNESS = (
-    "gain and offset (DN) of each light relative to the reference, from contrast and mean of the speckle, medians over "
-    "the elements; reported, not used"
-)
-_MATCH = (
-    "median correlation coefficient of the elements with their reference, for the light that matches best; NaN without "
-    "`frames.update_reference`"
-)
-_BEST = "largest `match` of the frames compared with the same reference, up to this one"
-_UPDATES = (
-    "indices in the result of the frames that became the reference, up to this one: this frame was compared with the "
-    "last one before it, or with the test's reference"
-)
-_RIGID = (
-    "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad); 0 for the first, NaN for a "
-    "light that sees nothing"
-)
-_UNREAD = "1 if the frame failed because it could not be read (`--resume` tries again), else 0"
-_TRIES = "2 for a key frame that was also measured from the frame just before it, else 1"
-_REFLECTION = "reduced picture of each light's reflection index, 255 for 1; empty if the separation does not give it"
-_SECONDS = f"time of each of the stages {', '.join(STAGES)}; NaN without `--timings`"
 _LEFT_OUT = "discretisation error of {}, caused by mesh and recovery, one sigma; empty unless `mesh.error` requests it"
 _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
 
 _TABLE = (
-    Quantity("number", (), "", "", _NUMBER, dtype=np.int64, blank=-1),
-    Quantity("time_ns", (), "ns", "", _TIME, dtype=np.int64, blank=UNKNOWN_TIME),
+    Quantity("number", (), "", "", "number of the frame; missing frames leave gaps", dtype=np.int64, blank=-1),
+    Quantity("time_ns", (), "ns", "",
+        "time of the frame after the trigger; the smallest 64-bit integer if it is not known",
+        dtype=np.int64, blank=UNKNOWN_TIME),
     Quantity("status", (), "", "status", "status of the frame, see below", dtype=np.int64, blank=2, codes=_ENDS),
     Quantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
-    Quantity("unread", (), "", "", _UNREAD, dtype=np.int64, blank=0),
-    Quantity("tries", (), "", "", _TRIES, dtype=np.int64, blank=1),
+    Quantity("unread", (), "", "",
+        "1 if the frame failed because it could not be read (`--resume` tries again), else 0", dtype=np.int64, blank=0),
+    Quantity("tries", (), "", "",
+        "2 for a key frame that was also measured from the frame just before it, else 1", dtype=np.int64, blank=1),
     Quantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
     Quantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
-    Quantity("inputs", ("file", 2), "", "", _INPUTS, **_TEXT),
-    Quantity("machine", (), "", "", _MACHINE, **_TEXT),
-    Quantity("checksum", (), "", "", _CHECKSUM, dtype=np.int64, blank=NO_CHECKSUM),
-    Quantity(
-        "node_status", _NODE, "", "node_status", "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS, kind="codes"
-    ),
+    Quantity("inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT),
+    Quantity("machine", (), "", "",
+        "processor and BLAS library that it was measured with, on which the last bits depend; empty if it failed",
+        **_TEXT),
+    Quantity("checksum", (), "", "",
+        "CRC-32 of the frame's samples where the reference was read; -1 if it failed. Noise makes all differ",
+        dtype=np.int64, blank=NO_CHECKSUM),
+    Quantity("node_status", _NODE, "", "node_status",
+        "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS, kind="codes"),
     Quantity("u", _NODE, "px", "displacement.0", f"displacement in x {_AT_NODE} {_NOT_FIT}", **_EXACT),
     Quantity("v", _NODE, "px", "displacement.1", f"displacement in y {_AT_NODE}", **_EXACT),
     Quantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
@@ -318,29 +289,41 @@ _TABLE = (
         Quantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
         Quantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_AROUND}"),
     ),
-    *(
-        Quantity(f"{name}_mesh_error", _ESTIMATED, unit, source, _LEFT_OUT.format(name))
-        for name, unit, source in (
-            ("u", "px", "displacement_error.0"),
-            ("v", "px", "displacement_error.1"),
-            ("exx", "", "strain_error.0"),
-            ("eyy", "", "strain_error.1"),
-            ("exy", "", "strain_error.2"),
-        )
-    ),
-    Quantity("match", (), "", "", _MATCH),
-    Quantity("best_match", (), "", "", _BEST, blank=0),
-    Quantity("reference_updates", ("reference_update",), "", "", _UPDATES, dtype=np.int64, blank=0),
-    Quantity("misfit", _NODE, "", "misfit", _MISFIT, kind="positive"),
-    Quantity("light_fraction", ("node", "light"), "", "light_fraction", _FRACTION, blank=0),
-    Quantity("residual", _LIGHT, "", "residual", _RESIDUAL),
-    Quantity("weight_fraction", _LIGHT, "", "weight_fraction", _WEIGHT),
-    Quantity("brightness", ("light", 2), "", "", _BRIGHTNESS),
-    Quantity("rigid", ("light", "function"), "", "rigid", _RIGID),
-    Quantity("seconds", (len(STAGES),), "s", "", _SECONDS),
+    Quantity("u_mesh_error", _ESTIMATED, "px", "displacement_error.0", _LEFT_OUT.format("u")),
+    Quantity("v_mesh_error", _ESTIMATED, "px", "displacement_error.1", _LEFT_OUT.format("v")),
+    Quantity("exx_mesh_error", _ESTIMATED, "", "strain_error.0", _LEFT_OUT.format("exx")),
+    Quantity("eyy_mesh_error", _ESTIMATED, "", "strain_error.1", _LEFT_OUT.format("eyy")),
+    Quantity("exy_mesh_error", _ESTIMATED, "", "strain_error.2", _LEFT_OUT.format("exy")),
+    Quantity("match", (), "", "",
+        "median correlation coefficient of the elements with their reference, for the light that matches best; NaN "
+        "without `frames.update_reference`"),
+    Quantity("best_match", (), "", "",
+        "largest `match` of the frames compared with the same reference, up to this one", blank=0),
+    Quantity("reference_updates", ("reference_update",), "", "",
+        "indices in the result of the frames that became the reference, up to this one: this frame was compared with "
+        "the last one before it, or with the test's reference", dtype=np.int64, blank=0),
+    Quantity("misfit", _NODE, "", "misfit",
+        "weighted rms residual around a node over its median: 1 is typical, 3 is suspicious", kind="positive"),
+    Quantity("light_fraction", ("node", "light"), "", "light_fraction",
+        "fraction of each light in the information that determines a node", blank=0),
+    Quantity("residual", _LIGHT, "", "residual",
+        "weighted rms of `f - g(x + u)`, in the unit of the correlated images: none if these are divided by their "
+        "local mean (the default), else DN"),
+    Quantity("weight_fraction", _LIGHT, "", "weight_fraction",
+        "mean fraction of each light in the weights; their sum is the part of the region that any light sees"),
+    Quantity("brightness", ("light", 2), "", "",
+        "gain and offset (DN) of each light relative to the reference, from contrast and mean of the speckle, medians "
+        "over the elements; reported, not used"),
+    Quantity("rigid", ("light", "function"), "", "rigid",
+        "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad); 0 for the first, NaN for "
+        "a light that sees nothing"),
+    Quantity("seconds", (len(STAGES),), "s", "",
+        f"time of each of the stages {', '.join(STAGES)}; NaN without `--timings`"),
     Quantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
-    Quantity("reflection_thumbnail", _PICTURE, "", "", _REFLECTION, **_BYTE),
-)
+    Quantity("reflection_thumbnail", _PICTURE, "", "",
+        "reduced picture of each light's reflection index, 255 for 1; empty if the separation does not give it",
+        **_BYTE),
+)  # fmt: skip
 
 QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _TABLE}
 """Every quantity by its name, in the order of the documents."""
@@ -367,109 +350,98 @@ SHARED: dict[str, Quantity] = {
 FINITE_ELEMENTS = ("node_number", "element_number", "node_mm")
 """Those of them that only a mesh of ``mesh.file`` has."""
 
+UV = ("u", "v")
+DERIVED = {
+    name: Quantity(
+        name, _NODE, unit, "", meaning, symbol=symbol, parts=parts, order=order,
+        group="Rates" if order else "Displacement",
+        kind="strain" if not unit else "positive" if parts == UV else "displacement",
+    )
+    for name, unit, symbol, meaning, parts, order in (
+        ("u", "px", "u", "displacement in x", ("u",), 0),
+        ("v", "px", "v", "displacement in y", ("v",), 0),
+        ("magnitude", "px", "|u|", "length of the displacement", UV, 0),
+        ("u_velocity", "px", "du/dt", "velocity in x", ("u",), 1),
+        ("v_velocity", "px", "dv/dt", "velocity in y", ("v",), 1),
+        ("velocity", "px", "|du/dt|", "magnitude of the velocity", UV, 1),
+        ("u_acceleration", "px", "d²u/dt²", "acceleration in x", ("u",), 2),
+        ("v_acceleration", "px", "d²v/dt²", "acceleration in y", ("v",), 2),
+        ("acceleration", "px", "|d²u/dt²|", "magnitude of the acceleration", UV, 2),
+        ("exx_rate", "", "dεxx/dt", "rate of the strain in x", ("exx",), 1),
+        ("eyy_rate", "", "dεyy/dt", "rate of the strain in y", ("eyy",), 1),
+        ("exy_rate", "", "dεxy/dt", "rate of the tensor shear", ("exy",), 1),
+        ("equivalent_rate", "", "dεeq/dt", "rate of the von Mises equivalent strain", ("equivalent",), 1),
+    )
+}  # fmt: skip
+"""Displacement, rates of displacement and strain, and strain itself, by name."""
+_POSITIVE: dict[str, Any] = {"group": "Strain", "kind": "positive"}
+_ANGLE: dict[str, Any] = {"group": "Strain", "kind": "angle"}
+_TOWARDS, _LARGEST = "direction of e1, from x towards y", "largest engineering shear in the plane, e1 - e2"
+STRAIN = (
+    *with_uncertainty(
+        Quantity("exx", _NODE, "", "components.0", "strain in x", symbol="εxx", group="Strain"),
+        Quantity("eyy", _NODE, "", "components.1", "strain in y", symbol="εyy", group="Strain"),
+        Quantity("exy", _NODE, "", "components.2", "strain, tensor shear", symbol="εxy", group="Strain"),
+    ),
+    *with_uncertainty(
+        Quantity("e1", _NODE, "", "principal.0", "larger principal strain in the plane", symbol="ε₁", group="Strain"),
+        Quantity("e2", _NODE, "", "principal.1", "smaller principal strain in the plane", symbol="ε₂", group="Strain"),
+    ),
+    *with_uncertainty(Quantity("direction", _NODE, "deg", "direction_deg", _TOWARDS, symbol="θ₁", **_ANGLE)),
+    *with_uncertainty(Quantity("shear", _NODE, "", "shear", _LARGEST, symbol="γmax", **_POSITIVE)),
+    *with_uncertainty(Quantity("equivalent", _NODE, "", "equivalent", EQUIVALENT, symbol="εeq (Hencky)", **_POSITIVE)),
+)
+"""Strain of a frame over a gauge, in the order of exports."""
+DERIVED |= {entry.name: entry for entry in STRAIN if entry.group == "Strain"}
+ELEMENT_STRAIN = tuple(
+    replace(entry, name=f"{entry.name}_element", axes=("element",), meaning=f"{entry.meaning}, constant in an element")
+    for entry in STRAIN[:3]
+)
+COMPONENTS = ("u", "v", "exx", "eyy", "exy")
+WITH_ERROR = {
+    f"{name}_{end}": Quantity(
+        f"{name}_{end}", _NODE, "px" if name in UV else "", "",
+        meaning.format(name if name in UV else f"the small strain {name} of the nodes"),
+        symbol=f"{name}_{end}", parts=(name,), group="Uncertainty", kind="positive",
+    )
+    for end, meaning in (
+        ("mesh_error", "discretisation error of {}: what mesh and recovery leave out"),
+        ("total", "noise and discretisation error of {} together"),
+    )
+    for name in COMPONENTS
+}  # fmt: skip
+_FINER_MESH = "largest discretisation error over the noise of u, v, exx, eyy, exy: above 1 a finer mesh is needed"
+WITH_ERROR["finer_mesh"] = Quantity(
+    "finer_mesh", _NODE, "", "", _FINER_MESH, symbol="finer_mesh", parts=COMPONENTS, kind="positive"
+)
+"""Quantities of results whose ``mesh.error`` asks for the discretisation error."""
+_GROUPS = ("Displacement", "Strain", "Rates", "Quality", "Uncertainty")
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameRecord(Described):
-    """The result of one frame; every quantity of `rgbmidic.results.QUANTITIES` is an attribute, such as ``record.u``.
 
-    Attributes
+def map_quantities(units: Units, lights: tuple[str, ...], *, with_error: bool) -> dict[str, Quantity]:
+    """Return what maps show by its name, group by group; each that has an uncertainty is followed by it further down.
+
+    Parameters
     ----------
-    values
-        Every quantity by its name, in the shape and type of the table: an array, or a plain number or text.
-    sizes
-        Number of nodes (``"node"``) and of lights (``"light"``).
+    units
+        Units of the reader, that of time included.
+    lights
+        Their names.
+    with_error
+        Whether the discretisation error is known.
 
-    Raises
-    ------
-    InputError
-        A quantity is missing, unknown or has another shape.
+    Returns
+    -------
+    dict of str to Quantity
     """
-
-    values: Mapping[str, Any]
-    sizes: Mapping[str, int]
-
-    def __post_init__(self) -> None:
-        """Check names and shapes, and take over the types of the table."""
-        if odd := self.values.keys() ^ QUANTITIES.keys():
-            raise InputError(f"a frame record holds {', '.join(QUANTITIES)}; missing or unknown: {', '.join(odd)}")
-        values = {name: entry.convert(self.values[name], self.sizes) for name, entry in QUANTITIES.items()}
-        object.__setattr__(self, "values", values)
-
-    @classmethod
-    def of(cls, *, nodes: int, lights: int, **values: Any) -> FrameRecord:
-        """Make a record of some quantities; the others have the value of a frame that could not be measured.
-
-        Parameters
-        ----------
-        nodes, lights
-            Their numbers N and k.
-        **values
-            Quantities by name; None where not known. `inputs` may be the SHA-256 of each file by its path.
-
-        Returns
-        -------
-        FrameRecord
-        """
-        sizes = {"node": nodes, "light": lights}
-        blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items()}
-        given = {name: value for name, value in values.items() if value is not None}
-        if isinstance(files := given.get("inputs"), Mapping):
-            given["inputs"] = np.array(list(files.items()), dtype=np.str_).reshape(-1, 2)
-        return cls(values=blank | given, sizes=sizes)
-
-    @classmethod
-    def from_solution(cls, solution: Solution, **given: Any) -> FrameRecord:
-        """Make the record of a solved frame.
-
-        Parameters
-        ----------
-        solution
-            Provides the quantities that have a `Quantity.source`.
-        **given
-            The others, such as `number`, `time_ns`, `inputs`, `brightness` and `weights_thumbnail`, as of `of`.
-
-        Returns
-        -------
-        FrameRecord
-        """
-        nodes, lights = np.shape(solution.light_fraction)
-        known = [entry for entry in QUANTITIES.values() if entry.source]
-        if not np.isfinite(solution.displacement_error).any():
-            known = [entry for entry in known if not entry.estimated]
-        return cls.of(nodes=nodes, lights=lights, **{entry.name: entry.of(solution) for entry in known}, **given)
-
-    @classmethod
-    def failed(cls, reason: str, *, nodes: int, lights: int, **given: Any) -> FrameRecord:
-        """Make the record of a frame that could not be measured at all: NaN everywhere, and the reason.
-
-        Parameters
-        ----------
-        reason
-            Why nothing could be measured.
-        nodes, lights
-            Their numbers N and k.
-        **given
-            Other quantities, as of `of`.
-
-        Returns
-        -------
-        FrameRecord
-        """
-        return cls.of(nodes=nodes, lights=lights, reason=reason, **given)
-
-    def __repr__(self) -> str:
-        """Return number, status and size of the frame, and the names of its quantities."""
-        end = QUANTITIES["status"].codes[self.values["status"]]
-        told = f": {self.values['reason']}" if self.values["reason"] else ""
-        about = f"<rgbmidic frame {self.values['number']}, {end}{told}; {self.sizes['node']} nodes>"
-        return f"{about}\nquantities: {', '.join(QUANTITIES)}"
-
-    def __getattr__(self, name: str, /) -> Any:
-        """Return a quantity of the table."""
-        if name not in QUANTITIES:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
-        return self.values[name]
-
-    def __dir__(self) -> list[str]:
-        """Return the names of all attributes, quantities included."""
-        return [*object.__dir__(self), *QUANTITIES]
+    spread = [entry.uncertainty for entry in DERIVED.values()]
+    taken = {entry.name for entry in (*DERIVED.values(), *spread)}
+    kept = [
+        replace(entry, symbol=name, meaning=", ".join(entry.codes) or entry.meaning)
+        for name, entry in QUANTITIES.items()
+        if entry.axes == _NODE and name not in taken
+    ]
+    meaning, names = QUANTITIES["light_fraction"].meaning, [f"fraction of {light}" for light in lights]
+    fractions = [Quantity(name, _NODE, "", "", meaning, symbol=name, kind="fraction") for name in names]
+    every = [*DERIVED.values(), *kept, *(WITH_ERROR.values() if with_error else ()), *fractions, *spread]
+    return {entry.name: entry.in_units(units) for entry in sorted(every, key=lambda one: _GROUPS.index(one.group))}

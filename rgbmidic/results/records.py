@@ -1,4 +1,4 @@
-"""The frames of a result on disk: an npz file for each, and the table of those that are there.
+"""The frames of a result: the record of one, an npz file for each, and the table of those that are there.
 
 ``000007.npz`` holds every quantity of frame 7, for `numpy.load` and others: a zip archive with a CRC-32 of every array,
 its directory at the end. All records have the same arrays in the same order, so that the directory is one structure of
@@ -16,18 +16,22 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic.errors import AnotherTestError, ResultError, disk_faults
+from rgbmidic.errors import AnotherTestError, InputError, ResultError, disk_faults
 from rgbmidic.results.files import npy_array, npy_bytes, write_complete
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
-from rgbmidic.results.quantities import QUANTITIES, FrameRecord
+from rgbmidic.results.quantities import QUANTITIES
 from rgbmidic.settings import regular
+from rgbmidic.text import Described
 from rgbmidic.typing import BoolArray, IntArray
+
+if TYPE_CHECKING:
+    from rgbmidic.correlation.solution import Solution
 
 FRAMES = "solution"
 """Folder of the records in that of a result."""
@@ -53,6 +57,113 @@ def _layout(names: tuple[str, ...]) -> tuple[dict[str, bytes], struct.Struct, st
     tail = "".join(f"4s6H3I5H2I{len(file)}s" for file in files.values())
     found = "".join(f"10xH4x2I18xI{len(file)}x" for file in files.values())
     return files, struct.Struct(f"<{tail}4s4H2IH16sQ"), struct.Struct(f"<{found}{_END}x16sQ")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameRecord(Described):
+    """The result of one frame; every quantity of `rgbmidic.results.QUANTITIES` is an attribute, such as ``record.u``.
+
+    Attributes
+    ----------
+    values
+        Every quantity by its name, in the shape and type of the table: an array, or a plain number or text.
+    sizes
+        Number of nodes (``"node"``) and of lights (``"light"``).
+
+    Raises
+    ------
+    InputError
+        A quantity is missing, unknown or has another shape.
+    """
+
+    values: Mapping[str, Any]
+    sizes: Mapping[str, int]
+
+    def __post_init__(self) -> None:
+        """Check names and shapes, and take over the types of the table."""
+        if odd := self.values.keys() ^ QUANTITIES.keys():
+            raise InputError(f"a frame record holds {', '.join(QUANTITIES)}; missing or unknown: {', '.join(odd)}")
+        values = {name: entry.convert(self.values[name], self.sizes) for name, entry in QUANTITIES.items()}
+        object.__setattr__(self, "values", values)
+
+    @classmethod
+    def of(cls, *, nodes: int, lights: int, **values: Any) -> FrameRecord:
+        """Make a record of some quantities; the others have the value of a frame that could not be measured.
+
+        Parameters
+        ----------
+        nodes, lights
+            Their numbers N and k.
+        **values
+            Quantities by name; None where not known. `inputs` may be the SHA-256 of each file by its path.
+
+        Returns
+        -------
+        FrameRecord
+        """
+        sizes = {"node": nodes, "light": lights}
+        blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items()}
+        given = {name: value for name, value in values.items() if value is not None}
+        if isinstance(files := given.get("inputs"), Mapping):
+            given["inputs"] = np.array(list(files.items()), dtype=np.str_).reshape(-1, 2)
+        return cls(values=blank | given, sizes=sizes)
+
+    @classmethod
+    def from_solution(cls, solution: Solution, **given: Any) -> FrameRecord:
+        """Make the record of a solved frame.
+
+        Parameters
+        ----------
+        solution
+            Provides the quantities that have a `Quantity.source`.
+        **given
+            The others, such as `number`, `time_ns`, `inputs`, `brightness` and `weights_thumbnail`, as of `of`.
+
+        Returns
+        -------
+        FrameRecord
+        """
+        nodes, lights = np.shape(solution.light_fraction)
+        known = [entry for entry in QUANTITIES.values() if entry.source]
+        if not np.isfinite(solution.displacement_error).any():
+            known = [entry for entry in known if not entry.estimated]
+        return cls.of(nodes=nodes, lights=lights, **{entry.name: entry.of(solution) for entry in known}, **given)
+
+    @classmethod
+    def failed(cls, reason: str, *, nodes: int, lights: int, **given: Any) -> FrameRecord:
+        """Make the record of a frame that could not be measured at all: NaN everywhere, and the reason.
+
+        Parameters
+        ----------
+        reason
+            Why nothing could be measured.
+        nodes, lights
+            Their numbers N and k.
+        **given
+            Other quantities, as of `of`.
+
+        Returns
+        -------
+        FrameRecord
+        """
+        return cls.of(nodes=nodes, lights=lights, reason=reason, **given)
+
+    def __repr__(self) -> str:
+        """Return number, status and size of the frame, and the names of its quantities."""
+        end = QUANTITIES["status"].codes[self.values["status"]]
+        told = f": {self.values['reason']}" if self.values["reason"] else ""
+        about = f"<rgbmidic frame {self.values['number']}, {end}{told}; {self.sizes['node']} nodes>"
+        return f"{about}\nquantities: {', '.join(QUANTITIES)}"
+
+    def __getattr__(self, name: str, /) -> Any:
+        """Return a quantity of the table."""
+        if name not in QUANTITIES:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
+        return self.values[name]
+
+    def __dir__(self) -> list[str]:
+        """Return the names of all attributes, quantities included."""
+        return [*object.__dir__(self), *QUANTITIES]
 
 
 def record_files(folder: Path) -> dict[int, os.DirEntry[str]]:
@@ -102,10 +213,10 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes) -> N
     write_complete(record_file(folder, frame), lambda file: file.write(content))
 
 
-def _read_record(folder: Path, frame: int, names: Iterable[str], run: bytes) -> dict[str, Any]:
+def _read_record(path: Path, frame: int, names: Iterable[str], run: bytes) -> dict[str, Any]:
     """Read some quantities of a frame and verify their checksums; what is of this run has its shapes."""
     files, directory, read = _layout(tuple(QUANTITIES))
-    with regular(record_file(folder, frame)).open("rb") as file:
+    with regular(path).open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - directory.size - _CHECK.size, 0))
         tail = file.read()
@@ -113,7 +224,7 @@ def _read_record(folder: Path, frame: int, names: Iterable[str], run: bytes) -> 
             raise ResultError("its directory is damaged or cut off")
         *places, owner, number = read.unpack(tail[: directory.size])
         if owner != run:
-            raise AnotherTestError(f"{file.name} is of another run than {folder.parent / PROVENANCE}: {PUT_BACK}")
+            raise AnotherTestError(f"{path} is of another run than {path.parents[1] / PROVENANCE}: {PUT_BACK}")
         if number != frame:
             raise ResultError(f"it holds frame {number}")
         each = iter(places)
@@ -201,16 +312,6 @@ class FrameTable:
                 damaged[frame] = True
         return replace(self, damaged=damaged)
 
-    def read(self, frame: int) -> FrameRecord:
-        """Read all of one frame; a frame that is not measured yet gives a blank record with that as its reason.
-
-        Raises
-        ------
-        ResultError
-            It is damaged.
-        """
-        return FrameRecord(values=next(self.each(None, [frame])), sizes=self.sizes)
-
     def each(self, names: Sequence[str] | None, frames: Iterable[int]) -> Iterator[dict[str, Any]]:
         """Read some quantities of one frame after the other.
 
@@ -232,23 +333,18 @@ class FrameTable:
             A record is damaged, or of another run; the message names file and frame.
         """
         chosen, finished = tuple(QUANTITIES if names is None else names), self.finished
-        blanks = dict[str, Mapping[str, Any]]()
+        blank = cache(partial(FrameRecord.failed, nodes=self.sizes["node"], lights=self.sizes["light"]))
         for frame in frames:
             if not finished[frame]:
-                reason = _DAMAGED if self.damaged[frame] else _NOT_YET
-                if reason not in blanks:
-                    blank = FrameRecord.failed(reason, nodes=self.sizes["node"], lights=self.sizes["light"])
-                    blanks[reason] = blank.values
-                yield {name: blanks[reason][name] for name in chosen}
+                values = blank(_DAMAGED if self.damaged[frame] else _NOT_YET).values
+                yield {name: values[name] for name in chosen}
                 continue
+            file = record_file(self.folder, frame)
             try:
-                values = _read_record(self.folder, frame, chosen, self.run)
+                yield _read_record(file, frame, chosen, self.run)
             except OSError as error:
-                reason = error.strerror or str(error)
-                raise ResultError(f"{record_file(self.folder, frame)} cannot be read: {reason}") from None
+                raise ResultError(f"{file} cannot be read: {error.strerror or error}") from None
             except (AnotherTestError, KeyError):  # KeyError: there is no quantity of this name
                 raise
             except Exception as error:  # numpy and zlib raise a dozen kinds on damaged files
-                file = record_file(self.folder, frame)
                 raise ResultError(f"{file} is damaged in frame {frame}: {error}; {_REMEDY}") from None
-            yield values

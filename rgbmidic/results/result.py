@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError, optional
-from rgbmidic.results.files import read_arrays, read_json
-from rgbmidic.results.provenance import PROVENANCE, PUT_BACK, digest, fingerprint, read_provenance
-from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, STACKED, FrameRecord
-from rgbmidic.results.records import FrameTable
+from rgbmidic.results.files import read_arrays, read_json, write_json
+from rgbmidic.results.provenance import PROVENANCE, PUT_BACK, digest, fingerprint, now, read_provenance, sealed
+from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, STACKED
+from rgbmidic.results.records import FrameRecord, FrameTable
 from rgbmidic.settings import read_section
 from rgbmidic.settings.schema import section_kinds
 from rgbmidic.text import Described
@@ -127,14 +127,14 @@ class Result(Portable, Described):
         """
         path = Path(path)
         provenance = read_provenance(path)
-        names, mesh, lights = read_names(path, provenance), read_mesh(path, provenance), tuple(provenance["lights"])
-        sizes, ended = {"node": len(mesh["nodes"]), "light": len(lights)}, "finished" in provenance
-        table = FrameTable.load(path, sizes, len(names), fingerprint(provenance))
-        made = cls(path=path, table=table, names=names, lights=lights, provenance=provenance, **mesh)
+        shared, lights = read_shared(path, provenance), tuple(provenance["lights"])
+        sizes = {"node": len(shared["nodes"]), "light": len(lights)}
+        table = FrameTable.load(path, sizes, len(shared["names"]), fingerprint(provenance))
+        made = cls(path=path, table=table, lights=lights, provenance=provenance, **shared)
         if not partial:
-            check_complete(made, ended=ended)
+            made._check_complete()
         elif check:
-            made = replace(made, table=made.table.without_damaged(ended=ended))
+            made = made.without_damaged()
             if lost := np.flatnonzero(made.table.damaged).tolist():
                 logger.warning("%s is damaged: frames lost: %s", path, listed(lost, made.names))
         return made
@@ -155,9 +155,32 @@ class Result(Portable, Described):
         if {**provenance, "finished": ""} != {**self.provenance, "finished": ""}:
             raise ResultError(f"{self.path} now holds another result; open it again")
         table = FrameTable.load(self.path, self.table.sizes, len(self), fingerprint(provenance))
-        if self.table.damaged.any():
-            table = table.without_damaged(ended="finished" in provenance)
-        return replace(self, table=table, provenance=provenance)
+        now = replace(self, table=table, provenance=provenance)
+        return now.without_damaged() if self.table.damaged.any() else now
+
+    def without_damaged(self) -> Self:
+        """Read every record once and return the result without the damaged ones; once ended it misses none.
+
+        Returns
+        -------
+        Result
+        """
+        return replace(self, table=self.table.without_damaged(ended="finished" in self.provenance))
+
+    def _check_complete(self) -> None:
+        """Raise a `ResultError` that names the frames that are missing, or lost to damage where all were there once."""
+        missing, path, count = np.flatnonzero(~self.finished).tolist(), self.path, len(self)
+        if not missing:
+            return
+        frames = listed(missing, self.names)
+        if "finished" in self.provenance or self.table.damaged.any():
+            raise ResultError(
+                f"{path} is damaged: of {count} frames are lost {frames}; `rgbmidic run TEST.toml --out {path} "
+                "--resume` measures them again, --partial (partial=True) reads the rest"
+            )
+        raise ResultError(
+            f"{path} is incomplete: of {count} frames are missing {frames}; was the run interrupted, or does it go on?"
+        )
 
     def __repr__(self) -> str:
         """Return what the result is of, in a few lines; values are not read."""
@@ -247,7 +270,8 @@ class Result(Portable, Described):
         """
         if not isinstance(index, int | np.integer) or not -len(self) <= index < len(self):
             raise InputError(f"there is no frame {index!r} in a result of {len(self)} frames (0 to {len(self) - 1})")
-        return self.table.read(int(index) % len(self))
+        values = next(self.table.each(None, [int(index) % len(self)]))
+        return FrameRecord(values=values, sizes=self.table.sizes)
 
     def each(self, name: str, frames: Iterable[int] | None = None) -> Iterator[Any]:
         """Read one quantity, frame after frame (None: all); yields arrays, or plain numbers or texts.
@@ -383,20 +407,23 @@ class Result(Portable, Described):
         return shape and (shape[0], shape[1])
 
 
-def check_complete(result: Result, *, ended: bool) -> None:
-    """Raise a `ResultError` that names the frames that are missing, or lost to damage where the result had `ended`."""
-    missing, path, count = np.flatnonzero(~result.finished).tolist(), result.path, len(result)
-    if not missing:
-        return
-    frames = listed(missing, result.names)
-    if ended or result.table.damaged.any():
-        raise ResultError(
-            f"{path} is damaged: of {count} frames are lost {frames}; `rgbmidic run TEST.toml --out {path} "
-            "--resume` measures them again, --partial (partial=True) reads the rest"
-        )
-    raise ResultError(
-        f"{path} is incomplete: of {count} frames are missing {frames}; was the run interrupted, or does it go on?"
-    )
+def finish_result(path: Path | str) -> None:
+    """Put the date of its end into the provenance of a result, once every record is read and found whole.
+
+    Parameters
+    ----------
+    path
+        The folder.
+
+    Raises
+    ------
+    ResultError
+        The folder is no result, a frame is missing or damaged, or it cannot be written.
+    """
+    result = Result.open(path, partial=True, check=False)
+    result.without_damaged()._check_complete()
+    if "finished" not in result.provenance:
+        write_json(result.path / PROVENANCE, sealed({**result.provenance, "finished": now()}))
 
 
 def listed(frames: Sequence[int], names: Sequence[str], most: int = 5) -> str:
@@ -405,8 +432,14 @@ def listed(frames: Sequence[int], names: Sequence[str], most: int = 5) -> str:
     return ", ".join(f"{frame} ({names[frame]})" for frame in frames[:most]) + more
 
 
-def read_names(path: Path, provenance: Mapping[str, Any]) -> tuple[str, ...]:
-    """Read the frames' names; a `ResultError` where they are not those of the provenance."""
+def read_shared(path: Path, provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Read ``names`` of the frames, ``nodes`` (N, 2), ``elements`` (E, 3) and, of a mesh file, `FINITE_ELEMENTS`.
+
+    Raises
+    ------
+    ResultError
+        They are not those of the provenance.
+    """
     try:
         names = read_json(path / NAMES)
     except FileNotFoundError:
@@ -414,22 +447,11 @@ def read_names(path: Path, provenance: Mapping[str, Any]) -> tuple[str, ...]:
     texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
     if not texts or {"count": len(names), "sha256": digest(names)} != provenance["frames"]:
         raise ResultError(f"{path / NAMES} is damaged: it does not hold the names of the frames")
-    return tuple(names)
-
-
-def read_mesh(path: Path, provenance: Mapping[str, Any]) -> dict[str, AnyArray]:
-    """Read ``nodes`` (N, 2), ``elements`` (E, 3) and, of a mesh file, `FINITE_ELEMENTS`.
-
-    Raises
-    ------
-    ResultError
-        They are not those of the provenance.
-    """
     stated = FINITE_ELEMENTS if "finite_elements" in provenance else ()
     mesh = _read(path / MESH, ["nodes", "elements", *stated], {})
     if digest(mesh) != provenance["mesh"]:
         raise ResultError(f"{path / MESH} is damaged or of another result")
-    return mesh
+    return {"names": tuple(names), **mesh}
 
 
 def read_reference(path: Path, sizes: Mapping[str, int], run: bytes) -> npt.NDArray[np.uint8] | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
@@ -19,28 +19,9 @@ import numpy as np
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results.claim import ALL_FRAMES, Claim
 from rgbmidic.results.files import remove_parts, write_arrays, write_json, writing
-from rgbmidic.results.provenance import (
-    PROVENANCE,
-    Origin,
-    check_same,
-    fingerprint,
-    is_result,
-    now,
-    read_provenance,
-    sealed,
-)
-from rgbmidic.results.quantities import FrameRecord
-from rgbmidic.results.records import FRAMES, FrameTable, record_file, record_files, write_record
-from rgbmidic.results.result import (
-    MESH,
-    NAMES,
-    REFERENCE,
-    Result,
-    check_complete,
-    read_mesh,
-    read_names,
-    read_reference,
-)
+from rgbmidic.results.provenance import PROVENANCE, Origin, check_same, fingerprint, is_result, read_provenance, sealed
+from rgbmidic.results.records import FRAMES, FrameRecord, FrameTable, record_file, record_files, write_record
+from rgbmidic.results.result import MESH, NAMES, REFERENCE, finish_result, read_reference, read_shared
 from rgbmidic.typing import BoolArray
 
 logger = logging.getLogger(__name__)
@@ -247,26 +228,6 @@ class ResultStore:
         finish_result(self.path)
 
 
-def finish_result(path: Path | str) -> None:
-    """Put the date of its end into the provenance of a result, once every record is read and found whole.
-
-    Parameters
-    ----------
-    path
-        The folder.
-
-    Raises
-    ------
-    ResultError
-        The folder is no result, a frame is missing or damaged, or it cannot be written.
-    """
-    result = Result.open(path, partial=True, check=False)
-    ended = "finished" in result.provenance
-    check_complete(replace(result, table=result.table.without_damaged(ended=ended)), ended=ended)
-    if not ended:
-        write_json(result.path / PROVENANCE, sealed({**result.provenance, "finished": now()}))
-
-
 def _make_room(path: Path, *, overwrite: bool) -> None:
     """Empty the folder of an old result, its provenance last; nothing else in it is touched."""
     if not is_result(path):
@@ -302,20 +263,15 @@ def _start(path: Path, origin: Origin, *, restate: bool) -> bytes:
     if restate and read_by != {name: kept.get(name) for name in read_by}:
         write_json(path / PROVENANCE, sealed({**kept, **read_by}))
     if kept["machine"] != stated["machine"]:
-        logger.warning(
-            "%s was begun with %s, and goes on with %s: the last bits of its frames may differ",
-            path,
-            kept["machine"],
-            stated["machine"],
-        )
+        text = "%s was begun with %s, and goes on with %s: the last bits of its frames may differ"
+        logger.warning(text, path, kept["machine"], stated["machine"])
     with writing(path):
         (path / FRAMES).mkdir(exist_ok=True)
         remove_parts(path, "*")
         remove_parts(path / FRAMES, "*")
     run, sizes = fingerprint(kept), {"light": len(origin.lights)}
-    if not _readable(lambda: read_names(path, kept)):
+    if not _readable(lambda: read_shared(path, kept)):
         write_json(path / NAMES, list(origin.names))
-    if not _readable(lambda: read_mesh(path, kept)):
         write_arrays(path / MESH, origin.mesh)
     if origin.reference is not None and not _readable(lambda: read_reference(path, sizes, run)):
         images = np.asarray(origin.reference, dtype=np.float32)  # stretched to 8 bit between percentiles 1 and 99

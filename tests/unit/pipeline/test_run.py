@@ -340,7 +340,7 @@ def test_a_finished_result_is_gone_on_with_only_where_it_is_damaged(
 ) -> None:
     out = Path(shutil.copytree(whole.path, tmp_path / "result"))
     kept = (out / "provenance.json").read_bytes()
-    monkeypatch.setattr("rgbmidic.results.store.now", lambda: "later")
+    monkeypatch.setattr("rgbmidic.results.result.now", lambda: "later")
     measured: list[str] = []
     same(in_order(settings(movie), out, resume=True, progress=counted(measured)), whole)
     assert "is finished and whole: nothing is left to be measured" in caplog.text

@@ -19,8 +19,7 @@ from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_m
 from rgbmidic.report.comparison import scale_text
 from rgbmidic.results import FrameRecord, Result
 from rgbmidic.results.comparison import Comparison, measured_mesh
-from rgbmidic.results.levelling import Levelling
-from rgbmidic.results.simulation import Simulation, place
+from rgbmidic.results.simulation import Levelling, Simulation, place
 
 NODES, STD, MM = len(MESH.nodes), 0.01, 0.05
 PLACEMENT = Placement.fit([[0, 0, 10, 170], [10, 0, 210, 170], [0, 8, 10, 10]])
