@@ -22,9 +22,9 @@ from rgbmidic.results.histories import frames_alone, read_histories, with_channe
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import probe_marks, probes
-from rgbmidic.view.canvas import columns, plain_plot
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.models import Background, ResultControls, warning
+from rgbmidic.view.picture import columns, plain_plot
 from rgbmidic.view.shown import ShownFields
 
 if TYPE_CHECKING:

@@ -198,6 +198,29 @@ class Draft:
             )
         return replace(self, file=file)
 
+    def with_masks(
+        self, marks: Sequence[Mark], lights: Sequence[str], shape: tuple[int, int]
+    ) -> tuple[Self, dict[Path, bytes]]:
+        """Return the draft with the masks of lights that are drawn, and their files: a picture (PNG) for each light.
+
+        A picture is 0 within the masks of its light, 255 elsewhere. Without a mask the draft stays as it is.
+
+        Raises
+        ------
+        ConfigurationError
+            A mask is of none of the lights.
+        """
+        if not (masks := masks_of(marks)):
+            return self, {}
+        if other := [light for light in masks if light not in lights]:
+            raise ConfigurationError(f"there is a mask of {', '.join(other)}, but the lights are {', '.join(lights)}")
+        whole, files = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1), shape), dict[Path, bytes]()
+        for number, light in enumerate(lights, 1):
+            picture = np.uint8(255) * whole.without(masks.get(light, ())).mask.astype(np.uint8)
+            name = f"{self.file.stem}_mask_{number}_{re.sub(r'[^A-Za-z0-9]+', '_', light)}.png"
+            files[self.file.parent / name] = cv2.imencode(".png", picture)[1].tobytes()
+        return self.changed({"weights": {"method": "images", "images": [file.name for file in files]}}), files
+
     def check(self) -> None:
         """Check that the draft is a complete test; errors as `write`."""
         TestSettings.from_mapping(self.document, self.file.parent)
@@ -340,27 +363,3 @@ def masks_of(marks: Sequence[Mark]) -> dict[str, list[Ring]]:
     for kind, ring in _complete(marks, [MASK]).items():
         found.setdefault(kind.split(" ", 2)[2], []).append(ring)
     return found
-
-
-def with_masks(
-    draft: Draft, marks: Sequence[Mark], lights: Sequence[str], shape: tuple[int, int]
-) -> tuple[Draft, dict[Path, bytes]]:
-    """Return a draft with the masks of lights that are drawn, and the files of these: a picture (PNG) for each light.
-
-    A picture is 0 within the masks of its light, 255 elsewhere. Without a mask the draft stays, and there is no file.
-
-    Raises
-    ------
-    ConfigurationError
-        A mask is of none of the lights.
-    """
-    if not (masks := masks_of(marks)):
-        return draft, {}
-    if other := [light for light in masks if light not in lights]:
-        raise ConfigurationError(f"there is a mask of {', '.join(other)}, but the lights are {', '.join(lights)}")
-    whole, files = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1), shape), dict[Path, bytes]()
-    for number, light in enumerate(lights, 1):
-        picture = np.uint8(255) * whole.without(masks.get(light, ())).mask.astype(np.uint8)
-        name = f"{draft.file.stem}_mask_{number}_{re.sub(r'[^A-Za-z0-9]+', '_', light)}.png"
-        files[draft.file.parent / name] = cv2.imencode(".png", picture)[1].tobytes()
-    return draft.changed({"weights": {"method": "images", "images": [file.name for file in files]}}), files

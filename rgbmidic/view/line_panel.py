@@ -22,16 +22,14 @@ from rgbmidic.results import Maps, MapValues
 from rgbmidic.results.profiles import Profile
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.view.address import probe_marks, probe_place
-from rgbmidic.view.canvas import columns, plain_plot
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.curves import NOW, band
 from rgbmidic.view.models import Background, labelled, warning
+from rgbmidic.view.picture import IMAGE, columns, plain_plot
 from rgbmidic.view.shown import ShownFields
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_IMAGE = "image x y dw dh"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -118,7 +116,7 @@ class LinePanel:
         self.choice.html_attributes = labelled("curves over time, or the field along a line")
         self.told = bk.Div(name="told_of_line", **look)
         self.told.html_attributes = {"aria-live": "polite"}
-        self._image = bk.ColumnDataSource(columns(_IMAGE), name="wave")
+        self._image = bk.ColumnDataSource(columns(IMAGE), name="wave")
         self._line = bk.ColumnDataSource(columns("x y"), name="profile")
         self._bands = bk.ColumnDataSource(columns("xs ys"), name="profile bands")
         hover = bk.HoverTool(visible=False, tooltips=[("at", "$x, $y"), ("value", "@image")])
@@ -127,7 +125,7 @@ class LinePanel:
         self.wave.toolbar.logo, self.wave.grid.visible = None, False
         nothing = "#00000000"  # what is not measured, or not read yet
         self._colours = bk.LinearColorMapper(palette=colours.palette, nan_color=nothing, name="wave_colours")
-        self.wave.image(*_IMAGE.split(), source=self._image, color_mapper=self._colours)
+        self.wave.image(*IMAGE.split(), source=self._image, color_mapper=self._colours)
         self.wave.add_layout(bk.ColorBar(color_mapper=self._colours, width=10), "right")
         self.now = bk.Span(name="wave_now", **NOW)
         self.wave.add_layout(self.now)
@@ -190,7 +188,7 @@ class LinePanel:
     def _draw(self) -> None:
         """Draw position against time: a column for each frame, or less where they are many."""
         if self._reading is None:
-            self._image.data = columns(_IMAGE)
+            self._image.data = columns(IMAGE)
             return
         profile, (clock, label) = self._reading.profile, self._clock
         there = np.flatnonzero(self._reading.maps.result.finished & np.isfinite(clock))
@@ -203,7 +201,7 @@ class LinePanel:
         half, apart = float(grid[-1] - grid[0]) / max(count - 1, 1) / 2 or 0.5, float(profile.positions[1])
         image = profile.values[nearest].T.astype(np.float32)
         left, wide = float(grid[0]) - half, float(grid[-1] - grid[0]) + 2 * half
-        self._image.data = columns(_IMAGE, [(image, left, -apart / 2, wide, apart * len(profile.positions))])
+        self._image.data = columns(IMAGE, [(image, left, -apart / 2, wide, apart * len(profile.positions))])
         low, high = self._shown.ends(profile.field.name, along=profile)
         self._colours.update(low=low, high=high)
         if self._colours.palette != self._map_colours.palette:

@@ -21,12 +21,12 @@ from rgbmidic.results.histories import history_csv
 from rgbmidic.settings import ChannelSettings, ProbeSettings
 from rgbmidic.text import uncertain
 from rgbmidic.view.address import BESIDE, OVER, SCALE, UNCERTAINTY, Mark, Steps, ViewState
-from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
 from rgbmidic.view.line_panel import LinePanel
 from rgbmidic.view.map_panel import MapPanel
 from rgbmidic.view.models import ResultControls, SharedState, every, guarded, script, warning
+from rgbmidic.view.picture import Canvas
 from rgbmidic.view.sections import FileButtons, FilmButton, ProbeNames
 from rgbmidic.view.shown import ShownFields
 

@@ -21,20 +21,10 @@ from rgbmidic.pipeline.region import finite_elements_of, read_region
 from rgbmidic.report.style import colour_range
 from rgbmidic.results.files import write_complete
 from rgbmidic.settings import ELEMENT_SIZE, RegionSettings, TestSettings, read_section
-from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.draft import (
-    SHAPES,
-    Confirmation,
-    Draft,
-    check_complete,
-    marks_of,
-    region_of,
-    region_section,
-    with_masks,
-)
+from rgbmidic.view.draft import SHAPES, Confirmation, Draft, check_complete, marks_of, region_of, region_section
 from rgbmidic.view.models import Background, SharedState, every, guarded, script, warning
-from rgbmidic.view.picture import AROUND, Overlay, paint, palette
+from rgbmidic.view.picture import AROUND, Canvas, Overlay, paint, palette
 from rgbmidic.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, overview, pictures
 
 _EXPECTED = "expected uncertainty"
@@ -252,7 +242,7 @@ class SetupPage:
         check_complete(self.drawing.marks)
         self._reopen()
         draft = self.draft.at(Path(self.parts.file.value))
-        draft, pictures = with_masks(draft, self.drawing.marks, self.source.lights, self.source.shape)
+        draft, pictures = draft.with_masks(self.drawing.marks, self.source.lights, self.source.shape)
         draft.check()
         same = draft.file == self._opened.file
         files = [*pictures, *([] if same and self._opened.is_file else [draft.file])]

@@ -29,11 +29,10 @@ from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.results import Result
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.view.address import Mark, Steps
-from rgbmidic.view.canvas import Canvas, columns
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.draft import HOLES, MASK, Draft, arranged, masks_of, rings
 from rgbmidic.view.models import Controls
-from rgbmidic.view.picture import Picture, grey_picture, stretched
+from rgbmidic.view.picture import Canvas, Picture, columns, grey_picture, stretched
 
 RAW = "raw frame"
 

@@ -13,8 +13,8 @@ from small_tests import grey_frame
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.settings import read_test
 from rgbmidic.view.address import Mark
-from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.draft import Confirmation, Draft, region_of
+from rgbmidic.view.picture import Canvas
 from rgbmidic.view.setup import SetupPage
 from rgbmidic.view.setup_panel import DraftFrames, RegionDrawing
 
