@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +19,7 @@ from rgbmidic.report import profile_figure
 from rgbmidic.report.style import time_axis
 from rgbmidic.results import Maps, MapValues
 from rgbmidic.results.profiles import Profile
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import probe_marks, probe_place
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.curves import NOW, band
@@ -32,33 +31,33 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Reading:
     """A field along a line in all frames of a result, as far as it is read.
 
+    Parameters
+    ----------
+    maps, field, place
+        The result, the name of the field, and the ends of the line.
+    before
+        What was read of the result when it was shorter: it is kept unless it may differ.
+
     Attributes
     ----------
-    maps, profile
-        The result, and a row of each of its frames.
+    profile
+        A row of each frame of the result.
     written : ndarray, shape (T,), int64
         When each frame was written: one that is measured again is read again.
     read : ndarray, shape (T,), bool
         Frames that are read, or cannot be.
     """
 
-    maps: Maps
-    profile: Profile
-    written: npt.NDArray[np.int64]
-    read: BoolArray
-
-    @classmethod
-    def begin(cls, maps: Maps, field: str, place: Sequence[float], before: _Reading | None) -> _Reading:
-        """Lay the line; what was read `before`, of the result when it was shorter, is kept unless it may differ."""
-        profile = Profile(maps, field, place, range(len(maps.result)))
-        now, read = maps.result.table.written, np.zeros(len(maps.result), dtype=np.bool_)
-        if before is not None and not profile.rate_window and (now == before.written)[before.read].all():
-            profile.values[:], profile.std[:], read = before.profile.values, before.profile.std, before.read.copy()
-        return cls(maps=maps, profile=profile, written=now, read=read).further()
+    def __init__(self, maps: Maps, field: str, place: Sequence[float], before: _Reading | None) -> None:
+        self.maps, self.profile = maps, Profile(maps, field, place, range(len(maps.result)))
+        self.written, self.read = maps.result.table.written, np.zeros(len(maps.result), dtype=np.bool_)
+        if before and not self.profile.rate_window and (self.written == before.written)[before.read].all():
+            self.profile.values[:], self.profile.std[:] = before.profile.values, before.profile.std
+            self.read = before.read.copy()
+        self.further()
 
     @property
     def missing(self) -> npt.NDArray[np.int64]:
@@ -155,7 +154,7 @@ class LinePanel:
             before = self._reading if asked[:-1] == self._asked[:-1] else None
             self._asked, self._reading = asked, before
             self.told.text = "reading the frames …"
-            self._reader.ask(partial(_Reading.begin, shown.maps, view.field, lines[view.line], before), self._take)
+            self._reader.ask(partial(_Reading, shown.maps, view.field, lines[view.line], before), self._take)
             self._look = None
         if look != self._look:
             self._look = look

@@ -60,7 +60,7 @@ class ResultPage:
         self.steps = Steps(view.marks)
         self.parts = p = ResultControls(len(result) - 1, view.frame, dark=dark)
         self.maps = MapPanel(document, self.shown, self._redraw, self._hover, dark=dark)
-        self.names, self.film = ProbeNames(p, self._take_marks), FilmButton(p, self.shown)
+        self.names, self.film = ProbeNames(p, self.shown, self._take_marks), FilmButton(p, self.shown)
         self.file, self.timeline = FileButtons(p, self.shown), TimeLine(len(result), view.frame)
         self.curves = CurvePanel(document, self.shown, p)
         self.line = LinePanel(document, self.shown, self.maps.canvas.colours, p.wide)
@@ -92,7 +92,7 @@ class ResultPage:
         p, view = self.parts, self.view
         self._offer_fields()
         self.curves.offer()
-        self.names.offer(view.marks)
+        self.names.offer()
         p.of["since"].high = len(self.result) - 1
         p.over.active = OVER.index(view.over)
         self._draw_progress()
@@ -170,7 +170,7 @@ class ResultPage:
         try:
             guarded(self._draw, self._blank)
             self.curves.update(self.maps.marks.colours)
-            self.names.offer(self.view.marks)
+            self.names.offer()
         finally:
             self.document.unhold()
 

@@ -54,9 +54,9 @@ class SetupPage:
 
     def __init__(self, document: Document, draft: Draft, runs: list[Run], *, dark: bool) -> None:
         self.document, self.draft, self.dark, self.runs = document, draft, dark, runs
-        self.source = DraftFrames.of(draft)
+        self.source = DraftFrames(draft)
         self.pictures: dict[str, Any] = {}
-        self.inspection: Inspection | None = None
+        self._expected: Overlay | None = None
         self._inspected, self._opened = 0, draft
         reference, out = draft.frames.reference[0], runs[-1].out if runs else draft.file.parent / "result"
         self.state = SharedState(name="state", asked=reference, shown=reference)
@@ -120,11 +120,7 @@ class SetupPage:
         raw, full = self.source.raw(index)
         chosen = self.parts.picture.value
         picture = self.pictures.get(chosen, raw)
-        over, ends, colours, window = None, (0.0, 1.0), palette("plasma"), self.canvas.window
-        if chosen == _EXPECTED and (found := self.inspection) is not None:
-            ends = colour_range(found.prediction.std[np.isfinite(found.prediction.std)])
-            mesh: dict[str, Any] = {"nodes": found.mesh.nodes, "elements": found.mesh.elements}
-            over = Overlay(**mesh, values=found.prediction.std, ends=ends, colours=colours, opacity=0.8)
+        over, window = self._expected if chosen == _EXPECTED else None, self.canvas.window
         image = paint(window, picture, over, AROUND[self.dark])
         if self.parts.glare.active:
             saturated = paint(window, full.astype(np.uint8) * 255, around=0)
@@ -133,14 +129,14 @@ class SetupPage:
         title = f"{chosen} (px)" if over else chosen
         if chosen != RAW and index != self._inspected:  # what was inspected stays while other frames are looked at
             title += f", of frame {self._inspected}: {self.source.series.name(self._inspected)}"
-        self.canvas.colour(ends, colours, title)
+        self.canvas.colour(over.ends if over else (0.0, 1.0), palette("plasma"), title)
         self.canvas.bar.visible = over is not None
 
     def _remesh(self) -> None:
         """Draw the mesh of the region; drop the inspection, of another region, element size or calibration."""
         self._reader.drop()
-        if self.inspection is not None:
-            self.inspection, self.pictures = None, {}
+        if self._expected is not None:
+            self._expected, self.pictures = None, {}
             self.parts.tiles.text = ""
             self.parts.picture.value, self.parts.picture.options = RAW, [RAW]
         self._edges.data = {"xs": [], "ys": []}
@@ -185,11 +181,18 @@ class SetupPage:
 
     def _have(self, inspected: Callable[[], Inspection], index: int) -> None:
         found, self._inspected = inspected(), index
-        self.inspection = found
         self.pictures = pictures(found, self.source.shape)
         self.parts.tiles.text = overview(found, self.pictures, self.source.raw(index)[0])
         self.parts.picture.options = [RAW, *self.pictures, _EXPECTED]
         known = found.prediction.std[np.isfinite(found.prediction.std)]
+        self._expected = Overlay(
+            nodes=found.mesh.nodes,
+            elements=found.mesh.elements,
+            values=found.prediction.std,
+            ends=colour_range(known) if known.size else (0.0, 1.0),
+            colours=palette("plasma"),
+            opacity=0.8,
+        )
         expected = f"median uncertainty to expect {np.median(known):.2g} px" if known.size else "no node is measured"
         lines = [f"<b>{html.escape(found.name)}</b>: {expected}"]
         self.parts.message.text = "<br>".join(lines + [f"• {html.escape(finding.text)}" for finding in found.findings])
@@ -219,7 +222,7 @@ class SetupPage:
         """Take the values of the controls, once the frames can be read with them."""
         draft = self._changed()
         other = draft.section("calibration") != self.draft.section("calibration")
-        self.draft, self.source = draft, DraftFrames.of(draft)
+        self.draft, self.source = draft, DraftFrames(draft)
         if other:
             self._offer_lights()
             self._remesh()
@@ -264,12 +267,9 @@ class SetupPage:
     def _run(self) -> None:
         if self.runs and self.runs[-1].going:
             self.parts.message.text = "The run still goes on."
-            return
-        if not self._write():
-            return
-        self.runs.append(Run.start(self.draft.file, Path(self.parts.out.value)))
+        elif self._write():
+            self.runs.append(Run(self.draft.file, Path(self.parts.out.value)))
 
     def _tick(self) -> None:
         if self.runs:
-            run, link = self.runs[-1], '<br><a id="result" href="result">look at the result as it grows</a>'
-            self.parts.ran.text = html.escape(run.summary()) + (link if run.result is not None else "")
+            self.parts.ran.text = self.runs[-1].text()
