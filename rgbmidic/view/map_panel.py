@@ -292,7 +292,7 @@ class MapPanel:
         result = shown.result
         self.canvas = canvas = Canvas(document, MARKS, shown.view.window or Canvas.around(result.nodes), redraw)
         canvas.plot.on_event(MouseMove, hover)
-        self.beside: list[Canvas] = []
+        self.beside, self._count = list[Canvas](), 1
         self._directions, self._contours = LineLayer(canvas, "direction lines"), LineLayer(canvas, "contour lines", 0.8)
         self._arrows, self._blank = LineLayer(canvas, "arrows"), LabelLayer(canvas, "blank nodes", size=5)
         self.marks, self._ends = MarkLayer(canvas, result.elements), LabelLayer(canvas, "extreme nodes", size=9)
@@ -367,14 +367,13 @@ class MapPanel:
         """
         alone = count > 1 and not self._shown.view.marks
         self.column.css_classes = [*(["several"] if count > 1 else []), *(["alone"] if alone else [])]
-        if count == sum(canvas.plot.visible for canvas in (self.canvas, *self.beside)):
+        if count == self._count:
             return
+        self._count = count
         while len(self.beside) < count - 1:
             self.beside.append(Canvas(self._document, (), self.canvas.wanted, self._redraw, like=self.canvas))
             self.beside[-1].plot.on_event(MouseMove, self._hover)
             self.beside[-1].plot.name = f"plot_{len(self.beside) + 1}"
-        for place, canvas in enumerate(self.beside):
-            canvas.plot.visible = place < count - 1
         plots = [canvas.plot for canvas in (self.canvas, *self.beside)][:count]
         wide = count == 2 and np.ptp(self._shown.result.nodes[:, 0]) > np.ptp(self._shown.result.nodes[:, 1])
         across = 1 if wide or count == 1 else 2

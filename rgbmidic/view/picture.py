@@ -307,8 +307,8 @@ class Canvas:
         redraw: Callable[[], None],
         like: Canvas | None = None,
     ) -> None:
-        left, top, right, bottom = self.wanted = tuple(map(float, edges))
         self.plot: Any
+        left, top, right, bottom = self.wanted = tuple(map(float, edges))
         self.window = Window(left=left, top=top, right=right, bottom=bottom, width=800, height=600).fitted()
         self._document, self._redraw, self._coming = document, redraw, False
         self.plot = plain_plot(
@@ -339,12 +339,11 @@ class Canvas:
         box, reset, save = bk.BoxZoomTool(match_aspect=True), bk.ResetTool(), bk.SaveTool(filename="field")
         self.plot.add_tools(pan, wheel, box, reset, save, *draw)
         self.plot.toolbar.active_drag, self.plot.toolbar.active_scroll, self.plot.toolbar.logo = pan, wheel, None
+        self.plot.on_event(RangesUpdate, (like or self)._moved)
         if like:
             self.plot.toolbar_location = None
-            self.plot.on_event(RangesUpdate, like._moved)
             return
         self.plot.name = "plot"
-        self.plot.on_event(RangesUpdate, self._moved)
         for name in ("inner_width", "inner_height"):
             self.plot.on_change(name, lambda attr, old, new: self.resize())
 

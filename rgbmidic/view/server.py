@@ -13,7 +13,6 @@ from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 from bokeh.application import Application
@@ -30,6 +29,7 @@ from tornado.ioloop import IOLoop
 from tornado.web import ErrorHandler
 
 from rgbmidic.errors import ConfigurationError, InputError, ResultError, RgbmidicError
+from rgbmidic.report.page import render
 from rgbmidic.results import Maps, Result
 from rgbmidic.results.provenance import PROVENANCE
 from rgbmidic.settings import read_table, read_toml
@@ -43,8 +43,6 @@ from rgbmidic.view.setup import SetupPage
 from rgbmidic.view.setup_panel import DraftFrames, Run
 
 _HOST = "127.0.0.1"
-_LIST_STYLE = """<style>a { color: inherit; } h1 { font-size: 22px; }
-th, td { padding: 3px 24px 3px 0; overflow-wrap: anywhere; text-align: left; }</style>"""
 
 
 class _Site(Application):  # type: ignore[misc]  # see pyproject.toml
@@ -197,21 +195,19 @@ def _found(folder: Path) -> dict[Path, float]:
 
 def _fill_list(folder: Path, document: Document) -> None:
     """Fill the page that lists the results and tests of a folder."""
-    rows = ['<tr><th scope="col">Name</th><th scope="col">What it is</th><th scope="col">Changed</th></tr>']
+    rows = []
     for file, changed in _found(folder).items():
-        name, about = str(file.relative_to(folder)), "test to set up or run"
+        about = "test to set up or run"
         if file.suffix != ".toml":
             try:
                 result = Result.open(file, partial=True, check=False)
                 about = f"result: {int(result.finished.sum())} of {len(result)} frames, {', '.join(result.lights)}"
             except RgbmidicError as error:
                 about = f"result that cannot be opened: {error}"
-        link = f'<a href="open?path={quote(name)}">{html.escape(name)}</a>'
-        when = f"{datetime.fromtimestamp(changed):%Y-%m-%d %H:%M}"
-        rows.append(f"<tr><td>{link}</td><td>{html.escape(about)}</td><td>{when}</td></tr>")
-    head = f"<h1>{html.escape(folder.resolve().name)}</h1><p>Results and tests, those changed last first.</p>"
-    table = Div(text=f"{_LIST_STYLE}{head}<table>{''.join(rows)}</table>", sizing_mode="stretch_width")
-    _place(document, {"list": table}, f"rgbmidic: {folder.resolve().name}")
+        rows.append((file.relative_to(folder), about, f"{datetime.fromtimestamp(changed):%Y-%m-%d %H:%M}"))
+    name = folder.resolve().name
+    table = render("list.html", Path(__file__).parent, heading=name, rows=rows)
+    _place(document, {"list": Div(text=table, sizing_mode="stretch_width")}, f"rgbmidic: {name}")
 
 
 def _or_error(fill: Callable[[Document], None], document: Document) -> None:

@@ -26,6 +26,7 @@ from rgbmidic.frames.series import open_series
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.inspection import Inspection, inspect_frame
 from rgbmidic.mesh import Region
+from rgbmidic.report.page import render
 from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.results import Result
 from rgbmidic.settings import ELEMENT_SIZE
@@ -105,18 +106,13 @@ def pictures(inspection: Inspection, shape: tuple[int, int]) -> dict[str, Pictur
 
 def overview(inspection: Inspection, named: Mapping[str, Picture], raw: Picture) -> str:
     """Return small pictures in rows, as HTML: the raw frame and the separated lights, their reflection index."""
-    across = 1 + len(inspection.images.names)
-    cells = []
+    tiles = []
     for name, picture in ((RAW, raw), *named.items()):
         height, width = picture.shape
         size = (VIEWER.tile_columns, max(1, round(VIEWER.tile_columns * height / width)))
         png = cv2.imencode(".png", cv2.resize(picture, size, interpolation=cv2.INTER_AREA))[1]
-        title, source = html.escape(name.replace("reflection index", "index")), base64.b64encode(png.tobytes()).decode()
-        image = f'<img alt="{title}" style="width:100%" src="data:image/png;base64,{source}">'
-        cells.append(f'<figure style="margin:0"><figcaption>{title}</figcaption>{image}</figure>')
-    cells[across:across] = ["<span></span>"]  # the raw frame has no index
-    grid = f"display:grid;gap:4px;font-size:11px;grid-template-columns:repeat({across},1fr)"
-    return f'<div style="{grid}">{"".join(cells)}</div>'
+        tiles.append((name.replace("reflection index", "index"), base64.b64encode(png.tobytes()).decode()))
+    return render("tiles.html", Path(__file__).parent, across=1 + len(inspection.images.names), tiles=tiles)
 
 
 _COLOURS = list(OKABE_ITO.values())
