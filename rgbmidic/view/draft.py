@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -288,19 +289,15 @@ def _shape(mark: str) -> str:
     return next(shape for shape in SHAPES if mark.startswith(shape))
 
 
-def _by_kind(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
-    return {kind: [mark for mark in marks if mark.kind == kind] for kind in dict.fromkeys(mark.kind for mark in marks)}
-
-
 def _complete(marks: Sequence[Mark], shapes: Iterable[str]) -> dict[str, Ring]:
     """Return the corners of the complete shapes of some kinds, by the kind of their marks.
 
     They are rounded to a tenth of a pixel: a pointer's precision.
     """
     found = {}
-    for kind, own in _by_kind(marks).items():
-        if _shape(kind) in shapes and len(own) >= SHAPES[_shape(kind)]:
-            places = [(mark.x, mark.y) for mark in own]
+    for kind in dict.fromkeys(mark.kind for mark in marks):
+        places = [(mark.x, mark.y) for mark in marks if mark.kind == kind]
+        if _shape(kind) in shapes and len(places) >= SHAPES[_shape(kind)]:
             if _shape(kind) in ("circle", "round hole"):
                 (x, y), on = places[:2]
                 radius, corners = math.dist((x, y), on), VIEWER.circle_corners
@@ -329,9 +326,9 @@ def check_complete(marks: Sequence[Mark]) -> None:
     ConfigurationError
         One does: it would be left out.
     """
-    for kind, own in _by_kind(marks).items():
-        if len(own) < (least := SHAPES[_shape(kind)]):
-            raise ConfigurationError(f"the {kind} needs {least} marks or more and has {len(own)}: finish or remove it")
+    for kind, count in Counter(mark.kind for mark in marks).items():
+        if count < (least := SHAPES[_shape(kind)]):
+            raise ConfigurationError(f"the {kind} needs {least} marks or more and has {count}: finish or remove it")
 
 
 def rings(marks: Sequence[Mark]) -> tuple[Ring, list[Ring]]:

@@ -227,19 +227,12 @@ def element_at(
     nodes: FloatArray, elements: npt.NDArray[np.int32], x: float, y: float
 ) -> tuple[npt.NDArray[np.int32], FloatArray] | None:
     """Return the nodes (3,) of the element that holds a point, and their shape functions (3,); None outside."""
-    a, b, c = (nodes[elements[:, corner]] for corner in range(3))
+    xs, ys = (nodes[elements] - (x, y)).transpose(2, 0, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        area = _cross(b - a, c - a)
-        second, third = _cross(np.array([x, y]) - a, c - a) / area, _cross(b - a, np.array([x, y]) - a) / area
-        inside = np.flatnonzero(np.minimum(np.minimum(second, third), 1 - second - third) >= -1e-9)
-    if not len(inside):
-        return None
-    e = inside[0]
-    return elements[e], np.array([1 - second[e] - third[e], second[e], third[e]])
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+        areas = np.roll(xs, -1, axis=1) * np.roll(ys, 1, axis=1) - np.roll(xs, 1, axis=1) * np.roll(ys, -1, axis=1)
+        shape = areas / areas.sum(axis=1, keepdims=True)  # of the triangles between the place and the opposite sides
+        inside = np.flatnonzero(shape.min(axis=1) >= -1e-9)
+    return (elements[inside[0]], shape[inside[0]]) if len(inside) else None
 
 
 def robust_range(read: MapValues | Profile) -> tuple[float, float] | None:

@@ -185,14 +185,9 @@ class SetupPage:
         self.parts.tiles.text = overview(found, self.pictures, self.source.raw(index)[0])
         self.parts.picture.options = [RAW, *self.pictures, _EXPECTED]
         known = found.prediction.std[np.isfinite(found.prediction.std)]
-        self._expected = Overlay(
-            nodes=found.mesh.nodes,
-            elements=found.mesh.elements,
-            values=found.prediction.std,
-            ends=colour_range(known) if known.size else (0.0, 1.0),
-            colours=palette("plasma"),
-            opacity=0.8,
-        )
+        mesh: dict[str, Any] = {"nodes": found.mesh.nodes, "elements": found.mesh.elements}
+        look: dict[str, Any] = {"ends": colour_range(known) if known.size else (0.0, 1.0), "opacity": 0.8}
+        self._expected = Overlay(**mesh, values=found.prediction.std, colours=palette("plasma"), **look)
         expected = f"median uncertainty to expect {np.median(known):.2g} px" if known.size else "no node is measured"
         lines = [f"<b>{html.escape(found.name)}</b>: {expected}"]
         self.parts.message.text = "<br>".join(lines + [f"• {html.escape(finding.text)}" for finding in found.findings])
