@@ -17,7 +17,7 @@ from rgbmidic.errors import ConfigurationError, InputError, RgbmidicError
 from rgbmidic.report import Movie, write_movie
 from rgbmidic.results import Maps
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, ScaleSettings, plain, read_section
-from rgbmidic.view.address import KINDS, SCALE, Mark, marks_of, probe_marks, probes
+from rgbmidic.view.address import KINDS, SCALE, Mark, common_gauge, marks_of, probe_marks, probes
 from rgbmidic.view.draft import Confirmation, Draft
 from rgbmidic.view.models import WRITTEN, ResultControls, warning
 from rgbmidic.view.picture import RawPictures
@@ -107,11 +107,10 @@ class FileButtons:
         """Return the marks of the probes that a TEST.toml states, and those of the scale; sets the gauge."""
         draft = Draft.of_result(self._shown.result, Path(self._parts.file.value))
         stated = read_section(ProbeSettings, "probes", draft.section("probes"))
-        lengths = {length for *_, length in stated.strain_gauges}
-        if len(lengths) > 1:
+        if (gauge := common_gauge(stated)) is None:
             raise InputError(f"the strain gauges of {draft.file} have different lengths; the page has one for all")
-        if lengths:
-            self._parts.of["gauge"].value = lengths.pop()
+        if gauge:
+            self._parts.of["gauge"].value = gauge
         self._parts.written.text = f"{len(stated.places)} probes are read from {html.escape(str(draft.file))}."
         return (*marks_of(stated), *(mark for mark in self._shown.view.marks if mark.kind == SCALE))
 
