@@ -141,6 +141,12 @@ def marks_of(stated: ProbeSettings) -> tuple[Mark, ...]:
     return tuple(marks)
 
 
+def common_gauge(stated: ProbeSettings) -> float | None:
+    """Return the length of the strain gauges stated, 0 without any; None where they differ: a page has one for all."""
+    lengths = {length for *_, length in stated.strain_gauges} or {0.0}
+    return lengths.pop() if len(lengths) == 1 else None
+
+
 def entry(usual: Any, kind: type[bk.Widget] | None = None, text: str = "", **options: Any) -> Any:
     """Entry of the view with its usual value, and kind, text and options of its control, which limit the value too."""
     return field(default=usual, metadata={"control": (kind, text, options)})
@@ -286,10 +292,9 @@ class ViewState:
 
         Strain gauges are among them if all have one length, `least` (px) or more, and the address states no other.
         """
-        lengths = {length for *_, length in stated.strain_gauges}
-        alike = len(lengths) == 1 and min(lengths) >= least and self.gauge in (0, *lengths)
-        marks = tuple(mark for mark in marks_of(stated) if alike or mark.kind != "strain_gauge")
-        gauge = max(lengths) if alike else self.gauge
+        gauge, marks = common_gauge(stated), marks_of(stated)
+        if not gauge or gauge < least or self.gauge not in (0, gauge):
+            gauge, marks = self.gauge, tuple(mark for mark in marks if mark.kind != "strain_gauge")
         return self if self.marks or not marks else replace(self, marks=marks, gauge=gauge)
 
     def with_channels(self, stated: ChannelSettings) -> Self:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -19,12 +19,12 @@ from rgbmidic.report import history_figure
 from rgbmidic.report.style import OKABE_ITO, time_axis, time_unit
 from rgbmidic.results import Channels, Histories, Result
 from rgbmidic.results.histories import frames_alone, read_histories, with_channels
-from rgbmidic.settings import ProbeSettings
+from rgbmidic.settings import ProbeSettings, ScaleSettings
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.address import probe_marks, probes
-from rgbmidic.view.canvas import columns, plain_plot
+from rgbmidic.view.address import Mark, probe_marks, probes
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.models import Background, ResultControls, warning
+from rgbmidic.view.picture import columns, plain_plot
 from rgbmidic.view.shown import ShownFields
 
 if TYPE_CHECKING:
@@ -54,6 +54,13 @@ def band(x: FloatArray, quantity: History) -> tuple[list[FloatArray], list[Float
         xs.append(np.concatenate([x[start:stop], x[start:stop][::-1]]))
         ys.append(np.concatenate([middle - reach, (middle + reach)[::-1]]))
     return xs, ys
+
+
+def _read(
+    result: Result, marks: Sequence[Mark], gauge: float, measure: str | None, scale: ScaleSettings | None
+) -> Histories:
+    """Read the probes that marks make off a result, as `read_histories`, which refuses some of them."""
+    return read_histories(result, probes(marks, gauge, result.section(ProbeSettings), measure), scale=scale)
 
 
 def _probe(quantity: History, names: Iterable[str]) -> str:
@@ -247,8 +254,8 @@ class CurvePanel:
             self._asked, self._colours, self.reading = asked, colours, bool(marks)
             if marks:
                 self._parts.message.text = "reading all frames …"
-                made = probes(view.marks, shown.gauge, shown.result.section(ProbeSettings), shown.measure)
-                self._reader.ask(partial(read_histories, shown.result, made, scale=shown.scale), self._have)
+                work = partial(_read, shown.result, view.marks, shown.gauge, shown.measure, shown.scale)
+                self._reader.ask(work, self._have)
             else:
                 self._reader.drop()
                 self._have(lambda: frames_alone(shown.result) if alone else None)

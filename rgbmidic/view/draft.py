@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -198,6 +199,29 @@ class Draft:
             )
         return replace(self, file=file)
 
+    def with_masks(
+        self, marks: Sequence[Mark], lights: Sequence[str], shape: tuple[int, int]
+    ) -> tuple[Self, dict[Path, bytes]]:
+        """Return the draft with the masks of lights that are drawn, and their files: a picture (PNG) for each light.
+
+        A picture is 0 within the masks of its light, 255 elsewhere. Without a mask the draft stays as it is.
+
+        Raises
+        ------
+        ConfigurationError
+            A mask is of none of the lights.
+        """
+        if not (masks := masks_of(marks)):
+            return self, {}
+        if other := [light for light in masks if light not in lights]:
+            raise ConfigurationError(f"there is a mask of {', '.join(other)}, but the lights are {', '.join(lights)}")
+        whole, files = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1), shape), dict[Path, bytes]()
+        for number, light in enumerate(lights, 1):
+            picture = np.uint8(255) * whole.without(masks.get(light, ())).mask.astype(np.uint8)
+            name = f"{self.file.stem}_mask_{number}_{re.sub(r'[^A-Za-z0-9]+', '_', light)}.png"
+            files[self.file.parent / name] = cv2.imencode(".png", picture)[1].tobytes()
+        return self.changed({"weights": {"method": "images", "images": [file.name for file in files]}}), files
+
     def check(self) -> None:
         """Check that the draft is a complete test; errors as `write`."""
         TestSettings.from_mapping(self.document, self.file.parent)
@@ -265,19 +289,15 @@ def _shape(mark: str) -> str:
     return next(shape for shape in SHAPES if mark.startswith(shape))
 
 
-def _by_kind(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
-    return {kind: [mark for mark in marks if mark.kind == kind] for kind in dict.fromkeys(mark.kind for mark in marks)}
-
-
 def _complete(marks: Sequence[Mark], shapes: Iterable[str]) -> dict[str, Ring]:
     """Return the corners of the complete shapes of some kinds, by the kind of their marks.
 
     They are rounded to a tenth of a pixel: a pointer's precision.
     """
     found = {}
-    for kind, own in _by_kind(marks).items():
-        if _shape(kind) in shapes and len(own) >= SHAPES[_shape(kind)]:
-            places = [(mark.x, mark.y) for mark in own]
+    for kind in dict.fromkeys(mark.kind for mark in marks):
+        places = [(mark.x, mark.y) for mark in marks if mark.kind == kind]
+        if _shape(kind) in shapes and len(places) >= SHAPES[_shape(kind)]:
             if _shape(kind) in ("circle", "round hole"):
                 (x, y), on = places[:2]
                 radius, corners = math.dist((x, y), on), VIEWER.circle_corners
@@ -306,9 +326,9 @@ def check_complete(marks: Sequence[Mark]) -> None:
     ConfigurationError
         One does: it would be left out.
     """
-    for kind, own in _by_kind(marks).items():
-        if len(own) < (least := SHAPES[_shape(kind)]):
-            raise ConfigurationError(f"the {kind} needs {least} marks or more and has {len(own)}: finish or remove it")
+    for kind, count in Counter(mark.kind for mark in marks).items():
+        if count < (least := SHAPES[_shape(kind)]):
+            raise ConfigurationError(f"the {kind} needs {least} marks or more and has {count}: finish or remove it")
 
 
 def rings(marks: Sequence[Mark]) -> tuple[Ring, list[Ring]]:
@@ -340,27 +360,3 @@ def masks_of(marks: Sequence[Mark]) -> dict[str, list[Ring]]:
     for kind, ring in _complete(marks, [MASK]).items():
         found.setdefault(kind.split(" ", 2)[2], []).append(ring)
     return found
-
-
-def with_masks(
-    draft: Draft, marks: Sequence[Mark], lights: Sequence[str], shape: tuple[int, int]
-) -> tuple[Draft, dict[Path, bytes]]:
-    """Return a draft with the masks of lights that are drawn, and the files of these: a picture (PNG) for each light.
-
-    A picture is 0 within the masks of its light, 255 elsewhere. Without a mask the draft stays, and there is no file.
-
-    Raises
-    ------
-    ConfigurationError
-        A mask is of none of the lights.
-    """
-    if not (masks := masks_of(marks)):
-        return draft, {}
-    if other := [light for light in masks if light not in lights]:
-        raise ConfigurationError(f"there is a mask of {', '.join(other)}, but the lights are {', '.join(lights)}")
-    whole, files = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1), shape), dict[Path, bytes]()
-    for number, light in enumerate(lights, 1):
-        picture = np.uint8(255) * whole.without(masks.get(light, ())).mask.astype(np.uint8)
-        name = f"{draft.file.stem}_mask_{number}_{re.sub(r'[^A-Za-z0-9]+', '_', light)}.png"
-        files[draft.file.parent / name] = cv2.imencode(".png", picture)[1].tobytes()
-    return draft.changed({"weights": {"method": "images", "images": [file.name for file in files]}}), files

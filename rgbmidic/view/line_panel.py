@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -20,47 +19,47 @@ from rgbmidic.report import profile_figure
 from rgbmidic.report.style import time_axis
 from rgbmidic.results import Maps, MapValues
 from rgbmidic.results.profiles import Profile
-from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.view.address import probe_marks, probe_place
-from rgbmidic.view.canvas import columns, plain_plot
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.curves import NOW, band
-from rgbmidic.view.models import Background, labelled, warning
+from rgbmidic.view.models import READ_OUT, Background, labelled, warning
+from rgbmidic.view.picture import IMAGE, columns, plain_plot
 from rgbmidic.view.shown import ShownFields
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_IMAGE = "image x y dw dh"
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Reading:
     """A field along a line in all frames of a result, as far as it is read.
 
+    Parameters
+    ----------
+    maps, field, place
+        The result, the name of the field, and the ends of the line.
+    before
+        What was read of the result when it was shorter: it is kept unless it may differ.
+
     Attributes
     ----------
-    maps, profile
-        The result, and a row of each of its frames.
+    profile
+        A row of each frame of the result.
     written : ndarray, shape (T,), int64
         When each frame was written: one that is measured again is read again.
     read : ndarray, shape (T,), bool
         Frames that are read, or cannot be.
+    clock, label
+        Time of all frames, and what it is.
     """
 
-    maps: Maps
-    profile: Profile
-    written: npt.NDArray[np.int64]
-    read: BoolArray
-
-    @classmethod
-    def begin(cls, maps: Maps, field: str, place: Sequence[float], before: _Reading | None) -> _Reading:
-        """Lay the line; what was read `before`, of the result when it was shorter, is kept unless it may differ."""
-        profile = Profile(maps, field, place, range(len(maps.result)))
-        now, read = maps.result.table.written, np.zeros(len(maps.result), dtype=np.bool_)
-        if before is not None and not profile.rate_window and (now == before.written)[before.read].all():
-            profile.values[:], profile.std[:], read = before.profile.values, before.profile.std, before.read.copy()
-        return cls(maps=maps, profile=profile, written=now, read=read).further()
+    def __init__(self, maps: Maps, field: str, place: Sequence[float], before: _Reading | None) -> None:
+        self.maps, self.profile = maps, Profile(maps, field, place, range(len(maps.result)))
+        self.written, self.read = maps.result.table.written, np.zeros(len(maps.result), dtype=np.bool_)
+        if before and not self.profile.rate_window and (self.written == before.written)[before.read].all():
+            self.profile.values[:], self.profile.std[:] = before.profile.values, before.profile.std
+            self.read = before.read.copy()
+        self.clock, self.label = time_axis(self.profile.times, self.profile.frames)
+        self.further()
 
     @property
     def missing(self) -> npt.NDArray[np.int64]:
@@ -114,11 +113,10 @@ class LinePanel:
         self._look: object = None
         self._shown, self._map_colours, self._reader = shown, colours, Background(document)
         self.names: list[str] = []
-        self.choice = bk.RadioButtonGroup(labels=[], name="beside_map", visible=False, **look)
-        self.choice.html_attributes = labelled("curves over time, or the field along a line")
-        self.told = bk.Div(name="told_of_line", **look)
-        self.told.html_attributes = {"aria-live": "polite"}
-        self._image = bk.ColumnDataSource(columns(_IMAGE), name="wave")
+        says = labelled("curves over time, or the field along a line")
+        self.choice = bk.RadioButtonGroup(labels=[], name="beside_map", visible=False, html_attributes=says, **look)
+        self.told = bk.Div(name="told_of_line", html_attributes=READ_OUT, **look)
+        self._image = bk.ColumnDataSource(columns(IMAGE), name="wave")
         self._line = bk.ColumnDataSource(columns("x y"), name="profile")
         self._bands = bk.ColumnDataSource(columns("xs ys"), name="profile bands")
         hover = bk.HoverTool(visible=False, tooltips=[("at", "$x, $y"), ("value", "@image")])
@@ -127,7 +125,7 @@ class LinePanel:
         self.wave.toolbar.logo, self.wave.grid.visible = None, False
         nothing = "#00000000"  # what is not measured, or not read yet
         self._colours = bk.LinearColorMapper(palette=colours.palette, nan_color=nothing, name="wave_colours")
-        self.wave.image(*_IMAGE.split(), source=self._image, color_mapper=self._colours)
+        self.wave.image(*IMAGE.split(), source=self._image, color_mapper=self._colours)
         self.wave.add_layout(bk.ColorBar(color_mapper=self._colours, width=10), "right")
         self.now = bk.Span(name="wave_now", **NOW)
         self.wave.add_layout(self.now)
@@ -149,7 +147,7 @@ class LinePanel:
             part.visible = there
         if not there:
             self._reader.drop()
-            self._asked, self._reading, self.told.visible = (), None, False
+            self._asked, self._reading, self.told.text = (), None, ""
             return False
         asked = (view.field, lines[view.line], shown.chosen, shown.result)
         look = (view.range, view.low, view.high, view.symmetric, view.palette, view.levels)
@@ -157,12 +155,11 @@ class LinePanel:
             before = self._reading if asked[:-1] == self._asked[:-1] else None
             self._asked, self._reading = asked, before
             self.told.text = "reading the frames …"
-            self._reader.ask(partial(_Reading.begin, shown.maps, view.field, lines[view.line], before), self._take)
+            self._reader.ask(partial(_Reading, shown.maps, view.field, lines[view.line], before), self._take)
             self._look = None
         if look != self._look:
             self._look = look
             self._draw()
-        self.told.visible = bool(self.told.text)
         self.show(values)
         return True
 
@@ -177,22 +174,15 @@ class LinePanel:
             self.told.text = f"{int(reading.read.sum())} frames read, {missing} to go" if missing else ""
             if missing:
                 self._reader.ask(reading.further, self._take)
-        self.told.visible = bool(self.told.text)
         self._draw()
         self.show(self._values)
-
-    @property
-    def _clock(self) -> tuple[FloatArray, str]:
-        """Time of all frames, and its label."""
-        profile = self._reading.profile if self._reading else None
-        return (np.zeros(0), "") if profile is None else time_axis(profile.times, profile.frames)
 
     def _draw(self) -> None:
         """Draw position against time: a column for each frame, or less where they are many."""
         if self._reading is None:
-            self._image.data = columns(_IMAGE)
+            self._image.data = columns(IMAGE)
             return
-        profile, (clock, label) = self._reading.profile, self._clock
+        profile, clock = self._reading.profile, self._reading.clock
         there = np.flatnonzero(self._reading.maps.result.finished & np.isfinite(clock))
         steps = np.diff(clock[there])
         steps = steps[steps > 0]
@@ -203,19 +193,19 @@ class LinePanel:
         half, apart = float(grid[-1] - grid[0]) / max(count - 1, 1) / 2 or 0.5, float(profile.positions[1])
         image = profile.values[nearest].T.astype(np.float32)
         left, wide = float(grid[0]) - half, float(grid[-1] - grid[0]) + 2 * half
-        self._image.data = columns(_IMAGE, [(image, left, -apart / 2, wide, apart * len(profile.positions))])
+        self._image.data = columns(IMAGE, [(image, left, -apart / 2, wide, apart * len(profile.positions))])
         low, high = self._shown.ends(profile.field.name, along=profile)
         self._colours.update(low=low, high=high)
         if self._colours.palette != self._map_colours.palette:
             self._colours.palette = self._map_colours.palette
         position = f"position ({profile.units.length})"
-        self.wave.xaxis.axis_label, self.wave.yaxis.axis_label = label, position
+        self.wave.xaxis.axis_label, self.wave.yaxis.axis_label = self._reading.label, position
         self.profile.xaxis.axis_label, self.profile.yaxis.axis_label = position, profile.field.label
         self.wave.title.text = f"{profile.field.label} along the line"
 
     def show(self, values: MapValues | None) -> None:
         """Show the profile of the frame in view, of which the map has the values; None: it shows nothing."""
-        self._values, frame = values, self._shown.view.frame
+        self._values, frame, self.told.visible = values, self._shown.view.frame, bool(self.told.text)
         if self._reading is None or values is None:
             self._line.data, self._bands.data, self.now.location = columns("x y"), columns("xs ys"), None
             return
@@ -224,7 +214,7 @@ class LinePanel:
         self._line.data = {"x": profile.positions, "y": along}
         curve = History(name=profile.field.name, unit=profile.field.unit, values=along, std=std)
         self._bands.data = dict(zip(("xs", "ys"), band(profile.positions, curve), strict=True))
-        at = self._clock[0][frame]
+        at = self._reading.clock[frame]
         self.now.location, self.profile.title.text = float(at) if np.isfinite(at) else None, f"Profile in frame {frame}"
 
     def figure(self) -> Figure | None:
@@ -239,5 +229,6 @@ class LinePanel:
 
     def frame(self, x: float) -> int:
         """Return the index of the frame at a place of the time axis."""
-        clock = self._clock[0]
-        return int(np.nanargmin(np.abs(clock - x))) if np.isfinite(clock).any() else self._shown.view.frame
+        if self._reading is None or not np.isfinite(self._reading.clock).any():
+            return self._shown.view.frame
+        return int(np.nanargmin(np.abs(self._reading.clock - x)))

@@ -20,9 +20,8 @@ from rgbmidic.report.style import BAR, OKABE_ITO, add_colour_bar, draw_figure, f
 from rgbmidic.results import frame_times
 from rgbmidic.typing import FloatArray
 from rgbmidic.view.address import MARKS, SCALE, Mark, probe_marks, probe_place
-from rgbmidic.view.canvas import Canvas, columns
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.picture import AROUND, Picture, Window, element_at, paint, palette
+from rgbmidic.view.picture import AROUND, Canvas, Picture, Window, columns, element_at, paint, palette
 from rgbmidic.view.shown import ShownFields
 
 if TYPE_CHECKING:
@@ -57,22 +56,23 @@ class LineLayer:
         Name of their data.
     width
         Of the light part, in pixels of the screen.
+
+    Attributes
+    ----------
+    lines : ndarray, shape (M, 4)
+        The lines that are shown.
     """
 
     def __init__(self, canvas: Canvas, name: str, width: float = 1.4) -> None:
-        self._lines = bk.ColumnDataSource(columns(_ENDS), name=name)
+        self.lines, self._drawn = np.zeros((0, 4)), bk.ColumnDataSource(columns(_ENDS), name=name)
         for colour, wide in (("#15181c", width + 1.6), ("#ffffff", width)):
-            canvas.plot.segment(*_ENDS.split(), source=self._lines, line_color=colour, line_width=wide)
+            canvas.plot.segment(*_ENDS.split(), source=self._drawn, line_color=colour, line_width=wide)
 
-    @property
-    def lines(self) -> FloatArray:
-        """The lines (M, 4) that are shown."""
-        return np.stack([np.asarray(self._lines.data[name], dtype=np.float64) for name in _ENDS.split()], axis=1)
-
-    def show(self, ends: FloatArray | None) -> None:
+    def show(self, lines: FloatArray | None = None) -> None:
         """Show lines (M, 4) from x0, y0 to x1, y1; None: none."""
-        if ends is not None or len(self._lines.data["x0"]):
-            self._lines.data = dict(zip(_ENDS.split(), (np.zeros((0, 4)) if ends is None else ends).T, strict=True))
+        if lines is not None or len(self.lines):
+            self.lines = np.zeros((0, 4)) if lines is None else lines
+            self._drawn.data = dict(zip(_ENDS.split(), self.lines.T, strict=True))
 
 
 class LabelLayer:
@@ -156,16 +156,13 @@ def contour_lines(
     lines = []
     for level in levels:
         above = values[whole] > level
-        cut = whole[above.any(axis=1) & ~above.all(axis=1)]
-        ends = []
+        crossed = above.any(axis=1) & ~above.all(axis=1)
+        cut, side = whole[crossed], above[crossed]
         # the corner that is alone on its side: from it, the line cuts both edges
-        side = values[cut] > level
         alone = np.where(side.sum(axis=1) == 1, side.argmax(axis=1), side.argmin(axis=1))
-        row = np.arange(len(cut))
-        for step in (1, 2):
-            a, b = cut[row, alone], cut[row, (alone + step) % 3]
-            part = ((level - values[a]) / (values[b] - values[a]))[:, None]
-            ends.append(nodes[a] + part * (nodes[b] - nodes[a]))
+        a, *others = np.take_along_axis(cut, (alone[:, None] + np.arange(3)) % 3, axis=1).T
+        parts = [((level - values[a]) / (values[b] - values[a]))[:, None] for b in others]
+        ends = [nodes[a] + part * (nodes[b] - nodes[a]) for part, b in zip(parts, others, strict=True)]
         lines.append(np.concatenate(ends, axis=1))
     return np.concatenate(lines) if lines else np.zeros((0, 4))
 
@@ -201,12 +198,14 @@ class MarkLayer:
     ----------
     colours
         Colour of each probe that the marks make, by its name.
+    drawn
+        Line (xs, ys), colour, and place (x, y) and text of each probe.
     """
 
     def __init__(self, canvas: Canvas, elements: npt.NDArray[np.int32]) -> None:
-        self.colours: dict[str, str] = {}
+        self.colours, self.drawn = dict[str, str](), list[tuple[Any, ...]]()
         self._canvas, self._elements, self._shown = canvas, elements, dict[object, tuple[Mark, Mark]]()
-        self._drawn: object = None
+        self._placed: object = None
         self._joined = bk.ColumnDataSource(columns(_PROBE), name="probes")
         canvas.plot.multi_line("xs", "ys", source=self._joined, line_color="colour", line_width=3)
         canvas.plot.text("x", "y", "text", source=self._joined, border_line_color="colour", **LETTERS)
@@ -221,10 +220,10 @@ class MarkLayer:
         at = [self._carried(mark, reference, nodes) for mark in marks]
         self._shown = {mark.key: (mark, own) for mark, own in zip(at, marks, strict=True)}
         self._canvas.place(at)
-        drawn = (at, dict(values), gauge, self._canvas.window)
-        if drawn == self._drawn:
+        placed = (at, dict(values), gauge, self._canvas.window)
+        if placed == self._placed:
             return
-        self._drawn = drawn
+        self._placed = placed
         ends = [mark for mark in at if mark.kind == SCALE]
         probes = {**probe_marks(at), **({SCALE: ends} if len(ends) > 1 else {})}
         self.colours = {name: _COLOURS[place % len(_COLOURS)] for place, name in enumerate(probes)}
@@ -232,14 +231,9 @@ class MarkLayer:
         texts = [
             (ends[0].x, ends[0].y, f"{name.replace('_', ' ')}{values.get(name, '')}") for name, ends in probes.items()
         ]
-        placed = beside(texts, self._canvas.window)
-        parts = zip(lines, self.colours.values(), texts, placed, strict=True)
-        self._joined.data = columns(_PROBE, [(*line, colour, *text, *side) for line, colour, text, side in parts])
-
-    @property
-    def drawn(self) -> list[tuple[Any, ...]]:
-        """Line (xs, ys), colour, and place (x, y) and text of each probe."""
-        return list(zip(*(self._joined.data[name] for name in _PROBE.split()[:6]), strict=True))
+        sides = beside(texts, self._canvas.window)
+        self.drawn = [(*line, self.colours[name], *text) for line, name, text in zip(lines, probes, texts, strict=True)]
+        self._joined.data = columns(_PROBE, [(*one, *side) for one, side in zip(self.drawn, sides, strict=True)])
 
     def taken(self, nodes: FloatArray, reference: FloatArray) -> tuple[Mark, ...] | None:
         """Return the marks, set over nodes (N, 2), on the `reference` (N, 2); None where none has changed."""
@@ -298,7 +292,7 @@ class MapPanel:
         result = shown.result
         self.canvas = canvas = Canvas(document, MARKS, shown.view.window or Canvas.around(result.nodes), redraw)
         canvas.plot.on_event(MouseMove, hover)
-        self.beside: list[Canvas] = []
+        self.beside, self._count = list[Canvas](), 1
         self._directions, self._contours = LineLayer(canvas, "direction lines"), LineLayer(canvas, "contour lines", 0.8)
         self._arrows, self._blank = LineLayer(canvas, "arrows"), LabelLayer(canvas, "blank nodes", size=5)
         self.marks, self._ends = MarkLayer(canvas, result.elements), LabelLayer(canvas, "extreme nodes", size=9)
@@ -308,10 +302,8 @@ class MapPanel:
         """Show nothing."""
         for canvas in (self.canvas, *self.beside):
             canvas.clear()
-        for layer in (self._directions, self._contours, self._arrows):
-            layer.show(None)
-        self._ends.show()
-        self._blank.show()
+        for layer in (self._directions, self._contours, self._arrows, self._ends, self._blank):
+            layer.show()
 
     def figure(self) -> Figure:
         """Draw the maps for print: light, with the frame, its time and how the fields are derived in the title."""
@@ -359,11 +351,14 @@ class MapPanel:
 
     def draw(self, picture: Picture) -> str:
         """Draw the fields over an image; returns what is to be said of the arrows."""
-        names, nodes = self._shown.names, self._shown.nodes
+        shown, names, window = self._shown, self._shown.names, self.canvas.window
         self._arrange(len(names))
         for canvas, name in zip((self.canvas, *self.beside), names, strict=False):
-            self._paint(canvas, name, picture)
-        return self._draw_layers(nodes)
+            field, over = shown.maps.all[name], shown.overlay(name)
+            canvas.show(paint(window, picture, over, AROUND[self._dark]), window)
+            canvas.colour(over.ends, over.colours, field.label, field.codes)
+            canvas.number(*shown.maps.physical.axes)
+        return self._draw_layers(shown.nodes)
 
     def _arrange(self, count: int) -> None:
         """Show so many canvases: side by side, two in a row, or one below the other where the field is wide.
@@ -372,14 +367,13 @@ class MapPanel:
         """
         alone = count > 1 and not self._shown.view.marks
         self.column.css_classes = [*(["several"] if count > 1 else []), *(["alone"] if alone else [])]
-        if count == sum(canvas.plot.visible for canvas in (self.canvas, *self.beside)):
+        if count == self._count:
             return
+        self._count = count
         while len(self.beside) < count - 1:
             self.beside.append(Canvas(self._document, (), self.canvas.wanted, self._redraw, like=self.canvas))
             self.beside[-1].plot.on_event(MouseMove, self._hover)
             self.beside[-1].plot.name = f"plot_{len(self.beside) + 1}"
-        for place, canvas in enumerate(self.beside):
-            canvas.plot.visible = place < count - 1
         plots = [canvas.plot for canvas in (self.canvas, *self.beside)][:count]
         wide = count == 2 and np.ptp(self._shown.result.nodes[:, 0]) > np.ptp(self._shown.result.nodes[:, 1])
         across = 1 if wide or count == 1 else 2
@@ -387,12 +381,6 @@ class MapPanel:
         if count % across:  # a plot of another shape would distort what all show of the image
             rows[-1].children = [*rows[-1].children, bk.Spacer(sizing_mode="stretch_both")]
         self.column.children = rows if count > 1 else plots
-
-    def _paint(self, canvas: Canvas, name: str, picture: Picture) -> None:
-        field, over = self._shown.maps.all[name], self._shown.overlay(name)
-        canvas.show(paint(self.canvas.window, picture, over, AROUND[self._dark]), self.canvas.window)
-        canvas.colour(over.ends, over.colours, field.label, field.codes)
-        canvas.number(*self._shown.maps.physical.axes)
 
     def _draw_layers(self, nodes: FloatArray) -> str:
         """Draw what lies over the first field: lines, arrows, extremes, nodes without data, marks."""

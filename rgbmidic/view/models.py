@@ -22,6 +22,8 @@ from rgbmidic.view.constants import VIEWER
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
+READ_OUT = {"aria-live": "polite"}
+"""Attributes of a text whose changes screen readers read out."""
 
 
 def page_file(name: str) -> str:
@@ -127,24 +129,22 @@ class Controls:
         self.small: dict[str, Any] = {"stylesheets": [bk.InlineStyleSheet(css=page_file(name)) for name in styles]}
         self.wide = wide = {**self.small, "sizing_mode": "stretch_width"}
         other, most = "light" if dark else "dark", max(last, 1)
-        self.head, self.description = bk.Div(**wide), bk.Div(name="description", **wide)
-        self.message = bk.Div(name="message", **wide)
+        self.head, self.message = bk.Div(**wide), bk.Div(name="message", **wide)
+        self.description = bk.Div(name="description", html_attributes=READ_OUT, **wide)
         self.theme = bk.Button(label=f"{other.capitalize()} page", **wide)
         self.theme.js_on_click(script("turn", theme=other))
         self.frame = bk.Slider(
             title="Frame", name="frame", start=0, end=most, step=1, value=frame, disabled=last < 1, **wide
         )
         self.play = bk.Toggle(label="▶ Play", name="play", width=90, **self.small)
-        self.step = bk.Spinner(name="step", low=1, high=most, value=1, width=70, **self.small)
-        self.step.html_attributes = labelled("frames that Play and the arrow keys go on by")
-        self.description.html_attributes = {"aria-live": "polite"}
+        says = labelled("frames that Play and the arrow keys go on by")
+        self.step = bk.Spinner(name="step", low=1, high=most, value=1, width=70, html_attributes=says, **self.small)
         self.player = row(self.play, self.step, self.frame, sizing_mode="stretch_width")
 
     def group(self, name: str, says: str, labels: Iterable[str], active: int | None = 0) -> Any:
         """Buttons of which one is pressed, with what they choose, for screen readers."""
-        made = bk.RadioButtonGroup(labels=list(labels), active=active, name=name, **self.wide)
-        made.html_attributes = labelled(says)
-        return made
+        look = {"html_attributes": labelled(says), **self.wide}
+        return bk.RadioButtonGroup(labels=list(labels), active=active, name=name, **look)
 
     def ask(self, state: SharedState) -> None:
         """Let the slider ask for frames, and play them."""
@@ -191,16 +191,16 @@ class ResultControls(Controls):
         self.section = self.group("section", "controls shown", SECTIONS)
         self.mode = self.group("mode", "what a click sets", MODES)
         self.scale = self.group("scale", "points of the scale", ["Move", "Two points of a distance"], active=None)
-        self.what = bk.CheckboxButtonGroup(labels=list(WRITTEN), active=[0], name="what", **wide)
-        self.what.html_attributes = labelled("sections that are written")
+        look = {"html_attributes": labelled("sections that are written"), **wide}
+        self.what = bk.CheckboxButtonGroup(labels=list(WRITTEN), active=[0], name="what", **look)
         self.curve, self.probe = (bk.Select(title=text, name=text.lower(), **wide) for text in ("Curve", "Probe"))
         self.name = bk.TextInput(title="its name", name="name", **wide)
         self.file = bk.TextInput(title="TEST.toml, beside test or result", name="file", value="TEST.toml", **wide)
         self.drag = bk.Toggle(label="Drag the channel along the time", name="drag", **wide)
         self.movie = bk.Toggle(label="Movie", name="movie", width=90, **self.small)
         folded = {"max-height": "48px", "overflow": "auto", "overflow-wrap": "anywhere"}
-        self.said = bk.Div(name="said", width=300, visible=False, styles=folded, **self.small)
-        self.said.html_attributes = {"aria-live": "polite"}
+        look = {"styles": folded, "html_attributes": READ_OUT, **self.small}
+        self.said = bk.Div(name="said", width=300, visible=False, **look)
         self.player = row(self.play, self.step, self.frame, self.movie, self.said, sizing_mode="stretch_width")
         labels = ("Lock the range", "Undo", "Redo", "Clear", "Save CSV", "Save PNG", "Write", "Take its probes")
         self.lock, self.undo, self.redo, self.clear, self.csv, self.png, self.write, self.take = (

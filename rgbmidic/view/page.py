@@ -21,12 +21,12 @@ from rgbmidic.results.histories import history_csv
 from rgbmidic.settings import ChannelSettings, ProbeSettings
 from rgbmidic.text import uncertain
 from rgbmidic.view.address import BESIDE, OVER, SCALE, UNCERTAINTY, Mark, Steps, ViewState
-from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
 from rgbmidic.view.line_panel import LinePanel
 from rgbmidic.view.map_panel import MapPanel
 from rgbmidic.view.models import ResultControls, SharedState, every, guarded, script, warning
+from rgbmidic.view.picture import Canvas
 from rgbmidic.view.sections import FileButtons, FilmButton, ProbeNames
 from rgbmidic.view.shown import ShownFields
 
@@ -60,7 +60,7 @@ class ResultPage:
         self.steps = Steps(view.marks)
         self.parts = p = ResultControls(len(result) - 1, view.frame, dark=dark)
         self.maps = MapPanel(document, self.shown, self._redraw, self._hover, dark=dark)
-        self.names, self.film = ProbeNames(p, self._take_marks), FilmButton(p, self.shown)
+        self.names, self.film = ProbeNames(p, self.shown, self._take_marks), FilmButton(p, self.shown)
         self.file, self.timeline = FileButtons(p, self.shown), TimeLine(len(result), view.frame)
         self.curves = CurvePanel(document, self.shown, p)
         self.line = LinePanel(document, self.shown, self.maps.canvas.colours, p.wide)
@@ -92,7 +92,7 @@ class ResultPage:
         p, view = self.parts, self.view
         self._offer_fields()
         self.curves.offer()
-        self.names.offer(view.marks)
+        self.names.offer()
         p.of["since"].high = len(self.result) - 1
         p.over.active = OVER.index(view.over)
         self._draw_progress()
@@ -170,7 +170,7 @@ class ResultPage:
         try:
             guarded(self._draw, self._blank)
             self.curves.update(self.maps.marks.colours)
-            self.names.offer(self.view.marks)
+            self.names.offer()
         finally:
             self.document.unhold()
 

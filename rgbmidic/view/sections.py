@@ -17,7 +17,7 @@ from rgbmidic.errors import ConfigurationError, InputError, RgbmidicError
 from rgbmidic.report import Movie, write_movie
 from rgbmidic.results import Maps
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, ScaleSettings, plain, read_section
-from rgbmidic.view.address import KINDS, SCALE, Mark, marks_of, probe_marks, probes
+from rgbmidic.view.address import KINDS, SCALE, Mark, common_gauge, marks_of, probe_marks, probes
 from rgbmidic.view.draft import Confirmation, Draft
 from rgbmidic.view.models import WRITTEN, ResultControls, warning
 from rgbmidic.view.picture import RawPictures
@@ -31,30 +31,28 @@ class ProbeNames:
     ----------
     parts
         Controls of the page.
+    shown
+        The fields in view, with the marks.
     take
         Called with the marks of which one has another name.
     """
 
-    def __init__(self, parts: ResultControls, take: Callable[[tuple[Mark, ...]], None]) -> None:
-        self._parts, self._take, self._marks = parts, take, tuple[Mark, ...]()
+    def __init__(self, parts: ResultControls, shown: ShownFields, take: Callable[[tuple[Mark, ...]], None]) -> None:
+        self._parts, self._shown, self._take = parts, shown, take
         parts.name.on_change("value", lambda attr, old, new: self._rename(new.strip()))
-        parts.probe.on_change("value", lambda attr, old, new: self._show())
+        parts.probe.on_change("value", lambda attr, old, new: self.offer())
 
-    def offer(self, marks: tuple[Mark, ...]) -> None:
-        """Offer the probes that marks make."""
-        probe, self._marks = self._parts.probe, marks
-        probe.options = list(probe_marks(marks))
-        if probe.value not in probe.options:
-            probe.value = next(iter(probe.options), "")
-        self._show()
-
-    def _show(self) -> None:
-        marks = probe_marks(self._marks).get(self._parts.probe.value)
-        self._parts.name.value = marks[0].name if marks else ""
+    def offer(self) -> None:
+        """Offer the probes that marks make, and the name of the one that is chosen."""
+        probe, probes = self._parts.probe, probe_marks(self._shown.view.marks)
+        probe.options = list(probes)
+        if probe.value not in probes:
+            probe.value = next(iter(probes), "")
+        self._parts.name.value = probes[probe.value][0].name if probes else ""
 
     def _rename(self, name: str) -> None:
         """Give the chosen probe a name; empty: its kind and number."""
-        p, marks = self._parts, self._marks
+        p, marks = self._parts, self._shown.view.marks
         found = probe_marks(marks).get(p.probe.value)
         if found is None or name == found[0].name:
             return
@@ -62,10 +60,11 @@ class ProbeNames:
             p.message.text = warning(
                 f'a name has letters, digits, spaces, "." and "-", and no other probe has it; not "{name}"'
             )
-            self._show()
+            self.offer()
             return
         self._take(tuple(replace(mark, name=name) if mark is found[0] else mark for mark in marks))
-        p.probe.value = name or next(key for key, own in probe_marks(self._marks).items() if own[1:] == found[1:])
+        renamed = probe_marks(self._shown.view.marks)
+        p.probe.value = name or next(key for key, own in renamed.items() if own[1:] == found[1:])
 
 
 class FileButtons:
@@ -108,11 +107,10 @@ class FileButtons:
         """Return the marks of the probes that a TEST.toml states, and those of the scale; sets the gauge."""
         draft = Draft.of_result(self._shown.result, Path(self._parts.file.value))
         stated = read_section(ProbeSettings, "probes", draft.section("probes"))
-        lengths = {length for *_, length in stated.strain_gauges}
-        if len(lengths) > 1:
+        if (gauge := common_gauge(stated)) is None:
             raise InputError(f"the strain gauges of {draft.file} have different lengths; the page has one for all")
-        if lengths:
-            self._parts.of["gauge"].value = lengths.pop()
+        if gauge:
+            self._parts.of["gauge"].value = gauge
         self._parts.written.text = f"{len(stated.places)} probes are read from {html.escape(str(draft.file))}."
         return (*marks_of(stated), *(mark for mark in self._shown.view.marks if mark.kind == SCALE))
 

@@ -13,7 +13,6 @@ from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 from bokeh.application import Application
@@ -30,6 +29,7 @@ from tornado.ioloop import IOLoop
 from tornado.web import ErrorHandler
 
 from rgbmidic.errors import ConfigurationError, InputError, ResultError, RgbmidicError
+from rgbmidic.report.page import render
 from rgbmidic.results import Maps, Result
 from rgbmidic.results.provenance import PROVENANCE
 from rgbmidic.settings import read_table, read_toml
@@ -43,9 +43,6 @@ from rgbmidic.view.setup import SetupPage
 from rgbmidic.view.setup_panel import DraftFrames, Run
 
 _HOST = "127.0.0.1"
-_LIST_STYLE = """<style>a { color: inherit; } h1 { font-size: 22px; }
-th, td { padding: 3px 24px 3px 0; overflow-wrap: anywhere; text-align: left; }</style>"""
-_THEMES = {"dark": "dark_minimal"}
 
 
 class _Site(Application):  # type: ignore[misc]  # see pyproject.toml
@@ -151,12 +148,12 @@ def _pages(path: Path, statement: Mapping[str, Any]) -> dict[str, Callable[[Docu
         if (place / PROVENANCE).exists():
             Result.open(place, partial=True, check=False)
             return partial(_fill, place, shared)
-        DraftFrames.of(Draft.of(place, statement))
+        DraftFrames(Draft.of(place, statement))
 
         def setup(document: Document) -> None:
-            theme = _asked(document, "theme")
-            page = SetupPage(document, Draft.of(place, statement), runs, dark=theme == "dark")
-            _place(document, page.roots, f"rgbmidic: {place.name}", theme)
+            dark = _asked(document, "theme") == "dark"
+            page = SetupPage(document, Draft.of(place, statement), runs, dark=dark)
+            _place(document, page.roots, f"rgbmidic: {place.name}")
 
         return setup
 
@@ -198,22 +195,19 @@ def _found(folder: Path) -> dict[Path, float]:
 
 def _fill_list(folder: Path, document: Document) -> None:
     """Fill the page that lists the results and tests of a folder."""
-    rows = ['<tr><th scope="col">Name</th><th scope="col">What it is</th><th scope="col">Changed</th></tr>']
+    rows = []
     for file, changed in _found(folder).items():
-        name, about = str(file.relative_to(folder)), "test to set up or run"
+        about = "test to set up or run"
         if file.suffix != ".toml":
             try:
                 result = Result.open(file, partial=True, check=False)
                 about = f"result: {int(result.finished.sum())} of {len(result)} frames, {', '.join(result.lights)}"
             except RgbmidicError as error:
                 about = f"result that cannot be opened: {error}"
-        link = f'<a href="open?path={quote(name)}">{html.escape(name)}</a>'
-        when = f"{datetime.fromtimestamp(changed):%Y-%m-%d %H:%M}"
-        rows.append(f"<tr><td>{link}</td><td>{html.escape(about)}</td><td>{when}</td></tr>")
-    head = f"<h1>{html.escape(folder.resolve().name)}</h1><p>Results and tests, those changed last first.</p>"
-    theme = _asked(document, "theme")
-    table = Div(text=f"{_LIST_STYLE}{head}<table>{''.join(rows)}</table>", sizing_mode="stretch_width")
-    _place(document, {"list": table}, f"rgbmidic: {folder.resolve().name}", theme)
+        rows.append((file.relative_to(folder), about, f"{datetime.fromtimestamp(changed):%Y-%m-%d %H:%M}"))
+    name = folder.resolve().name
+    table = render("list.html", Path(__file__).parent, heading=name, rows=rows)
+    _place(document, {"list": Div(text=table, sizing_mode="stretch_width")}, f"rgbmidic: {name}")
 
 
 def _or_error(fill: Callable[[Document], None], document: Document) -> None:
@@ -222,7 +216,7 @@ def _or_error(fill: Callable[[Document], None], document: Document) -> None:
         fill(document)
     except RgbmidicError as error:
         document.clear()
-        _place(document, {"head": Div(text=html.escape(str(error)))}, "rgbmidic", "")
+        _place(document, {"head": Div(text=html.escape(str(error)))}, "rgbmidic")
 
 
 def _query(document: Document) -> dict[str, list[bytes]]:
@@ -243,17 +237,18 @@ def _fill(path: Path, shared: dict[tuple[Path, str], Progress], document: Docume
     view = ViewState.from_query(_query(document), frames=len(result), names=names, frame=last)
     progress = shared.setdefault((path, result.provenance["created"]), Progress(len(result)))
     page = ResultPage(document, result, view, progress)
-    _place(document, page.roots, f"rgbmidic: {result.path.name}", view.theme)
+    _place(document, page.roots, f"rgbmidic: {result.path.name}")
 
 
-def _place(document: Document, roots: Mapping[str, Model], title: str, theme: str) -> None:
-    """Place the parts of a page in its template, with its style and its keys."""
+def _place(document: Document, roots: Mapping[str, Model], title: str) -> None:
+    """Place the parts of a page in its template, with its style, its keys and the theme of its address."""
+    theme = _asked(document, "theme")
     with document.models.freeze():  # else all models are counted anew for each
         for name, root in roots.items():
             root.name = name
             document.add_root(root)
-    if theme in _THEMES:
-        document.theme = _THEMES[theme]
+    if theme == "dark":
+        document.theme = "dark_minimal"
     document.title = title
     page, style, script = map(page_file, ("page.html", "page.css", "page.js"))
     document.template = get_env().from_string(page)

@@ -21,20 +21,10 @@ from rgbmidic.pipeline.plan import finite_elements_of, read_region
 from rgbmidic.report.style import colour_range
 from rgbmidic.results.files import write_complete
 from rgbmidic.settings import ELEMENT_SIZE, RegionSettings, TestSettings, read_section
-from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.draft import (
-    SHAPES,
-    Confirmation,
-    Draft,
-    check_complete,
-    marks_of,
-    region_of,
-    region_section,
-    with_masks,
-)
+from rgbmidic.view.draft import SHAPES, Confirmation, Draft, check_complete, marks_of, region_of, region_section
 from rgbmidic.view.models import Background, SharedState, every, guarded, script, warning
-from rgbmidic.view.picture import AROUND, Overlay, paint, palette
+from rgbmidic.view.picture import AROUND, Canvas, Overlay, paint, palette
 from rgbmidic.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, overview, pictures
 
 _EXPECTED = "expected uncertainty"
@@ -64,9 +54,9 @@ class SetupPage:
 
     def __init__(self, document: Document, draft: Draft, runs: list[Run], *, dark: bool) -> None:
         self.document, self.draft, self.dark, self.runs = document, draft, dark, runs
-        self.source = DraftFrames.of(draft)
+        self.source = DraftFrames(draft)
         self.pictures: dict[str, Any] = {}
-        self.inspection: Inspection | None = None
+        self._expected: Overlay | None = None
         self._inspected, self._opened = 0, draft
         reference, out = draft.frames.reference[0], runs[-1].out if runs else draft.file.parent / "result"
         self.state = SharedState(name="state", asked=reference, shown=reference)
@@ -130,11 +120,7 @@ class SetupPage:
         raw, full = self.source.raw(index)
         chosen = self.parts.picture.value
         picture = self.pictures.get(chosen, raw)
-        over, ends, colours, window = None, (0.0, 1.0), palette("plasma"), self.canvas.window
-        if chosen == _EXPECTED and (found := self.inspection) is not None:
-            ends = colour_range(found.prediction.std[np.isfinite(found.prediction.std)])
-            mesh: dict[str, Any] = {"nodes": found.mesh.nodes, "elements": found.mesh.elements}
-            over = Overlay(**mesh, values=found.prediction.std, ends=ends, colours=colours, opacity=0.8)
+        over, window = self._expected if chosen == _EXPECTED else None, self.canvas.window
         image = paint(window, picture, over, AROUND[self.dark])
         if self.parts.glare.active:
             saturated = paint(window, full.astype(np.uint8) * 255, around=0)
@@ -143,14 +129,14 @@ class SetupPage:
         title = f"{chosen} (px)" if over else chosen
         if chosen != RAW and index != self._inspected:  # what was inspected stays while other frames are looked at
             title += f", of frame {self._inspected}: {self.source.series.name(self._inspected)}"
-        self.canvas.colour(ends, colours, title)
+        self.canvas.colour(over.ends if over else (0.0, 1.0), palette("plasma"), title)
         self.canvas.bar.visible = over is not None
 
     def _remesh(self) -> None:
         """Draw the mesh of the region; drop the inspection, of another region, element size or calibration."""
         self._reader.drop()
-        if self.inspection is not None:
-            self.inspection, self.pictures = None, {}
+        if self._expected is not None:
+            self._expected, self.pictures = None, {}
             self.parts.tiles.text = ""
             self.parts.picture.value, self.parts.picture.options = RAW, [RAW]
         self._edges.data = {"xs": [], "ys": []}
@@ -195,11 +181,13 @@ class SetupPage:
 
     def _have(self, inspected: Callable[[], Inspection], index: int) -> None:
         found, self._inspected = inspected(), index
-        self.inspection = found
         self.pictures = pictures(found, self.source.shape)
         self.parts.tiles.text = overview(found, self.pictures, self.source.raw(index)[0])
         self.parts.picture.options = [RAW, *self.pictures, _EXPECTED]
         known = found.prediction.std[np.isfinite(found.prediction.std)]
+        mesh: dict[str, Any] = {"nodes": found.mesh.nodes, "elements": found.mesh.elements}
+        look: dict[str, Any] = {"ends": colour_range(known) if known.size else (0.0, 1.0), "opacity": 0.8}
+        self._expected = Overlay(**mesh, values=found.prediction.std, colours=palette("plasma"), **look)
         expected = f"median uncertainty to expect {np.median(known):.2g} px" if known.size else "no node is measured"
         lines = [f"<b>{html.escape(found.name)}</b>: {expected}"]
         self.parts.message.text = "<br>".join(lines + [f"• {html.escape(finding.text)}" for finding in found.findings])
@@ -229,7 +217,7 @@ class SetupPage:
         """Take the values of the controls, once the frames can be read with them."""
         draft = self._changed()
         other = draft.section("calibration") != self.draft.section("calibration")
-        self.draft, self.source = draft, DraftFrames.of(draft)
+        self.draft, self.source = draft, DraftFrames(draft)
         if other:
             self._offer_lights()
             self._remesh()
@@ -252,7 +240,7 @@ class SetupPage:
         check_complete(self.drawing.marks)
         self._reopen()
         draft = self.draft.at(Path(self.parts.file.value))
-        draft, pictures = with_masks(draft, self.drawing.marks, self.source.lights, self.source.shape)
+        draft, pictures = draft.with_masks(self.drawing.marks, self.source.lights, self.source.shape)
         draft.check()
         same = draft.file == self._opened.file
         files = [*pictures, *([] if same and self._opened.is_file else [draft.file])]
@@ -274,12 +262,9 @@ class SetupPage:
     def _run(self) -> None:
         if self.runs and self.runs[-1].going:
             self.parts.message.text = "The run still goes on."
-            return
-        if not self._write():
-            return
-        self.runs.append(Run.start(self.draft.file, Path(self.parts.out.value)))
+        elif self._write():
+            self.runs.append(Run(self.draft.file, Path(self.parts.out.value)))
 
     def _tick(self) -> None:
         if self.runs:
-            run, link = self.runs[-1], '<br><a id="result" href="result">look at the result as it grows</a>'
-            self.parts.ran.text = html.escape(run.summary()) + (link if run.result is not None else "")
+            self.parts.ran.text = self.runs[-1].text()

@@ -8,10 +8,11 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import Any
 
 import bokeh.models as bk
 import cv2
@@ -21,26 +22,30 @@ from bokeh.document import Document
 from bokeh.layouts import column, row
 
 from rgbmidic.errors import ResultError
-from rgbmidic.frames.series import FrameSeries, open_series
+from rgbmidic.frames.series import open_series
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.inspection import Inspection, inspect_frame
 from rgbmidic.mesh import Region
+from rgbmidic.report.page import render
 from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.results import Result
 from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.view.address import Mark, Steps
-from rgbmidic.view.canvas import Canvas, columns
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.draft import HOLES, MASK, Draft, arranged, masks_of, rings
 from rgbmidic.view.models import Controls
-from rgbmidic.view.picture import Picture, grey_picture, stretched
+from rgbmidic.view.picture import Canvas, Picture, columns, grey_picture, stretched
 
 RAW = "raw frame"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DraftFrames:
     """The frames of a test that is being set up.
+
+    Parameters
+    ----------
+    draft
+        The test as far as it is known.
 
     Attributes
     ----------
@@ -50,39 +55,20 @@ class DraftFrames:
         Calibration of the lights; None where none is stated.
     shape
         Rows and columns of a frame.
+
+    Raises
+    ------
+    RgbmidicError
+        The frames or the calibration cannot be read as the draft states.
     """
 
-    series: FrameSeries
-    calibration: Calibration | None
-    shape: tuple[int, int]
-
-    @classmethod
-    def of(cls, draft: Draft) -> DraftFrames:
-        """Open the frames that a draft names.
-
-        Parameters
-        ----------
-        draft
-            The test as far as it is known.
-
-        Returns
-        -------
-        DraftFrames
-            Its frames, with the calibration that belongs to them.
-
-        Raises
-        ------
-        RgbmidicError
-            The frames or the calibration cannot be read as the draft states.
-        """
+    def __init__(self, draft: Draft) -> None:
         file = draft.section("calibration").get("file")
         calibration = Calibration.read(draft.file.parent / file) if isinstance(file, str) else None
-        series = open_series(draft.frames, draft.file.parent, calibration)
-        first = series.read(0)[0]
-        shape = first.values.shape[-2], first.values.shape[-1]
-        if calibration is not None:
-            calibration = calibration.cropped(draft.frames.crop_origin, shape)
-        return cls(series=series, calibration=calibration, shape=shape)
+        self.series = open_series(draft.frames, draft.file.parent, calibration)
+        height, width = self.series.read(0)[0].values.shape[-2:]
+        self.shape = height, width
+        self.calibration = calibration and calibration.cropped(draft.frames.crop_origin, self.shape)
 
     @property
     def lights(self) -> tuple[str, ...]:
@@ -120,18 +106,13 @@ def pictures(inspection: Inspection, shape: tuple[int, int]) -> dict[str, Pictur
 
 def overview(inspection: Inspection, named: Mapping[str, Picture], raw: Picture) -> str:
     """Return small pictures in rows, as HTML: the raw frame and the separated lights, their reflection index."""
-    across = 1 + len(inspection.images.names)
-    cells = []
+    tiles = []
     for name, picture in ((RAW, raw), *named.items()):
         height, width = picture.shape
         size = (VIEWER.tile_columns, max(1, round(VIEWER.tile_columns * height / width)))
         png = cv2.imencode(".png", cv2.resize(picture, size, interpolation=cv2.INTER_AREA))[1]
-        title, source = html.escape(name.replace("reflection index", "index")), base64.b64encode(png.tobytes()).decode()
-        image = f'<img alt="{title}" style="width:100%" src="data:image/png;base64,{source}">'
-        cells.append(f'<figure style="margin:0"><figcaption>{title}</figcaption>{image}</figure>')
-    cells[across:across] = ["<span></span>"]  # the raw frame has no index
-    grid = f"display:grid;gap:4px;font-size:11px;grid-template-columns:repeat({across},1fr)"
-    return f'<div style="{grid}">{"".join(cells)}</div>'
+        tiles.append((name.replace("reflection index", "index"), base64.b64encode(png.tobytes()).decode()))
+    return render("tiles.html", Path(__file__).parent, across=1 + len(inspection.images.names), tiles=tiles)
 
 
 _COLOURS = list(OKABE_ITO.values())
@@ -282,67 +263,38 @@ class SetupControls(Controls):
         self.side = column(*shown, self.calibration, self.inspect, self.theme, sizing_mode="stretch_width")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Run:
-    """``rgbmidic run TEST.toml --out DIR``, going on or at its end.
+    """``rgbmidic run TEST.toml --out DIR``, going on or at its end; it checks its input and reports errors itself.
 
-    Attributes
+    Parameters
     ----------
+    test
+        The TEST.toml.
     out
         Folder of the result.
-    process
-        Process of the command.
-    output
-        What it prints.
     """
 
-    out: Path
-    process: subprocess.Popen[bytes]
-    output: IO[bytes]
-
-    @classmethod
-    def start(cls, test: Path, out: Path) -> Self:
-        """Start the command, which checks its input and reports errors itself.
-
-        Parameters
-        ----------
-        test
-            The TEST.toml.
-        out
-            Folder of the result.
-
-        Returns
-        -------
-        Run
-            The run.
-        """
-        output = tempfile.TemporaryFile()  # noqa: SIM115 it lives as long as the run
+    def __init__(self, test: Path, out: Path) -> None:
+        self.out, self._output = out, tempfile.TemporaryFile()  # noqa: SIM115 it lives as long as the run
         command = [sys.executable, "-P", "-m", "rgbmidic.cli", "run", str(test), "--out", str(out), "--no-figures"]
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
-        return cls(out=out, process=process, output=output)
+        output = self._output
+        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
 
     @property
     def going(self) -> bool:
         """Whether it goes on."""
-        return self.process.poll() is None
+        return self._process.poll() is None
 
-    @property
-    def result(self) -> Result | None:
-        """The result so far; None where there is nothing to look at."""
-        try:
-            return Result.open(self.out, partial=True, check=False)
-        except ResultError:
-            return None
-
-    def summary(self) -> str:
-        """Return how many frames are measured, or how the run ended."""
-        going, result = self.going, self.result
-        far = "preparing the reference"
-        if result is not None:
+    def text(self) -> str:
+        """Return how many frames are measured, with a link to them, or how the run ended, as HTML."""
+        going, far, link = self.going, "preparing the reference", ""
+        with suppress(ResultError):
+            result = Result.open(self.out, partial=True, check=False)
             far = f"{int(result.finished.sum())} of {len(result)} frames measured"
-        if going or not self.process.returncode:
-            return f"running: {far}" if going else f"ended: {far}"
-        self.output.seek(0)
-        lines = [line for line in self.output.read().decode("utf-8", "replace").splitlines() if line.strip()]
+            link = '<br><a id="result" href="result">look at the result as it grows</a>'
+        if going or not self._process.returncode:
+            return f"{'running' if going else 'ended'}: {far}{link}"
+        self._output.seek(0)
+        lines = [line for line in self._output.read().decode("utf-8", "replace").splitlines() if line.strip()]
         errors = [line for line in lines if line.startswith("error: ")]
-        return f"failed: {[*errors, *lines[-1:], 'it printed nothing'][0]}"
+        return html.escape(f"failed: {[*errors, *lines[-1:], 'it printed nothing'][0]}") + link

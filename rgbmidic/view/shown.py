@@ -102,17 +102,11 @@ class ShownFields:
     def choose(self) -> None:
         """Derive fields as the view has it."""
         view = self.view
-        chosen = (view.gauge, view.measure, view.since, view.rigid, view.rate_window, self.scale)
-        if chosen != self.chosen:
-            maps = self.maps.chosen(
-                gauge=view.gauge or None,
-                measure=view.measure,
-                since=None if view.since < 0 else view.since,
-                rigid_removed=view.rigid,
-                window=view.rate_window or None,
-            )
-            self._take(maps)
-            self.chosen = chosen
+        options: dict[str, Any] = {"gauge": view.gauge or None, "measure": view.measure, "rigid_removed": view.rigid}
+        options |= {"since": None if view.since < 0 else view.since, "window": view.rate_window or None}
+        if (options, self.scale) != self.chosen:
+            self._take(self.maps.chosen(**options))
+            self.chosen = options, self.scale
 
     def grow(self, result: Result) -> None:
         """Go on with more frames of the result."""

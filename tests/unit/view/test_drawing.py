@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import random
+from dataclasses import replace
 
 import cv2
+import numpy as np
 import pytest
 from bokeh.document import Document
 from small_tests import grey_frame
@@ -13,8 +15,8 @@ from small_tests import grey_frame
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.settings import read_test
 from rgbmidic.view.address import Mark
-from rgbmidic.view.canvas import Canvas
 from rgbmidic.view.draft import Confirmation, Draft, region_of
+from rgbmidic.view.picture import Canvas
 from rgbmidic.view.setup import SetupPage
 from rgbmidic.view.setup_panel import DraftFrames, RegionDrawing
 
@@ -203,6 +205,15 @@ def test_a_file_that_was_edited_meanwhile_is_replaced_only_when_asked_twice(page
     assert file.read_bytes() == edited.encode() + b"# \xe4\n"
     assert "is written" in page.press()
     assert "is written" in page.press()
+
+
+def test_an_inspection_that_measures_no_node_is_reported_and_drawn(page):
+    _, region, size = page._meshed()
+    found = page.source.inspected(0, region, size)
+    nothing = replace(found.prediction, std=np.full_like(found.prediction.std, np.nan))
+    page._have(lambda: replace(found, prediction=nothing), 0)
+    assert "no node is measured" in page.parts.message.text
+    assert page.canvas.bar.visible
 
 
 def test_a_question_is_of_the_content_that_it_was_asked_about(tmp_path):

@@ -137,6 +137,7 @@ def test_a_folder_lists_its_results_and_tests_newest_first_and_opens_only_those(
     with serving(tmp_path) as told:
         path = urlsplit(told).path
         assert ask(told, "GET", path)[0] == 200
+        assert b'class="dark"' in ask(told, "GET", f"{path}open?path=none&theme=dark")[1]  # else it is loaded for ever
         assert b"all results and tests</a>" in ask(told, "GET", f"{path}open?path=deep/new")[1]
         for name in ("deep/new", "../x", "/etc/passwd", "", "test.toml"):
             status, body = ask(told, "GET", f"{path}open?path={quote(name)}")

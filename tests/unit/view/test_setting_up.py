@@ -13,15 +13,7 @@ from rgbmidic.errors import ConfigurationError
 from rgbmidic.mesh import Region
 from rgbmidic.settings import ProbeSettings, ScaleSettings, read_section, read_test
 from rgbmidic.view.address import Mark
-from rgbmidic.view.draft import (
-    Confirmation,
-    Draft,
-    arranged,
-    marks_of,
-    masks_of,
-    region_of,
-    with_masks,
-)
+from rgbmidic.view.draft import Confirmation, Draft, arranged, marks_of, masks_of, region_of
 from rgbmidic.view.sections import probe_section, scale_section
 from rgbmidic.view.setup import SetupPage
 from rgbmidic.view.setup_panel import SetupControls
@@ -178,4 +170,4 @@ def test_masks_of_a_light_that_there_is_not_are_refused():
     assert masks_of(marks) == {"red": [[[2, 2], [8, 2], [8, 8]]]}
     assert region_of([Mark("rectangle", 0, 0), Mark("rectangle", 9, 9), *marks]) == {"rectangle": [0, 0, 9, 9]}
     with pytest.raises(ConfigurationError, match="mask of red, but the lights are green, blue"):
-        with_masks(Draft(file=Path("TEST.toml"), text=""), marks, ("green", "blue"), (10, 10))
+        Draft(file=Path("TEST.toml"), text="").with_masks(marks, ("green", "blue"), (10, 10))
