@@ -323,16 +323,14 @@ def arrival_times(
     signs = np.where(np.abs(size).max(axis=0) > 0, np.sign(size[np.abs(size).argmax(axis=0), np.arange(y.shape[1])]), 0)
     series = (1.0 if signs.sum() >= 0 else -1.0) * y
     first = _Smooth(when, _CONSTANTS.smoothest * interval)
-    rises = [
-        first.rise(series[:, p], known[:, p]) for p in np.flatnonzero((np.abs(size) > _CONSTANTS.clear).any(axis=0))
-    ]
-    rises = [rise for rise in rises if math.isfinite(rise)]
-    rise = float(np.median(rises)) if rises else math.nan
-    smooth = _Smooth(when, max(_CONSTANTS.smoothest * interval, _WIDTHS[what] * rise if rises else 0.0))
+    clear = np.flatnonzero((np.abs(size) > _CONSTANTS.clear).any(axis=0))
+    rises = np.array([first.rise(series[:, p], known[:, p]) for p in clear])
+    rise = float(np.median(rises[np.isfinite(rises)])) if np.isfinite(rises).any() else 0.0
+    smooth = _Smooth(when, max(_CONSTANTS.smoothest * interval, _WIDTHS[what] * rise))
     found, errors, weights = np.full(y.shape[1], np.nan), np.full(y.shape[1], np.nan), np.zeros(y.T.shape)
     own = np.eye(len(when)) if between_frames is None else between_frames
     step = first.rise((when > when[len(when) // 2]) * 1.0, np.ones(len(when), dtype=bool))
-    abrupt = bool(rises) and rise < _CONSTANTS.abrupt * step
+    abrupt = 0 < rise < _CONSTANTS.abrupt * step
     for p in range(y.shape[1]):
         at = smooth.arrival(series[:, p], np.where(known[:, p], spread[:, p], np.nan), what, level)
         if at is not None:
@@ -530,14 +528,12 @@ def fit_front(
             f"(chi-square {chi_square:.3g} of {freedom}); "
             f"a speed needs {_CONSTANTS.travels:g} standard uncertainties"
         )
-    chosen = np.zeros(len(positions), dtype=bool)
-    chosen[used] = True
     return Front(
         speed=float(1 / slope),
         speed_std=float(slope_std / slope**2),
         start=float(start),
         start_std=float(start_std),
-        used=chosen,
+        used=np.isin(np.arange(len(positions)), used),
         residuals=residuals,
         chi_square=chi_square,
         freedom=freedom,
