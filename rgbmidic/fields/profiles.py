@@ -256,8 +256,6 @@ class Arrivals:
         In the unit of the frames' times, with their standard uncertainty; NaN where nothing arrives.
     weights : ndarray, shape (P, T)
         Change of each arrival time by the value in each frame.
-    smoothing
-        Half-width of the smoothing, in the unit of the times.
     abrupt
         Whether the rise is shorter than the frames resolve; a uniform distribution between two frames is then part of
         the uncertainty.
@@ -266,7 +264,6 @@ class Arrivals:
     times: FloatArray
     std: FloatArray
     weights: FloatArray
-    smoothing: float
     abrupt: bool
 
 
@@ -339,7 +336,7 @@ def arrival_times(
             noise = (1 - common_fraction) * parts @ own @ parts + common_fraction * parts.sum() ** 2
             errors[p] = math.sqrt(noise + abrupt * interval**2 / 12)
     weights *= 1.0 if signs.sum() >= 0 else -1.0
-    return Arrivals(times=found, std=errors, weights=weights, smoothing=smooth.half, abrupt=abrupt)
+    return Arrivals(times=found, std=errors, weights=weights, abrupt=abrupt)
 
 
 class _Smooth:
@@ -435,7 +432,7 @@ class Front:
     speed, speed_std
         In the unit of the positions over that of the times, negative where it travels towards the first end. It is
         that over the material, on the reference.
-    start, start_std
+    start
         When it is at position 0.
     used : ndarray, shape (P,), bool
         Positions that the fit takes in, so far apart that their noise is little correlated.
@@ -451,7 +448,6 @@ class Front:
     speed: float
     speed_std: float
     start: float
-    start_std: float
     used: BoolArray
     residuals: FloatArray
     chi_square: float
@@ -520,9 +516,10 @@ def fit_front(
     chi_square, freedom = float(residuals[used] @ np.linalg.solve(cover, residuals[used])), len(used) - 2
     probability = float(chdtrc(freedom, chi_square))
     spread = spread * max(chi_square / freedom, 1)
-    start_std, slope_std = np.sqrt(np.diag(spread))
+    slope_std = math.sqrt(spread[1, 1])
     if not abs(slope) > _CONSTANTS.travels * slope_std:
-        differ = uncertain(*(part * np.ptp(positions[used]) for part in (slope, slope_std)))
+        span = float(np.ptp(positions[used]))
+        differ = uncertain(slope * span, slope_std * span)
         raise InputError(
             f"no front travels along the line: the arrival times differ by {differ} between its ends "
             f"(chi-square {chi_square:.3g} of {freedom}); "
@@ -532,7 +529,6 @@ def fit_front(
         speed=float(1 / slope),
         speed_std=float(slope_std / slope**2),
         start=float(start),
-        start_std=float(start_std),
         used=np.isin(np.arange(len(positions)), used),
         residuals=residuals,
         chi_square=chi_square,
