@@ -20,7 +20,7 @@ import numpy.typing as npt
 from scipy.linalg import cholesky, solve_triangular
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields.cracks import at_some, crack_faces, listed, lowest_copies, nearest_node
+from rgbmidic.fields.cracks import at_some, crack_faces, listed, nearest_node
 from rgbmidic.fields.history import History, Nodal, Part, histories_of
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.units import Units
@@ -225,7 +225,7 @@ class CrackTip:
     def __init__(self, covariance: NodalCovariance, name: str, *place: float, williams: Williams) -> None:
         mesh, (inner, outer) = covariance.mesh, place[2:]
         self.name, self.williams, self.radii = name, williams, (float(inner), float(outer))
-        faces, places = crack_faces(mesh), lowest_copies(mesh)
+        faces, places = crack_faces(mesh), mesh.one_of_copies
         alone = np.setdiff1d(faces, mesh.copies)
         node = nearest_node(mesh, name, alone, np.array(place[:2]), "the tip of a crack")
         self.tip = tip = mesh.nodes[node]
