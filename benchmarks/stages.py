@@ -24,23 +24,23 @@ from .tables import table
 
 def stages(work: Callable[[], object], repeats: int) -> tuple[dict[str, float], dict[str, float]]:
     """Milliseconds of each stage, and those of its kernels, in the fastest of several runs after one that compiles."""
-    shared, share = dict.fromkeys(timing.STAGES, 0.0), threads._share
+    shared, call = dict.fromkeys(timing.STAGES, 0.0), threads.Kernel.__call__
 
-    def counted(*arguments: Any) -> None:
-        begin = time.process_time()
-        share(*arguments)
-        if (on := timing._on.get()) is not None:
+    def counted(kernel: threads.Kernel, *arguments: Any) -> Any:
+        begin, found = time.process_time(), call(kernel, *arguments)
+        if (on := timing._on.get()) is not None and kernel.over is not None:
             shared[on[0]] += time.process_time() - begin
+        return found
 
     timing.time = SimpleNamespace(perf_counter=time.process_time)  # processor time, whatever else the machine does
-    threads._share, best = counted, (float("inf"), {}, {})
+    threads.Kernel.__call__, best = counted, (float("inf"), {}, {})
     work()
     for _ in range(repeats):
         shared.update(dict.fromkeys(shared, 0.0))
         with timing.timed() as seconds:
             work()
         best = min(best, (sum(seconds.values()), dict(seconds), dict(shared)), key=lambda one: one[0])
-    threads._share = share
+    threads.Kernel.__call__ = call
     taken, inside = ({name: 1e3 * value for name, value in part.items()} for part in best[1:])
     return taken, inside
 

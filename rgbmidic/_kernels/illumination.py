@@ -7,7 +7,7 @@ of red in the 2x2 cell of the unpadded mosaic; blue is diagonal to it.
 
 import numpy as np
 
-from rgbmidic._kernels.threads import compiled, helper
+from rgbmidic._kernels.threads import compiled
 
 
 @compiled("out", axis=1)
@@ -44,29 +44,7 @@ def unmix(start, stop, channels, valid, grid, step, needed, out, out_valid):
 
 
 PAD = 2
-"""Pixels added on every side by `pad_mosaic`."""
-
-
-@helper()
-def _mirror(index, size):
-    period = 2 * (size - 1)
-    index = abs(index) % period
-    return min(index, period - index)
-
-
-@compiled("out")
-def pad_mosaic(start, stop, values, invalid, out):
-    """Copy (H, W) `values` into (H + 4, W + 4) `out`, mirrored at the borders, NaN where `invalid`; H, W >= 2."""
-    rows, columns = values.shape
-    for i in range(start, stop):
-        source = _mirror(i - PAD, rows)
-        for j in range(columns):
-            out[i, j + PAD] = np.nan if invalid[source, j] else values[source, j]
-        for side in range(PAD):
-            left = _mirror(side - PAD, columns)
-            right = _mirror(columns + side, columns)
-            out[i, side] = np.nan if invalid[source, left] else values[source, left]
-            out[i, columns + PAD + side] = np.nan if invalid[source, right] else values[source, right]
+"""Pixels by which a mosaic is padded on every side."""
 
 
 @compiled("out", axis=1)

@@ -98,7 +98,7 @@ def product_sums(start, stop, values, weights, lines, run_offsets, offsets, side
     """
     out[:, start:stop] = 0
     columns = np.zeros((len(out), out.shape[2] * side + _LANES), dtype=np.float32)
-    largest = np.diff(offsets).max()
+    largest = _largest(offsets)
     field, root = np.empty((2, len(values), largest), dtype=np.float32)
     products = np.empty((len(out), largest), dtype=np.float32)
     for e in range(run_offsets.size - 1):
@@ -124,7 +124,7 @@ def score_sums(start, stop, residual, weights, gradient_x, gradient_y, lines, ru
     """
     out[:, start:stop] = 0
     columns = np.zeros((4, out.shape[2] * side + _LANES), dtype=np.float32)
-    scores = np.empty((4, np.diff(offsets).max()), dtype=np.float32)
+    scores = np.empty((4, _largest(offsets)), dtype=np.float32)
     for e in range(run_offsets.size - 1):
         first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
         scores[:] = 0
@@ -137,6 +137,15 @@ def score_sums(start, stop, residual, weights, gradient_x, gradient_y, lines, ru
                 scores[2, i] += w * (gx * gx + gy * gy)
                 scores[3, i] = max(scores[3, i], _ONE if w > _ZERO else _ZERO)
         _add(scores, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
+
+
+@helper()
+def _largest(offsets):
+    """Number of pixels of the largest element."""
+    most = 0
+    for e in range(offsets.size - 1):
+        most = max(most, offsets[e + 1] - offsets[e])
+    return most
 
 
 @helper()

@@ -29,7 +29,9 @@ def block_sums(start, stop, values, block, sums):
     """Sum the finite samples of the four planes in each block, then count them: `sums` (8, h, w) float32."""
     total = np.empty((4, sums.shape[2] * block), np.float32)
     for bi in range(start, stop):
-        total[:] = 0
+        for n in range(4):
+            for j in range(total.shape[1]):
+                total[n, j] = 0
         for i in range(bi * block, min((bi + 1) * block, len(values))):
             line, value, known = values[i], total[i % 2], total[2 + i % 2]
             for j in range(line.size):
@@ -91,8 +93,7 @@ def scaled_contrast(start, stop, contrast, scale, block, pad, out):
         for side in range(1, pad + 1):
             out[p, pad - side] = target[side]
             target[columns - 1 + side] = target[columns - 1 - side]
-        for j in range(columns + pad, target.size):
-            target[j] = 0.0
+        target[columns + pad :] = 0
 
 
 @helper(fastmath={"contract"})

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from scipy.linalg import cholesky, solve_triangular
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields.cracks import at_some, crack_faces, listed, lowest_copies, nearest_node
+from rgbmidic.fields.cracks import at_some, crack_faces, listed, nearest_node
 from rgbmidic.fields.history import History, Nodal, Part, histories_of
 from rgbmidic.fields.nodal import NodalCovariance, Places
 from rgbmidic.fields.units import Units
@@ -225,7 +225,7 @@ class CrackTip:
     def __init__(self, covariance: NodalCovariance, name: str, *place: float, williams: Williams) -> None:
         mesh, (inner, outer) = covariance.mesh, place[2:]
         self.name, self.williams, self.radii = name, williams, (float(inner), float(outer))
-        faces, places = crack_faces(mesh), lowest_copies(mesh)
+        faces, places = crack_faces(mesh), mesh.one_of_copies
         alone = np.setdiff1d(faces, mesh.copies)
         node = nearest_node(mesh, name, alone, np.array(place[:2]), "the tip of a crack")
         self.tip = tip = mesh.nodes[node]
@@ -305,7 +305,7 @@ class CrackTip:
         terms = self.williams.terms or self._terms([one for one in data.values() if not one.certain])
         found, chi_square = np.full((len(fields), 4, 2), np.nan), np.full(len(fields), np.nan)
         for frame, weighted in data.items():
-            if (fit := weighted.fit(terms, fit_tip=fit_tip)) is not None:
+            if (fit := weighted.fit(terms)) is not None:
                 values, covariance, chi_square[frame] = fit
                 std = np.sqrt(np.diag(covariance) * max(1.0, chi_square[frame]))
                 if weighted.certain:
@@ -419,13 +419,13 @@ class _Weighted:
         taken = np.linalg.qr(self.whiten(self.series(orders)))[0].T @ self.data
         return np.asarray((self.data**2).sum() - np.cumsum((taken**2).reshape(-1, 2).sum(axis=1)))
 
-    def fit(self, terms: int, *, fit_tip: bool) -> tuple[FloatArray, FloatArray, float] | None:
+    def fit(self, terms: int) -> tuple[FloatArray, FloatArray, float] | None:
         """Fit the terms: coefficients, their covariance, and chi-square over its degrees of freedom.
 
-        With `fit_tip` the last value is the way (px) by which the tip is ahead, less than half the inner radius, beyond
-        which the annulus is another one; None where it is not found.
+        Where the tip is fitted the last value is the way (px) by which it is ahead, less than half the inner radius,
+        beyond which the annulus is another one; None where it is not found.
         """
-        orders, tip, step = range(terms + 1), 0.0, 1e-3 * self.probe.radii[1]
+        orders, tip, step, fit_tip = range(terms + 1), 0.0, 1e-3 * self.probe.radii[1], self.probe.williams.fit_tip
         solved = self._solved(self.series(orders))
         for _ in range(_CONSTANTS.steps if fit_tip else 0):
             values = solved[0][: 2 * len(orders)]

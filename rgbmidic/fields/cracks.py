@@ -59,7 +59,7 @@ class JumpAlong:
         from scipy.sparse.csgraph import dijkstra
 
         mesh, faces = covariance.mesh, crack_faces(covariance.mesh)
-        places = lowest_copies(mesh)[faces]
+        places = mesh.one_of_copies[faces]
         ends = [nearest_node(mesh, name, places.ravel(), np.array(place[i : i + 2])) for i in (0, 2)]
         length = np.hypot(*(mesh.nodes[faces[:, 1]] - mesh.nodes[faces[:, 0]]).T)
         graph = csr_matrix((length, places.T), shape=(len(mesh.nodes),) * 2)
@@ -131,13 +131,6 @@ class JumpAlong:
 def listed(numbers: Any) -> str:
     """Numbers with commas between them."""
     return ", ".join(f"{number:g}" for number in numbers)
-
-
-def lowest_copies(mesh: Tri3Mesh) -> IntArray:
-    """Lowest of the nodes at the same place, for every node (N,)."""
-    place, copies = np.arange(len(mesh.nodes)), mesh.copies
-    np.minimum.at(place, copies[:, 1], copies[:, 0])
-    return place
 
 
 def crack_faces(mesh: Tri3Mesh) -> IntArray:

@@ -306,18 +306,16 @@ def high_pass(field: npt.ArrayLike, sigma: float = SIGMA) -> FloatArray:
         raise InputError("the field is measured at fewer than 10 pixels")
     trend, laplacian = _quadratic_trend(values, known)
     rest = np.where(known, values - trend, 0.0)
-    weight = _blur(known.astype(np.float64), sigma)
+    # zeros beyond the image, which the normalisation corrects; what is filtered is small beside the displacement
+    # itself: single precision holds it to 1e-7 px
+    total, weight = (
+        cv2.GaussianBlur(part.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT).astype(np.float64)
+        for part in (rest, known)
+    )
     least = 1e-3  # of the weight on measured pixels: single precision then holds the mean to 1e-4
-    smooth = _blur(rest, sigma) / np.maximum(weight, least)
+    smooth = total / np.maximum(weight, least)
     usable = known & (weight > least)
     return np.where(usable, rest - smooth - sigma**2 / 2 * laplacian, np.nan)
-
-
-def _blur(image: FloatArray, sigma: float) -> FloatArray:
-    """Filter by a Gaussian with zeros beyond the image, which the normalisation corrects."""
-    # what is filtered is small beside the displacement itself: single precision holds it to 1e-7 px
-    filtered = cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(filtered, dtype=np.float64)
 
 
 def _quadratic_trend(values: FloatArray, known: BoolArray) -> tuple[FloatArray, float]:

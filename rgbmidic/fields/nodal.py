@@ -266,10 +266,7 @@ class NodalCovariance:
         -------
         ndarray, shape (m, m)
         """
-        chosen = sp.csr_matrix(
-            (np.ones(len(nodes)), (np.arange(len(nodes)), nodes)), shape=(len(nodes), len(self.mesh.nodes))
-        )
-        return np.asarray((chosen @ self.correlation @ chosen.T).toarray())
+        return np.asarray(self.correlation[nodes][:, nodes].toarray())
 
 
 def _chebyshev_inverse(matrix: sp.csr_matrix, degree: int = 4) -> sp.csr_matrix:
@@ -407,19 +404,16 @@ class RigidMotion:
         there = arm + moved - shift
         along, turned = (arm * there).sum(), (arm[:, 0] * there[:, 1] - arm[:, 1] * there[:, 0]).sum()
         even = known / known.sum()
-        lever = np.zeros((2, len(nodes)))
-        angle = float(np.arctan2(turned, along))
+        lever, angle = np.zeros((2, len(nodes))), float(np.arctan2(turned, along))
         # d(angle) = sum of (arm, turned along) x d(moved) / (arm . there)
         c, s = np.cos(angle), np.sin(angle)
-        lever[:, known] = np.stack([-(s * arm[:, 0] + c * arm[:, 1]), c * arm[:, 0] - s * arm[:, 1]]) / np.hypot(
-            along, turned
-        )
-        variance = [covariance.variance(even, part) for part in (u_std, v_std)]
+        lever[:, known] = np.stack([-(s * arm[:, 0] + c * arm[:, 1]), c * arm[:, 0] - s * arm[:, 1]])
+        lever /= np.hypot(along, turned)
         turning = covariance.variance(lever[0], u_std) + covariance.variance(lever[1], v_std)
         return cls(
             centre=centre,
             shift=shift,
-            shift_std=np.sqrt(np.array(variance)),
+            shift_std=np.sqrt(np.array([covariance.variance(even, part) for part in (u_std, v_std)])),
             rotation=angle,
             rotation_std=float(np.sqrt(turning)),
         )

@@ -233,7 +233,7 @@ class CameraCalibration:
         motion : ndarray, shape (3, 3)
         """
         assert self.homography is not None
-        homography = self.homography / self.homography[2, 2]
+        homography = self.homography
         slope = homography[:2, :2] - np.outer(homography[:2, 2], homography[2, :2])
         x, y = slope[:, 0] / np.linalg.norm(slope[:, 0])
         motion = np.eye(3)
@@ -290,10 +290,9 @@ class CameraCalibration:
         scale = float(np.sqrt(np.linalg.det(self.jacobian(point[None])[0])))
         around = point + _SPAN * np.array([[-1.0, 0], [1, 0], [0, -1], [0, 1]])
         places, slopes = self.to_mm(around), self.sensitivity(around)
-        along, across = places[1] - places[0], places[3] - places[2]
+        (along, across), (d_along, d_across) = ((part[1] - part[0], part[3] - part[2]) for part in (places, slopes))
         area = along[0] * across[1] - along[1] * across[0]
-        slope = (slopes[1] - slopes[0])[0] * across[1] + along[0] * (slopes[3] - slopes[2])[1]
-        slope -= (slopes[1] - slopes[0])[1] * across[0] + along[1] * (slopes[3] - slopes[2])[0]
+        slope = d_along[0] * across[1] + along[0] * d_across[1] - (d_along[1] * across[0] + along[1] * d_across[0])
         return scale, float(scale * np.sqrt(slope @ self.correlation @ slope) / (2 * area))
 
     def check(self, shape: tuple[int, int]) -> None:

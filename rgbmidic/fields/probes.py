@@ -103,15 +103,10 @@ class Mean:
         """
         places = Places.of(covariance.mesh, points)
         places.check(name)
-        weights = places.mean()
+        weights, least = places.mean(), least - _CONSTANTS.rounding
         nodes = np.flatnonzero(weights).astype(np.int64)
-        return cls(
-            name=name,
-            nodes=nodes,
-            weights=weights[nodes],
-            correlation=covariance.part(nodes),
-            least=least - _CONSTANTS.rounding,
-        )
+        correlation = covariance.part(nodes)
+        return cls(name=name, nodes=nodes, weights=weights[nodes], correlation=correlation, least=least)
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px.
@@ -126,7 +121,7 @@ class Mean:
         list of History
         """
         known = _known(nodal)
-        u, v = (self.average(*pair, known) for pair in ((nodal.u, nodal.u_std), (nodal.v, nodal.v_std)))
+        u, v = self.average(nodal.u, nodal.u_std, known), self.average(nodal.v, nodal.v_std, known)
         note = _cut(self.name, "mean", self.inside * np.where(np.isfinite(u[0]), known @ self.weights, 1.0))
         return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], note)
 
@@ -360,8 +355,7 @@ class Area(Mean):
         return [*moved, *_strain_histories(self.name, strain, moved[0].note)]
 
 
-_Make = Callable[..., Probe]
-PROBES: dict[str, tuple[int, int, _Make]] = {
+PROBES: dict[str, tuple[int, int, Callable[..., Probe]]] = {
     "point": (1, 0, lambda c, name, *place: Mean.over(c, name, [place])),
     "line": (2, 0, lambda c, name, *place: Mean.over(c, name, _line(*place), _CONSTANTS.least)),
     "circle": (1, 1, lambda c, name, *place, **more: Area(c, name, _circle(*place), **more)),
@@ -375,6 +369,8 @@ PROBES: dict[str, tuple[int, int, _Make]] = {
 """Every kind of probe with how many points and lengths (px) place it, and what makes it."""
 _STRAINED = ("circle", "region", "strain_gauge")
 """Those that measure a strain of a stated measure."""
+_OF_TIPS = ("youngs_modulus", "poissons_ratio", "plane", "terms", "fit_tip")
+"""Settings of a crack's tip, which [probes] with tips checks, as `Williams` takes them."""
 
 
 def make_probe(
@@ -417,15 +413,6 @@ def make_probe(
         raise InputError(f"{name} is placed by {2 * points + lengths} numbers, not by {list(place)}")
     more: dict[str, Any] = {"measure": settings.measure} if kind in _STRAINED else {}
     if kind == "tip":
-        assert settings.youngs_modulus is not None  # as [probes] with tips checks
-        assert settings.poissons_ratio is not None
-        assert settings.plane is not None
-        more["williams"] = Williams(
-            youngs_modulus=settings.youngs_modulus,
-            poissons_ratio=settings.poissons_ratio,
-            plane=settings.plane,
-            units=Units() if rectified is None else rectified.units,
-            terms=settings.terms,
-            fit_tip=settings.fit_tip,
-        )
+        stated: dict[str, Any] = {name: getattr(settings, name) for name in _OF_TIPS}
+        more["williams"] = Williams(units=Units() if rectified is None else rectified.units, **stated)
     return make(covariance, name, *(place if rectified is None else rectified.place(place, points)), **more)

@@ -256,8 +256,6 @@ class Arrivals:
         In the unit of the frames' times, with their standard uncertainty; NaN where nothing arrives.
     weights : ndarray, shape (P, T)
         Change of each arrival time by the value in each frame.
-    smoothing
-        Half-width of the smoothing, in the unit of the times.
     abrupt
         Whether the rise is shorter than the frames resolve; a uniform distribution between two frames is then part of
         the uncertainty.
@@ -266,7 +264,6 @@ class Arrivals:
     times: FloatArray
     std: FloatArray
     weights: FloatArray
-    smoothing: float
     abrupt: bool
 
 
@@ -323,16 +320,14 @@ def arrival_times(
     signs = np.where(np.abs(size).max(axis=0) > 0, np.sign(size[np.abs(size).argmax(axis=0), np.arange(y.shape[1])]), 0)
     series = (1.0 if signs.sum() >= 0 else -1.0) * y
     first = _Smooth(when, _CONSTANTS.smoothest * interval)
-    rises = [
-        first.rise(series[:, p], known[:, p]) for p in np.flatnonzero((np.abs(size) > _CONSTANTS.clear).any(axis=0))
-    ]
-    rises = [rise for rise in rises if math.isfinite(rise)]
-    rise = float(np.median(rises)) if rises else math.nan
-    smooth = _Smooth(when, max(_CONSTANTS.smoothest * interval, _WIDTHS[what] * rise if rises else 0.0))
+    clear = np.flatnonzero((np.abs(size) > _CONSTANTS.clear).any(axis=0))
+    rises = np.array([first.rise(series[:, p], known[:, p]) for p in clear])
+    rise = float(np.median(rises[np.isfinite(rises)])) if np.isfinite(rises).any() else 0.0
+    smooth = _Smooth(when, max(_CONSTANTS.smoothest * interval, _WIDTHS[what] * rise))
     found, errors, weights = np.full(y.shape[1], np.nan), np.full(y.shape[1], np.nan), np.zeros(y.T.shape)
     own = np.eye(len(when)) if between_frames is None else between_frames
     step = first.rise((when > when[len(when) // 2]) * 1.0, np.ones(len(when), dtype=bool))
-    abrupt = bool(rises) and rise < _CONSTANTS.abrupt * step
+    abrupt = 0 < rise < _CONSTANTS.abrupt * step
     for p in range(y.shape[1]):
         at = smooth.arrival(series[:, p], np.where(known[:, p], spread[:, p], np.nan), what, level)
         if at is not None:
@@ -341,7 +336,7 @@ def arrival_times(
             noise = (1 - common_fraction) * parts @ own @ parts + common_fraction * parts.sum() ** 2
             errors[p] = math.sqrt(noise + abrupt * interval**2 / 12)
     weights *= 1.0 if signs.sum() >= 0 else -1.0
-    return Arrivals(times=found, std=errors, weights=weights, smoothing=smooth.half, abrupt=abrupt)
+    return Arrivals(times=found, std=errors, weights=weights, abrupt=abrupt)
 
 
 class _Smooth:
@@ -437,7 +432,7 @@ class Front:
     speed, speed_std
         In the unit of the positions over that of the times, negative where it travels towards the first end. It is
         that over the material, on the reference.
-    start, start_std
+    start
         When it is at position 0.
     used : ndarray, shape (P,), bool
         Positions that the fit takes in, so far apart that their noise is little correlated.
@@ -453,7 +448,6 @@ class Front:
     speed: float
     speed_std: float
     start: float
-    start_std: float
     used: BoolArray
     residuals: FloatArray
     chi_square: float
@@ -522,22 +516,20 @@ def fit_front(
     chi_square, freedom = float(residuals[used] @ np.linalg.solve(cover, residuals[used])), len(used) - 2
     probability = float(chdtrc(freedom, chi_square))
     spread = spread * max(chi_square / freedom, 1)
-    start_std, slope_std = np.sqrt(np.diag(spread))
+    slope_std = math.sqrt(spread[1, 1])
     if not abs(slope) > _CONSTANTS.travels * slope_std:
-        differ = uncertain(*(part * np.ptp(positions[used]) for part in (slope, slope_std)))
+        span = float(np.ptp(positions[used]))
+        differ = uncertain(slope * span, slope_std * span)
         raise InputError(
             f"no front travels along the line: the arrival times differ by {differ} between its ends "
             f"(chi-square {chi_square:.3g} of {freedom}); "
             f"a speed needs {_CONSTANTS.travels:g} standard uncertainties"
         )
-    chosen = np.zeros(len(positions), dtype=bool)
-    chosen[used] = True
     return Front(
         speed=float(1 / slope),
         speed_std=float(slope_std / slope**2),
         start=float(start),
-        start_std=float(start_std),
-        used=chosen,
+        used=np.isin(np.arange(len(positions)), used),
         residuals=residuals,
         chi_square=chi_square,
         freedom=freedom,

@@ -146,13 +146,14 @@ def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: st
     along, across = np.stack([c * c, s * s, 2 * c * s], axis=1), np.stack([s * s, c * c, -2 * c * s], axis=1)
     turn = np.stack([-c * s, c * s, c * c - s * s], axis=1)
     split = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 2.0]])  # exx - eyy and 2 exy, whose length is e1 - e2
-    shear, shear_std = length_of(_components(tensor) @ split.T, split @ covariance @ split.T)
+    components, of_equivalent = (np.stack([t[:, 0, 0], t[:, 1, 1], t[:, 0, 1]], axis=1) for t in (tensor, hencky[0]))
+    shear, shear_std = length_of(components @ split.T, split @ covariance @ split.T)
     with np.errstate(divide="ignore", invalid="ignore"):
-        equivalent, equivalent_std = _equivalent(_components(hencky[0]), of_hencky)
+        equivalent, equivalent_std = _equivalent(of_equivalent, of_hencky)
         apart = principal[:, 0] - principal[:, 1]
         direction_std = np.degrees(_deviation(turn, covariance) / apart)
     parts = {
-        "components": _components(tensor),
+        "components": components,
         "components_std": np.sqrt(np.maximum(np.einsum("naa->na", covariance), 0)),
         "principal": principal,
         "principal_std": np.stack([_deviation(along, covariance), _deviation(across, covariance)], axis=1),
@@ -196,10 +197,6 @@ def _eigen(tensor: FloatArray) -> tuple[FloatArray, FloatArray]:
     c, s = np.cos(angle), np.sin(angle)
     vectors = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
     return np.stack([middle + radius, middle - radius], axis=1), vectors
-
-
-def _components(tensor: FloatArray) -> FloatArray:
-    return np.stack([tensor[:, 0, 0], tensor[:, 1, 1], tensor[:, 0, 1]], axis=1)
 
 
 def _deviation(direction: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -427,11 +424,9 @@ class StrainGauges:
         for component, (value, std) in enumerate(((u, u_std), (v, v_std))):
             moved, square = (np.where(measured, part, 0.0)[self.nodes] for part in (value, std**2))
             values[:, component] = np.stack([self._sum(w * moved) for w in weights], axis=1)
-            parts = [(0, 0), (1, 1), (0, 1)]
-            sums = np.stack([self._sum(weights[a] * weights[b] * square) for a, b in parts], axis=1) * self.inflation
-            for (a, b), part in zip(parts, sums.T, strict=True):
-                spread[:, 2 * component + a, 2 * component + b] = part
-                spread[:, 2 * component + b, 2 * component + a] = part
+            products, own = weights[[0, 1, 0]] * weights[[0, 1, 1]] * square, slice(2 * component, 2 * component + 2)
+            sums = np.stack([self._sum(part) for part in products], axis=1) * self.inflation
+            spread[:, own, own] = sums[:, [[0, 2], [2, 1]]]
         values[~known], spread[~known] = np.nan, np.nan
         return values, spread
 

@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.demosaicing import TILE, fill_unknown, predict, prediction_taps
-from rgbmidic._kernels.illumination import PAD, malvar, pad_mosaic
+from rgbmidic._kernels.illumination import PAD, malvar
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.colour_factors import (
@@ -85,8 +85,8 @@ class MalvarDemosaicer:
     def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
         """Demosaic; see `Demosaicer`."""
         values = np.empty((3, *mosaic.values.shape), dtype=np.float32)
-        padded = np.empty([side + 2 * PAD for side in mosaic.values.shape], dtype=np.float32)
-        pad_mosaic(mosaic.values, mosaic.saturated, padded)
+        known = np.where(mosaic.saturated, np.float32(np.nan), mosaic.values)
+        padded = cv2.copyMakeBorder(known, PAD, PAD, PAD, PAD, cv2.BORDER_REFLECT_101)
         malvar(padded, *red_position(mosaic.cfa), values)
         return LinearChannels(values=values, valid=np.isfinite(values), full_scale=mosaic.full_scale)
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from rgbmidic.correlation.recovery import Recovery, linear_fit_offset
+from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
 from rgbmidic.fields.nodal import Places
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh, read_mesh
@@ -291,7 +291,7 @@ class Levelling:
         self._covered: BoolArray = np.asarray(mesh.to_nodes(np.asarray(used, dtype=np.float64)) > 0)
         self._factors = splu(sp.csc_matrix(weighted @ shape + sp.diags(1.0 * ~self._covered)))
         self._moments = sp.csr_matrix(weighted @ read)
-        self._recovery = Recovery.over(mesh, used, self._covered.astype(np.float64), linear_fit_offset(mesh))
+        self._recovery = Recovery.over(mesh, used, self._covered.astype(np.float64))
 
     def __call__(self, displacement: FloatArray) -> FloatArray:
         """Displacement (2, N) at the measurement's nodes of a simulated one (M, 2); NaN where that does not reach."""
