@@ -21,7 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, RgbmidicError
-from rgbmidic.pipeline.run import Progress, measure
+from rgbmidic.pipeline.resolution import Progress
+from rgbmidic.pipeline.run import measure
 from rgbmidic.results import Histories, Maps, Result, shared_part
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.histories import read_histories
@@ -171,7 +172,7 @@ def run_batch(
     elastic: tuple[float, float] = ELASTIC,
     overwrite: bool = False,
     conclude: Callable[[Result, TestSettings, bool], None] | None = None,
-    progress: Callable[[str], Progress] | None = None,
+    progress: Progress | None = None,
 ) -> Iterator[Outcome]:
     """Measure tests one after the other, each into a folder of its name; yield what each gave as it ends.
 
@@ -190,7 +191,7 @@ def run_batch(
     conclude
         Called with each result, its settings, and whether it was measured now.
     progress
-        Gives for the name of a test what `measure` calls after every frame.
+        Called after every frame of each test, as of `measure`.
 
     Yields
     ------
@@ -200,8 +201,7 @@ def run_batch(
     for test in tests:
         folder = out / test.name
         try:
-            report = progress and progress(test.name)
-            result, settings, now = _measured(test, folder, workers, report, overwrite=overwrite)
+            result, settings, now = _measured(test, folder, workers, progress, overwrite=overwrite)
             if conclude is not None:
                 conclude(result, settings, now)
             yield Outcome(name=test.name, folder=folder, measured=now, values=_values(result, settings, elastic))

@@ -33,17 +33,6 @@ from rgbmidic.results import FrameRecord
 logger = logging.getLogger(__name__)
 
 
-class Workers(Protocol):
-    """Measure frames, as many at a time as there are slots."""
-
-    @property
-    def slots(self) -> int:
-        """How many."""
-
-    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
-        """Have one frame measured."""
-
-
 class Sink(Protocol):
     """Where measured frames go, by their places in the result."""
 
@@ -96,7 +85,7 @@ class Schedule:
             self._waiting.setdefault(before, []).append(place)
             self.want(before)
 
-    def run(self, workers: Workers) -> None:
+    def run(self, workers: Threads | Cluster) -> None:
         """Have workers measure the frames, and give each to the sink as it finishes.
 
         Raises

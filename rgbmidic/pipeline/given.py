@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -51,46 +51,33 @@ def check_given(
     check_object("weights", weights, "reference", "deformed")
     check_type("mesh", mesh, Tri3Mesh | None, "a Tri3Mesh")
     frames, stated, method = settings.frames, settings.mesh, settings.weights.method
-    refused = (
-        (
-            source is not None and frames.path,
-            f"frames.path names {', '.join(frames.path)}, and a frame source is given: leave the path empty "
-            "(path = [])",
-        ),
-        (
-            source is not None and frames.lights > 1,
-            "frames.lights is for files; a frame source gives all lights of a state by one index",
-        ),
-        (
-            weights is not None and method not in ("statistics", "none"),
-            f'weights.method = "{method}", and weights are given: state "statistics", with which both count, or "none"',
-        ),
-        (
-            mesh is not None and stated.file is not None,
-            f"mesh.file names {stated.file}, and a mesh is given: leave one of them out",
-        ),
-        (
-            mesh is not None and stated.cracks,
-            "mesh.cracks splits a mesh that is made here; the mesh that is given has its own",
-        ),
-        (
-            stated.element_size == "auto",
-            'mesh.element_size = "auto" is found on the frames of a test by rgbmidic.measure, for a mesh that is made '
-            "there: state a number",
-        ),
-        (
-            stated.refine is not False,
-            "mesh.refine is done on the frames of a test by rgbmidic.measure, for a mesh made there: leave it out",
-        ),
-        (
-            frames.kind in ("bayer", "rgb") and separation is None and settings.calibration.file is None,
-            f'frames.kind = "{frames.kind}" needs the lights\' crosstalk: state calibration.file, a file that '
-            "rgbmidic-calibrate writes",
-        ),
-    )
-    for found, message in refused:
-        if found:
-            raise ConfigurationError(message)
+
+    def contradictions() -> Iterator[str]:
+        if source is not None and frames.path:
+            yield (
+                f"frames.path names {', '.join(frames.path)}, and a frame source is given: leave the path empty "
+                "(path = [])"
+            )
+        if source is not None and frames.lights > 1:
+            yield "frames.lights is for files; a frame source gives all lights of a state by one index"
+        if weights is not None and method not in ("statistics", "none"):
+            given = 'and weights are given: state "statistics", with which both count, or "none"'
+            yield f'weights.method = "{method}", {given}'
+        if mesh is not None and stated.file is not None:
+            yield f"mesh.file names {stated.file}, and a mesh is given: leave one of them out"
+        if mesh is not None and stated.cracks:
+            yield "mesh.cracks splits a mesh that is made here; the mesh that is given has its own"
+        measured = "on the frames of a test by rgbmidic.measure, for a mesh"
+        if stated.element_size == "auto":
+            yield f'mesh.element_size = "auto" is found {measured} that is made there: state a number'
+        if stated.refine is not False:
+            yield f"mesh.refine is done {measured} made there: leave it out"
+        if frames.kind in ("bayer", "rgb") and separation is None and settings.calibration.file is None:
+            needed = "state calibration.file, a file that rgbmidic-calibrate writes"
+            yield f'frames.kind = "{frames.kind}" needs the lights\' crosstalk: {needed}'
+
+    for message in contradictions():
+        raise ConfigurationError(message)
 
 
 def check_object(name: str, given: object, *methods: str) -> None:

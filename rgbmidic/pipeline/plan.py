@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from threading import Lock
@@ -77,14 +77,6 @@ class ProcessState:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
-    """Element size that the frames of a test recommend (`rgbmidic.pipeline.resolution`), and why, in a sentence."""
-
-    element_size: float
-    reason: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """What all frames of a test share; it can be pickled, so that any process can measure any frame.
 
@@ -116,12 +108,9 @@ class Plan:
         Part of the reference frames that is read; all positions (region, mesh, images) count from where it begins.
     finite_elements, placement
         The mesh of ``mesh.file``, the part that is measured, and where it lies in the frame; None: there is no file.
-    choice
-        Why the elements have their size, where ``mesh.element_size`` is ``"auto"``; else None.
-    refinement
-        In which frame and how far the mesh was refined (``mesh.refine``), in a sentence; else None.
-    calibration
-        Figures of the calibration, for the provenance (`Calibration.figures`).
+    notes
+        For the provenance: figures of the calibration (`Calibration.figures`), why the elements have their size where
+        ``mesh.element_size`` is ``"auto"``, in which frame and how far the mesh was refined (``mesh.refine``).
     timings
         Whether to tell the time that each stage of a frame takes.
     process
@@ -143,9 +132,7 @@ class Plan:
     element_size: float
     finite_elements: FiniteElementMesh | None = None
     placement: Placement | None = None
-    choice: Choice | None = None
-    refinement: str | None = None
-    calibration: dict[str, Any] = field(default_factory=dict)
+    notes: Mapping[str, Any] = field(default_factory=dict)
     timings: bool = False
     process: ProcessState = field(default_factory=ProcessState, repr=False, compare=False)
 
@@ -220,13 +207,12 @@ class Plan:
             mesh = Tri3Mesh.from_region(region, size, cracks)
         cracked = len(mesh.crack_edges) > 0
         sigma, solver = grey_levels(settings.illumination.normalise, settings.solver, cracked=cracked)
+
+        def images_of(index: int) -> IlluminationImages:
+            return light_images(separate, series.read(index, window), window)
+
         weights = weights or prepare_weights(
-            settings,
-            images,
-            region,
-            shape=window.frame,
-            frames=len(series),
-            images_of=lambda index: light_images(separate, series.read(index, window), window),
+            settings, images, region, shape=frame, frames=len(series), images_of=images_of
         )
         reference = _reference(images, weights, region, mesh, sigma, solver)
         if isinstance(weights, ThresholdWeights):
@@ -253,7 +239,7 @@ class Plan:
             element_size=size,
             finite_elements=finite_elements,
             placement=placement,
-            calibration=camera.figures() if camera else {},
+            notes={"calibration_figures": camera.figures() if camera else {}},
         )
 
     @property

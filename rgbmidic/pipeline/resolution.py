@@ -23,8 +23,16 @@ from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import refined
 from rgbmidic.pipeline.frame import prepared_frame
-from rgbmidic.pipeline.plan import Choice, Plan
-from rgbmidic.pipeline.size_figures import CONSTANTS, Field, ResolutionStudy, SizeFigures, measure_size, rms, solved
+from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.size_figures import (
+    CONSTANTS,
+    Choice,
+    ResolutionStudy,
+    SizeFigures,
+    measure_size,
+    rms,
+    solved,
+)
 from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.settings import ELEMENT_SIZE, TestSettings
 from rgbmidic.typing import FloatArray
@@ -126,7 +134,7 @@ def study_sizes(
     key = _KeyFrame.find(plan, frames)
     at_rest = settings.frames.reference[: CONSTANTS.static] if static and len(settings.frames.reference) > 1 else ()
     rest = [_deformed(plan, index) for index in at_rest]
-    figures, finer = [], list[Field]()
+    figures, finer = [], list[tuple[Tri3Mesh, Solution]]()
     for number, size in enumerate(sizes):
         report(number + 1, len(sizes) + 1, f"elements of {size:g} px")
         try:
@@ -207,7 +215,7 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
     Returns
     -------
     Plan
-        With the finer mesh, and `Plan.refinement` that tells of it.
+        With the finer mesh, and a note that tells of it.
 
     Raises
     ------
@@ -239,17 +247,17 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
         text = f"from {counts[0]} to {counts[-1]} nodes in {len(counts) - 1} steps, where {worth}; no leg is shorter "
         text += f"than {least:.3g} px"
     logger.info("refined: %s", text)
-    return replace(plan, refinement=text)
+    return replace(plan, notes={**plan.notes, "refinement": text})
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class _KeyFrame:
     """The deformed frame that sizes are compared in, measured on the mesh of a plan."""
 
     index: int
     deformed: Deformed
-    places: Tri3Mesh
-    displacement: FloatArray
+    mesh: Tri3Mesh
+    solution: Solution
     seconds: float
 
     @classmethod
@@ -278,18 +286,16 @@ class _KeyFrame:
                 reasons.append(f"{plan.series.name(index)}: {error}")
                 continue
             if (rest := _beyond_affine(solution)) > most:
-                mesh = plan.reference.mesh
-                whole = solution.displacement[mesh.nearest(solution.measured)[1]]
-                found = cls(index=index, deformed=deformed, places=mesh, displacement=whole, seconds=seconds)
-                most = rest
+                found, most = cls(index, deformed, plan.reference.mesh, solution, seconds), rest
         if found is None:
             raise FrameError(f"no deformed frame can be measured: {'; '.join(reasons)}")
         return found
 
     def start(self, mesh: Tri3Mesh) -> FloatArray:
         """The displacement (N, 2) at the nodes of another mesh of the region."""
-        found = Places.of(self.places, mesh.places)
-        corners = self.displacement[self.places.elements[found.element]]
+        found = Places.of(self.mesh, mesh.places)
+        whole = self.solution.displacement[self.mesh.nearest(self.solution.measured)[1]]
+        corners = whole[self.mesh.elements[found.element]]
         return np.asarray(np.einsum("nc,nci->ni", found.barycentric, corners))
 
 

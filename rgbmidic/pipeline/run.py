@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from itertools import chain
@@ -21,8 +21,8 @@ from rgbmidic.pipeline.engine import Schedule, following, open_workers, rank_of
 from rgbmidic.pipeline.frame import Measured, Updated, read_state
 from rgbmidic.pipeline.given import FrameSequence, check_object, check_type, describe
 from rgbmidic.pipeline.order import dependants
-from rgbmidic.pipeline.plan import Choice, Plan
-from rgbmidic.pipeline.resolution import choose, refine
+from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.resolution import Progress, choose, refine
 from rgbmidic.pipeline.suitability import light_levels
 from rgbmidic.results import Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
@@ -32,8 +32,6 @@ from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.weights import LightWeights
 
 logger = logging.getLogger(__name__)
-
-Progress = Callable[[int, int, str], None]
 
 _OF_NODES = {
     "displacement": ("u", "v"),
@@ -124,23 +122,23 @@ def measure(
     check_type("workers", workers, int | None, "a whole number")
     check_object("progress", progress, "__call__")
     given: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
-    choice: Choice | None = None
     begun = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()
     kept = read_provenance(Path(out)) if begun else {}
-    if settings.mesh.element_size == "auto":
-        choice = Choice(**kept["element_size"]) if kept.get("element_size") else choose(settings, **given)
+    sized, notes = settings.mesh, dict[str, Any]()
+    if sized.element_size == "auto":
+        choice = notes["element_size"] = kept.get("element_size") or asdict(choose(settings, **given))
+        sized = replace(sized, element_size=choice["element_size"])
     refines = settings.mesh.refine is not False
     if refines and mesh is not None:
         raise InputError("mesh.refine is for a mesh made here, and a mesh is given: leave one of them out")
-    sized = settings.mesh if choice is None else replace(settings.mesh, element_size=choice.element_size)
     plan = Plan.from_settings(replace(settings, mesh=replace(sized, refine=False)), **given)
     if refines and "refinement" in kept:
         stored = read_mesh(Path(out), kept)
         finer = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
-        plan = replace(plan.on_mesh(finer), refinement=kept["refinement"])
+        plan, notes["refinement"] = plan.on_mesh(finer), kept["refinement"]
     elif refines:
         plan = refine(plan, settings.mesh.refine)
-    plan = replace(plan, settings=settings, choice=choice, timings=timings)
+    plan = replace(plan, settings=settings, notes={**plan.notes, **notes}, timings=timings)
     objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
     if settings.weights.method == "images":  # the masks, whatever their files are called
         objects["weights"] = describe(plan.weights)
@@ -199,17 +197,14 @@ class _Folder:
         if not places:
             return ()
         mesh, lights, chosen = self._plan.reference.mesh, len(self._plan.images.names), self._plan.series.chosen
-        blank = Solution.failed(mesh, lights, "", np.zeros(0))
-
-        def solution(kept: Mapping[str, Any]) -> Solution:
-            arrays: dict[str, Any] = {
-                name: np.stack([kept[part] for part in parts], axis=1, dtype=np.float64)
-                for name, parts in _OF_NODES.items()
-            }
-            return replace(blank, **arrays, node_status=kept["node_status"], rigid=kept["rigid"].astype(np.float64))
-
-        kept = self._store.table().each([*chain(*_OF_NODES.values()), "node_status", "rigid"], places)
-        return [(chosen[place], solution(one)) for place, one in zip(places, kept, strict=True)]
+        blank, found = Solution.failed(mesh, lights, "", np.zeros(0)), []
+        names = [*chain(*_OF_NODES.values()), "node_status", "rigid"]
+        for place, kept in zip(places, self._store.table().each(names, places), strict=True):
+            arrays: dict[str, Any] = {"node_status": kept["node_status"], "rigid": kept["rigid"].astype(np.float64)}
+            for name, parts in _OF_NODES.items():
+                arrays[name] = np.stack([kept[part] for part in parts], axis=1, dtype=np.float64)
+            found.append((chosen[place], replace(blank, **arrays)))
+        return found
 
     def keep(self, place: int, found: Measured, after: Start) -> None:
         """Write a frame, and report what became of it."""
@@ -308,8 +303,7 @@ def _origin(plan: Plan, objects: Mapping[str, str], unread_before: Collection[st
         reference=plan.images.values,
         notes={
             **getattr(plan.weights, "notes", {}),
-            **({} if plan.choice is None else {"element_size": asdict(plan.choice)}),
-            **({} if plan.refinement is None else {"refinement": plan.refinement}),
+            **plan.notes,
             "grey_levels": {"normalise": plan.normalise, "brightness": plan.solver.brightness},
             "frame_rate": recording.frame_rate,
             "exposure_ns": recording.exposure_ns,
@@ -321,6 +315,5 @@ def _origin(plan: Plan, objects: Mapping[str, str], unread_before: Collection[st
                 {"light": light, "median": level, "excluded": float(1 - part)}
                 for (light, level), part in zip(levels, usable, strict=True)
             ],
-            "calibration_figures": plan.calibration,
         },
     )

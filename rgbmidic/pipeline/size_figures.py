@@ -15,7 +15,7 @@ from rgbmidic.fields import NodalCovariance, Places, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.quadratic_fit import quadratic_fit
-from rgbmidic.pipeline.plan import Choice, Plan
+from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.typing import FloatArray
 
@@ -163,6 +163,14 @@ class SizeFigures(ErrorFigures):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """Element size that the frames of a test recommend, and why, in a sentence."""
+
+    element_size: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ResolutionStudy:
     """Figures of several element sizes on a test's own frames.
 
@@ -233,7 +241,7 @@ def measure_size(
     start: FloatArray,
     rest: Sequence[Deformed],
     gauges: Sequence[float],
-    finer: list[Field],
+    finer: list[tuple[Tri3Mesh, Solution]],
 ) -> SizeFigures:
     """Measure the figures of the size of a plan's elements.
 
@@ -248,7 +256,7 @@ def measure_size(
     gauges
         Lengths of virtual strain gauges, px; those too short for the elements are left out.
     finer
-        Fields on finer elements, to which that on these is added.
+        Meshes of finer elements and the solutions on them, to which those of these are added.
     """
     mesh, speckle = plan.reference.mesh, plan.speckle or float("nan")
     before = time.process_time()
@@ -258,13 +266,12 @@ def measure_size(
         raise FrameError(solution.reason)
     still = [solved(plan, static, np.zeros_like(mesh.nodes)) for static in rest]
     known = discretisation_error(plan.reference, deformed, solution, plan.solver, plan.method)
-    field = Field.of(mesh, known)
-    other = [one for one in finer if CONSTANTS.finer * one.mesh.size <= mesh.size]
+    other = [one for one in finer if CONSTANTS.finer * one[0].size <= mesh.size]
     # it differs from all of them, each of which has an error of its own (in proportion to the size's third power);
     # reflections, which every size averages in its own way, hardly differ from the next
-    part = [1 - (one.mesh.size / mesh.size) ** 3 for one in other]
-    apart = [min(np.divide(found, part), default=0.0) for found in field.apart(other)]
-    finer.append(field)
+    part = [1 - (fine.size / mesh.size) ** 3 for fine, _ in other]
+    apart = [min(np.divide(found, part), default=0.0) for found in _apart(mesh, known, other)]
+    finer.append((mesh, known))
     whole = solution.measured[mesh.elements].all(axis=1)
 
     def errors(name: str, beyond: float) -> dict[str, Any]:
@@ -284,49 +291,43 @@ def measure_size(
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Field:
-    """Displacement and strain (N, 5) on a mesh, and their noise."""
+def _field_at(mesh: Tri3Mesh, solution: Solution, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Displacement and strain (P, 5) at points (P, 2), and their noise without the misfit of the elements.
 
-    mesh: Tri3Mesh
-    values: FloatArray
-    noise: FloatArray
+    They follow the quadratics through the nodes around each node (`rgbmidic.fields.at_pixels`).
+    """
+    values = np.hstack([solution.displacement, solution.strain])
+    used = np.asarray(np.isfinite(values)[mesh.elements].all(axis=(1, 2)))
+    _, x, y, xx, xy, yy = (operator @ np.nan_to_num(values) for operator in quadratic_fit(mesh, used))
+    places = Places.of(mesh, points)
+    node, weight = mesh.elements[places.element], places.barycentric
+    dx, dy = np.moveaxis(points[:, None] - mesh.nodes[node], -1, 0)[..., None]
+    bent = xx[node] * dx * dx / 2 + xy[node] * dx * dy + yy[node] * dy * dy / 2
+    out = np.einsum("pc,pci->pi", weight, values[node] + x[node] * dx + y[node] * dy + bent)
+    nodal = np.hstack([solution.displacement_std, solution.strain_std])[node]
+    noise = np.sqrt(np.einsum("pc,pci->pi", weight, nodal**2))
+    return np.where(places.inside[:, None] & used[places.element][:, None], out, np.nan), noise
 
-    @classmethod
-    def of(cls, mesh: Tri3Mesh, solution: Solution) -> Field:
-        """Those of a solution, the noise without the misfit of the elements."""
-        values = np.hstack([solution.displacement, solution.strain])
-        return cls(mesh=mesh, values=values, noise=np.hstack([solution.displacement_std, solution.strain_std]))
 
-    def at(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The field at points (P, 2), by the quadratics through the nodes around each node (`at_pixels`), and noise."""
-        used = np.asarray(np.isfinite(self.values)[self.mesh.elements].all(axis=(1, 2)))
-        known = np.nan_to_num(self.values)
-        _, x, y, xx, xy, yy = (operator @ known for operator in quadratic_fit(self.mesh, used))
-        places = Places.of(self.mesh, points)
-        node, weight = self.mesh.elements[places.element], places.barycentric
-        dx, dy = np.moveaxis(points[:, None] - self.mesh.nodes[node], -1, 0)[..., None]
-        bent = xx[node] * dx * dx / 2 + xy[node] * dx * dy + yy[node] * dy * dy / 2
-        out = np.einsum("pc,pci->pi", weight, self.values[node] + x[node] * dx + y[node] * dy + bent)
-        noise = np.sqrt(np.einsum("pc,pci->pi", weight, self.noise[node] ** 2))
-        return np.where(places.inside[:, None] & used[places.element][:, None], out, np.nan), noise
+def _apart(
+    mesh: Tri3Mesh, solution: Solution, finer: Sequence[tuple[Tri3Mesh, Solution]]
+) -> tuple[list[float], list[float]]:
+    """How far a solution is from each of those on `finer` elements beyond the noise of both, at the nodes of those.
 
-    def apart(self, finer: Sequence[Field]) -> tuple[list[float], list[float]]:
-        """How far this field is from each of `finer` elements beyond the noise of both, at the nodes of those.
-
-        Halved elements show little of what is far smaller than they are, or lies between their nodes; the finer sizes
-        of a study have measured it. Of displacement and strain.
-        """
-        found: tuple[list[float], list[float]] = ([], [])
-        for other in finer:
-            here, noise = self.at(other.mesh.nodes)
-            square, variance = (here - other.values) ** 2, noise**2 + other.noise**2
-            for errors, part in zip(found, (slice(2), slice(2, 5)), strict=True):
-                known = np.isfinite(square[:, part] + variance[:, part])
-                beyond, expected = (square - variance)[:, part][known], variance[:, part][known]
-                plain = beyond.sum() > CONSTANTS.sure * np.sqrt(2 * (expected**2).sum() / CONSTANTS.independent)
-                errors.append(float(np.sqrt(beyond.mean())) if plain else 0.0)
-        return found
+    Halved elements show little of what is far smaller than they are, or lies between their nodes; the finer sizes of a
+    study have measured it. Of displacement and strain.
+    """
+    found: tuple[list[float], list[float]] = ([], [])
+    for fine, other in finer:
+        here, noise = _field_at(mesh, solution, fine.nodes)
+        square = (here - np.hstack([other.displacement, other.strain])) ** 2
+        variance = noise**2 + np.hstack([other.displacement_std, other.strain_std]) ** 2
+        for errors, part in zip(found, (slice(2), slice(2, 5)), strict=True):
+            known = np.isfinite(square[:, part] + variance[:, part])
+            beyond, expected = (square - variance)[:, part][known], variance[:, part][known]
+            plain = beyond.sum() > CONSTANTS.sure * np.sqrt(2 * (expected**2).sum() / CONSTANTS.independent)
+            errors.append(float(np.sqrt(beyond.mean())) if plain else 0.0)
+    return found
 
 
 def _floor(fields: Sequence[FloatArray], references: int) -> tuple[float, float]:
