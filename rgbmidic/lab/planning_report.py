@@ -13,7 +13,7 @@ from rgbmidic._version import __version__
 from rgbmidic.errors import InputError
 from rgbmidic.lab import write_findings
 from rgbmidic.lab.planning import Outlook, Plan, Proposal
-from rgbmidic.pipeline.size_figures import rms
+from rgbmidic.pipeline.resolution import rms
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, literal
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS

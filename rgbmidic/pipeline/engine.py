@@ -6,7 +6,6 @@ latest state alone and a few initial guesses.
 
 from __future__ import annotations
 
-import importlib
 import logging
 import sys
 import threading
@@ -25,6 +24,7 @@ from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.correlation import NodeStatus, Start, Status
 from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError
+from rgbmidic.extras import optional
 from rgbmidic.pipeline.frame import Measured, Updated, attempt, failed_frame
 from rgbmidic.pipeline.order import STRIDE, is_key, parent
 from rgbmidic.pipeline.plan import Plan
@@ -214,12 +214,7 @@ class Cluster:
     """The workers of a Dask cluster; what a lost one was doing is done again by another."""
 
     def __init__(self, plan: Plan, address: str) -> None:
-        try:
-            distributed: Any = importlib.import_module("distributed")
-        except ImportError:
-            raise ConfigurationError(
-                "a Dask cluster needs the packages dask and distributed: install rgbmidic[cluster]"
-            ) from None
+        distributed = optional("distributed", "cluster")
         # what becomes of the cluster is reported here, without its tracebacks; some loggers have levels of their own
         names = [name for name in logging.root.manager.loggerDict if name.startswith(("distributed", "tornado"))]
         self._levels = {log: log.level for log in map(logging.getLogger, names)}

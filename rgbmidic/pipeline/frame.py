@@ -117,14 +117,8 @@ def failed_frame(plan: Plan, index: int, reason: str, *, unread: bool = False) -
     time_ns = None
     with suppress(FrameError):  # a movie that is gone tells no times
         time_ns = plan.series.time_ns(index)
-    return FrameRecord.failed(
-        reason,
-        nodes=len(plan.reference.mesh.nodes),
-        lights=len(plan.images.names),
-        number=plan.series.numbers[index],
-        time_ns=time_ns,
-        unread=unread,
-    )
+    nodes, lights, number = len(plan.reference.mesh.nodes), len(plan.images.names), plan.series.numbers[index]
+    return FrameRecord.failed(reason, nodes=nodes, lights=lights, number=number, time_ns=time_ns, unread=unread)
 
 
 class _UnreadError(FrameError):

@@ -17,12 +17,17 @@ STRIDE = 16
 
 def parent(position: int) -> int | None:
     """The frame that a frame starts from; None for the first."""
-    return position - _step(position) if position else None
+    if position == 0:
+        return None
+    step = 1
+    while position % (step * STRIDE) == 0:
+        step *= STRIDE
+    return position - step
 
 
 def is_key(position: int) -> bool:
     """Whether a frame starts from one that is not just before it."""
-    return position > 0 and _step(position) > 1
+    return position > 0 and position % STRIDE == 0
 
 
 def dependants(places: Iterable[int], tries: Sequence[int]) -> set[int]:
@@ -35,11 +40,3 @@ def dependants(places: Iterable[int], tries: Sequence[int]) -> set[int]:
         if parent(place) in found or (tried > 1 and place - 1 in found):
             found.add(place)
     return found
-
-
-def _step(position: int) -> int:
-    """The largest power of `STRIDE` that divides the position of a frame after the first."""
-    step = 1
-    while position % (step * STRIDE) == 0:
-        step *= STRIDE
-    return step

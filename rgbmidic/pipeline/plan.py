@@ -214,7 +214,7 @@ class Plan:
         weights = weights or prepare_weights(
             settings, images, region, shape=frame, frames=len(series), images_of=images_of
         )
-        reference = _reference(images, weights, region, mesh, sigma, solver)
+        reference = _reference(images, weights, region, mesh, sigma, solver.prefilter)
         if isinstance(weights, ThresholdWeights):
             _tell_no_effect(weights, images, region)
         speckle = suitability.speckle_size(images, region)
@@ -259,7 +259,7 @@ class Plan:
         -------
         Plan
         """
-        reference = _reference(self.images, self.weights, self.region, mesh, self.normalise, self.solver)
+        reference = _reference(self.images, self.weights, self.region, mesh, self.normalise, self.solver.prefilter)
         return replace(self, reference=reference)
 
     def prepared(self, images: IlluminationImages, index: int) -> tuple[FloatImage, FloatImage]:
@@ -307,22 +307,13 @@ class Plan:
 
 
 def _reference(
-    images: IlluminationImages,
-    weights: LightWeights,
-    region: Region,
-    mesh: Tri3Mesh,
-    sigma: float,
-    solver: SolverSettings,
+    images: IlluminationImages, weights: LightWeights, region: Region, mesh: Tri3Mesh, sigma: float, prefilter: str
 ) -> Reference:
     """The reference state as the solve needs it."""
+    values, origin, registration = correlated(images, sigma), images.origin, images.registration
+    counted = as_weights(weights.reference(images), images.values.shape, "weights of the reference")
     return Reference.prepare(
-        correlated(images, sigma),
-        region,
-        as_weights(weights.reference(images), images.values.shape, "weights of the reference"),
-        mesh=mesh,
-        prefilter=solver.prefilter,
-        origin=images.origin,
-        registration=images.registration,
+        values, region, counted, mesh=mesh, prefilter=prefilter, origin=origin, registration=registration
     )
 
 
@@ -404,10 +395,8 @@ def finite_elements_of(
     camera = None if settings.scale.camera is None else CameraCalibration.read(settings.scale.camera)
     placement = Placement.fit(settings.mesh.points or (), camera)
     logger.info("mesh.points: %s", placement.summary())
-    limits = settings.region
-    allowed = read_region(limits, frame) if limits.is_stated else Region.from_mask(np.ones(frame, dtype=bool))
     every = read_mesh(settings.mesh.file, unit=settings.mesh.unit or "mm", part=settings.mesh.part)
-    part, mesh, region = on_image(every, placement, frame, allowed.without(limits.holes))
+    part, mesh, region = on_image(every, placement, frame, read_region(settings.region, frame))
     return part, placement, mesh, region
 
 
@@ -433,7 +422,7 @@ def window_around(
 
 
 def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
-    """The region of interest of the settings on images of `shape` (H, W).
+    """The region of interest of the settings on images of `shape` (H, W); all of them where none is stated.
 
     Parameters
     ----------
@@ -455,8 +444,9 @@ def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
         outlined = Region.from_rectangle(settings.rectangle, shape)
     elif settings.polygon is not None:
         outlined = Region.from_polygon(settings.polygon, shape)
+    elif settings.mask is None:
+        outlined = Region.from_mask(np.ones(shape, dtype=bool))
     else:
-        assert settings.mask is not None
         try:
             outlined = Region.from_mask(read_frame(settings.mask, kind="monochrome").values[0], shape)
         except RegionError as error:
