@@ -24,7 +24,7 @@ from rgbmidic.errors import AnotherTestError, InputError, ResultError, RgbmidicE
 from rgbmidic.pipeline.resolution import Progress
 from rgbmidic.pipeline.run import measure
 from rgbmidic.results import Histories, Maps, Result, shared_part
-from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.provenance import is_result
 from rgbmidic.settings import TestSettings, read_test, read_toml, regular
@@ -362,7 +362,4 @@ def check_summary(out: Path, *, overwrite: bool) -> None:
 
 def write_summary(outcomes: Sequence[Outcome], path: Path) -> None:
     """Write `summary_rows` as a CSV file, in place of an earlier one."""
-    header, rows = summary_rows(outcomes)
-    text = io.StringIO(newline="")
-    csv.writer(text).writerows([header, *rows])
-    write_complete(path, lambda file: file.write(text.getvalue().encode()))
+    write_complete(path, lambda file: write_table(file, *summary_rows(outcomes)))

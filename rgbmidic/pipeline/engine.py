@@ -1,4 +1,4 @@
-"""The engine: frames are measured in the order of `rgbmidic.pipeline.order`, by workers, into a sink.
+"""The engine: frames are measured in the order of `rgbmidic.pipeline.plan`, by workers, into a sink.
 
 `rgbmidic.measure` runs it with threads or a Dask cluster and a result folder, `rgbmidic.measure_sequence` with the
 latest state alone and a few initial guesses.
@@ -26,8 +26,7 @@ from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError
 from rgbmidic.extras import optional
 from rgbmidic.pipeline.frame import Measured, Updated, attempt, failed_frame
-from rgbmidic.pipeline.order import STRIDE, is_key, parent
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.plan import STRIDE, Plan, is_key, parent
 from rgbmidic.results import FrameRecord
 
 logger = logging.getLogger(__name__)

@@ -24,8 +24,7 @@ from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.data import Window
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState, light_images
-from rgbmidic.pipeline.order import STRIDE
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.plan import STRIDE, Plan
 from rgbmidic.pipeline.suitability import SUITABILITY, exposure_fault, saturated_fraction, too_small
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed

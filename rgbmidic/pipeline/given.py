@@ -116,9 +116,6 @@ def describe(given: Any, longest: int = 120) -> str:
         text = f"{class_name(given)}: {told()}"
     elif callable(given) and hasattr(given, "__qualname__"):
         text = f"{given.__module__}.{given.__qualname__}"
-    elif isinstance(given, np.ndarray):
-        digest = hashlib.sha256(np.ascontiguousarray(given).tobytes()).hexdigest()
-        text = f"{given.dtype} array of shape {given.shape}, {digest[:16]}"
     elif repr(given) == object.__repr__(given):
         text = class_name(given)
     else:

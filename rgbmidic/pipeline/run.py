@@ -20,8 +20,7 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, following, open_workers, rank_of
 from rgbmidic.pipeline.frame import Measured, Updated, read_state
 from rgbmidic.pipeline.given import FrameSequence, check_object, check_type, describe
-from rgbmidic.pipeline.order import dependants
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.plan import Plan, dependants
 from rgbmidic.pipeline.resolution import Progress, choose, refine
 from rgbmidic.pipeline.suitability import light_levels
 from rgbmidic.results import Origin, Result, ResultStore
@@ -154,7 +153,7 @@ def measure(
         opened = ResultStore.create(out, origin, overwrite=overwrite)
     with opened as store:
         if resume and frames is None:
-            _take_back(plan, store, retry_failed=retry_failed)
+            _take_back(plan, store, origin.names, retry_failed=retry_failed)
         sink = _Folder(plan, store, places, progress)
         schedule = Schedule(plan, sink, places)
         if schedule.done and frames is None and "finished" in read_provenance(store.path):
@@ -164,7 +163,7 @@ def measure(
         if not schedule.done:
             with closing(open_workers(plan, min(workers, len(places)), scheduler)) as others:
                 schedule.run(others)
-        _tell_repeated(plan, store, places)
+        _tell_repeated(store, places, origin.names)
         if frames is None:
             store.finish()
     return Result.open(out, partial=frames is not None, check=False)
@@ -220,14 +219,13 @@ class _Folder:
         self._progress(done, len(places), f"{self._plan.series.name(self._plan.series.chosen[place])}: {line}")
 
 
-def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
+def _take_back(plan: Plan, store: ResultStore, names: Sequence[str], *, retry_failed: bool) -> None:
     """Take back the frames that are to be measured again, and those whose bits depend on what becomes of them.
 
     A damaged frame comes back with the same bits, unless it had failed because it could not be read.
     """
     table = store.table()
     damaged = table.without_damaged(ended="finished" in read_provenance(store.path)).damaged
-    names, chosen = [plan.series.name(index) for index in plan.series.chosen], plan.series.chosen
     changed, readable, tries = list[int](), list[int](), [2] * len(names)
     for place, there in enumerate(table.finished.tolist()):
         try:
@@ -238,7 +236,7 @@ def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
         tries[place] = kept["tries"]
         if kept["unread"]:
             with suppress(FrameError):
-                read_state(plan, chosen[place])
+                read_state(plan, plan.series.chosen[place])
                 readable.append(place)
                 continue
         if retry_failed and kept["status"] == Status.FAILED:
@@ -253,13 +251,12 @@ def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
     store.discard(again)
 
 
-def _tell_repeated(plan: Plan, store: ResultStore, places: range) -> None:
+def _tell_repeated(store: ResultStore, places: range, names: Sequence[str]) -> None:
     """Warn of frames with the samples of the frame before, bit for bit."""
     sums = [kept["checksum"] for kept in store.table().each(["checksum"], places)]
     pairs = zip(places[1:], sums[1:], sums, strict=False)
     repeated = [place for place, mine, before in pairs if mine == before != NO_CHECKSUM]
     if repeated:
-        names = [plan.series.name(index) for index in plan.series.chosen]
         what = "all frames repeat" if len(repeated) == len(places) - 1 else "frames that repeat"
         logger.warning(
             f"{what} the one before, bit for bit, which camera noise makes impossible: {listed(repeated, names)}; were "

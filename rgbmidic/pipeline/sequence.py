@@ -28,8 +28,7 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, Threads
 from rgbmidic.pipeline.frame import Measured, next_reference
 from rgbmidic.pipeline.given import check_object, check_type
-from rgbmidic.pipeline.order import STRIDE
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.plan import STRIDE, Plan
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.settings import ELEMENT_SIZE, SolverOptions, TestSettings, check_names, grey_levels, sections
 from rgbmidic.typing import FloatArray
@@ -244,17 +243,13 @@ def measure_sequence(
     check_type("settings", settings, TestSettings | None, "a TestSettings")
     remaining = iter(states)
     own = reference is None
-    if own:
-        try:
-            reference = next(remaining)
-        except StopIteration:
-            raise InputError("there is no state to measure: the sequence is empty") from None
+    if own and (reference := next(remaining, None)) is None:
+        raise InputError("there is no state to measure: the sequence is empty")
     latest = _Latest(reference=reference, light_images=settings is None)
     mask = region if isinstance(region, Region) else None
     if settings is None:
         height, width = np.shape(getattr(reference, "values", reference))[-2:]
-        whole = region is None or isinstance(region, Region)
-        corners: Any = (0, 0, width - 1, height - 1) if whole else tuple(cast(Any, region))
+        corners = (0, 0, width - 1, height - 1) if region is None or mask is not None else tuple(cast(Any, region))
         settings = TestSettings(
             frames=sections.FrameSettings(path=(), update_reference=update_reference),
             region=sections.RegionSettings(rectangle=corners),

@@ -68,12 +68,11 @@ def tell_small(mesh: Tri3Mesh, speckle: float | None, finite_elements: FiniteEle
     It goes with the inverse of the element's side (`rgbmidic.scene.forecast.node_constant`).
     """
     sides = np.sqrt(2 * mesh.areas)
-    small = sides < SPECKLES * (speckle or 0.0)
-    if speckle is None or not small.any():
+    few = SPECKLES * (speckle or 0.0)
+    if not (small := sides < few).any():
         return
     least = int(np.argmin(sides))
     typical = float(np.median(sides[small]))
-    few = SPECKLES * speckle
     text = (
         f"{int(small.sum())} of {sides.size} triangles have sides under {SPECKLES:g} speckles of {speckle:.1f} px, "
         f"{typical:.1f} px in the median (element {finite_elements.element_numbers[least]}: {sides[least]:.1f} px): "
