@@ -22,7 +22,7 @@ import numpy as np
 from rgbmidic.correlation.images import unmasked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RgbmidicError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.series import FrameSeries, chosen_frames
+from rgbmidic.frames.series import FrameSeries, chosen_frames, open_series
 from rgbmidic.frames.stored import Camera, StoredFrame, raw_frame
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import LightSeparation, RawState
@@ -309,8 +309,8 @@ Series = FrameSeries | SourceSeries
 itself, such as read parts of frames."""
 
 
-def open_sequence(source: FrameSequence | Series, stated: FrameSettings, camera: Camera | None) -> Series:
-    """The series that the pipeline reads from a source, checked on the first frame of the reference.
+def open_frames(settings: TestSettings, source: FrameSequence | Series | None, camera: Camera | None) -> Series:
+    """The series that the pipeline reads: of files, or of a source, checked on the first frame of the reference.
 
     Raises
     ------
@@ -319,6 +319,9 @@ def open_sequence(source: FrameSequence | Series, stated: FrameSettings, camera:
     FrameError
         A reference frame, or the first or last frame, does not exist or cannot be read.
     """
+    stated = settings.frames
+    if source is None:
+        return open_series(stated, settings.base, camera)
     members = {name for name in set(dir(FrameSeries)) & set(dir(SourceSeries)) if not name.startswith("_")}
     if all(hasattr(source, name) for name in members):  # also by `__getattr__` of a wrapper
         return cast(Series, source)

@@ -27,7 +27,7 @@ from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError
 from rgbmidic.fields import CameraCalibration
-from rgbmidic.frames import Window, open_series, read_frame
+from rgbmidic.frames import Window, read_frame
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import DARK, IlluminationImages, correlated
@@ -42,7 +42,7 @@ from rgbmidic.illumination.separation import (
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
 from rgbmidic.mesh.placement import on_image
 from rgbmidic.pipeline import suitability
-from rgbmidic.pipeline.given import FrameSequence, Series, check_given, open_sequence
+from rgbmidic.pipeline.given import FrameSequence, Series, check_given, open_frames
 from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings, grey_levels
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights
@@ -185,10 +185,7 @@ class Plan:
         """
         check_given(settings, source, separation, weights, mesh)
         camera = None if settings.calibration.file is None else Calibration.read(settings.calibration.file)
-        if source is None:
-            series: Series = open_series(settings.frames, settings.base, camera)
-        else:
-            series = open_sequence(source, settings.frames, camera)
+        series = open_frames(settings, source, camera)
         frame = series.shape
         if settings.scale.camera is not None:
             CameraCalibration.read(settings.scale.camera).check(frame)
@@ -221,16 +218,7 @@ class Plan:
         weights = weights or prepare_weights(
             settings, images, region, shape=frame, frames=len(series), images_of=images_of
         )
-        reference = _reference(images, weights, region, mesh, sigma, solver.prefilter)
-        if isinstance(weights, ThresholdWeights):
-            _tell_no_effect(weights, images, region)
-        speckle = suitability.speckle_size(images, region)
-        if finite_elements is not None:
-            suitability.tell_small(mesh, speckle, finite_elements)
-        elif small := suitability.too_small(size, speckle, suitability.SUITABILITY.hardly_enough):
-            logger.warning("%s", small)
-        _check_seen(state, ", ".join(map(series.name, settings.frames.reference)), images, reference, region)
-        return cls(
+        plan = cls(
             settings=settings,
             normalise=sigma,
             solver=solver,
@@ -239,8 +227,8 @@ class Plan:
             region=region,
             weights=weights,
             images=images,
-            reference=reference,
-            speckle=speckle,
+            reference=_reference(images, weights, region, mesh, sigma, solver.prefilter),
+            speckle=suitability.speckle_size(images, region),
             saturated=suitability.saturated_fraction(state, region.mask),
             window=window,
             element_size=size,
@@ -248,6 +236,8 @@ class Plan:
             placement=placement,
             notes={"calibration_figures": camera.figures() if camera else {}},
         )
+        _check_reference(plan, state)
+        return plan
 
     @property
     def method(self) -> PrecisionMethod | None:
@@ -366,31 +356,33 @@ def _read_reference(
     return states[0], images, learnt
 
 
-def _check_seen(state: RawState, name: str, images: IlluminationImages, reference: Reference, region: Region) -> None:
-    """Refuse a reference that no light sees or that shows no texture; warn of a light that is off."""
-    if not reference.pixel_weights.any():
-        fault = suitability.exposure_fault(state, region.mask) or "it is saturated, dark or excluded by the weights"
-        raise FrameError(f"no light sees the region in the reference ({name}): {fault}")
-    suitability.check_texture(state, region.mask, name)
-    off = [
-        f"{light} ({level:.1%})" for light, level in suitability.light_levels(images, region).items() if level < DARK
-    ]
-    if off and not isinstance(state, IlluminationImages):
-        logger.warning(
-            f"the reference ({name}) shows no light of {', '.join(off)}: the median in the region is under "
-            f"{100 * DARK:.0f} % of the full scale; are the lamps on?"
-        )
-
-
-def _tell_no_effect(weights: ThresholdWeights, images: IlluminationImages, region: Region) -> None:
-    """Warn of a threshold that excludes nothing in the region of the reference."""
-    inside = region.mask
-    if (weights.reference(images) > 0)[:, inside].sum() == images.valid[:, inside].sum():
+def _check_reference(plan: Plan, state: RawState) -> None:
+    """Refuse a reference that no light sees or that shows no texture; warn of what will be measured badly."""
+    weights, images, region = plan.weights, plan.images, plan.region
+    inside, name = region.mask, ", ".join(map(plan.series.name, plan.settings.frames.reference))
+    if isinstance(weights, ThresholdWeights) and (
+        (weights.reference(images) > 0)[:, inside].sum() == images.valid[:, inside].sum()
+    ):
         most = blurred(images, weights.blur)[:, inside].max() / images.full_scale
         logger.warning(
             f"weights.threshold = {weights.threshold:.3g} excludes nothing in the reference: no light, blurred over "
             f"{weights.blur:g} px, exceeds {most:.2g} of the dynamic range in the region. State a lower one, or "
             'weights.method = "statistics"'
+        )
+    if plan.finite_elements is not None:
+        suitability.tell_small(plan.reference.mesh, plan.speckle, plan.finite_elements)
+    elif small := suitability.too_small(plan.element_size, plan.speckle, suitability.SUITABILITY.hardly_enough):
+        logger.warning("%s", small)
+    if not plan.reference.pixel_weights.any():
+        fault = suitability.exposure_fault(state, inside) or "it is saturated, dark or excluded by the weights"
+        raise FrameError(f"no light sees the region in the reference ({name}): {fault}")
+    suitability.check_texture(state, inside, name)
+    levels = suitability.light_levels(images, region).items()
+    off = [f"{light} ({level:.1%})" for light, level in levels if level < DARK]
+    if off and not isinstance(state, IlluminationImages):
+        logger.warning(
+            f"the reference ({name}) shows no light of {', '.join(off)}: the median in the region is under "
+            f"{100 * DARK:.0f} % of the full scale; are the lamps on?"
         )
 
 
