@@ -72,9 +72,6 @@ def check_given(
             yield f'mesh.element_size = "auto" is found {measured} that is made there: state a number'
         if stated.refine is not False:
             yield f"mesh.refine is done {measured} made there: leave it out"
-        if frames.kind in ("bayer", "rgb") and separation is None and settings.calibration.file is None:
-            needed = "state calibration.file, a file that rgbmidic-calibrate writes"
-            yield f'frames.kind = "{frames.kind}" needs the lights\' crosstalk: {needed}'
 
     for message in contradictions():
         raise ConfigurationError(message)
