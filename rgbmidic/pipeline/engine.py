@@ -285,5 +285,4 @@ def _measure_elsewhere(plan: Plan, index: int, start: Start, updated: Updated) -
         found = attempt(plan, index, start, updated)
     finally:
         logger.removeHandler(handler)
-    messages = tuple((record.levelno, handler.format(record)) for record in handler.buffer)
-    return Measured(record=found.record, messages=messages)
+    return Measured(record=found.record, messages=tuple((one.levelno, handler.format(one)) for one in handler.buffer))

@@ -53,11 +53,8 @@ def check_given(
     frames, stated, method = settings.frames, settings.mesh, settings.weights.method
 
     def contradictions() -> Iterator[str]:
-        if source is not None and frames.path:
-            yield (
-                f"frames.path names {', '.join(frames.path)}, and a frame source is given: leave the path empty "
-                "(path = [])"
-            )
+        if source is not None and (path := ", ".join(frames.path)):
+            yield f"frames.path names {path}, and a frame source is given: leave the path empty (path = [])"
         if source is not None and frames.lights > 1:
             yield "frames.lights is for files; a frame source gives all lights of a state by one index"
         if weights is not None and method not in ("statistics", "none"):
@@ -213,7 +210,6 @@ class SourceSeries:
         FrameError
             The source raises an error, gives something that is no frame, or contradicts ``[frames]``.
         """
-        assert window is None or window.is_whole, "frames of a source are read whole"
         try:
             state = self.source[index]
         except RgbmidicError:

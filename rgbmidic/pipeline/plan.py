@@ -209,8 +209,7 @@ class Plan:
             size = settings.mesh.side
             cracks = [np.subtract(path, window.origin) for path in settings.mesh.cracks]
             mesh = Tri3Mesh.from_region(region, size, cracks)
-        cracked = len(mesh.crack_edges) > 0
-        sigma, solver = grey_levels(settings.illumination.normalise, settings.solver, cracked=cracked)
+        sigma, solver = grey_levels(settings.illumination.normalise, settings.solver, cracked=len(mesh.crack_edges) > 0)
 
         def images_of(index: int) -> IlluminationImages:
             return light_images(separate, series.read(index, window), window)
@@ -407,17 +406,15 @@ def window_of_reference(region: Region, settings: TestSettings, frame: tuple[int
     return Window.whole(frame) if np.prod(window.shape) > _WORTH * np.prod(frame) else window
 
 
-def window_around(
-    points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int], around: float = 96.0
-) -> Window:
+def window_around(points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int]) -> Window:
     """What lies within `reach` of points (N, 2), and what its images depend on.
 
-    The separation's local statistics use `around` px: three standard deviations of their windows with all that is
+    The separation's local statistics use 96 px around: three standard deviations of their windows with all that is
     between (`rgbmidic.lab.inspection.channels.InspectionConstants`).
     """
     may_crack = bool(settings.mesh.cracks) or settings.mesh.file is not None
     sigma, _ = grey_levels(settings.illumination.normalise, settings.solver, cracked=may_crack)
-    return Window.around(points, reach + max(around, 3 * max(sigma, settings.weights.blur)), frame)
+    return Window.around(points, reach + max(96.0, 3 * max(sigma, settings.weights.blur)), frame)
 
 
 def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:

@@ -39,27 +39,33 @@ noise by as much and the discretisation error of a smooth field by 4 (its third 
 Progress = Callable[[int, int, str], None]
 
 
-def largest_size(plan: Plan) -> float:
-    """Largest elements (px) of which three lie side by side across the region, in x and in y."""
-    spans = [np.flatnonzero(plan.region.mask.any(axis=axis)) for axis in (0, 1)]
-    return min(float(span[-1] - span[0]) for span in spans) / CONSTANTS.fewest
+def sizes_to_try(plan: Plan, stated: Sequence[float] = ()) -> tuple[float, ...]:
+    """The sizes that are stated, in rising order; else the `SIZES` that suit speckle and region.
 
-
-def sizes_to_try(plan: Plan) -> tuple[float, ...]:
-    """The `SIZES` that hold enough speckles and of which enough lie in the region; the nearest to that if none does.
+    Those hold enough speckles, and enough lie across the region; the nearest to that if none does.
 
     Raises
     ------
+    InputError
+        Of the largest that is stated fewer than three lie side by side across the region, in x or in y.
     RegionError
         The region is too small for any.
     """
-    least, most = max(SPECKLES * (plan.speckle or 0.0), CONSTANTS.least), largest_size(plan)
-    if most < CONSTANTS.least:
+    spans = [np.flatnonzero(plan.region.mask.any(axis=axis)) for axis in (0, 1)]
+    most = min(float(span[-1] - span[0]) for span in spans) / CONSTANTS.fewest
+    least = max(SPECKLES * (plan.speckle or 0.0), CONSTANTS.least)
+    if stated and max(stated) > most:
+        raise InputError(
+            f"elements of {max(stated):g} px are too large for the region: {most:.0f} px are the largest of which "
+            f"{CONSTANTS.fewest:g} lie across it"
+        )
+    if not stated and most < CONSTANTS.least:
         raise RegionError(
             f"the region is too small to compare element sizes: {CONSTANTS.fewest:g} elements of {CONSTANTS.least:g} "
             "px must lie across it; state mesh.element_size"
         )
-    return tuple(size for size in SIZES if least <= size <= most) or (float(np.floor(min(least, most))),)
+    suited = stated or [size for size in SIZES if least <= size <= most]
+    return tuple(sorted(suited)) or (float(np.floor(min(least, most))),)
 
 
 def study_sizes(
@@ -109,12 +115,7 @@ def study_sizes(
         raise InputError(f"elements of {min(sizes):g} px are too small: {CONSTANTS.least:g} px are the least")
     middle = min(sizes, key=lambda size: abs(size - ELEMENT_SIZE), default=ELEMENT_SIZE)
     plan = Plan.from_settings(replace(settings, mesh=replace(settings.mesh, element_size=middle)), **given)
-    sizes = tuple(sorted(sizes)) or sizes_to_try(plan)
-    if max(sizes) > (most := largest_size(plan)):
-        raise InputError(
-            f"elements of {max(sizes):g} px are too large for the region: {most:.0f} px are the largest of which "
-            f"{CONSTANTS.fewest:g} lie across it"
-        )
+    sizes = sizes_to_try(plan, sizes)
     lengths = [SHORTEST * size for size in sizes] if gauges is None else sorted(gauges)
     if lengths and max(lengths) < (shortest := SHORTEST * min(sizes) * (1 - CONSTANTS.equal)):
         raise InputError(
@@ -130,8 +131,7 @@ def study_sizes(
     for number, size in enumerate(sizes):
         report(number + 1, len(sizes) + 1, f"elements of {size:g} px")
         try:
-            sized = _resized(plan, size)
-            figures.append(measure_size(sized, key.deformed, key.start(sized.reference.mesh), rest, lengths, finer))
+            figures.append(key.figures(_resized(plan, size), rest, lengths, finer))
         except RgbmidicError as error:
             logger.warning("elements of %g px: %s", size, error)
             figures.append(SizeFigures(element_size=size, reason=str(error)))
@@ -154,62 +154,6 @@ def rms(values: FloatArray) -> float:
 def solved(plan: Plan, deformed: Deformed, start: FloatArray | None) -> Solution:
     """Solution of a frame from an initial guess (N, 2), or from a search."""
     return track(plan.reference, deformed, Start(displacement=start), plan.solver, plan.method)
-
-
-def measure_size(
-    plan: Plan,
-    deformed: Deformed,
-    start: FloatArray,
-    rest: Sequence[Deformed],
-    gauges: Sequence[float],
-    finer: list[tuple[Tri3Mesh, Solution]],
-) -> SizeFigures:
-    """Measure the figures of the size of a plan's elements.
-
-    Parameters
-    ----------
-    plan
-        The test with elements of this size.
-    deformed, start
-        The key frame and its initial guess (N, 2).
-    rest
-        Static frames.
-    gauges
-        Lengths of virtual strain gauges, px; those too short for the elements are left out.
-    finer
-        Meshes of finer elements and the solutions on them, to which those of these are added.
-    """
-    mesh, speckle = plan.reference.mesh, plan.speckle or float("nan")
-    before = time.process_time()
-    solution = solved(plan, deformed, start)
-    seconds = time.process_time() - before
-    if solution.status is Status.FAILED:
-        raise FrameError(solution.reason)
-    still = [solved(plan, static, np.zeros_like(mesh.nodes)) for static in rest]
-    known = discretisation_error(plan.reference, deformed, solution, plan.solver, plan.method)
-    other = [one for one in finer if CONSTANTS.finer * one[0].size <= mesh.size]
-    # it differs from all of them, each of which has an error of its own (in proportion to the size's third power);
-    # reflections, which every size averages in its own way, hardly differ from the next
-    part = [1 - (fine.size / mesh.size) ** 3 for fine, _ in other]
-    apart = [min(np.divide(found, part), default=0.0) for found in _apart(mesh, known, other)]
-    finer.append((mesh, known))
-    whole = solution.measured[mesh.elements].all(axis=1)
-
-    def errors(name: str, beyond: float) -> dict[str, Any]:
-        bias, scatter = _floor([getattr(one, name) for one in still], len(plan.settings.frames.reference))
-        stated, error = (rms(getattr(known, f"{name}_{kind}")) for kind in ("std", "error"))
-        return {"bias": bias, "scatter": scatter, "stated": stated, "discretisation": float(np.fmax(error, beyond))}
-
-    return SizeFigures(
-        element_size=plan.element_size,
-        speckles=plan.element_size / speckle,
-        nodes=len(mesh.nodes),
-        measured=float(mesh.areas[whole].sum() / mesh.areas.sum()),
-        strain=ErrorFigures(**errors("strain", apart[1])),
-        seconds=seconds,
-        gauges=tuple(_gauge_figures(plan, solution, still, gauges)),
-        **errors("displacement", apart[0]),
-    )
 
 
 def _field_at(mesh: Tri3Mesh, solution: Solution, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -430,6 +374,54 @@ class _KeyFrame:
         whole = self.solution.displacement[self.mesh.nearest(self.solution.measured)[1]]
         corners = whole[self.mesh.elements[found.element]]
         return np.asarray(np.einsum("nc,nci->ni", found.barycentric, corners))
+
+    def figures(
+        self, plan: Plan, rest: Sequence[Deformed], gauges: Sequence[float], finer: list[tuple[Tri3Mesh, Solution]]
+    ) -> SizeFigures:
+        """Measure the figures of the size of a plan's elements.
+
+        Parameters
+        ----------
+        plan
+            The test with elements of this size.
+        rest
+            Static frames.
+        gauges
+            Lengths of virtual strain gauges, px; those too short for the elements are left out.
+        finer
+            Meshes of finer elements and the solutions on them, to which those of these are added.
+        """
+        mesh, speckle = plan.reference.mesh, plan.speckle or float("nan")
+        before = time.process_time()
+        solution = solved(plan, self.deformed, self.start(mesh))
+        seconds = time.process_time() - before
+        if solution.status is Status.FAILED:
+            raise FrameError(solution.reason)
+        still = [solved(plan, static, np.zeros_like(mesh.nodes)) for static in rest]
+        known = discretisation_error(plan.reference, self.deformed, solution, plan.solver, plan.method)
+        other = [one for one in finer if CONSTANTS.finer * one[0].size <= mesh.size]
+        # it differs from all of them, each of which has an error of its own (in proportion to the size's third power);
+        # reflections, which every size averages in its own way, hardly differ from the next
+        part = [1 - (fine.size / mesh.size) ** 3 for fine, _ in other]
+        apart = [min(np.divide(found, part), default=0.0) for found in _apart(mesh, known, other)]
+        finer.append((mesh, known))
+        whole = solution.measured[mesh.elements].all(axis=1)
+
+        def errors(name: str, beyond: float) -> dict[str, Any]:
+            bias, scatter = _floor([getattr(one, name) for one in still], len(plan.settings.frames.reference))
+            stated, error = (rms(getattr(known, f"{name}_{kind}")) for kind in ("std", "error"))
+            return {"bias": bias, "scatter": scatter, "stated": stated, "discretisation": float(np.fmax(error, beyond))}
+
+        return SizeFigures(
+            element_size=plan.element_size,
+            speckles=plan.element_size / speckle,
+            nodes=len(mesh.nodes),
+            measured=float(mesh.areas[whole].sum() / mesh.areas.sum()),
+            strain=ErrorFigures(**errors("strain", apart[1])),
+            seconds=seconds,
+            gauges=tuple(_gauge_figures(plan, solution, still, gauges)),
+            **errors("displacement", apart[0]),
+        )
 
 
 def _deformed(plan: Plan, index: int) -> Deformed:

@@ -23,7 +23,7 @@ from rgbmidic.pipeline.given import FrameSequence, check_object, check_type, des
 from rgbmidic.pipeline.plan import Plan, dependants
 from rgbmidic.pipeline.resolution import Progress, choose, refine
 from rgbmidic.pipeline.suitability import light_levels
-from rgbmidic.results import Origin, Result, ResultStore
+from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.results.store import listed, read_mesh
@@ -33,10 +33,8 @@ from rgbmidic.weights import LightWeights
 logger = logging.getLogger(__name__)
 
 _OF_NODES = {
-    "displacement": ("u", "v"),
-    "displacement_std": ("u_std", "v_std"),
-    "strain": ("exx", "eyy", "exy"),
-    "strain_std": ("exx_std", "eyy_std", "exy_std"),
+    array: [one.name for one in QUANTITIES.values() if one.source.startswith(f"{array}.")]
+    for array in ("displacement", "displacement_std", "strain", "strain_std")
 }
 """Quantities of a frame that it makes a reference with, as columns of its solution's arrays."""
 
@@ -225,7 +223,7 @@ def _take_back(plan: Plan, store: ResultStore, names: Sequence[str], *, retry_fa
     A damaged frame comes back with the same bits, unless it had failed because it could not be read.
     """
     table = store.table()
-    damaged = table.without_damaged(ended="finished" in read_provenance(store.path)).damaged
+    lost = np.flatnonzero(table.without_damaged(ended="finished" in read_provenance(store.path)).damaged).tolist()
     changed, readable, tries = list[int](), list[int](), [2] * len(names)
     for place, there in enumerate(table.finished.tolist()):
         try:
@@ -241,14 +239,12 @@ def _take_back(plan: Plan, store: ResultStore, names: Sequence[str], *, retry_fa
                 continue
         if retry_failed and kept["status"] == Status.FAILED:
             changed.append(place)
-    lost = np.flatnonzero(damaged).tolist()
-    again = {*lost, *dependants([*changed, *readable], tries)}
     if lost:
         logger.warning("lost to damage and measured again: %s", listed(lost, names))
     if readable:
         again_for = listed(readable, names)
         logger.warning("measured again with what started from it, since it can be read now: %s", again_for)
-    store.discard(again)
+    store.discard({*lost, *dependants([*changed, *readable], tries)})
 
 
 def _tell_repeated(store: ResultStore, places: range, names: Sequence[str]) -> None:

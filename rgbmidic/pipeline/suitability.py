@@ -146,8 +146,7 @@ def neighbour_correlation(frame: Mosaic | ChannelFrame | IlluminationImages, ins
 def _planes(frame: Mosaic | ChannelFrame | IlluminationImages, inside: BoolArray) -> list[FloatArray]:
     """Samples of each channel on their own lattice, less their local mean (shading); 0 outside and where saturated."""
     step = 2 if isinstance(frame, Mosaic) else 1
-    seen = frame.valid if isinstance(frame, IlluminationImages) else frame.values < frame.white_level
-    usable = inside & seen
+    usable = inside & (frame.valid if isinstance(frame, IlluminationImages) else frame.values < frame.white_level)
     known = np.where(usable, frame.values, np.nan).astype(np.float32).reshape(-1, *inside.shape)
     rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
     # a cell of a mosaic is any 2 x 2 samples, wherever the region begins
