@@ -109,7 +109,7 @@ def batch(
             elastic=(low, high),
             overwrite=overwrite,
             conclude=conclude,
-            progress=lambda name: progress,
+            progress=progress,
         ):
             outcomes.append(outcome)
             series.write_summary(outcomes, out / "summary.csv")

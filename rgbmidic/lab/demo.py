@@ -28,7 +28,7 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import align
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Plan, Separation, correlate, measure
-from rgbmidic.pipeline.size_figures import rms
+from rgbmidic.pipeline.resolution import rms
 from rgbmidic.results import Result
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ScaleSettings, TestSettings, read_test

@@ -12,7 +12,7 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.lab import document, number, write_findings
 from rgbmidic.lab.planning import Outlook, Plan
-from rgbmidic.pipeline.size_figures import rms
+from rgbmidic.pipeline.resolution import rms
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, finish_picture, literal
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS

@@ -14,16 +14,19 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, RgbmidicError
-from rgbmidic.pipeline.run import Progress, measure
+from rgbmidic.pipeline.resolution import Progress
+from rgbmidic.pipeline.run import measure
 from rgbmidic.results import Histories, Maps, Result, shared_part
-from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.provenance import is_result
 from rgbmidic.settings import TestSettings, read_test, read_toml, regular
@@ -37,20 +40,8 @@ ELASTIC = (0.0005, 0.0025)
 """Strains between which a modulus is fitted where none are stated: those of ISO 527-1."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BatchTest:
-    """A test of a batch.
-
-    Attributes
-    ----------
-    name
-        Its name and that of its folder.
-    read
-        Gives its settings, when its turn comes.
-    """
-
-    name: str
-    read: Callable[[], TestSettings]
+Tests = Mapping[str, Callable[[], TestSettings]]
+"""The tests of a batch: by their names, those of their folders, what reads their settings when their turn comes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,7 +69,7 @@ class Outcome:
     values: Mapping[str, float] = field(default_factory=dict)
 
 
-def read_tests(paths: Sequence[Path]) -> list[BatchTest]:
+def read_tests(paths: Sequence[Path]) -> Tests:
     """Name the tests of TEST.toml files, by the file, or by its folder where several are called alike.
 
     Parameters
@@ -93,14 +84,13 @@ def read_tests(paths: Sequence[Path]) -> list[BatchTest]:
     """
     stems = [path.stem for path in paths]
     names = [path.stem if stems.count(path.stem) == 1 else path.resolve().parent.name for path in paths]
-    tests = [BatchTest(name=name, read=partial(read_test, path)) for path, name in zip(paths, names, strict=True)]
-    _check_names(tests)
+    _check_names(names)
     if missing := [str(path) for path in paths if not path.is_file()]:
         raise InputError(f"there is no settings file {', '.join(missing)}")
-    return tests
+    return {name: partial(read_test, path) for path, name in zip(paths, names, strict=True)}
 
 
-def read_table(template: Path, table: Path) -> list[BatchTest]:
+def read_table(template: Path, table: Path) -> Tests:
     """Make tests from a template and a table: a row a test, with values that replace keys of the template.
 
     Parameters
@@ -132,46 +122,43 @@ def read_table(template: Path, table: Path) -> list[BatchTest]:
         )
     if twice := [name for name in dict.fromkeys(head) if head.count(name) > 1]:
         raise InputError(f"the table {table} has several columns of one name: {', '.join(twice)}")
-    tests = []
+    _check_names([row[0].strip() for row in rows[1:]])
+    tests = {}
     for number, row in enumerate(rows[1:], 2):
         if len(row) != len(head):
             raise InputError(f"row {number} of the table {table} has {len(row)} fields, the header {len(head)}")
-        changed = {section: dict(keys) if isinstance(keys, Mapping) else keys for section, keys in document.items()}
+        changed = deepcopy(document)
         for name, text in zip(head[1:], map(str.strip, row[1:]), strict=True):
             section, key = name.split(".", 1)
+            value: Any = text
             with suppress(tomllib.TOMLDecodeError):  # a text may go without quotes
-                changed.setdefault(section, {})[key] = tomllib.loads(f"value = {text}")["value"]
-                continue
+                value = tomllib.loads(f"value = {text}")["value"]
             if text:
-                changed.setdefault(section, {})[key] = text
-        settings = partial(TestSettings.from_mapping, changed, template.parent)
-        tests.append(BatchTest(name=row[0].strip(), read=settings))
-    _check_names(tests)
+                changed.setdefault(section, {})[key] = value
+        tests[row[0].strip()] = partial(TestSettings.from_mapping, changed, template.parent)
     return tests
 
 
-def _check_names(tests: Sequence[BatchTest]) -> None:
-    names = [test.name.casefold() for test in tests]  # as file systems without capitals take them
-    for test, folded in zip(tests, names, strict=True):
-        if not re.fullmatch(r"[\w][\w .+-]{0,79}", test.name) or folded in SUMMARIES:
-            raise InputError(
-                f'"{test.name}" names no test: letters, digits, . _ + - only, and not {" or ".join(SUMMARIES)}'
-            )
-        if names.count(folded) > 1:
-            raise InputError(f'"{test.name}" is the name of two tests')
-    if not tests:
+def _check_names(names: Sequence[str]) -> None:
+    folded = [name.casefold() for name in names]  # as file systems without capitals take them
+    for name, plain in zip(names, folded, strict=True):
+        if not re.fullmatch(r"[\w][\w .+-]{0,79}", name) or plain in SUMMARIES:
+            raise InputError(f'"{name}" names no test: letters, digits, . _ + - only, and not {" or ".join(SUMMARIES)}')
+        if folded.count(plain) > 1:
+            raise InputError(f'"{name}" is the name of two tests')
+    if not names:
         raise InputError("a batch needs one test or more")
 
 
 def run_batch(
-    tests: Sequence[BatchTest],
+    tests: Tests,
     out: Path,
     *,
     workers: int | None = None,
     elastic: tuple[float, float] = ELASTIC,
     overwrite: bool = False,
     conclude: Callable[[Result, TestSettings, bool], None] | None = None,
-    progress: Callable[[str], Progress] | None = None,
+    progress: Progress | None = None,
 ) -> Iterator[Outcome]:
     """Measure tests one after the other, each into a folder of its name; yield what each gave as it ends.
 
@@ -190,30 +177,29 @@ def run_batch(
     conclude
         Called with each result, its settings, and whether it was measured now.
     progress
-        Gives for the name of a test what `measure` calls after every frame.
+        Called after every frame of each test, as of `measure`.
 
     Yields
     ------
     Outcome
         Of each test.
     """
-    for test in tests:
-        folder = out / test.name
+    for name, read in tests.items():
+        folder = out / name
         try:
-            report = progress and progress(test.name)
-            result, settings, now = _measured(test, folder, workers, report, overwrite=overwrite)
+            result, settings, now = _measured(read, folder, workers, progress, overwrite=overwrite)
             if conclude is not None:
                 conclude(result, settings, now)
-            yield Outcome(name=test.name, folder=folder, measured=now, values=_values(result, settings, elastic))
+            yield Outcome(name=name, folder=folder, measured=now, values=_values(result, settings, elastic))
         except (RgbmidicError, OSError) as error:
-            yield Outcome(name=test.name, folder=folder, reason=str(error))
+            yield Outcome(name=name, folder=folder, reason=str(error))
 
 
 def _measured(
-    test: BatchTest, folder: Path, workers: int | None, progress: Progress | None, *, overwrite: bool
+    read: Callable[[], TestSettings], folder: Path, workers: int | None, progress: Progress | None, *, overwrite: bool
 ) -> tuple[Result, TestSettings, bool]:
     """Measure a test unless it is measured already; whether it was measured now comes last."""
-    settings, moved = test.read(), False
+    settings, moved = read(), False
 
     def count(done: int, total: int, line: str) -> None:
         nonlocal moved
@@ -227,7 +213,7 @@ def _measured(
         reason = str(error).rpartition("; ")[0]
         if not overwrite:
             raise ResultError(f"{reason}; --overwrite measures it again") from None
-        logger.warning("%s is measured again: %s", test.name, reason)
+        logger.warning("%s is measured again: %s", folder.name, reason)
         result = measure(settings, folder, overwrite=True, workers=workers, progress=count)
     return result, settings, moved
 
@@ -362,7 +348,4 @@ def check_summary(out: Path, *, overwrite: bool) -> None:
 
 def write_summary(outcomes: Sequence[Outcome], path: Path) -> None:
     """Write `summary_rows` as a CSV file, in place of an earlier one."""
-    header, rows = summary_rows(outcomes)
-    text = io.StringIO(newline="")
-    csv.writer(text).writerows([header, *rows])
-    write_complete(path, lambda file: file.write(text.getvalue().encode()))
+    write_complete(path, lambda file: write_table(file, *summary_rows(outcomes)))

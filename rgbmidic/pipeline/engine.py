@@ -1,4 +1,4 @@
-"""The engine: frames are measured in the order of `rgbmidic.pipeline.order`, by workers, into a sink.
+"""The engine: frames are measured in the order of `rgbmidic.pipeline.plan`, by workers, into a sink.
 
 `rgbmidic.measure` runs it with threads or a Dask cluster and a result folder, `rgbmidic.measure_sequence` with the
 latest state alone and a few initial guesses.
@@ -6,7 +6,6 @@ latest state alone and a few initial guesses.
 
 from __future__ import annotations
 
-import importlib
 import logging
 import sys
 import threading
@@ -25,23 +24,12 @@ from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.correlation import NodeStatus, Start, Status
 from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError
+from rgbmidic.extras import optional
 from rgbmidic.pipeline.frame import Measured, Updated, attempt, failed_frame
-from rgbmidic.pipeline.order import STRIDE, is_key, parent
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.plan import STRIDE, Plan, is_key, parent
 from rgbmidic.results import FrameRecord
 
 logger = logging.getLogger(__name__)
-
-
-class Workers(Protocol):
-    """Measure frames, as many at a time as there are slots."""
-
-    @property
-    def slots(self) -> int:
-        """How many."""
-
-    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
-        """Have one frame measured."""
 
 
 class Sink(Protocol):
@@ -96,7 +84,7 @@ class Schedule:
             self._waiting.setdefault(before, []).append(place)
             self.want(before)
 
-    def run(self, workers: Workers) -> None:
+    def run(self, workers: Threads | Cluster) -> None:
         """Have workers measure the frames, and give each to the sink as it finishes.
 
         Raises
@@ -225,12 +213,7 @@ class Cluster:
     """The workers of a Dask cluster; what a lost one was doing is done again by another."""
 
     def __init__(self, plan: Plan, address: str) -> None:
-        try:
-            distributed: Any = importlib.import_module("distributed")
-        except ImportError:
-            raise ConfigurationError(
-                "a Dask cluster needs the packages dask and distributed: install rgbmidic[cluster]"
-            ) from None
+        distributed = optional("distributed", "cluster")
         # what becomes of the cluster is reported here, without its tracebacks; some loggers have levels of their own
         names = [name for name in logging.root.manager.loggerDict if name.startswith(("distributed", "tornado"))]
         self._levels = {log: log.level for log in map(logging.getLogger, names)}
@@ -302,5 +285,4 @@ def _measure_elsewhere(plan: Plan, index: int, start: Start, updated: Updated) -
         found = attempt(plan, index, start, updated)
     finally:
         logger.removeHandler(handler)
-    messages = tuple((record.levelno, handler.format(record)) for record in handler.buffer)
-    return Measured(record=found.record, messages=messages)
+    return Measured(record=found.record, messages=tuple((one.levelno, handler.format(one)) for one in handler.buffer))

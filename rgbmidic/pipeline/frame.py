@@ -24,8 +24,7 @@ from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.data import Window
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState, light_images
-from rgbmidic.pipeline.order import STRIDE
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.plan import STRIDE, Plan
 from rgbmidic.pipeline.suitability import SUITABILITY, exposure_fault, saturated_fraction, too_small
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed
@@ -117,14 +116,8 @@ def failed_frame(plan: Plan, index: int, reason: str, *, unread: bool = False) -
     time_ns = None
     with suppress(FrameError):  # a movie that is gone tells no times
         time_ns = plan.series.time_ns(index)
-    return FrameRecord.failed(
-        reason,
-        nodes=len(plan.reference.mesh.nodes),
-        lights=len(plan.images.names),
-        number=plan.series.numbers[index],
-        time_ns=time_ns,
-        unread=unread,
-    )
+    nodes, lights, number = len(plan.reference.mesh.nodes), len(plan.images.names), plan.series.numbers[index]
+    return FrameRecord.failed(reason, nodes=nodes, lights=lights, number=number, time_ns=time_ns, unread=unread)
 
 
 class _UnreadError(FrameError):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,7 +22,7 @@ import numpy as np
 from rgbmidic.correlation.images import unmasked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RgbmidicError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.series import FrameSeries, chosen_frames
+from rgbmidic.frames.series import FrameSeries, chosen_frames, open_series
 from rgbmidic.frames.stored import Camera, StoredFrame, raw_frame
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import LightSeparation, RawState
@@ -51,46 +51,27 @@ def check_given(
     check_object("weights", weights, "reference", "deformed")
     check_type("mesh", mesh, Tri3Mesh | None, "a Tri3Mesh")
     frames, stated, method = settings.frames, settings.mesh, settings.weights.method
-    refused = (
-        (
-            source is not None and frames.path,
-            f"frames.path names {', '.join(frames.path)}, and a frame source is given: leave the path empty "
-            "(path = [])",
-        ),
-        (
-            source is not None and frames.lights > 1,
-            "frames.lights is for files; a frame source gives all lights of a state by one index",
-        ),
-        (
-            weights is not None and method not in ("statistics", "none"),
-            f'weights.method = "{method}", and weights are given: state "statistics", with which both count, or "none"',
-        ),
-        (
-            mesh is not None and stated.file is not None,
-            f"mesh.file names {stated.file}, and a mesh is given: leave one of them out",
-        ),
-        (
-            mesh is not None and stated.cracks,
-            "mesh.cracks splits a mesh that is made here; the mesh that is given has its own",
-        ),
-        (
-            stated.element_size == "auto",
-            'mesh.element_size = "auto" is found on the frames of a test by rgbmidic.measure, for a mesh that is made '
-            "there: state a number",
-        ),
-        (
-            stated.refine is not False,
-            "mesh.refine is done on the frames of a test by rgbmidic.measure, for a mesh made there: leave it out",
-        ),
-        (
-            frames.kind in ("bayer", "rgb") and separation is None and settings.calibration.file is None,
-            f'frames.kind = "{frames.kind}" needs the lights\' crosstalk: state calibration.file, a file that '
-            "rgbmidic-calibrate writes",
-        ),
-    )
-    for found, message in refused:
-        if found:
-            raise ConfigurationError(message)
+
+    def contradictions() -> Iterator[str]:
+        if source is not None and (path := ", ".join(frames.path)):
+            yield f"frames.path names {path}, and a frame source is given: leave the path empty (path = [])"
+        if source is not None and frames.lights > 1:
+            yield "frames.lights is for files; a frame source gives all lights of a state by one index"
+        if weights is not None and method not in ("statistics", "none"):
+            given = 'and weights are given: state "statistics", with which both count, or "none"'
+            yield f'weights.method = "{method}", {given}'
+        if mesh is not None and stated.file is not None:
+            yield f"mesh.file names {stated.file}, and a mesh is given: leave one of them out"
+        if mesh is not None and stated.cracks:
+            yield "mesh.cracks splits a mesh that is made here; the mesh that is given has its own"
+        measured = "on the frames of a test by rgbmidic.measure, for a mesh"
+        if stated.element_size == "auto":
+            yield f'mesh.element_size = "auto" is found {measured} that is made there: state a number'
+        if stated.refine is not False:
+            yield f"mesh.refine is done {measured} made there: leave it out"
+
+    for message in contradictions():
+        raise ConfigurationError(message)
 
 
 def check_object(name: str, given: object, *methods: str) -> None:
@@ -129,9 +110,6 @@ def describe(given: Any, longest: int = 120) -> str:
         text = f"{class_name(given)}: {told()}"
     elif callable(given) and hasattr(given, "__qualname__"):
         text = f"{given.__module__}.{given.__qualname__}"
-    elif isinstance(given, np.ndarray):
-        digest = hashlib.sha256(np.ascontiguousarray(given).tobytes()).hexdigest()
-        text = f"{given.dtype} array of shape {given.shape}, {digest[:16]}"
     elif repr(given) == object.__repr__(given):
         text = class_name(given)
     else:
@@ -232,7 +210,6 @@ class SourceSeries:
         FrameError
             The source raises an error, gives something that is no frame, or contradicts ``[frames]``.
         """
-        assert window is None or window.is_whole, "frames of a source are read whole"
         try:
             state = self.source[index]
         except RgbmidicError:
@@ -325,8 +302,8 @@ Series = FrameSeries | SourceSeries
 itself, such as read parts of frames."""
 
 
-def open_sequence(source: FrameSequence | Series, stated: FrameSettings, camera: Camera | None) -> Series:
-    """The series that the pipeline reads from a source, checked on the first frame of the reference.
+def open_frames(settings: TestSettings, source: FrameSequence | Series | None, camera: Camera | None) -> Series:
+    """The series that the pipeline reads: of files, or of a source, checked on the first frame of the reference.
 
     Raises
     ------
@@ -335,6 +312,9 @@ def open_sequence(source: FrameSequence | Series, stated: FrameSettings, camera:
     FrameError
         A reference frame, or the first or last frame, does not exist or cannot be read.
     """
+    stated = settings.frames
+    if source is None:
+        return open_series(stated, settings.base, camera)
     members = {name for name in set(dir(FrameSeries)) & set(dir(SourceSeries)) if not name.startswith("_")}
     if all(hasattr(source, name) for name in members):  # also by `__getattr__` of a wrapper
         return cast(Series, source)

@@ -1,14 +1,20 @@
-"""What all frames of a test share, made once before the first is measured.
+"""What all frames of a test share, made once before the first is measured, and which frame each of them starts from.
 
 calibration -> series of frames -> reference frames, checked -> one image per light, averaged -> region and mesh ->
 weights -> reference of the solve.
+
+The frames are the leaves of a tree of base `STRIDE`, whatever the number of workers: a frame starts from the one before
+it, every 16th from the 16th before, every 256th from the 256th before, and so on, so that chunks of consecutive frames
+can be measured side by side once their key frame is, and any range of frames needs only some key frames of those before
+it. A key frame that is not measured well from there is measured once more from the frame just before it, and the better
+of both is kept (`rgbmidic.pipeline.engine`).
 """
 
 from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from threading import Lock
@@ -21,7 +27,7 @@ from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError
 from rgbmidic.fields import CameraCalibration
-from rgbmidic.frames import Window, open_series, read_frame
+from rgbmidic.frames import Window, read_frame
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import DARK, IlluminationImages, correlated
@@ -36,7 +42,7 @@ from rgbmidic.illumination.separation import (
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
 from rgbmidic.mesh.placement import on_image
 from rgbmidic.pipeline import suitability
-from rgbmidic.pipeline.given import FrameSequence, Series, check_given, open_sequence
+from rgbmidic.pipeline.given import FrameSequence, Series, check_given, open_frames
 from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings, grey_levels
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights
@@ -44,7 +50,8 @@ from rgbmidic.weights.threshold import ThresholdWeights, blurred
 
 logger = logging.getLogger(__name__)
 
-
+STRIDE = 16
+"""Frames from one key frame to the next: so many workers are kept busy by one chain of key frames."""
 _WORTH = 0.5
 """Share of the frame from which all of it is read: what a window saves would be less than half."""
 
@@ -74,14 +81,6 @@ class ProcessState:
                     return reference_update
             self._updates.append((frames, make()))
             return self._updates[-1][1]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
-    """Element size that the frames of a test recommend (`rgbmidic.pipeline.resolution`), and why, in a sentence."""
-
-    element_size: float
-    reason: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,12 +115,9 @@ class Plan:
         Part of the reference frames that is read; all positions (region, mesh, images) count from where it begins.
     finite_elements, placement
         The mesh of ``mesh.file``, the part that is measured, and where it lies in the frame; None: there is no file.
-    choice
-        Why the elements have their size, where ``mesh.element_size`` is ``"auto"``; else None.
-    refinement
-        In which frame and how far the mesh was refined (``mesh.refine``), in a sentence; else None.
-    calibration
-        Figures of the calibration, for the provenance (`Calibration.figures`).
+    notes
+        For the provenance: figures of the calibration (`Calibration.figures`), why the elements have their size where
+        ``mesh.element_size`` is ``"auto"``, in which frame and how far the mesh was refined (``mesh.refine``).
     timings
         Whether to tell the time that each stage of a frame takes.
     process
@@ -143,9 +139,7 @@ class Plan:
     element_size: float
     finite_elements: FiniteElementMesh | None = None
     placement: Placement | None = None
-    choice: Choice | None = None
-    refinement: str | None = None
-    calibration: dict[str, Any] = field(default_factory=dict)
+    notes: Mapping[str, Any] = field(default_factory=dict)
     timings: bool = False
     process: ProcessState = field(default_factory=ProcessState, repr=False, compare=False)
 
@@ -191,10 +185,7 @@ class Plan:
         """
         check_given(settings, source, separation, weights, mesh)
         camera = None if settings.calibration.file is None else Calibration.read(settings.calibration.file)
-        if source is None:
-            series: Series = open_series(settings.frames, settings.base, camera)
-        else:
-            series = open_sequence(source, settings.frames, camera)
+        series = open_frames(settings, source, camera)
         frame = series.shape
         if settings.scale.camera is not None:
             CameraCalibration.read(settings.scale.camera).check(frame)
@@ -218,26 +209,15 @@ class Plan:
             size = settings.mesh.side
             cracks = [np.subtract(path, window.origin) for path in settings.mesh.cracks]
             mesh = Tri3Mesh.from_region(region, size, cracks)
-        cracked = len(mesh.crack_edges) > 0
-        sigma, solver = grey_levels(settings.illumination.normalise, settings.solver, cracked=cracked)
+        sigma, solver = grey_levels(settings.illumination.normalise, settings.solver, cracked=len(mesh.crack_edges) > 0)
+
+        def images_of(index: int) -> IlluminationImages:
+            return light_images(separate, series.read(index, window), window)
+
         weights = weights or prepare_weights(
-            settings,
-            images,
-            region,
-            shape=window.frame,
-            frames=len(series),
-            images_of=lambda index: light_images(separate, series.read(index, window), window),
+            settings, images, region, shape=frame, frames=len(series), images_of=images_of
         )
-        reference = _reference(images, weights, region, mesh, sigma, solver)
-        if isinstance(weights, ThresholdWeights):
-            _tell_no_effect(weights, images, region)
-        speckle = suitability.speckle_size(images, region)
-        if finite_elements is not None:
-            suitability.tell_small(mesh, speckle, finite_elements)
-        elif small := suitability.too_small(size, speckle, suitability.SUITABILITY.hardly_enough):
-            logger.warning("%s", small)
-        _check_seen(state, ", ".join(map(series.name, settings.frames.reference)), images, reference, region)
-        return cls(
+        plan = cls(
             settings=settings,
             normalise=sigma,
             solver=solver,
@@ -246,15 +226,17 @@ class Plan:
             region=region,
             weights=weights,
             images=images,
-            reference=reference,
-            speckle=speckle,
+            reference=_reference(images, weights, region, mesh, sigma, solver.prefilter),
+            speckle=suitability.speckle_size(images, region),
             saturated=suitability.saturated_fraction(state, region.mask),
             window=window,
             element_size=size,
             finite_elements=finite_elements,
             placement=placement,
-            calibration=camera.figures() if camera else {},
+            notes={"calibration_figures": camera.figures() if camera else {}},
         )
+        _check_reference(plan, state)
+        return plan
 
     @property
     def method(self) -> PrecisionMethod | None:
@@ -273,7 +255,7 @@ class Plan:
         -------
         Plan
         """
-        reference = _reference(self.images, self.weights, self.region, mesh, self.normalise, self.solver)
+        reference = _reference(self.images, self.weights, self.region, mesh, self.normalise, self.solver.prefilter)
         return replace(self, reference=reference)
 
     def prepared(self, images: IlluminationImages, index: int) -> tuple[FloatImage, FloatImage]:
@@ -321,22 +303,13 @@ class Plan:
 
 
 def _reference(
-    images: IlluminationImages,
-    weights: LightWeights,
-    region: Region,
-    mesh: Tri3Mesh,
-    sigma: float,
-    solver: SolverSettings,
+    images: IlluminationImages, weights: LightWeights, region: Region, mesh: Tri3Mesh, sigma: float, prefilter: str
 ) -> Reference:
     """The reference state as the solve needs it."""
+    values, origin, registration = correlated(images, sigma), images.origin, images.registration
+    counted = as_weights(weights.reference(images), images.values.shape, "weights of the reference")
     return Reference.prepare(
-        correlated(images, sigma),
-        region,
-        as_weights(weights.reference(images), images.values.shape, "weights of the reference"),
-        mesh=mesh,
-        prefilter=solver.prefilter,
-        origin=images.origin,
-        registration=images.registration,
+        values, region, counted, mesh=mesh, prefilter=prefilter, origin=origin, registration=registration
     )
 
 
@@ -382,31 +355,33 @@ def _read_reference(
     return states[0], images, learnt
 
 
-def _check_seen(state: RawState, name: str, images: IlluminationImages, reference: Reference, region: Region) -> None:
-    """Refuse a reference that no light sees or that shows no texture; warn of a light that is off."""
-    if not reference.pixel_weights.any():
-        fault = suitability.exposure_fault(state, region.mask) or "it is saturated, dark or excluded by the weights"
-        raise FrameError(f"no light sees the region in the reference ({name}): {fault}")
-    suitability.check_texture(state, region.mask, name)
-    off = [
-        f"{light} ({level:.1%})" for light, level in suitability.light_levels(images, region).items() if level < DARK
-    ]
-    if off and not isinstance(state, IlluminationImages):
-        logger.warning(
-            f"the reference ({name}) shows no light of {', '.join(off)}: the median in the region is under "
-            f"{100 * DARK:.0f} % of the full scale; are the lamps on?"
-        )
-
-
-def _tell_no_effect(weights: ThresholdWeights, images: IlluminationImages, region: Region) -> None:
-    """Warn of a threshold that excludes nothing in the region of the reference."""
-    inside = region.mask
-    if (weights.reference(images) > 0)[:, inside].sum() == images.valid[:, inside].sum():
+def _check_reference(plan: Plan, state: RawState) -> None:
+    """Refuse a reference that no light sees or that shows no texture; warn of what will be measured badly."""
+    weights, images, region = plan.weights, plan.images, plan.region
+    inside, name = region.mask, ", ".join(map(plan.series.name, plan.settings.frames.reference))
+    if isinstance(weights, ThresholdWeights) and (
+        (weights.reference(images) > 0)[:, inside].sum() == images.valid[:, inside].sum()
+    ):
         most = blurred(images, weights.blur)[:, inside].max() / images.full_scale
         logger.warning(
             f"weights.threshold = {weights.threshold:.3g} excludes nothing in the reference: no light, blurred over "
             f"{weights.blur:g} px, exceeds {most:.2g} of the dynamic range in the region. State a lower one, or "
             'weights.method = "statistics"'
+        )
+    if plan.finite_elements is not None:
+        suitability.tell_small(plan.reference.mesh, plan.speckle, plan.finite_elements)
+    elif small := suitability.too_small(plan.element_size, plan.speckle, suitability.SUITABILITY.hardly_enough):
+        logger.warning("%s", small)
+    if not plan.reference.pixel_weights.any():
+        fault = suitability.exposure_fault(state, inside) or "it is saturated, dark or excluded by the weights"
+        raise FrameError(f"no light sees the region in the reference ({name}): {fault}")
+    suitability.check_texture(state, inside, name)
+    levels = suitability.light_levels(images, region).items()
+    off = [f"{light} ({level:.1%})" for light, level in levels if level < DARK]
+    if off and not isinstance(state, IlluminationImages):
+        logger.warning(
+            f"the reference ({name}) shows no light of {', '.join(off)}: the median in the region is under "
+            f"{100 * DARK:.0f} % of the full scale; are the lamps on?"
         )
 
 
@@ -418,10 +393,8 @@ def finite_elements_of(
     camera = None if settings.scale.camera is None else CameraCalibration.read(settings.scale.camera)
     placement = Placement.fit(settings.mesh.points or (), camera)
     logger.info("mesh.points: %s", placement.summary())
-    limits = settings.region
-    allowed = read_region(limits, frame) if limits.is_stated else Region.from_mask(np.ones(frame, dtype=bool))
     every = read_mesh(settings.mesh.file, unit=settings.mesh.unit or "mm", part=settings.mesh.part)
-    part, mesh, region = on_image(every, placement, frame, allowed.without(limits.holes))
+    part, mesh, region = on_image(every, placement, frame, read_region(settings.region, frame))
     return part, placement, mesh, region
 
 
@@ -433,21 +406,19 @@ def window_of_reference(region: Region, settings: TestSettings, frame: tuple[int
     return Window.whole(frame) if np.prod(window.shape) > _WORTH * np.prod(frame) else window
 
 
-def window_around(
-    points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int], around: float = 96.0
-) -> Window:
+def window_around(points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int]) -> Window:
     """What lies within `reach` of points (N, 2), and what its images depend on.
 
-    The separation's local statistics use `around` px: three standard deviations of their windows with all that is
+    The separation's local statistics use 96 px around: three standard deviations of their windows with all that is
     between (`rgbmidic.lab.inspection.channels.InspectionConstants`).
     """
     may_crack = bool(settings.mesh.cracks) or settings.mesh.file is not None
     sigma, _ = grey_levels(settings.illumination.normalise, settings.solver, cracked=may_crack)
-    return Window.around(points, reach + max(around, 3 * max(sigma, settings.weights.blur)), frame)
+    return Window.around(points, reach + max(96.0, 3 * max(sigma, settings.weights.blur)), frame)
 
 
 def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
-    """The region of interest of the settings on images of `shape` (H, W).
+    """The region of interest of the settings on images of `shape` (H, W); all of them where none is stated.
 
     Parameters
     ----------
@@ -469,10 +440,38 @@ def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
         outlined = Region.from_rectangle(settings.rectangle, shape)
     elif settings.polygon is not None:
         outlined = Region.from_polygon(settings.polygon, shape)
+    elif settings.mask is None:
+        outlined = Region.from_mask(np.ones(shape, dtype=bool))
     else:
-        assert settings.mask is not None
         try:
             outlined = Region.from_mask(read_frame(settings.mask, kind="monochrome").values[0], shape)
         except RegionError as error:
             raise RegionError(f"region.mask {settings.mask}: {error}") from None
     return outlined.without(settings.holes)
+
+
+def parent(position: int) -> int | None:
+    """The frame that a frame starts from; None for the first."""
+    if position == 0:
+        return None
+    step = 1
+    while position % (step * STRIDE) == 0:
+        step *= STRIDE
+    return position - step
+
+
+def is_key(position: int) -> bool:
+    """Whether a frame starts from one that is not just before it."""
+    return position > 0 and position % STRIDE == 0
+
+
+def dependants(places: Iterable[int], tries: Sequence[int]) -> set[int]:
+    """Some frames, and all that depend on them, directly or through others, of a test with as many as `tries`.
+
+    A frame depends on the one that it starts from; a key frame of 2 `tries` also on the one just before it.
+    """
+    found = set(places)
+    for place, tried in enumerate(tries):
+        if parent(place) in found or (tried > 1 and place - 1 in found):
+            found.add(place)
+    return found

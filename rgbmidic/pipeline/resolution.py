@@ -9,22 +9,22 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from rgbmidic.correlation import Deformed, Solution, Status
-from rgbmidic.correlation.discretisation import discretisation_error
+from rgbmidic.correlation import Deformed, Solution, Start, Status, discretisation_error, track
+from rgbmidic.correlation.recovery import quadratic_fit
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionError, RgbmidicError
-from rgbmidic.fields import Places
+from rgbmidic.fields import NodalCovariance, Places, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import refined
 from rgbmidic.pipeline.frame import prepared_frame
-from rgbmidic.pipeline.plan import Choice, Plan
-from rgbmidic.pipeline.size_figures import CONSTANTS, Field, ResolutionStudy, SizeFigures, measure_size, rms, solved
+from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.size_figures import CONSTANTS, Choice, ErrorFigures, GaugeFigures, ResolutionStudy, SizeFigures
 from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.settings import ELEMENT_SIZE, TestSettings
 from rgbmidic.typing import FloatArray
@@ -39,27 +39,33 @@ noise by as much and the discretisation error of a smooth field by 4 (its third 
 Progress = Callable[[int, int, str], None]
 
 
-def largest_size(plan: Plan) -> float:
-    """Largest elements (px) of which three lie side by side across the region, in x and in y."""
-    spans = [np.flatnonzero(plan.region.mask.any(axis=axis)) for axis in (0, 1)]
-    return min(float(span[-1] - span[0]) for span in spans) / CONSTANTS.fewest
+def sizes_to_try(plan: Plan, stated: Sequence[float] = ()) -> tuple[float, ...]:
+    """The sizes that are stated, in rising order; else the `SIZES` that suit speckle and region.
 
-
-def sizes_to_try(plan: Plan) -> tuple[float, ...]:
-    """The `SIZES` that hold enough speckles and of which enough lie in the region; the nearest to that if none does.
+    Those hold enough speckles, and enough lie across the region; the nearest to that if none does.
 
     Raises
     ------
+    InputError
+        Of the largest that is stated fewer than three lie side by side across the region, in x or in y.
     RegionError
         The region is too small for any.
     """
-    least, most = max(SPECKLES * (plan.speckle or 0.0), CONSTANTS.least), largest_size(plan)
-    if most < CONSTANTS.least:
+    spans = [np.flatnonzero(plan.region.mask.any(axis=axis)) for axis in (0, 1)]
+    most = min(float(span[-1] - span[0]) for span in spans) / CONSTANTS.fewest
+    least = max(SPECKLES * (plan.speckle or 0.0), CONSTANTS.least)
+    if stated and max(stated) > most:
+        raise InputError(
+            f"elements of {max(stated):g} px are too large for the region: {most:.0f} px are the largest of which "
+            f"{CONSTANTS.fewest:g} lie across it"
+        )
+    if not stated and most < CONSTANTS.least:
         raise RegionError(
             f"the region is too small to compare element sizes: {CONSTANTS.fewest:g} elements of {CONSTANTS.least:g} "
             "px must lie across it; state mesh.element_size"
         )
-    return tuple(size for size in SIZES if least <= size <= most) or (float(np.floor(min(least, most))),)
+    suited = stated or [size for size in SIZES if least <= size <= most]
+    return tuple(sorted(suited)) or (float(np.floor(min(least, most))),)
 
 
 def study_sizes(
@@ -109,12 +115,7 @@ def study_sizes(
         raise InputError(f"elements of {min(sizes):g} px are too small: {CONSTANTS.least:g} px are the least")
     middle = min(sizes, key=lambda size: abs(size - ELEMENT_SIZE), default=ELEMENT_SIZE)
     plan = Plan.from_settings(replace(settings, mesh=replace(settings.mesh, element_size=middle)), **given)
-    sizes = tuple(sorted(sizes)) or sizes_to_try(plan)
-    if max(sizes) > (most := largest_size(plan)):
-        raise InputError(
-            f"elements of {max(sizes):g} px are too large for the region: {most:.0f} px are the largest of which "
-            f"{CONSTANTS.fewest:g} lie across it"
-        )
+    sizes = sizes_to_try(plan, sizes)
     lengths = [SHORTEST * size for size in sizes] if gauges is None else sorted(gauges)
     if lengths and max(lengths) < (shortest := SHORTEST * min(sizes) * (1 - CONSTANTS.equal)):
         raise InputError(
@@ -126,12 +127,11 @@ def study_sizes(
     key = _KeyFrame.find(plan, frames)
     at_rest = settings.frames.reference[: CONSTANTS.static] if static and len(settings.frames.reference) > 1 else ()
     rest = [_deformed(plan, index) for index in at_rest]
-    figures, finer = [], list[Field]()
+    figures, finer = [], list[tuple[Tri3Mesh, Solution]]()
     for number, size in enumerate(sizes):
         report(number + 1, len(sizes) + 1, f"elements of {size:g} px")
         try:
-            sized = _resized(plan, size)
-            figures.append(measure_size(sized, key.deformed, key.start(sized.reference.mesh), rest, lengths, finer))
+            figures.append(key.figures(_resized(plan, size), rest, lengths, finer))
         except RgbmidicError as error:
             logger.warning("elements of %g px: %s", size, error)
             figures.append(SizeFigures(element_size=size, reason=str(error)))
@@ -143,6 +143,91 @@ def study_sizes(
         preparation=key.seconds,
         sizes=_mesh_errors(figures),
     )
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square of the finite values; NaN where there are none."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+
+
+def solved(plan: Plan, deformed: Deformed, start: FloatArray | None) -> Solution:
+    """Solution of a frame from an initial guess (N, 2), or from a search."""
+    return track(plan.reference, deformed, Start(displacement=start), plan.solver, plan.method)
+
+
+def _field_at(mesh: Tri3Mesh, solution: Solution, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Displacement and strain (P, 5) at points (P, 2), and their noise without the misfit of the elements.
+
+    They follow the quadratics through the nodes around each node (`rgbmidic.fields.at_pixels`).
+    """
+    values = np.hstack([solution.displacement, solution.strain])
+    used = np.asarray(np.isfinite(values)[mesh.elements].all(axis=(1, 2)))
+    _, x, y, xx, xy, yy = (operator @ np.nan_to_num(values) for operator in quadratic_fit(mesh, used))
+    places = Places.of(mesh, points)
+    node, weight = mesh.elements[places.element], places.barycentric
+    dx, dy = np.moveaxis(points[:, None] - mesh.nodes[node], -1, 0)[..., None]
+    bent = xx[node] * dx * dx / 2 + xy[node] * dx * dy + yy[node] * dy * dy / 2
+    out = np.einsum("pc,pci->pi", weight, values[node] + x[node] * dx + y[node] * dy + bent)
+    nodal = np.hstack([solution.displacement_std, solution.strain_std])[node]
+    noise = np.sqrt(np.einsum("pc,pci->pi", weight, nodal**2))
+    return np.where(places.inside[:, None] & used[places.element][:, None], out, np.nan), noise
+
+
+def _apart(
+    mesh: Tri3Mesh, solution: Solution, finer: Sequence[tuple[Tri3Mesh, Solution]]
+) -> tuple[list[float], list[float]]:
+    """How far a solution is from each of those on `finer` elements beyond the noise of both, at the nodes of those.
+
+    Halved elements show little of what is far smaller than they are, or lies between their nodes; the finer sizes of a
+    study have measured it. Of displacement and strain.
+    """
+    found: tuple[list[float], list[float]] = ([], [])
+    for fine, other in finer:
+        here, noise = _field_at(mesh, solution, fine.nodes)
+        square = (here - np.hstack([other.displacement, other.strain])) ** 2
+        variance = noise**2 + np.hstack([other.displacement_std, other.strain_std]) ** 2
+        for errors, part in zip(found, (slice(2), slice(2, 5)), strict=True):
+            known = np.isfinite(square[:, part] + variance[:, part])
+            beyond, expected = (square - variance)[:, part][known], variance[:, part][known]
+            plain = beyond.sum() > CONSTANTS.sure * np.sqrt(2 * (expected**2).sum() / CONSTANTS.independent)
+            errors.append(float(np.sqrt(beyond.mean())) if plain else 0.0)
+    return found
+
+
+def _floor(fields: Sequence[FloatArray], references: int) -> tuple[float, float]:
+    """Bias and scatter of fields (N, C) of static frames, as of one frame against the mean of `references`.
+
+    They are differences among these frames, which do not depend on the reference: one frame scatters against the mean
+    of n by sqrt(1 + 1/n) more than they do around their own mean.
+    """
+    if len(fields) < 2:
+        return float("nan"), float("nan")
+    stack = np.stack(fields)
+    apart = (stack - stack.mean(axis=0)) * np.sqrt(1 + 1 / references) * np.sqrt(len(fields) / (len(fields) - 1))
+    mean = np.nanmean(apart, axis=1, keepdims=True)
+    return rms(mean), rms(apart - mean)
+
+
+def _gauge_figures(
+    plan: Plan, solution: Solution, still: Sequence[Solution], lengths: Sequence[float]
+) -> Iterator[GaugeFigures]:
+    """Figures of the virtual strain gauges that are not too short for the elements."""
+    mesh, measure = plan.reference.mesh, plan.settings.probes.measure
+    fit = [length for length in lengths if length >= SHORTEST * plan.element_size * (1 - CONSTANTS.equal)]
+    if not fit:
+        return
+    covariance = NodalCovariance.from_mesh(mesh)
+    for length in fit:
+        gauge = StrainGauges.at_nodes(covariance, length)
+        strains = [gauge.strain(*one.displacement.T, *one.displacement_std.T, measure=measure) for one in still]
+        loaded = gauge.strain(*solution.displacement.T, *solution.displacement_std.T, measure=measure)
+        floor = _floor([one.components for one in strains], len(plan.settings.frames.reference))[1]
+        size = np.abs(loaded.components)
+        known = size[np.isfinite(size)]
+        largest = float(np.quantile(known, CONSTANTS.largest)) if known.size else float("nan")
+        noise = floor if np.isfinite(floor) else rms(loaded.components_std)
+        yield GaugeFigures(length=length, noise=noise, largest=largest)
 
 
 def _mesh_errors(sizes: Sequence[SizeFigures]) -> tuple[SizeFigures, ...]:
@@ -207,7 +292,7 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
     Returns
     -------
     Plan
-        With the finer mesh, and `Plan.refinement` that tells of it.
+        With the finer mesh, and a note that tells of it.
 
     Raises
     ------
@@ -239,17 +324,17 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
         text = f"from {counts[0]} to {counts[-1]} nodes in {len(counts) - 1} steps, where {worth}; no leg is shorter "
         text += f"than {least:.3g} px"
     logger.info("refined: %s", text)
-    return replace(plan, refinement=text)
+    return replace(plan, notes={**plan.notes, "refinement": text})
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class _KeyFrame:
     """The deformed frame that sizes are compared in, measured on the mesh of a plan."""
 
     index: int
     deformed: Deformed
-    places: Tri3Mesh
-    displacement: FloatArray
+    mesh: Tri3Mesh
+    solution: Solution
     seconds: float
 
     @classmethod
@@ -278,19 +363,65 @@ class _KeyFrame:
                 reasons.append(f"{plan.series.name(index)}: {error}")
                 continue
             if (rest := _beyond_affine(solution)) > most:
-                mesh = plan.reference.mesh
-                whole = solution.displacement[mesh.nearest(solution.measured)[1]]
-                found = cls(index=index, deformed=deformed, places=mesh, displacement=whole, seconds=seconds)
-                most = rest
+                found, most = cls(index, deformed, plan.reference.mesh, solution, seconds), rest
         if found is None:
             raise FrameError(f"no deformed frame can be measured: {'; '.join(reasons)}")
         return found
 
     def start(self, mesh: Tri3Mesh) -> FloatArray:
         """The displacement (N, 2) at the nodes of another mesh of the region."""
-        found = Places.of(self.places, mesh.places)
-        corners = self.displacement[self.places.elements[found.element]]
+        found = Places.of(self.mesh, mesh.places)
+        whole = self.solution.displacement[self.mesh.nearest(self.solution.measured)[1]]
+        corners = whole[self.mesh.elements[found.element]]
         return np.asarray(np.einsum("nc,nci->ni", found.barycentric, corners))
+
+    def figures(
+        self, plan: Plan, rest: Sequence[Deformed], gauges: Sequence[float], finer: list[tuple[Tri3Mesh, Solution]]
+    ) -> SizeFigures:
+        """Measure the figures of the size of a plan's elements.
+
+        Parameters
+        ----------
+        plan
+            The test with elements of this size.
+        rest
+            Static frames.
+        gauges
+            Lengths of virtual strain gauges, px; those too short for the elements are left out.
+        finer
+            Meshes of finer elements and the solutions on them, to which those of these are added.
+        """
+        mesh, speckle = plan.reference.mesh, plan.speckle or float("nan")
+        before = time.process_time()
+        solution = solved(plan, self.deformed, self.start(mesh))
+        seconds = time.process_time() - before
+        if solution.status is Status.FAILED:
+            raise FrameError(solution.reason)
+        still = [solved(plan, static, np.zeros_like(mesh.nodes)) for static in rest]
+        known = discretisation_error(plan.reference, self.deformed, solution, plan.solver, plan.method)
+        other = [one for one in finer if CONSTANTS.finer * one[0].size <= mesh.size]
+        # it differs from all of them, each of which has an error of its own (in proportion to the size's third power);
+        # reflections, which every size averages in its own way, hardly differ from the next
+        part = [1 - (fine.size / mesh.size) ** 3 for fine, _ in other]
+        apart = [min(np.divide(found, part), default=0.0) for found in _apart(mesh, known, other)]
+        finer.append((mesh, known))
+        whole = solution.measured[mesh.elements].all(axis=1)
+
+        def errors(name: str, beyond: float) -> dict[str, Any]:
+            bias, scatter = _floor([getattr(one, name) for one in still], len(plan.settings.frames.reference))
+            stated, error = (rms(getattr(known, f"{name}_{kind}")) for kind in ("std", "error"))
+            return {"bias": bias, "scatter": scatter, "stated": stated, "discretisation": float(np.fmax(error, beyond))}
+
+        return SizeFigures(
+            element_size=plan.element_size,
+            speckles=plan.element_size / speckle,
+            nodes=len(mesh.nodes),
+            measured=float(mesh.areas[whole].sum() / mesh.areas.sum()),
+            strain=ErrorFigures(**errors("strain", apart[1])),
+            seconds=seconds,
+            gauges=tuple(_gauge_figures(plan, solution, still, gauges)),
+            **errors("displacement", apart[0]),
+        )
 
 
 def _deformed(plan: Plan, index: int) -> Deformed:

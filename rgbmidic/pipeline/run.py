@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from itertools import chain
@@ -20,11 +20,10 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, following, open_workers, rank_of
 from rgbmidic.pipeline.frame import Measured, Updated, read_state
 from rgbmidic.pipeline.given import FrameSequence, check_object, check_type, describe
-from rgbmidic.pipeline.order import dependants
-from rgbmidic.pipeline.plan import Choice, Plan
-from rgbmidic.pipeline.resolution import choose, refine
+from rgbmidic.pipeline.plan import Plan, dependants
+from rgbmidic.pipeline.resolution import Progress, choose, refine
 from rgbmidic.pipeline.suitability import light_levels
-from rgbmidic.results import Origin, Result, ResultStore
+from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.results.result import listed, read_shared
@@ -33,13 +32,9 @@ from rgbmidic.weights import LightWeights
 
 logger = logging.getLogger(__name__)
 
-Progress = Callable[[int, int, str], None]
-
 _OF_NODES = {
-    "displacement": ("u", "v"),
-    "displacement_std": ("u_std", "v_std"),
-    "strain": ("exx", "eyy", "exy"),
-    "strain_std": ("exx_std", "eyy_std", "exy_std"),
+    array: [one.name for one in QUANTITIES.values() if one.source.startswith(f"{array}.")]
+    for array in ("displacement", "displacement_std", "strain", "strain_std")
 }
 """Quantities of a frame that it makes a reference with, as columns of its solution's arrays."""
 
@@ -124,23 +119,23 @@ def measure(
     check_type("workers", workers, int | None, "a whole number")
     check_object("progress", progress, "__call__")
     given: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
-    choice: Choice | None = None
     begun = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()
     kept = read_provenance(Path(out)) if begun else {}
-    if settings.mesh.element_size == "auto":
-        choice = Choice(**kept["element_size"]) if kept.get("element_size") else choose(settings, **given)
+    sized, notes = settings.mesh, dict[str, Any]()
+    if sized.element_size == "auto":
+        choice = notes["element_size"] = kept.get("element_size") or asdict(choose(settings, **given))
+        sized = replace(sized, element_size=choice["element_size"])
     refines = settings.mesh.refine is not False
     if refines and mesh is not None:
         raise InputError("mesh.refine is for a mesh made here, and a mesh is given: leave one of them out")
-    sized = settings.mesh if choice is None else replace(settings.mesh, element_size=choice.element_size)
     plan = Plan.from_settings(replace(settings, mesh=replace(sized, refine=False)), **given)
     if refines and "refinement" in kept:
         stored = read_shared(Path(out), kept)
         finer = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
-        plan = replace(plan.on_mesh(finer), refinement=kept["refinement"])
+        plan, notes["refinement"] = plan.on_mesh(finer), kept["refinement"]
     elif refines:
         plan = refine(plan, settings.mesh.refine)
-    plan = replace(plan, settings=settings, choice=choice, timings=timings)
+    plan = replace(plan, settings=settings, notes={**plan.notes, **notes}, timings=timings)
     objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
     if settings.weights.method == "images":  # the masks, whatever their files are called
         objects["weights"] = describe(plan.weights)
@@ -156,7 +151,7 @@ def measure(
         opened = ResultStore.create(out, origin, overwrite=overwrite)
     with opened as store:
         if resume and frames is None:
-            _take_back(plan, store, retry_failed=retry_failed)
+            _take_back(plan, store, origin.names, retry_failed=retry_failed)
         sink = _Folder(plan, store, places, progress)
         schedule = Schedule(plan, sink, places)
         if schedule.done and frames is None and "finished" in read_provenance(store.path):
@@ -166,7 +161,7 @@ def measure(
         if not schedule.done:
             with closing(open_workers(plan, min(workers, len(places)), scheduler)) as others:
                 schedule.run(others)
-        _tell_repeated(plan, store, places)
+        _tell_repeated(store, places, origin.names)
         if frames is None:
             store.finish()
     return Result.open(out, partial=frames is not None, check=False)
@@ -199,17 +194,14 @@ class _Folder:
         if not places:
             return ()
         mesh, lights, chosen = self._plan.reference.mesh, len(self._plan.images.names), self._plan.series.chosen
-        blank = Solution.failed(mesh, lights, "", np.zeros(0))
-
-        def solution(kept: Mapping[str, Any]) -> Solution:
-            arrays: dict[str, Any] = {
-                name: np.stack([kept[part] for part in parts], axis=1, dtype=np.float64)
-                for name, parts in _OF_NODES.items()
-            }
-            return replace(blank, **arrays, node_status=kept["node_status"], rigid=kept["rigid"].astype(np.float64))
-
-        kept = self._store.table().each([*chain(*_OF_NODES.values()), "node_status", "rigid"], places)
-        return [(chosen[place], solution(one)) for place, one in zip(places, kept, strict=True)]
+        blank, found = Solution.failed(mesh, lights, "", np.zeros(0)), []
+        names = [*chain(*_OF_NODES.values()), "node_status", "rigid"]
+        for place, kept in zip(places, self._store.table().each(names, places), strict=True):
+            arrays: dict[str, Any] = {"node_status": kept["node_status"], "rigid": kept["rigid"].astype(np.float64)}
+            for name, parts in _OF_NODES.items():
+                arrays[name] = np.stack([kept[part] for part in parts], axis=1, dtype=np.float64)
+            found.append((chosen[place], replace(blank, **arrays)))
+        return found
 
     def keep(self, place: int, found: Measured, after: Start) -> None:
         """Write a frame, and report what became of it."""
@@ -225,14 +217,13 @@ class _Folder:
         self._progress(done, len(places), f"{self._plan.series.name(self._plan.series.chosen[place])}: {line}")
 
 
-def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
+def _take_back(plan: Plan, store: ResultStore, names: Sequence[str], *, retry_failed: bool) -> None:
     """Take back the frames that are to be measured again, and those whose bits depend on what becomes of them.
 
     A damaged frame comes back with the same bits, unless it had failed because it could not be read.
     """
     table = store.table()
-    damaged = table.without_damaged(ended="finished" in read_provenance(store.path)).damaged
-    names, chosen = [plan.series.name(index) for index in plan.series.chosen], plan.series.chosen
+    lost = np.flatnonzero(table.without_damaged(ended="finished" in read_provenance(store.path)).damaged).tolist()
     changed, readable, tries = list[int](), list[int](), [2] * len(names)
     for place, there in enumerate(table.finished.tolist()):
         try:
@@ -243,28 +234,25 @@ def _take_back(plan: Plan, store: ResultStore, *, retry_failed: bool) -> None:
         tries[place] = kept["tries"]
         if kept["unread"]:
             with suppress(FrameError):
-                read_state(plan, chosen[place])
+                read_state(plan, plan.series.chosen[place])
                 readable.append(place)
                 continue
         if retry_failed and kept["status"] == Status.FAILED:
             changed.append(place)
-    lost = np.flatnonzero(damaged).tolist()
-    again = {*lost, *dependants([*changed, *readable], tries)}
     if lost:
         logger.warning("lost to damage and measured again: %s", listed(lost, names))
     if readable:
         again_for = listed(readable, names)
         logger.warning("measured again with what started from it, since it can be read now: %s", again_for)
-    store.discard(again)
+    store.discard({*lost, *dependants([*changed, *readable], tries)})
 
 
-def _tell_repeated(plan: Plan, store: ResultStore, places: range) -> None:
+def _tell_repeated(store: ResultStore, places: range, names: Sequence[str]) -> None:
     """Warn of frames with the samples of the frame before, bit for bit."""
     sums = [kept["checksum"] for kept in store.table().each(["checksum"], places)]
     pairs = zip(places[1:], sums[1:], sums, strict=False)
     repeated = [place for place, mine, before in pairs if mine == before != NO_CHECKSUM]
     if repeated:
-        names = [plan.series.name(index) for index in plan.series.chosen]
         what = "all frames repeat" if len(repeated) == len(places) - 1 else "frames that repeat"
         logger.warning(
             f"{what} the one before, bit for bit, which camera noise makes impossible: {listed(repeated, names)}; were "
@@ -308,8 +296,7 @@ def _origin(plan: Plan, objects: Mapping[str, str], unread_before: Collection[st
         reference=plan.images.values,
         notes={
             **getattr(plan.weights, "notes", {}),
-            **({} if plan.choice is None else {"element_size": asdict(plan.choice)}),
-            **({} if plan.refinement is None else {"refinement": plan.refinement}),
+            **plan.notes,
             "grey_levels": {"normalise": plan.normalise, "brightness": plan.solver.brightness},
             "frame_rate": recording.frame_rate,
             "exposure_ns": recording.exposure_ns,
@@ -321,6 +308,5 @@ def _origin(plan: Plan, objects: Mapping[str, str], unread_before: Collection[st
                 {"light": light, "median": level, "excluded": float(1 - part)}
                 for (light, level), part in zip(levels, usable, strict=True)
             ],
-            "calibration_figures": plan.calibration,
         },
     )

@@ -17,19 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.threads import aside
-from rgbmidic.correlation import (
-    Deformed,
-    PrecisionMethod,
-    Reference,
-    Solution,
-    Start,
-    discretisation_error,
-    fill,
-    solve,
-    track,
-)
+from rgbmidic.correlation import Deformed, Reference, Solution, Start, discretisation_error, fill, solve, track
 from rgbmidic.correlation.images import as_light_stack, unmasked
 from rgbmidic.correlation.reference_update import ReferenceUpdate
+from rgbmidic.correlation.residual import PrecisionMethod
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.illumination.images import normalise as divide_by_local_mean
 from rgbmidic.illumination.separation import LightSeparation
@@ -37,22 +28,9 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, Threads
 from rgbmidic.pipeline.frame import Measured, next_reference
 from rgbmidic.pipeline.given import check_object, check_type
-from rgbmidic.pipeline.order import STRIDE
-from rgbmidic.pipeline.plan import Plan
+from rgbmidic.pipeline.plan import STRIDE, Plan
 from rgbmidic.results.quantities import NO_CHECKSUM
-from rgbmidic.settings import (
-    ELEMENT_SIZE,
-    FrameSettings,
-    IlluminationSettings,
-    MeshSettings,
-    RegionSettings,
-    SolverOptions,
-    SolverSettings,
-    TestSettings,
-    WeightSettings,
-    check_names,
-    grey_levels,
-)
+from rgbmidic.settings import ELEMENT_SIZE, SolverOptions, TestSettings, check_names, grey_levels, sections
 from rgbmidic.typing import FloatArray
 from rgbmidic.weights import LightWeights, MaskWeights, Statistics, as_weights
 
@@ -156,7 +134,7 @@ def correlate(
     return fill(mesh, solution, solver.fill) if solver.fill else solution
 
 
-def solver_settings(options: SolverOptions) -> SolverSettings:
+def solver_settings(options: SolverOptions) -> sections.SolverSettings:
     """The settings of the solve that options of a function state.
 
     Raises
@@ -165,8 +143,8 @@ def solver_settings(options: SolverOptions) -> SolverSettings:
         An option is unknown or out of range.
     """
     try:
-        check_names(options, (entry.name for entry in fields(SolverSettings)), "option", "correlate")
-        return SolverSettings(**options)
+        check_names(options, (entry.name for entry in fields(sections.SolverSettings)), "option", "correlate")
+        return sections.SolverSettings(**options)
     except ConfigurationError as error:
         raise InputError(str(error)) from None
 
@@ -265,23 +243,19 @@ def measure_sequence(
     check_type("settings", settings, TestSettings | None, "a TestSettings")
     remaining = iter(states)
     own = reference is None
-    if own:
-        try:
-            reference = next(remaining)
-        except StopIteration:
-            raise InputError("there is no state to measure: the sequence is empty") from None
+    if own and (reference := next(remaining, None)) is None:
+        raise InputError("there is no state to measure: the sequence is empty")
     latest = _Latest(reference=reference, light_images=settings is None)
     mask = region if isinstance(region, Region) else None
     if settings is None:
         height, width = np.shape(getattr(reference, "values", reference))[-2:]
-        whole = region is None or isinstance(region, Region)
-        corners: Any = (0, 0, width - 1, height - 1) if whole else tuple(cast(Any, region))
+        corners = (0, 0, width - 1, height - 1) if region is None or mask is not None else tuple(cast(Any, region))
         settings = TestSettings(
-            frames=FrameSettings(path=(), update_reference=update_reference),
-            region=RegionSettings(rectangle=corners),
-            mesh=MeshSettings(element_size=element_size),
-            illumination=IlluminationSettings(normalise=normalise),
-            weights=WeightSettings(method="statistics" if statistics else "none"),
+            frames=sections.FrameSettings(path=(), update_reference=update_reference),
+            region=sections.RegionSettings(rectangle=corners),
+            mesh=sections.MeshSettings(element_size=element_size),
+            illumination=sections.IlluminationSettings(normalise=normalise),
+            weights=sections.WeightSettings(method="statistics" if statistics else "none"),
             solver=solver_settings(options),
         )
     elif options or region is not None:

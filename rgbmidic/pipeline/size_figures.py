@@ -2,22 +2,11 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from rgbmidic.correlation import Deformed, Solution, Start, Status, discretisation_error, track
-from rgbmidic.correlation.recovery import quadratic_fit
-from rgbmidic.errors import FrameError
-from rgbmidic.fields import NodalCovariance, Places, StrainGauges
-from rgbmidic.fields.strain import SHORTEST
-from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.plan import Choice, Plan
 from rgbmidic.pipeline.suitability import SPECKLES
-from rgbmidic.typing import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,6 +152,14 @@ class SizeFigures(ErrorFigures):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """Element size that the frames of a test recommend, and why, in a sentence."""
+
+    element_size: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ResolutionStudy:
     """Figures of several element sizes on a test's own frames.
 
@@ -214,151 +211,3 @@ class ResolutionStudy:
             names = ", ".join(f"{one.element_size:g}" for one in few)
             parts.append(f"{names} px are less than {SPECKLES:g} speckles of {self.speckle:.1f} px")
         return Choice(element_size=best.element_size, reason="; ".join(parts))
-
-
-def solved(plan: Plan, deformed: Deformed, start: FloatArray | None) -> Solution:
-    """Solution of a frame from an initial guess (N, 2), or from a search."""
-    return track(plan.reference, deformed, Start(displacement=start), plan.solver, plan.method)
-
-
-def rms(values: FloatArray) -> float:
-    """Root mean square of the finite values; NaN where there are none."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
-
-
-def measure_size(
-    plan: Plan,
-    deformed: Deformed,
-    start: FloatArray,
-    rest: Sequence[Deformed],
-    gauges: Sequence[float],
-    finer: list[Field],
-) -> SizeFigures:
-    """Measure the figures of the size of a plan's elements.
-
-    Parameters
-    ----------
-    plan
-        The test with elements of this size.
-    deformed, start
-        The key frame and its initial guess (N, 2).
-    rest
-        Static frames.
-    gauges
-        Lengths of virtual strain gauges, px; those too short for the elements are left out.
-    finer
-        Fields on finer elements, to which that on these is added.
-    """
-    mesh, speckle = plan.reference.mesh, plan.speckle or float("nan")
-    before = time.process_time()
-    solution = solved(plan, deformed, start)
-    seconds = time.process_time() - before
-    if solution.status is Status.FAILED:
-        raise FrameError(solution.reason)
-    still = [solved(plan, static, np.zeros_like(mesh.nodes)) for static in rest]
-    known = discretisation_error(plan.reference, deformed, solution, plan.solver, plan.method)
-    field = Field.of(mesh, known)
-    other = [one for one in finer if CONSTANTS.finer * one.mesh.size <= mesh.size]
-    # it differs from all of them, each of which has an error of its own (in proportion to the size's third power);
-    # reflections, which every size averages in its own way, hardly differ from the next
-    part = [1 - (one.mesh.size / mesh.size) ** 3 for one in other]
-    apart = [min(np.divide(found, part), default=0.0) for found in field.apart(other)]
-    finer.append(field)
-    whole = solution.measured[mesh.elements].all(axis=1)
-
-    def errors(name: str, beyond: float) -> dict[str, Any]:
-        bias, scatter = _floor([getattr(one, name) for one in still], len(plan.settings.frames.reference))
-        stated, error = (rms(getattr(known, f"{name}_{kind}")) for kind in ("std", "error"))
-        return {"bias": bias, "scatter": scatter, "stated": stated, "discretisation": float(np.fmax(error, beyond))}
-
-    return SizeFigures(
-        element_size=plan.element_size,
-        speckles=plan.element_size / speckle,
-        nodes=len(mesh.nodes),
-        measured=float(mesh.areas[whole].sum() / mesh.areas.sum()),
-        strain=ErrorFigures(**errors("strain", apart[1])),
-        seconds=seconds,
-        gauges=tuple(_gauge_figures(plan, solution, still, gauges)),
-        **errors("displacement", apart[0]),
-    )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Field:
-    """Displacement and strain (N, 5) on a mesh, and their noise."""
-
-    mesh: Tri3Mesh
-    values: FloatArray
-    noise: FloatArray
-
-    @classmethod
-    def of(cls, mesh: Tri3Mesh, solution: Solution) -> Field:
-        """Those of a solution, the noise without the misfit of the elements."""
-        values = np.hstack([solution.displacement, solution.strain])
-        return cls(mesh=mesh, values=values, noise=np.hstack([solution.displacement_std, solution.strain_std]))
-
-    def at(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The field at points (P, 2), by the quadratics through the nodes around each node (`at_pixels`), and noise."""
-        used = np.asarray(np.isfinite(self.values)[self.mesh.elements].all(axis=(1, 2)))
-        known = np.nan_to_num(self.values)
-        _, x, y, xx, xy, yy = (operator @ known for operator in quadratic_fit(self.mesh, used))
-        places = Places.of(self.mesh, points)
-        node, weight = self.mesh.elements[places.element], places.barycentric
-        dx, dy = np.moveaxis(points[:, None] - self.mesh.nodes[node], -1, 0)[..., None]
-        bent = xx[node] * dx * dx / 2 + xy[node] * dx * dy + yy[node] * dy * dy / 2
-        out = np.einsum("pc,pci->pi", weight, self.values[node] + x[node] * dx + y[node] * dy + bent)
-        noise = np.sqrt(np.einsum("pc,pci->pi", weight, self.noise[node] ** 2))
-        return np.where(places.inside[:, None] & used[places.element][:, None], out, np.nan), noise
-
-    def apart(self, finer: Sequence[Field]) -> tuple[list[float], list[float]]:
-        """How far this field is from each of `finer` elements beyond the noise of both, at the nodes of those.
-
-        Halved elements show little of what is far smaller than they are, or lies between their nodes; the finer sizes
-        of a study have measured it. Of displacement and strain.
-        """
-        found: tuple[list[float], list[float]] = ([], [])
-        for other in finer:
-            here, noise = self.at(other.mesh.nodes)
-            square, variance = (here - other.values) ** 2, noise**2 + other.noise**2
-            for errors, part in zip(found, (slice(2), slice(2, 5)), strict=True):
-                known = np.isfinite(square[:, part] + variance[:, part])
-                beyond, expected = (square - variance)[:, part][known], variance[:, part][known]
-                plain = beyond.sum() > CONSTANTS.sure * np.sqrt(2 * (expected**2).sum() / CONSTANTS.independent)
-                errors.append(float(np.sqrt(beyond.mean())) if plain else 0.0)
-        return found
-
-
-def _floor(fields: Sequence[FloatArray], references: int) -> tuple[float, float]:
-    """Bias and scatter of fields (N, C) of static frames, as of one frame against the mean of `references`.
-
-    They are differences among these frames, which do not depend on the reference: one frame scatters against the mean
-    of n by sqrt(1 + 1/n) more than they do around their own mean.
-    """
-    if len(fields) < 2:
-        return float("nan"), float("nan")
-    stack = np.stack(fields)
-    apart = (stack - stack.mean(axis=0)) * np.sqrt(1 + 1 / references) * np.sqrt(len(fields) / (len(fields) - 1))
-    mean = np.nanmean(apart, axis=1, keepdims=True)
-    return rms(mean), rms(apart - mean)
-
-
-def _gauge_figures(
-    plan: Plan, solution: Solution, still: Sequence[Solution], lengths: Sequence[float]
-) -> Iterator[GaugeFigures]:
-    """Figures of the virtual strain gauges that are not too short for the elements."""
-    mesh, measure = plan.reference.mesh, plan.settings.probes.measure
-    fit = [length for length in lengths if length >= SHORTEST * plan.element_size * (1 - CONSTANTS.equal)]
-    if not fit:
-        return
-    covariance = NodalCovariance.from_mesh(mesh)
-    for length in fit:
-        gauge = StrainGauges.at_nodes(covariance, length)
-        strains = [gauge.strain(*one.displacement.T, *one.displacement_std.T, measure=measure) for one in still]
-        loaded = gauge.strain(*solution.displacement.T, *solution.displacement_std.T, measure=measure)
-        floor = _floor([one.components for one in strains], len(plan.settings.frames.reference))[1]
-        size = np.abs(loaded.components)
-        known = size[np.isfinite(size)]
-        largest = float(np.quantile(known, CONSTANTS.largest)) if known.size else float("nan")
-        noise = floor if np.isfinite(floor) else rms(loaded.components_std)
-        yield GaugeFigures(length=length, noise=noise, largest=largest)

@@ -68,12 +68,11 @@ def tell_small(mesh: Tri3Mesh, speckle: float | None, finite_elements: FiniteEle
     It goes with the inverse of the element's side (`rgbmidic.scene.forecast.node_constant`).
     """
     sides = np.sqrt(2 * mesh.areas)
-    small = sides < SPECKLES * (speckle or 0.0)
-    if speckle is None or not small.any():
+    few = SPECKLES * (speckle or 0.0)
+    if not (small := sides < few).any():
         return
     least = int(np.argmin(sides))
     typical = float(np.median(sides[small]))
-    few = SPECKLES * speckle
     text = (
         f"{int(small.sum())} of {sides.size} triangles have sides under {SPECKLES:g} speckles of {speckle:.1f} px, "
         f"{typical:.1f} px in the median (element {finite_elements.element_numbers[least]}: {sides[least]:.1f} px): "
@@ -147,8 +146,7 @@ def neighbour_correlation(frame: Mosaic | ChannelFrame | IlluminationImages, ins
 def _planes(frame: Mosaic | ChannelFrame | IlluminationImages, inside: BoolArray) -> list[FloatArray]:
     """Samples of each channel on their own lattice, less their local mean (shading); 0 outside and where saturated."""
     step = 2 if isinstance(frame, Mosaic) else 1
-    seen = frame.valid if isinstance(frame, IlluminationImages) else frame.values < frame.white_level
-    usable = inside & seen
+    usable = inside & (frame.valid if isinstance(frame, IlluminationImages) else frame.values < frame.white_level)
     known = np.where(usable, frame.values, np.nan).astype(np.float32).reshape(-1, *inside.shape)
     rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
     # a cell of a mosaic is any 2 x 2 samples, wherever the region begins

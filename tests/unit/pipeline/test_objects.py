@@ -126,7 +126,7 @@ def test_a_separation_of_ones_own_needs_no_calibration(tmp_path):
     result = measure(bayer, tmp_path / "out", source=FRAMES, separation=plain)
     assert result.lights == ("a", "b")
     assert error(result) < 0.05
-    with pytest.raises(ConfigurationError, match=r'kind = "bayer" needs the lights'):
+    with pytest.raises(ConfigurationError, match=r"calibration\.file is missing: colour frames need"):
         measure(bayer, tmp_path / "no", source=FRAMES)
 
 
