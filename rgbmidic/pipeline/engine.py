@@ -23,8 +23,7 @@ import numpy as np
 from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.correlation import NodeStatus, Start, Status
 from rgbmidic.correlation.solution import rank
-from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError
-from rgbmidic.extras import optional
+from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError, optional
 from rgbmidic.pipeline.frame import Measured, Updated, attempt, failed_frame
 from rgbmidic.pipeline.plan import STRIDE, Plan, is_key, parent
 from rgbmidic.results import FrameRecord
