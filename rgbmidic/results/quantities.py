@@ -327,8 +327,6 @@ _TABLE = (
 
 QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _TABLE}
 """Every quantity by its name, in the order of the documents."""
-STACKED = tuple(name for name, entry in QUANTITIES.items() if entry.stackable or entry.estimated)
-"""Those with one shape in all frames, which are attributes of a result; all are attributes of a record."""
 FAILED = QUANTITIES["status"].codes.index("failed")
 """`status` of a frame that could not be measured."""
 

@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -59,8 +59,64 @@ def _layout(names: tuple[str, ...]) -> tuple[dict[str, bytes], struct.Struct, st
     return files, struct.Struct(f"<{tail}4s4H2IH16sQ"), struct.Struct(f"<{found}{_END}x16sQ")
 
 
+T_co = TypeVar("T_co", covariant=True)
+
+
+class _Holder(Protocol[T_co]):
+    def _quantity(self, name: str, /) -> T_co: ...
+
+
+class _Attribute:
+    """A quantity of the table as an attribute of what holds it."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, holder: _Holder[T_co], owner: type | None = None) -> T_co:
+        if holder is None:  # asked of the class, by documentation
+            raise AttributeError(self._name)
+        return holder._quantity(self._name)
+
+
+class Quantities:
+    """Quantities with one shape in all frames as attributes: of all frames in a result, of one in a record."""
+
+    __slots__ = ()
+    number = _Attribute()
+    time_ns = _Attribute()
+    status = _Attribute()
+    unread = _Attribute()
+    tries = _Attribute()
+    iterations = _Attribute()
+    checksum = _Attribute()
+    node_status = _Attribute()
+    u = _Attribute()
+    v = _Attribute()
+    u_std = _Attribute()
+    v_std = _Attribute()
+    exx = _Attribute()
+    eyy = _Attribute()
+    exy = _Attribute()
+    exx_std = _Attribute()
+    eyy_std = _Attribute()
+    exy_std = _Attribute()
+    u_mesh_error = _Attribute()
+    v_mesh_error = _Attribute()
+    exx_mesh_error = _Attribute()
+    eyy_mesh_error = _Attribute()
+    exy_mesh_error = _Attribute()
+    match = _Attribute()
+    best_match = _Attribute()
+    misfit = _Attribute()
+    light_fraction = _Attribute()
+    residual = _Attribute()
+    weight_fraction = _Attribute()
+    brightness = _Attribute()
+    seconds = _Attribute()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameRecord(Described):
+class FrameRecord(Quantities, Described):
     """The result of one frame; every quantity of `rgbmidic.results.QUANTITIES` is an attribute, such as ``record.u``.
 
     Attributes
@@ -78,6 +134,14 @@ class FrameRecord(Described):
 
     values: Mapping[str, Any]
     sizes: Mapping[str, int]
+    reason = _Attribute()
+    history = _Attribute()
+    inputs = _Attribute()
+    machine = _Attribute()
+    reference_updates = _Attribute()
+    rigid = _Attribute()
+    weights_thumbnail = _Attribute()
+    reflection_thumbnail = _Attribute()
 
     def __post_init__(self) -> None:
         """Check names and shapes, and take over the types of the table."""
@@ -155,15 +219,8 @@ class FrameRecord(Described):
         about = f"<rgbmidic frame {self.values['number']}, {end}{told}; {self.sizes['node']} nodes>"
         return f"{about}\nquantities: {', '.join(QUANTITIES)}"
 
-    def __getattr__(self, name: str, /) -> Any:
-        """Return a quantity of the table."""
-        if name not in QUANTITIES:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
+    def _quantity(self, name: str, /) -> Any:
         return self.values[name]
-
-    def __dir__(self) -> list[str]:
-        """Return the names of all attributes, quantities included."""
-        return [*object.__dir__(self), *QUANTITIES]
 
 
 def record_files(folder: Path) -> dict[int, os.DirEntry[str]]:

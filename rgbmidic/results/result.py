@@ -15,8 +15,8 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError, ResultError, optional
 from rgbmidic.results.files import read_arrays, read_json, write_json
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK, digest, fingerprint, now, read_provenance, sealed
-from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED, STACKED
-from rgbmidic.results.records import FrameRecord, FrameTable
+from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED
+from rgbmidic.results.records import FrameRecord, FrameTable, Quantities
 from rgbmidic.settings import read_section
 from rgbmidic.settings.schema import section_kinds
 from rgbmidic.text import Described
@@ -46,7 +46,7 @@ class Portable:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Result(Portable, Described):
+class Result(Portable, Quantities, Described):
     """The result of a test, for post-processing.
 
     `Result.open` opens a result folder, also during a run, and reads only the mesh and which frames there are. The
@@ -344,16 +344,9 @@ class Result(Portable, Described):
         dataset: xr.Dataset = optional("rgbmidic.results.dataset", "xarray").to_dataset(self, scale)
         return dataset
 
-    def __getattr__(self, name: str, /) -> AnyArray:
-        """Read a quantity of the table in all frames, at its first use."""
-        if name not in STACKED:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
+    def _quantity(self, name: str, /) -> AnyArray:
         stacked = self.__dict__[name] = self.stack(name)
         return stacked
-
-    def __dir__(self) -> list[str]:
-        """Return the names of all attributes, quantities included."""
-        return [*object.__dir__(self), *STACKED]
 
     @property
     def strain(self) -> FloatArray:
