@@ -351,7 +351,7 @@ def print_table(title: str, headings: list[str], rows: list[list[str]], words: M
     for row in rows:
         table.add_row(*row)
     print(title)
-    Console(soft_wrap=True, width=400).print(table)
+    Console(soft_wrap=True, width=400, markup=False).print(table)  # a name may have brackets
     for heading, meaning in (words or {}).items():
         print(f"  {heading}: {meaning}")
     print()

@@ -432,7 +432,7 @@ class Front:
     speed, speed_std
         In the unit of the positions over that of the times, negative where it travels towards the first end. It is
         that over the material, on the reference.
-    start
+    start, start_std
         When it is at position 0.
     used : ndarray, shape (P,), bool
         Positions that the fit takes in, so far apart that their noise is little correlated.
@@ -448,6 +448,7 @@ class Front:
     speed: float
     speed_std: float
     start: float
+    start_std: float
     used: BoolArray
     residuals: FloatArray
     chi_square: float
@@ -516,10 +517,9 @@ def fit_front(
     chi_square, freedom = float(residuals[used] @ np.linalg.solve(cover, residuals[used])), len(used) - 2
     probability = float(chdtrc(freedom, chi_square))
     spread = spread * max(chi_square / freedom, 1)
-    slope_std = math.sqrt(spread[1, 1])
+    start_std, slope_std = np.sqrt(np.diag(spread))
     if not abs(slope) > _CONSTANTS.travels * slope_std:
-        span = float(np.ptp(positions[used]))
-        differ = uncertain(slope * span, slope_std * span)
+        differ = uncertain(*(part * np.ptp(positions[used]) for part in (slope, slope_std)))
         raise InputError(
             f"no front travels along the line: the arrival times differ by {differ} between its ends "
             f"(chi-square {chi_square:.3g} of {freedom}); "
@@ -529,6 +529,7 @@ def fit_front(
         speed=float(1 / slope),
         speed_std=float(slope_std / slope**2),
         start=float(start),
+        start_std=float(start_std),
         used=np.isin(np.arange(len(positions)), used),
         residuals=residuals,
         chi_square=chi_square,

@@ -146,7 +146,7 @@ class FrameSource(ABC):
 
     def _stored(self, index: int) -> StoredFrame:
         """Read a frame, of a format that does not allow to read some rows alone."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} reads no samples: it defines neither _rows nor _stored")
 
     @abstractmethod
     def _shape(self) -> tuple[int, int]: ...
