@@ -23,7 +23,7 @@ from results import corrupt, make_origin, make_result, random_record, smooth_rec
 from small_tests import colour_test
 
 from rgbmidic import __version__, cli, report
-from rgbmidic.command import FRAME_OPTIONS, execute, gather, read_frames, read_place, read_shape
+from rgbmidic.command import FRAME_OPTIONS, execute, gather, print_table, read_frames, read_place, read_shape
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 
@@ -92,6 +92,11 @@ def test_wrong_input_is_one_line_and_status_2(
     assert word in error
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_a_table_prints_names_with_brackets_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table("frames", ["frame", "file"], [["0", "[/red]a[b].dng"]])
+    assert "[/red]a[b].dng" in capsys.readouterr().out
 
 
 def test_a_huge_argument_is_refused_in_a_line_that_can_be_read(command: Run) -> None:
