@@ -70,7 +70,12 @@ class Sphere(_Body):
         return np.eye(3)
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels."""
+        """[kind, radius, half width, half height] for the kernels.
+
+        Returns
+        -------
+        ndarray, shape (4,)
+        """
         return np.array([kernels.SPHERE, self.radius, np.inf, np.inf])
 
 
@@ -99,7 +104,12 @@ class Cylinder(_Body):
         return rotation(self.tilt_deg, (0.0, 0.0, 1.0))
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels."""
+        """[kind, radius, half width, half height] for the kernels.
+
+        Returns
+        -------
+        ndarray, shape (4,)
+        """
         return np.array([kernels.CYLINDER, self.radius, np.inf, self.length / 2])
 
 
@@ -128,7 +138,12 @@ class Plate(_Body):
         return rotation(self.tilt_deg[1], (1.0, 0.0, 0.0)) @ rotation(self.tilt_deg[0], (0.0, 1.0, 0.0))
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels."""
+        """[kind, radius, half width, half height] for the kernels.
+
+        Returns
+        -------
+        ndarray, shape (4,)
+        """
         return np.array([kernels.PLATE, 0.0, self.width / 2, self.height / 2])
 
 
