@@ -3,10 +3,10 @@
 from rgbmidic.illumination.images import correlated
 from rgbmidic.illumination.separation import LightSeparation, Separation
 from rgbmidic.pipeline.frame import measure_frame
-from rgbmidic.pipeline.given import FrameSequence
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.run import measure
 from rgbmidic.pipeline.sequence import correlate, measure_sequence
+from rgbmidic.pipeline.source import FrameSequence
 
 __all__ = [
     "FrameSequence",

@@ -42,7 +42,8 @@ from rgbmidic.illumination.separation import (
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
 from rgbmidic.mesh.placement import on_image
 from rgbmidic.pipeline import suitability
-from rgbmidic.pipeline.given import FrameSequence, Series, check_given, open_frames
+from rgbmidic.pipeline.objects import check_given
+from rgbmidic.pipeline.source import FrameSequence, Series, open_frames
 from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings, grey_levels
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights

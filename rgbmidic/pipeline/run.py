@@ -19,9 +19,10 @@ from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, following, open_workers, rank_of
 from rgbmidic.pipeline.frame import Measured, Updated, read_state
-from rgbmidic.pipeline.given import FrameSequence, check_object, check_type, describe
+from rgbmidic.pipeline.objects import check_object, check_type, describe
 from rgbmidic.pipeline.plan import Plan, dependants
 from rgbmidic.pipeline.resolution import Progress, choose, refine
+from rgbmidic.pipeline.source import FrameSequence
 from rgbmidic.pipeline.suitability import light_levels
 from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
