@@ -18,7 +18,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities, spectral_response
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.scene import Physical
+from rgbmidic.scene.checked import PartOfScene
 from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
@@ -34,7 +34,7 @@ Floating = TypeVar("Floating", bound=np.floating)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Light(Physical):
+class Light(PartOfScene):
     """A point light; the irradiance falls with the square of the distance.
 
     Attributes
@@ -97,7 +97,7 @@ class Light(Physical):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Polarisers(Physical):
+class Polarisers(PartOfScene):
     """Crossed linear polarisers, one before every lamp and one before the camera.
 
     Diffuse light counts as depolarised, the reflection as polarised like the lamp but for a small fraction.
@@ -166,7 +166,7 @@ al., J. Opt. Soc. Am. A 32, 2015) and shipped by colour-science (BSD-3-Clause). 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Camera(Physical):
+class Camera(PartOfScene):
     """A camera at the origin that looks along +z, x to the right and y downwards.
 
     Attributes

@@ -15,15 +15,15 @@ import numpy as np
 from rgbmidic._kernels import render as kernels
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Led, Sensitivities
-from rgbmidic.scene import Physical
 from rgbmidic.scene.camera import PIXEL, REFERENCE_CROSSTALK, Camera, Light, Polarisers, Vector, rotation, three_lights
+from rgbmidic.scene.checked import PartOfScene
 from rgbmidic.scene.surface import AffineField, InPlaneField, MeshField, Surface
 from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value, read_section, read_table, read_toml, regular
 from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
 
-class _Body(Physical):
+class _Body(PartOfScene):
     """What bodies have in common."""
 
     __slots__ = ()
@@ -319,7 +319,7 @@ _FIELD_KEYS = ("displacement_gradient", "displacement_offset", "displacement_fil
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DatasetSettings(Physical):
+class DatasetSettings(PartOfScene):
     """Settings of the output (``[output]``).
 
     Attributes

@@ -16,7 +16,7 @@ from scipy.special import pdtr
 from rgbmidic._kernels.mesh import interpolate_at_points
 from rgbmidic._kernels.render import PLATE, sample_paint
 from rgbmidic.errors import InputError
-from rgbmidic.scene import Physical
+from rgbmidic.scene.checked import PartOfScene
 from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
@@ -29,7 +29,7 @@ BOUND = math.sqrt(6.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finish(Physical):
+class Finish(PartOfScene):
     """How one paint reflects.
 
     Attributes
@@ -71,7 +71,7 @@ class Finish(Physical):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Surface(Physical):
+class Surface(PartOfScene):
     """White paint under a spray of black droplets, thrown at random (Boolean model).
 
     Attributes

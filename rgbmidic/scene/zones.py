@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.scene import Physical
 from rgbmidic.scene.camera import NOMINAL_DISTANCE, Light
+from rgbmidic.scene.checked import PartOfScene
 from rgbmidic.scene.scene import Cylinder, Plate, Scene, Sphere, State
 from rgbmidic.scene.surface import Finish, Surface, material_from_spatial
 from rgbmidic.settings.conversion import bounded
@@ -190,7 +190,7 @@ def region_in_view(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reflectance(Physical):
+class Reflectance(PartOfScene):
     """How a painted surface reflects, at the scale of the speckle.
 
     Radiance under unit irradiance: ``diffuse n.l + specular exp(-t^2/(2 width^2)) / (v.h)``, with t the tangent of the

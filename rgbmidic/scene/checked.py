@@ -1,0 +1,17 @@
+"""The checks of what a scene consists of."""
+
+from rgbmidic.errors import ConfigurationError, InputError
+from rgbmidic.settings.conversion import Checked
+
+
+class PartOfScene(Checked):
+    """Something that a scene consists of: checked as the settings of a test are, and `InputError` where a value is impossible."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        try:
+            super().__post_init__()
+        except ConfigurationError as error:
+            raise InputError(f"{type(self).__name__}: {error}") from None
