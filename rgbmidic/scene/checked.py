@@ -5,7 +5,7 @@ from rgbmidic.settings.conversion import Checked
 
 
 class PartOfScene(Checked):
-    """Something that a scene consists of: checked as the settings of a test are, and `InputError` where a value is impossible."""
+    """A part of a scene, checked as the settings of a test are: an `InputError` where a value is impossible."""
 
     __slots__ = ()
 
