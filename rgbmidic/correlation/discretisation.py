@@ -167,8 +167,7 @@ def _finer_field(
     recovery = halves.recovery(children & equations.textured[fine.mesh.elements].all(axis=1), equations)
     variance = _score_variance(halves.straightened(last, recovery, found), weights) * (loss[:, None] ** 2)
     known = (equations.textured & ~fine.mesh.beside(~equations.textured))[:count]
-    found_here = np.concatenate([recovery.displacement(found), recovery.strain(found)], axis=1)
-    return np.where(known[:, None], found_here, np.nan), variance[:count]
+    return np.where(known[:, None], recovery.field(*found.T), np.nan), variance[:count]
 
 
 def _right_side(reference: Reference, weights: FloatImage, difference: FloatImage) -> FloatArray:
@@ -388,11 +387,13 @@ def _drawn(halves: _Halves, reference: Reference) -> _Draws:
     fine_recovery = halves.recovery(np.repeat(everywhere, len(_CHILDREN)), finer)
     drawn = _scores(finer, random)
     right = np.stack([fine.assembly.vector(one) for one in drawn], axis=1)
-    fields = _fields(recovery, coarse.solve(halves.restricted(right)))
+    found = coarse.solve(halves.restricted(right))
+    fields = recovery.field(found[::2], found[1::2])
     strain = np.ascontiguousarray(fields[..., 2:])
     unsmoothed = halves.unsmooth(strain.reshape(count, -1)).reshape(strain.shape)
     unsmoothed[mesh.on_boundary] = np.nan
-    difference = fields - _fields(fine_recovery, finer.solve(right))
+    found = finer.solve(right)
+    difference = fields - fine_recovery.field(found[::2], found[1::2])
     squares = np.concatenate([difference, unsmoothed], axis=2) ** 2
     means = halves.averaged(squares.reshape(count, -1)).reshape(squares.shape)
     typical = means.mean(axis=1)
@@ -423,13 +424,6 @@ def _scores(equations: Equations, random: np.random.Generator) -> FloatArray:
     covariance += _CONSTANTS.held * np.trace(covariance.mean(axis=0)) * np.eye(6)
     drawn = np.linalg.cholesky(covariance) @ random.standard_normal((len(blocks), 6, _CONSTANTS.draws))
     return np.moveaxis(drawn, 2, 0).reshape(_CONSTANTS.draws, -1, 3, 2)
-
-
-def _fields(recovery: Recovery, fitted: FloatArray) -> FloatArray:
-    """u, v, exx, eyy, exy (N, R, 5) for nodal values (2 N, R) of the linear fit."""
-    u, v = fitted[::2], fitted[1::2]
-    (xu, xv), (yu, yv) = ((slope @ u, slope @ v) for slope in (recovery.slope_x, recovery.slope_y))
-    return np.stack([recovery.value @ u, recovery.value @ v, xu, yv, (yu + xv) / 2], axis=-1)
 
 
 def _left(reference: Reference, noise: FloatImage, field: FloatArray) -> Residual:

@@ -155,10 +155,6 @@ class Equations:
             motion = motion - self.rigid.follows @ rigid
         return np.einsum("nij,nj->ni", self.rotation, motion.reshape(-1, 2)), rigid
 
-    def turned_back(self, columns: FloatArray) -> FloatArray:
-        """Turn nodal vectors (2 N, m) into the axes of the reference."""
-        return _turned_back(self.rotation, columns)
-
 
 def _rotation(mesh: Tri3Mesh, displacement: FloatArray, blocks: FloatArray) -> FloatArray:
     """Rotation (N, 2, 2) of the surface around each node: the polar factor of I + grad u in the plane.
@@ -175,6 +171,7 @@ def _rotation(mesh: Tri3Mesh, displacement: FloatArray, blocks: FloatArray) -> F
 
 
 def _turned_back(rotation: FloatArray, columns: FloatArray) -> FloatArray:
+    """Turn nodal vectors (2 N, m) into the axes of the reference."""
     turned = np.einsum("nji,njm->nim", rotation, columns.reshape(len(rotation), 2, -1))
     return np.asarray(turned.reshape(columns.shape))
 
@@ -332,7 +329,7 @@ def _right_sides(
     """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
     reference, assembly = problem.reference, problem.reference.assembly
     bend = assembly.smoothness @ estimate.displacement.ravel()
-    held = -equations.smoothness * equations.turned_back(bend[:, None]).ravel()
+    held = -equations.smoothness * _turned_back(equations.rotation, bend[:, None]).ravel()
     total, rigid, difference = held.copy(), [], np.empty_like(values[0])
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
         if known is not None:

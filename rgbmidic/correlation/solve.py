@@ -16,20 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, UnsolvableError, compare, iterate
-from rgbmidic.correlation.light_bias import LightBias
-from rgbmidic.correlation.nodes import (
-    Evidence,
-    judge,
-    matching_elements,
-    misfit,
-    one_sided_texture,
-    torn_elements,
-)
+from rgbmidic.correlation.light_bias import light_bias
+from rgbmidic.correlation.nodes import judge, matching_elements, misfit, one_sided_texture, torn_elements
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual, brought_nearer, corrected_values
@@ -70,11 +62,6 @@ class Weighting:
     precision: Precision | None = None
     returned: int = 0
     learnt_at: FloatArray
-
-    @property
-    def seen(self) -> BoolArray:
-        """Which lights (k,) see an element that takes part."""
-        return np.asarray((self.residual.moments[:, self.matched, 0] > 0).any(axis=1))
 
     def weights(self, pixels: slice = slice(None)) -> FloatImage:
         """Weights (k, P) of pixels in the next pass."""
@@ -286,7 +273,7 @@ def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Eq
     UnsolvableError
         Nothing is left to be measured.
     """
-    seen = weighting.seen
+    seen = np.any(weighting.residual.moments[:, weighting.matched, 0] > 0, axis=1)
     if not seen.any():
         raise UnsolvableError(_nothing_left(weighting), estimate)
     if problem.functions.shape[1] and not seen[0]:
@@ -319,19 +306,20 @@ def _nothing_left(weighting: Weighting) -> str:
 def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weighting: Weighting) -> Solution:
     """Conclude the solve: which nodes count as measured, their values and uncertainty."""
     reference, mesh = problem.reference, problem.reference.mesh
-    mismatched = np.zeros(len(mesh.nodes), dtype=bool)
-    mismatched[mesh.elements[~weighting.matched]] = True
     used = weighting.matched & equations.textured[mesh.elements].all(axis=1)
     recovery = Recovery.over(reference.material, used, equations.information(reference))
     fitted = estimate.displacement
     residual = weighting.residual.without(*recovery.bend(fitted))
     std = standard_uncertainty(residual, equations, weighting.precision, recovery)
     if weighting.precision is not None:
-        bias = LightBias.of(weighting.residual, equations.weights)
-        fitted = fitted + bias.values
-        std = np.hypot(std, bias.of_recovered())
-    squares = weighting.residual.squares(equations.weights)
-    node_status = _judged(estimate, equations, weighting, mismatched, std)
+        bias, bias_std = light_bias(weighting.residual, equations.weights)
+        fitted, std = fitted + bias, np.hypot(std, bias_std)
+    node_status = judge(equations, weighting.residual, weighting.matched, std[:, :2])
+    measured = np.asarray(node_status == NodeStatus.MEASURED)
+    if not measured.any():
+        along = one_sided_texture(equations, weighting.residual) & (node_status == NodeStatus.NOT_SEEN)
+        one_sided = "the texture runs in one direction only: what lies along it cannot be measured"
+        raise UnsolvableError(one_sided if along.any() else NO_MATCH, estimate)
     if equations.rigid is not None and equations.rigid.hidden.any():
         numbers = [str(number) for number in np.flatnonzero(equations.rigid.hidden)]
         named = f"lights {', '.join(numbers)} share" if len(numbers) > 1 else f"light {numbers[0]} shares"
@@ -341,20 +329,17 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
             'solver.rigid = "none"',
             estimate,
         )
-    measured = node_status == NodeStatus.MEASURED
     inner = measured & ~mesh.beside(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
+    squares, field = weighting.residual.squares(equations.weights), recovery.field(*fitted.T)
     square, total, _ = squares.sum(axis=1).T
     history = estimate.history(measured)
     converged = bool(history[-1] <= problem.options.tolerance)
-    return Solution(
-        nodes=mesh.nodes,
-        elements=mesh.elements,
-        displacement=np.where(measured[:, None], recovery.displacement(fitted), np.nan),
+    return replace(
+        Solution.failed(mesh, len(reference.images), "", history),
+        displacement=np.where(measured[:, None], field[:, :2], np.nan),
         displacement_std=np.where(measured[:, None], std[:, :2], np.nan),
-        strain=np.where(inner[:, None], recovery.strain(fitted), np.nan),
+        strain=np.where(inner[:, None], field[:, 2:], np.nan),
         strain_std=np.where(inner[:, None], std[:, 2:], np.nan),
-        displacement_error=np.full((len(inner), 2), np.nan),
-        strain_error=np.full((len(inner), 3), np.nan),
         node_status=node_status,
         light_fraction=equations.light_fraction,
         misfit=np.where(measured, misfit(mesh, squares, equations.textured), np.nan),
@@ -363,39 +348,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         rigid=np.where(np.any(equations.weights, axis=1, keepdims=True), estimate.rigid, np.nan),
         residual=np.sqrt(np.divide(square, total, out=np.full(total.size, np.nan), where=total > 0)),
         weight_fraction=_weight_fractions(equations.weights),
-        history=history,
     )
-
-
-def _judged(
-    estimate: Estimate,
-    equations: Equations,
-    weighting: Weighting,
-    mismatched: BoolArray,
-    std: FloatArray,
-) -> npt.NDArray[np.uint8]:
-    """Status of every node (N,).
-
-    Raises
-    ------
-    UnsolvableError
-        No node is measured.
-    """
-    evidence = Evidence(
-        textured=equations.textured,
-        one_sided=one_sided_texture(equations, weighting.residual),
-        mismatched=mismatched,
-        std=std[:, :2],
-        lost=weighting.residual.reference.constants.lost,
-    )
-    node_status = judge(evidence)
-    if not (node_status == NodeStatus.MEASURED).any():
-        one_sided = (evidence.one_sided & (node_status == NodeStatus.NOT_SEEN)).any()
-        raise UnsolvableError(
-            "the texture runs in one direction only: what lies along it cannot be measured" if one_sided else NO_MATCH,
-            estimate,
-        )
-    return node_status
 
 
 def _unsettled(problem: Problem, estimate: Estimate, measured: BoolArray) -> str:
