@@ -154,18 +154,16 @@ def _finer_field(
     first = replace(first, values=values, difference=first.difference_from(values))
     children = np.repeat(used, len(_CHILDREN))
     given = first.weights * np.repeat(children, np.diff(fine.pixels.offsets))
-    weights, _ = _weighed(method, first, given)
-    equations = Equations.build(fine, weights, functions[:, :0], start, None if method is None else given)
+    equations, _ = _weighed(method, first, given, start)
     estimate = stepped(problem, equations, values, estimate, first.difference)
     last = compare(problem, values, estimate)
-    weights, loss = _weighed(method, last, given)
-    equations = Equations.build(fine, weights, functions[:, :0], start, None if method is None else given)
+    equations, loss = _weighed(method, last, given, start)
     # a robust loss bends less than the weights of one residual state: with these alone noise is followed too little
-    rest = loss[:, None] * equations.solve(_right_side(fine, weights, last.difference)).reshape(-1, 2)
+    rest = loss[:, None] * equations.solve(_right_side(fine, equations.weights, last.difference)).reshape(-1, 2)
     last = replace(last, difference=_left(fine, last.difference, rest).difference)
     found = estimate.displacement + np.einsum("nij,nj->ni", equations.rotation, rest)
     recovery = halves.recovery(children & equations.textured[fine.mesh.elements].all(axis=1), equations)
-    variance = _score_variance(halves.straightened(last, recovery, found), weights) * (loss[:, None] ** 2)
+    variance = _score_variance(halves.straightened(last, recovery, found), equations.weights) * (loss[:, None] ** 2)
     known = (equations.textured & ~fine.mesh.beside(~equations.textured))[:count]
     return np.where(known[:, None], recovery.field(*found.T), np.nan), variance[:count]
 
@@ -176,13 +174,17 @@ def _right_side(reference: Reference, weights: FloatImage, difference: FloatImag
     return reference.assembly.vector(np.sum([reference.projected(*light) for light in lights], axis=0))
 
 
-def _weighed(method: PrecisionMethod | None, residual: Residual, given: FloatImage) -> tuple[FloatImage, FloatArray]:
-    """Weights (k, P) by the residual's precision, and the factor (N,) by which the robust loss bends less than they."""
+def _weighed(
+    method: PrecisionMethod | None, residual: Residual, given: FloatImage, start: FloatArray
+) -> tuple[Equations, FloatArray]:
+    """Equations with weights by the residual's precision, and the factor (N,) by which the robust loss bends less."""
+    reference, weights, loss = residual.reference, given, np.ones(len(start))
     precision = None if method is None else method.precision(residual)
-    if precision is None:
-        return given, np.ones(len(residual.reference.mesh.nodes))
-    weights = given * precision.factor
-    return weights, precision.robust_loss(residual.reference, weights)
+    if precision is not None:
+        weights = given * precision.factor
+        loss = precision.robust_loss(reference, weights)
+    without = np.zeros((start.size, 0))  # rigid functions
+    return Equations.build(reference, weights, without, start, None if method is None else given), loss
 
 
 def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:

@@ -256,12 +256,7 @@ def compare(problem: Problem, values: FloatImage, estimate: Estimate) -> Residua
 
 @stage("iteration")
 def iterate(
-    problem: Problem,
-    equations: Equations,
-    values: FloatImage,
-    residual: Residual,
-    estimate: Estimate,
-    tolerance: float,
+    problem: Problem, equations: Equations, values: FloatImage, residual: Residual, estimate: Estimate, tolerance: float
 ) -> Estimate:
     """Iterate with one Hessian until no textured node moves by more than `tolerance`.
 
@@ -299,11 +294,7 @@ def iterate(
 
 
 def stepped(
-    problem: Problem,
-    equations: Equations,
-    values: FloatImage,
-    estimate: Estimate,
-    known: FloatImage | None,
+    problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, known: FloatImage | None
 ) -> Estimate:
     """One Gauss-Newton iteration; `known` is the difference (k, P) of the states at the estimate, if it is."""
     motion, shifts = equations.increment(*_right_sides(problem, equations, values, estimate, known))

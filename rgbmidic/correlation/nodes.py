@@ -87,9 +87,9 @@ def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> 
 
 
 def matching_elements(
-    residual: Residual, precision: Precision | None = None, *, least: float | None = None
+    residual: Residual, displacement: FloatArray, precision: Precision | None = None, *, least: float | None = None
 ) -> BoolArray:
-    """Find the elements whose images match: zero-mean correlation coefficient of all lights together.
+    """Find the elements that are whole and match: zero-mean correlation coefficient of all lights together.
 
     Elements without weight or texture in the reference count as matched.
 
@@ -97,6 +97,8 @@ def matching_elements(
     ----------
     residual
         At the displacement found.
+    displacement : ndarray, shape (N, 2)
+        That displacement, px.
     precision
         Of the lights, by which they count in an element; None: all alike.
     least
@@ -112,8 +114,9 @@ def matching_elements(
     # a few speckles can match by chance; those of all elements around a node hardly
     around = correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
     coefficient = np.minimum(own, np.sort(around[mesh.elements], axis=1)[:, 1])
+    whole = ~torn_elements(mesh, displacement, constants)
     if least is not None:
-        return np.asarray(coefficient >= least)
+        return np.asarray(whole & (coefficient >= least))
     poor, good = constants.matched if precision is None else constants.matched_precise
     matched = np.asarray(coefficient >= good)
     between = ~matched & (coefficient >= poor)
@@ -124,7 +127,7 @@ def matching_elements(
         nearest = cKDTree(centre[textured]).query(centre[between], k=ranks)[1]
         typical = np.median(coefficient[textured][nearest], axis=1)
     matched[between] = coefficient[between] >= 1 - constants.worse * (1 - typical)
-    return matched
+    return matched & whole
 
 
 def torn_elements(mesh: Tri3Mesh, displacement: FloatArray, constants: SolverConstants = USUAL) -> BoolArray:

@@ -419,15 +419,7 @@ def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: floa
     return found
 
 
-def brought_nearer(
-    residual: Residual,
-    displacement: FloatArray,
-    *,
-    reduction: int = 2,
-    half: int = 6,
-    most: int = 4,
-    least: float = 0.5,
-) -> FloatArray:
+def brought_nearer(residual: Residual, displacement: FloatArray) -> FloatArray:
     """Bring an initial guess to within some tenths of a pixel by matching patches around the nodes.
 
     Both states are compared as the residual holds them, in the reference's axes, so that turn and strain of the guess
@@ -440,21 +432,17 @@ def brought_nearer(
         At the initial guess.
     displacement : ndarray, shape (N, 2)
         The guess, at most 8 px away in x and y.
-    reduction
-        Of the pictures in which patches are matched: a speckle of 4 px keeps 2, and they cost 16 times less.
-    half
-        Pixels of a patch to each side of its node there: 26 px hold some 40 speckles, of which chance reaches a
-        correlation of .3 in 81 places (derived).
-    most
-        Largest shift of a patch, px there: 8 px of the image, two speckles. Twice as many cost 3 times as much.
-    least
-        Correlation coefficient from which a patch has been found, as in `confidence`.
 
     Returns
     -------
     ndarray, shape (N, 2)
         px; the guess itself where too few patches are found.
     """
+    # Pictures are reduced: a speckle of 4 px keeps 2, and they cost 16 times less. A patch reaches so many pixels to
+    # each side of its node there: 26 px hold some 40 speckles, of which chance reaches a correlation of .3 in 81 places
+    # (derived). Its largest shift is 8 px of the image, two speckles: twice as many cost 3 times as much. It has been
+    # found from a correlation coefficient as in `Search.confidence`.
+    reduction, half, most, least = 2, 6, 4, 0.5
     mesh, pixels, reach = residual.reference.mesh, residual.reference.pixels, half + most
     f, g = _reduced(residual, reduction, reach)
     top, left = pixels.bounds[:2]

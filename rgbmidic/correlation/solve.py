@@ -21,7 +21,7 @@ from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, UnsolvableError, compare, iterate
 from rgbmidic.correlation.light_bias import light_bias
-from rgbmidic.correlation.nodes import judge, matching_elements, misfit, one_sided_texture, torn_elements
+from rgbmidic.correlation.nodes import judge, matching_elements, misfit, one_sided_texture
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual, brought_nearer, corrected_values
@@ -83,7 +83,7 @@ def first_weighting(problem: Problem, estimate: Estimate, residual: Residual | N
     return Weighting(
         residual=residual,
         values=corrected_values(residual, "global" if kind == "local" else kind),
-        matched=_matched(problem, residual, estimate, least=problem.constants.begun),
+        matched=matching_elements(residual, estimate.displacement, least=problem.constants.begun),
         learnt_at=estimate.displacement,
     )
 
@@ -96,7 +96,7 @@ def next_weighting(
     residual, method = compare(problem, last.values, estimate), problem.method
     # without the precision of the lights, which the first pass has not, an element half on another body may match
     precision = last.precision if number or method is None else method.precision(residual)
-    matched = _matched(problem, residual, estimate, precision)
+    matched = matching_elements(residual, estimate.displacement, precision)
     if not matched.all() or estimate.longest > problem.constants.first_pass:
         lost = _lost_nodes(problem, last, equations, residual, estimate, number)
         matched &= ~lost[problem.reference.mesh.elements].any(axis=1)
@@ -139,19 +139,6 @@ def _learnt_anew(last: Weighting, matched: BoolArray, equations: Equations, esti
     motion = np.hypot(*(estimate.displacement - last.learnt_at).T)[equations.textured]
     elsewhere = number == 1 < len(last.residual.values) and (motion > constants.elsewhere).mean() > constants.swinging
     return max(last.returned, number) if elsewhere else last.returned
-
-
-def _matched(
-    problem: Problem,
-    residual: Residual,
-    estimate: Estimate,
-    precision: Precision | None = None,
-    *,
-    least: float | None = None,
-) -> BoolArray:
-    """Elements (E,) that match and are whole."""
-    torn = torn_elements(problem.reference.mesh, estimate.displacement, problem.constants)
-    return matching_elements(residual, precision, least=least) & ~torn
 
 
 def settled(weighting: Weighting, equations: Equations) -> bool:
@@ -261,7 +248,7 @@ def _begin(problem: Problem, estimate: Estimate, residual: Residual | None) -> t
     nearer = first_weighting(problem, moved)
     if nearer.matched.sum() <= weighting.matched.sum():
         return estimate, weighting
-    return moved, replace(nearer, matched=_matched(problem, nearer.residual, moved))
+    return moved, replace(nearer, matched=matching_elements(nearer.residual, moved.displacement))
 
 
 @stage("equations")
@@ -332,7 +319,8 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     inner = measured & ~mesh.beside(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
     squares, field = weighting.residual.squares(equations.weights), recovery.field(*fitted.T)
     square, total, _ = squares.sum(axis=1).T
-    history = estimate.history(measured)
+    some = equations.weights[:, :: max(1, equations.weights.shape[1] // 100_000)]
+    seen, history = some.sum(axis=0), estimate.history(measured)
     converged = bool(history[-1] <= problem.options.tolerance)
     return replace(
         Solution.failed(mesh, len(reference.images), "", history),
@@ -347,7 +335,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         reason="" if converged else _unsettled(problem, estimate, measured),
         rigid=np.where(np.any(equations.weights, axis=1, keepdims=True), estimate.rigid, np.nan),
         residual=np.sqrt(np.divide(square, total, out=np.full(total.size, np.nan), where=total > 0)),
-        weight_fraction=_weight_fractions(equations.weights),
+        weight_fraction=np.mean(some / np.where(seen > 0, seen, np.float32(1)), axis=1, dtype=np.float64),
     )
 
 
@@ -360,10 +348,3 @@ def _unsettled(problem: Problem, estimate: Estimate, measured: BoolArray) -> str
         f"{int(measured.sum())} nodes by more than the tolerance of {tolerance:g} px, most the one at x {x:.0f}, "
         f"y {y:.0f}: by {motion.max():.3g} px"
     )
-
-
-def _weight_fractions(weights: FloatImage) -> FloatArray:
-    """Mean fraction (k,) of each light in the sum of the weights (k, P), over about 100 000 pixels."""
-    some = weights[:, :: max(1, weights.shape[1] // 100_000)]
-    total = some.sum(axis=0)
-    return np.asarray((some / np.where(total > 0, total, np.float32(1))).mean(axis=1, dtype=np.float64))
