@@ -189,7 +189,7 @@ def _observability(
     smallest[smallest < constants.rounding * half] = 0  # texture in one direction only
     density = smallest / area
     typical = np.median(density[density > constants.silent * density.max()]) if density.max() > 0 else 0.0
-    seen = density > least * typical if typical > 0 else np.zeros(len(density), dtype=bool)
+    seen = density > least * typical
     return seen, float(np.median(half[seen]) if seen.any() else half.max(initial=0.0)) or 1.0
 
 
@@ -229,11 +229,6 @@ class Estimate:
     rigid: FloatArray
     increments: tuple[FloatArray, ...] = ()
     longest: float = float("inf")
-
-    @classmethod
-    def start(cls, problem: Problem, initial: FloatArray) -> Estimate:
-        """From a displacement (N, 2), without rigid motions."""
-        return cls(displacement=initial, rigid=np.zeros((len(problem.reference.images), problem.functions.shape[1])))
 
     def history(self, nodes: BoolArray | None = None) -> FloatArray:
         """Largest motion of `nodes` (N,), or of all, in every iteration, px; shape (iterations,)."""

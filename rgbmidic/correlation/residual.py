@@ -454,22 +454,20 @@ def brought_nearer(residual: Residual, displacement: FloatArray) -> FloatArray:
         if patch.min() < patch.max():  # of a blank patch OpenCV says that it is everywhere
             around = g[y - reach : y + reach + 1, x - reach : x + reach + 1]
             out[:] = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
-    i, j = np.divmod(found.reshape(len(at), -1).argmax(axis=1), 2 * most + 1)
-    node = np.flatnonzero((i > 0) & (i < 2 * most) & (j > 0) & (j < 2 * most))
-    i, j, (shift, score) = i[node], j[node], (np.zeros((len(at), 2)), np.zeros(len(at)))
-    score[node] = here = found[node, i, j]
+    score, (i, j) = found.max(axis=(1, 2)), np.divmod(found.reshape(len(at), -1).argmax(axis=1), 2 * most + 1)
+    node = np.flatnonzero((score >= least) & (i > 0) & (i < 2 * most) & (j > 0) & (j < 2 * most))
+    if len(node) < _FITTED:
+        return displacement
+    i, j, here = i[node], j[node], score[node]
+    shift = np.stack([j, i], axis=1) - float(most)
     for axis, (di, dj) in enumerate(((0, 1), (1, 0))):
         before, after = found[node, i - di, j - dj], found[node, i + di, j + dj]
         bend = before - 2 * here + after
         # the crest of the parabola through three values, of which the middle one is the largest
-        shift[node, axis] = np.divide((before - after) / 2, bend, out=np.zeros_like(bend), where=bend < 0)
-    shift[node] += np.stack([j, i], axis=1) - most
-    agrees = score >= least
-    if agrees.sum() < _FITTED:
-        return displacement
+        shift[:, axis] += np.divide((before - after) / 2, bend, out=np.zeros_like(bend), where=bend < 0)
     shift *= reduction
-    beyond = shift + np.einsum("nij,nj->ni", mesh.nodal_gradient(displacement), shift)
-    return displacement + follow(mesh.nodes[agrees], beyond[agrees], mesh, 1.0)
+    beyond = shift + np.einsum("nij,nj->ni", mesh.nodal_gradient(displacement)[node], shift)
+    return displacement + follow(mesh.nodes[node], beyond, mesh, 1.0)
 
 
 def _reduced(residual: Residual, side: int, border: int) -> FloatImage:

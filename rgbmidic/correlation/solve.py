@@ -204,9 +204,10 @@ def solve(
         method=method,
         functions=rigid_functions(reference.mesh.nodes, options.rigid),
     )
+    rigid = np.zeros((len(reference.images), problem.functions.shape[1]))
     try:
         with one_blas_thread():
-            return _conclude(problem, *_passes(problem, Estimate.start(problem, initial), residual))
+            return _conclude(problem, *_passes(problem, Estimate(displacement=initial, rigid=rigid), residual))
     except UnsolvableError as error:
         return Solution.failed(reference.mesh, len(reference.images), str(error), error.history)
 
@@ -244,7 +245,7 @@ def _begin(problem: Problem, estimate: Estimate, residual: Residual | None) -> t
     weighting = first_weighting(problem, estimate, residual)
     if weighting.matched.all():
         return estimate, weighting
-    moved = Estimate.start(problem, brought_nearer(weighting.residual, estimate.displacement))
+    moved = replace(estimate, displacement=brought_nearer(weighting.residual, estimate.displacement))
     nearer = first_weighting(problem, moved)
     if nearer.matched.sum() <= weighting.matched.sum():
         return estimate, weighting
