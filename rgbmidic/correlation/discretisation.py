@@ -16,7 +16,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
@@ -30,6 +29,7 @@ from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, corrected_values
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.mesh.outline_mesh import EDGES, edge_keys
 from rgbmidic.settings import SMALLEST_HALVED, SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -229,9 +229,7 @@ class _Halves:
     mesh
         The reference's own.
     fine
-        The reference on the finer mesh, whose first nodes are those of `mesh`.
-    ends : ndarray, shape (M, 2)
-        The two nodes that each other node of the finer mesh is between.
+        The reference on the finer mesh: its first nodes are those of `mesh`, each other is between two `neighbours`.
     around : csr_matrix, shape (N, N)
         Mean over each node and those beside it, boundary and interior apart.
     unsmooth
@@ -240,30 +238,28 @@ class _Halves:
 
     mesh: Tri3Mesh
     fine: Reference
-    ends: npt.NDArray[np.int64]
     around: sp.csr_matrix
     unsmooth: Callable[[FloatArray], FloatArray]
 
     def prolonged(self, nodal: FloatArray) -> FloatArray:
         """Interpolate linearly at the nodes of the finer mesh."""
-        return np.concatenate([nodal, nodal[self.ends].mean(axis=1)])
+        return np.concatenate([nodal, nodal[self.mesh.neighbours].mean(axis=1)])
 
     def restricted(self, sums: FloatArray) -> FloatArray:
         """Sum right-hand sides (2 M, R) of the finer mesh to those (2 N, R) of the coarse one."""
         parts, count = sums.reshape(-1, 2, *sums.shape[1:]), len(self.mesh.nodes)
         total = parts[:count].copy()
-        for end in self.ends.T:
+        for end in self.mesh.neighbours.T:
             np.add.at(total, end, parts[count:] / 2)
         return total.reshape(2 * count, *sums.shape[1:])
 
     def interpolated(self, nodal: FloatArray, used: BoolArray) -> FloatArray:
         """Interpolate a displacement (N, 2) between nodes with its second derivatives there."""
-        second = self.prolonged(np.stack([curved @ nodal for curved in quadratic_fit(self.mesh, used)[3:]], axis=-1))
-        x, y = (self.mesh.nodes[self.ends[:, 1]] - self.mesh.nodes[self.ends[:, 0]]).T
-        squares = np.stack([x * x, 2 * x * y, y * y], axis=1)
-        fine = self.prolonged(nodal)
-        fine[len(nodal) :] -= np.einsum("nct,nt->nc", second[len(nodal) :], squares) / 8
-        return fine
+        ends = self.mesh.neighbours
+        second = np.stack([curved @ nodal for curved in quadratic_fit(self.mesh, used)[3:]], axis=-1)[ends].mean(axis=1)
+        x, y = (self.mesh.nodes[ends[:, 1]] - self.mesh.nodes[ends[:, 0]]).T
+        sag = np.einsum("nct,nt->nc", second, np.stack([x * x, 2 * x * y, y * y], axis=1)) / 8
+        return np.concatenate([nodal, nodal[ends].mean(axis=1) - sag])
 
     def recovery(self, used: BoolArray, equations: Equations) -> Recovery:
         """Recover the field on the finer mesh, at the nodes of the coarse one."""
@@ -321,12 +317,9 @@ _CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 def _halves(reference: Reference) -> tuple[_Halves, _Draws]:
     """Halve the elements of a reference, and find what noise does; the last result is kept."""
     mesh, count = reference.mesh, len(reference.mesh.nodes)
-    corners = mesh.elements.astype(np.int64)
-    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
-    keys, place = np.unique(edges[:, 0] * count + edges[:, 1], return_inverse=True)
-    ends = np.stack(np.divmod(keys, count), axis=1)
-    six = np.concatenate([corners, count + place.reshape(3, -1).T], axis=1)
-    nodes = np.concatenate([mesh.nodes, mesh.nodes[ends].mean(axis=1)])
+    place = np.unique(edge_keys(mesh.elements[:, EDGES].reshape(-1, 2), count), return_inverse=True)[1]
+    six = np.concatenate([mesh.elements, count + place.reshape(-1, 3)], axis=1)
+    nodes = np.concatenate([mesh.nodes, mesh.nodes[mesh.neighbours].mean(axis=1)])
     fine_mesh = Tri3Mesh(nodes=nodes, elements=six[:, _CHILDREN].reshape(-1, 3))
     edge = mesh.on_boundary
     i, j = mesh.neighbours[edge[mesh.neighbours[:, 0]] == edge[mesh.neighbours[:, 1]]].T
@@ -336,7 +329,6 @@ def _halves(reference: Reference) -> tuple[_Halves, _Draws]:
     halves = _Halves(
         mesh=mesh,
         fine=_on_mesh(reference, fine_mesh),
-        ends=ends,
         around=sp.csr_matrix((1 / number[row], (row, column)), shape=(count, count)),
         unsmooth=_unsmoothing(mesh),
     )
