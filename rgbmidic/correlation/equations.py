@@ -230,10 +230,9 @@ class Estimate:
     increments: tuple[FloatArray, ...] = ()
     longest: float = float("inf")
 
-    def history(self, nodes: BoolArray | None = None) -> FloatArray:
+    def history(self, nodes: BoolArray | slice = slice(None)) -> FloatArray:
         """Largest motion of `nodes` (N,), or of all, in every iteration, px; shape (iterations,)."""
-        chosen = slice(None) if nodes is None else nodes
-        return np.array([increment[chosen].max() for increment in self.increments], dtype=np.float64)
+        return np.array([increment[nodes].max() for increment in self.increments], dtype=np.float64)
 
 
 class UnsolvableError(Exception):

@@ -32,8 +32,7 @@ def judge(equations: Equations, residual: Residual, matched: BoolArray, std: Flo
         Standard uncertainty of u and v, px.
     """
     textured, one_sided = equations.textured, one_sided_texture(equations, residual)
-    mismatched = np.zeros(len(textured), dtype=bool)
-    mismatched[residual.reference.mesh.elements[~matched]] = True
+    mismatched = residual.reference.mesh.to_nodes((~matched).astype(np.float64)) > 0
     rules = (
         # the elements around it do not match, and the others have too little texture
         (mismatched & (one_sided | ~textured), NodeStatus.DECORRELATED),

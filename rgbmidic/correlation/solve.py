@@ -231,10 +231,9 @@ def _passes(problem: Problem, estimate: Estimate, residual: Residual | None) -> 
         matched = weighting.matched & ~swinging[problem.reference.mesh.elements].any(axis=1)
         few = 0 < swinging.mean() < problem.constants.swinging and matched.any()
         if few and len(estimate.increments) < problem.options.max_iterations:
-            residual = compare(problem, weighting.values, estimate)
-            weighting = replace(weighting, residual=residual, matched=matched)
+            weighting = replace(weighting, residual=compare(problem, weighting.values, estimate), matched=matched)
             equations = _equations(problem, weighting, estimate)
-            estimate = iterate(problem, equations, weighting.values, residual, estimate, tolerance)
+            estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance)
         weighting = replace(weighting, residual=compare(problem, weighting.values, estimate))
     return estimate, equations, weighting
 

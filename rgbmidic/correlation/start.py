@@ -202,8 +202,7 @@ class Search:
         reference, around = residual.reference, correlation_around(residual)
         weight = reference.sums(reference.pixel_weights, reference.pixel_weights[0])[..., 0].sum(axis=0)
         seen = reference.mesh.to_nodes(weight) > 0
-        with np.errstate(invalid="ignore"):
-            agrees = around >= (self.agrees if least is None else least)
+        agrees = around >= (self.agrees if least is None else least)
         return float(agrees.sum() / max(int(np.isfinite(around).sum()), 0.1 * seen.sum(), 1))
 
     def _keypoints(
