@@ -298,10 +298,8 @@ def unfitted_fraction(
     whole = np.bincount(mesh.elements.ravel(), weights=parts, minlength=len(mesh.nodes))
     limits = np.array([side * rows, side * columns]) - 1
     row, column = (np.clip(mesh.nodes[:, ::-1] - (top, left), 0, limits) // side).astype(int).T
-    here = [np.zeros((rows, columns)), np.zeros((rows, columns))]
-    for grid, values in zip(here, (fitted, whole), strict=True):
-        np.add.at(grid, (row, column), values)
-    around = [window_sums(grid, constants.score_range / side) for grid in here]
+    here = (np.bincount(row * columns + column, values, rows * columns) for values in (fitted, whole))
+    around = [window_sums(grid.reshape(rows, columns), constants.score_range / side) for grid in here]
     centre = mesh.centres[:, ::-1] - (top, left)
     row, column = (np.clip(centre, 0, limits) // side).astype(int).T
     known = np.maximum(around[1][row, column], np.finfo(float).tiny)

@@ -16,7 +16,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
@@ -30,6 +29,7 @@ from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, corrected_values
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.mesh.outline_mesh import EDGES, edge_keys
 from rgbmidic.settings import SMALLEST_HALVED, SolverSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -154,21 +154,18 @@ def _finer_field(
     first = replace(first, values=values, difference=first.difference_from(values))
     children = np.repeat(used, len(_CHILDREN))
     given = first.weights * np.repeat(children, np.diff(fine.pixels.offsets))
-    weights, _ = _weighed(method, first, given)
-    equations = Equations.build(fine, weights, functions[:, :0], start, None if method is None else given)
+    equations, _ = _weighed(method, first, given, start)
     estimate = stepped(problem, equations, values, estimate, first.difference)
     last = compare(problem, values, estimate)
-    weights, loss = _weighed(method, last, given)
-    equations = Equations.build(fine, weights, functions[:, :0], start, None if method is None else given)
+    equations, loss = _weighed(method, last, given, start)
     # a robust loss bends less than the weights of one residual state: with these alone noise is followed too little
-    rest = loss[:, None] * equations.solve(_right_side(fine, weights, last.difference)).reshape(-1, 2)
+    rest = loss[:, None] * equations.solve(_right_side(fine, equations.weights, last.difference)).reshape(-1, 2)
     last = replace(last, difference=_left(fine, last.difference, rest).difference)
     found = estimate.displacement + np.einsum("nij,nj->ni", equations.rotation, rest)
     recovery = halves.recovery(children & equations.textured[fine.mesh.elements].all(axis=1), equations)
-    variance = _score_variance(halves.straightened(last, recovery, found), weights) * (loss[:, None] ** 2)
+    variance = _score_variance(halves.straightened(last, recovery, found), equations.weights) * (loss[:, None] ** 2)
     known = (equations.textured & ~fine.mesh.beside(~equations.textured))[:count]
-    found_here = np.concatenate([recovery.displacement(found), recovery.strain(found)], axis=1)
-    return np.where(known[:, None], found_here, np.nan), variance[:count]
+    return np.where(known[:, None], recovery.field(*found.T), np.nan), variance[:count]
 
 
 def _right_side(reference: Reference, weights: FloatImage, difference: FloatImage) -> FloatArray:
@@ -177,13 +174,17 @@ def _right_side(reference: Reference, weights: FloatImage, difference: FloatImag
     return reference.assembly.vector(np.sum([reference.projected(*light) for light in lights], axis=0))
 
 
-def _weighed(method: PrecisionMethod | None, residual: Residual, given: FloatImage) -> tuple[FloatImage, FloatArray]:
-    """Weights (k, P) by the residual's precision, and the factor (N,) by which the robust loss bends less than they."""
+def _weighed(
+    method: PrecisionMethod | None, residual: Residual, given: FloatImage, start: FloatArray
+) -> tuple[Equations, FloatArray]:
+    """Equations with weights by the residual's precision, and the factor (N,) by which the robust loss bends less."""
+    reference, weights, loss = residual.reference, given, np.ones(len(start))
     precision = None if method is None else method.precision(residual)
-    if precision is None:
-        return given, np.ones(len(residual.reference.mesh.nodes))
-    weights = given * precision.factor
-    return weights, precision.robust_loss(residual.reference, weights)
+    if precision is not None:
+        weights = given * precision.factor
+        loss = precision.robust_loss(reference, weights)
+    without = np.zeros((start.size, 0))  # rigid functions
+    return Equations.build(reference, weights, without, start, None if method is None else given), loss
 
 
 def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:
@@ -228,9 +229,7 @@ class _Halves:
     mesh
         The reference's own.
     fine
-        The reference on the finer mesh, whose first nodes are those of `mesh`.
-    ends : ndarray, shape (M, 2)
-        The two nodes that each other node of the finer mesh is between.
+        The reference on the finer mesh: its first nodes are those of `mesh`, each other is between two `neighbours`.
     around : csr_matrix, shape (N, N)
         Mean over each node and those beside it, boundary and interior apart.
     unsmooth
@@ -239,30 +238,28 @@ class _Halves:
 
     mesh: Tri3Mesh
     fine: Reference
-    ends: npt.NDArray[np.int64]
     around: sp.csr_matrix
     unsmooth: Callable[[FloatArray], FloatArray]
 
     def prolonged(self, nodal: FloatArray) -> FloatArray:
         """Interpolate linearly at the nodes of the finer mesh."""
-        return np.concatenate([nodal, nodal[self.ends].mean(axis=1)])
+        return np.concatenate([nodal, nodal[self.mesh.neighbours].mean(axis=1)])
 
     def restricted(self, sums: FloatArray) -> FloatArray:
         """Sum right-hand sides (2 M, R) of the finer mesh to those (2 N, R) of the coarse one."""
         parts, count = sums.reshape(-1, 2, *sums.shape[1:]), len(self.mesh.nodes)
         total = parts[:count].copy()
-        for end in self.ends.T:
+        for end in self.mesh.neighbours.T:
             np.add.at(total, end, parts[count:] / 2)
         return total.reshape(2 * count, *sums.shape[1:])
 
     def interpolated(self, nodal: FloatArray, used: BoolArray) -> FloatArray:
         """Interpolate a displacement (N, 2) between nodes with its second derivatives there."""
-        second = self.prolonged(np.stack([curved @ nodal for curved in quadratic_fit(self.mesh, used)[3:]], axis=-1))
-        x, y = (self.mesh.nodes[self.ends[:, 1]] - self.mesh.nodes[self.ends[:, 0]]).T
-        squares = np.stack([x * x, 2 * x * y, y * y], axis=1)
-        fine = self.prolonged(nodal)
-        fine[len(nodal) :] -= np.einsum("nct,nt->nc", second[len(nodal) :], squares) / 8
-        return fine
+        ends = self.mesh.neighbours
+        second = np.stack([curved @ nodal for curved in quadratic_fit(self.mesh, used)[3:]], axis=-1)[ends].mean(axis=1)
+        x, y = (self.mesh.nodes[ends[:, 1]] - self.mesh.nodes[ends[:, 0]]).T
+        sag = np.einsum("nct,nt->nc", second, np.stack([x * x, 2 * x * y, y * y], axis=1)) / 8
+        return np.concatenate([nodal, nodal[ends].mean(axis=1) - sag])
 
     def recovery(self, used: BoolArray, equations: Equations) -> Recovery:
         """Recover the field on the finer mesh, at the nodes of the coarse one."""
@@ -320,12 +317,9 @@ _CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 def _halves(reference: Reference) -> tuple[_Halves, _Draws]:
     """Halve the elements of a reference, and find what noise does; the last result is kept."""
     mesh, count = reference.mesh, len(reference.mesh.nodes)
-    corners = mesh.elements.astype(np.int64)
-    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
-    keys, place = np.unique(edges[:, 0] * count + edges[:, 1], return_inverse=True)
-    ends = np.stack(np.divmod(keys, count), axis=1)
-    six = np.concatenate([corners, count + place.reshape(3, -1).T], axis=1)
-    nodes = np.concatenate([mesh.nodes, mesh.nodes[ends].mean(axis=1)])
+    place = np.unique(edge_keys(mesh.elements[:, EDGES].reshape(-1, 2), count), return_inverse=True)[1]
+    six = np.concatenate([mesh.elements, count + place.reshape(-1, 3)], axis=1)
+    nodes = np.concatenate([mesh.nodes, mesh.nodes[mesh.neighbours].mean(axis=1)])
     fine_mesh = Tri3Mesh(nodes=nodes, elements=six[:, _CHILDREN].reshape(-1, 3))
     edge = mesh.on_boundary
     i, j = mesh.neighbours[edge[mesh.neighbours[:, 0]] == edge[mesh.neighbours[:, 1]]].T
@@ -335,7 +329,6 @@ def _halves(reference: Reference) -> tuple[_Halves, _Draws]:
     halves = _Halves(
         mesh=mesh,
         fine=_on_mesh(reference, fine_mesh),
-        ends=ends,
         around=sp.csr_matrix((1 / number[row], (row, column)), shape=(count, count)),
         unsmooth=_unsmoothing(mesh),
     )
@@ -388,11 +381,13 @@ def _drawn(halves: _Halves, reference: Reference) -> _Draws:
     fine_recovery = halves.recovery(np.repeat(everywhere, len(_CHILDREN)), finer)
     drawn = _scores(finer, random)
     right = np.stack([fine.assembly.vector(one) for one in drawn], axis=1)
-    fields = _fields(recovery, coarse.solve(halves.restricted(right)))
+    found = coarse.solve(halves.restricted(right))
+    fields = recovery.field(found[::2], found[1::2])
     strain = np.ascontiguousarray(fields[..., 2:])
     unsmoothed = halves.unsmooth(strain.reshape(count, -1)).reshape(strain.shape)
     unsmoothed[mesh.on_boundary] = np.nan
-    difference = fields - _fields(fine_recovery, finer.solve(right))
+    found = finer.solve(right)
+    difference = fields - fine_recovery.field(found[::2], found[1::2])
     squares = np.concatenate([difference, unsmoothed], axis=2) ** 2
     means = halves.averaged(squares.reshape(count, -1)).reshape(squares.shape)
     typical = means.mean(axis=1)
@@ -423,13 +418,6 @@ def _scores(equations: Equations, random: np.random.Generator) -> FloatArray:
     covariance += _CONSTANTS.held * np.trace(covariance.mean(axis=0)) * np.eye(6)
     drawn = np.linalg.cholesky(covariance) @ random.standard_normal((len(blocks), 6, _CONSTANTS.draws))
     return np.moveaxis(drawn, 2, 0).reshape(_CONSTANTS.draws, -1, 3, 2)
-
-
-def _fields(recovery: Recovery, fitted: FloatArray) -> FloatArray:
-    """u, v, exx, eyy, exy (N, R, 5) for nodal values (2 N, R) of the linear fit."""
-    u, v = fitted[::2], fitted[1::2]
-    (xu, xv), (yu, yv) = ((slope @ u, slope @ v) for slope in (recovery.slope_x, recovery.slope_y))
-    return np.stack([recovery.value @ u, recovery.value @ v, xu, yv, (yu + xv) / 2], axis=-1)
 
 
 def _left(reference: Reference, noise: FloatImage, field: FloatArray) -> Residual:

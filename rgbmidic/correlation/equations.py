@@ -155,10 +155,6 @@ class Equations:
             motion = motion - self.rigid.follows @ rigid
         return np.einsum("nij,nj->ni", self.rotation, motion.reshape(-1, 2)), rigid
 
-    def turned_back(self, columns: FloatArray) -> FloatArray:
-        """Turn nodal vectors (2 N, m) into the axes of the reference."""
-        return _turned_back(self.rotation, columns)
-
 
 def _rotation(mesh: Tri3Mesh, displacement: FloatArray, blocks: FloatArray) -> FloatArray:
     """Rotation (N, 2, 2) of the surface around each node: the polar factor of I + grad u in the plane.
@@ -175,6 +171,7 @@ def _rotation(mesh: Tri3Mesh, displacement: FloatArray, blocks: FloatArray) -> F
 
 
 def _turned_back(rotation: FloatArray, columns: FloatArray) -> FloatArray:
+    """Turn nodal vectors (2 N, m) into the axes of the reference."""
     turned = np.einsum("nji,njm->nim", rotation, columns.reshape(len(rotation), 2, -1))
     return np.asarray(turned.reshape(columns.shape))
 
@@ -192,7 +189,7 @@ def _observability(
     smallest[smallest < constants.rounding * half] = 0  # texture in one direction only
     density = smallest / area
     typical = np.median(density[density > constants.silent * density.max()]) if density.max() > 0 else 0.0
-    seen = density > least * typical if typical > 0 else np.zeros(len(density), dtype=bool)
+    seen = density > least * typical
     return seen, float(np.median(half[seen]) if seen.any() else half.max(initial=0.0)) or 1.0
 
 
@@ -233,15 +230,9 @@ class Estimate:
     increments: tuple[FloatArray, ...] = ()
     longest: float = float("inf")
 
-    @classmethod
-    def start(cls, problem: Problem, initial: FloatArray) -> Estimate:
-        """From a displacement (N, 2), without rigid motions."""
-        return cls(displacement=initial, rigid=np.zeros((len(problem.reference.images), problem.functions.shape[1])))
-
-    def history(self, nodes: BoolArray | None = None) -> FloatArray:
+    def history(self, nodes: BoolArray | slice = slice(None)) -> FloatArray:
         """Largest motion of `nodes` (N,), or of all, in every iteration, px; shape (iterations,)."""
-        chosen = slice(None) if nodes is None else nodes
-        return np.array([increment[chosen].max() for increment in self.increments], dtype=np.float64)
+        return np.array([increment[nodes].max() for increment in self.increments], dtype=np.float64)
 
 
 class UnsolvableError(Exception):
@@ -259,12 +250,7 @@ def compare(problem: Problem, values: FloatImage, estimate: Estimate) -> Residua
 
 @stage("iteration")
 def iterate(
-    problem: Problem,
-    equations: Equations,
-    values: FloatImage,
-    residual: Residual,
-    estimate: Estimate,
-    tolerance: float,
+    problem: Problem, equations: Equations, values: FloatImage, residual: Residual, estimate: Estimate, tolerance: float
 ) -> Estimate:
     """Iterate with one Hessian until no textured node moves by more than `tolerance`.
 
@@ -302,11 +288,7 @@ def iterate(
 
 
 def stepped(
-    problem: Problem,
-    equations: Equations,
-    values: FloatImage,
-    estimate: Estimate,
-    known: FloatImage | None,
+    problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, known: FloatImage | None
 ) -> Estimate:
     """One Gauss-Newton iteration; `known` is the difference (k, P) of the states at the estimate, if it is."""
     motion, shifts = equations.increment(*_right_sides(problem, equations, values, estimate, known))
@@ -332,7 +314,7 @@ def _right_sides(
     """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
     reference, assembly = problem.reference, problem.reference.assembly
     bend = assembly.smoothness @ estimate.displacement.ravel()
-    held = -equations.smoothness * equations.turned_back(bend[:, None]).ravel()
+    held = -equations.smoothness * _turned_back(equations.rotation, bend[:, None]).ravel()
     total, rigid, difference = held.copy(), [], np.empty_like(values[0])
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
         if known is not None:

@@ -153,10 +153,6 @@ class SlidingWindow:
         means[first, second] = means[second, first] = self._means(sums[::2], sums[1::2])
         return means
 
-    def spread(self, pixels: PixelMap, grids: FloatImage) -> FloatImage:
-        """Interpolate such means (n, h, w) at the pixels (n, P)."""
-        return pixels.from_blocks(grids, self.step)
-
     def _means(self, totals: FloatImage, weights: FloatImage) -> FloatImage:
         """Divide sums (n, h, w) by those of their weights (n, h, w) or (1, h, w), both blurred."""
         sigma = self.sigma / self.step

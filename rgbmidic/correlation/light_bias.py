@@ -10,8 +10,6 @@ independent; of two lights that disagree nobody knows which is right, and half t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
@@ -20,57 +18,43 @@ from rgbmidic.illumination.displacement import agreement
 from rgbmidic.typing import FloatArray, FloatImage
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LightBias:
-    """Bias of the solution from lights that are displaced, at the nodes.
+def light_bias(residual: Residual, weights: FloatImage) -> tuple[FloatArray, FloatArray]:
+    """Bias at the nodes, from the residual at a solution with these pixel weights (k, P); none with one light.
 
-    Attributes
-    ----------
-    values : ndarray, shape (N, 2)
+    Returns
+    -------
+    bias : ndarray, shape (N, 2)
         What is to be added to the displacement, px.
-    std : ndarray, shape (N, 2)
-        Standard uncertainty that is left, px.
-    reach : float
-        Distance over which it is alike, px.
+    std : ndarray, shape (N, 5)
+        Standard uncertainty that is left of u, v, exx, eyy and exy: a bias that is alike over the reach of the window
+        changes by so much over it.
     """
-
-    values: FloatArray
-    std: FloatArray
-    reach: float
-
-    @classmethod
-    def of(cls, residual: Residual, weights: FloatImage) -> LightBias:
-        """From the residual at a solution with these pixel weights (k, P); none with one light."""
-        reference = residual.reference
-        mesh, pixels, count = reference.mesh, reference.pixels, len(weights)
-        block, reach = reference.constants.block, reference.constants.bias_range
-        if count == 1:
-            return cls(values=np.zeros_like(mesh.nodes), std=np.zeros_like(mesh.nodes), reach=reach)
-        lights = zip(residual.difference, weights, *reference.gradient, strict=True)
-        # scores in x and y, and their information, (k, 3, h, w)
-        blocks = np.stack([reference.score_sums(block, *(field[None] for field in light))[:3] for light in lights])
-        sigma = (0, 0, reach / block, reach / block)
-        around = gaussian_filter(blocks, sigma, mode="constant", truncate=3)
-        half = np.maximum(around[:, 2] / 2, 1e-30)
-        displacement = around[:, :2] / half[:, None]
-        # scatter of the blocks' scores about the window's displacement, a window holding so many blocks
-        scatter = ((blocks[:, :2] - displacement * blocks[:, 2:] / 2) ** 2).mean(axis=1)
-        held = 4 * np.pi * (reach / block) ** 2
-        variance = gaussian_filter(scatter, sigma[1:], mode="constant", truncate=3) / half**2 / held
-        precision = half / np.maximum(half.sum(axis=0), 1e-30)
-        believed, agree = agreement(displacement, variance, precision)
-        part = precision + agree * (believed - precision)
-        mean = (part[:, None] * displacement).sum(axis=0)
-        apart = np.maximum((displacement - mean) ** 2 - variance[:, None], 0)
-        left = count / (count - 1) * (part[:, None] ** 2 * apart).sum(axis=0)
-        off = mean - (precision[:, None] * displacement).sum(axis=0)
-        top, left_edge = pixels.bounds[:2]
-        place = (mesh.nodes[:, ::-1] - (top, left_edge)).T / block - 0.5
-        at_nodes = [map_coordinates(one, place, order=1, mode="nearest") for one in (*off, *left)]
-        values, rest = np.stack(at_nodes, axis=1).reshape(-1, 2, 2).swapaxes(0, 1)
-        return cls(values=values, std=np.sqrt(rest), reach=reach)
-
-    def of_recovered(self) -> FloatArray:
-        """Standard uncertainty (N, 5) of u, v, exx, eyy and exy: a bias alike over `reach` changes so much over it."""
-        x, y = self.std.T
-        return np.stack([x, y, x / self.reach, y / self.reach, np.hypot(x, y) / (2 * self.reach)], axis=1)
+    reference = residual.reference
+    mesh, pixels, count = reference.mesh, reference.pixels, len(weights)
+    block, reach = reference.constants.block, reference.constants.bias_range
+    if count == 1:
+        return np.zeros_like(mesh.nodes), np.zeros((len(mesh.nodes), 5))
+    lights = zip(residual.difference, weights, *reference.gradient, strict=True)
+    # scores in x and y, and their information, (k, 3, h, w)
+    blocks = np.stack([reference.score_sums(block, *(field[None] for field in light))[:3] for light in lights])
+    sigma = (0, 0, reach / block, reach / block)
+    around = gaussian_filter(blocks, sigma, mode="constant", truncate=3)
+    half = np.maximum(around[:, 2] / 2, 1e-30)
+    displacement = around[:, :2] / half[:, None]
+    # scatter of the blocks' scores about the window's displacement, a window holding so many blocks
+    scatter = ((blocks[:, :2] - displacement * blocks[:, 2:] / 2) ** 2).mean(axis=1)
+    held = 4 * np.pi * (reach / block) ** 2
+    variance = gaussian_filter(scatter, sigma[1:], mode="constant", truncate=3) / half**2 / held
+    precision = half / np.maximum(half.sum(axis=0), 1e-30)
+    believed, agree = agreement(displacement, variance, precision)
+    part = precision + agree * (believed - precision)
+    mean = (part[:, None] * displacement).sum(axis=0)
+    apart = np.maximum((displacement - mean) ** 2 - variance[:, None], 0)
+    left = count / (count - 1) * (part[:, None] ** 2 * apart).sum(axis=0)
+    off = mean - (precision[:, None] * displacement).sum(axis=0)
+    top, left_edge = pixels.bounds[:2]
+    place = (mesh.nodes[:, ::-1] - (top, left_edge)).T / block - 0.5
+    at_nodes = [map_coordinates(one, place, order=1, mode="nearest") for one in (*off, *left)]
+    bias, square = np.stack(at_nodes, axis=1).reshape(-1, 2, 2).swapaxes(0, 1)
+    x, y = np.sqrt(square).T
+    return bias, np.stack([x, y, x / reach, y / reach, np.hypot(x, y) / (2 * reach)], axis=1)

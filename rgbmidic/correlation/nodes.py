@@ -1,13 +1,10 @@
 """Which elements match, and which nodes count as measured.
 
 The matching criterion of an element is the zero-mean correlation coefficient of all lights at the displacement found.
-A node counts as measured unless one of an ordered table of rules applies to it.
+A node counts as measured unless one of an ordered table of rules applies to it (`judge`).
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -22,49 +19,32 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Evidence:
-    """State of knowledge on the N nodes at the end of a solve.
+def judge(equations: Equations, residual: Residual, matched: BoolArray, std: FloatArray) -> npt.NDArray[np.uint8]:
+    """`NodeStatus` of every node (N,) at the end of a solve: of the rules, the first that applies decides.
 
-    Attributes
+    Parameters
     ----------
-    textured : ndarray, shape (N,), bool
-        Enough texture is seen around the node, by what precision there is (`Equations`).
-    one_sided : ndarray, shape (N,), bool
-        The texture runs in one direction only (`one_sided_texture`).
-    mismatched : ndarray, shape (N,), bool
-        An element around the node does not match.
+    equations, residual
+        Of the last pass.
+    matched : ndarray, shape (E,), bool
+        Elements whose images match.
     std : ndarray, shape (N, 2)
         Standard uncertainty of u and v, px.
-    lost : float
-        That from which a node is decorrelated, px.
     """
-
-    textured: BoolArray
-    one_sided: BoolArray
-    mismatched: BoolArray
-    std: FloatArray
-    lost: float
-
-
-RULES: tuple[tuple[NodeStatus, Callable[[Evidence], BoolArray]], ...] = (
-    # the elements around it do not match, and the others have too little texture
-    (NodeStatus.DECORRELATED, lambda nodes: nodes.mismatched & (nodes.one_sided | ~nodes.textured)),
-    # no light sees enough texture around it
-    (NodeStatus.NOT_SEEN, lambda nodes: ~nodes.textured),
-    # the texture runs in one direction only: what lies along it cannot be measured
-    (NodeStatus.NOT_SEEN, lambda nodes: nodes.one_sided),
-    # its displacement is uncertain by half a pixel or more
-    (NodeStatus.DECORRELATED, lambda nodes: nodes.std.max(axis=1) > nodes.lost),
-)
-"""Status of a node to which a rule applies, in this order; one to which none does is measured."""
-
-
-def judge(evidence: Evidence) -> npt.NDArray[np.uint8]:
-    """`NodeStatus` of every node (N,) by the `RULES`."""
-    status, applies = zip(*RULES, strict=True)
-    applied = [rule(evidence) for rule in applies]
-    return np.select(applied, [np.uint8(one) for one in status], np.uint8(NodeStatus.MEASURED))
+    textured, one_sided = equations.textured, one_sided_texture(equations, residual)
+    mismatched = residual.reference.mesh.to_nodes((~matched).astype(np.float64)) > 0
+    rules = (
+        # the elements around it do not match, and the others have too little texture
+        (mismatched & (one_sided | ~textured), NodeStatus.DECORRELATED),
+        # no light sees enough texture around it
+        (~textured, NodeStatus.NOT_SEEN),
+        # the texture runs in one direction only: what lies along it cannot be measured
+        (one_sided, NodeStatus.NOT_SEEN),
+        # its displacement is uncertain by half a pixel or more
+        (std.max(axis=1) > residual.reference.constants.lost, NodeStatus.DECORRELATED),
+    )
+    status = [np.uint8(one) for _, one in rules]
+    return np.select([applies for applies, _ in rules], status, np.uint8(NodeStatus.MEASURED))
 
 
 def one_sided_texture(equations: Equations, residual: Residual) -> BoolArray:
@@ -106,9 +86,9 @@ def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> 
 
 
 def matching_elements(
-    residual: Residual, precision: Precision | None = None, *, least: float | None = None
+    residual: Residual, displacement: FloatArray, precision: Precision | None = None, *, least: float | None = None
 ) -> BoolArray:
-    """Find the elements whose images match: zero-mean correlation coefficient of all lights together.
+    """Find the elements that are whole and match: zero-mean correlation coefficient of all lights together.
 
     Elements without weight or texture in the reference count as matched.
 
@@ -116,6 +96,8 @@ def matching_elements(
     ----------
     residual
         At the displacement found.
+    displacement : ndarray, shape (N, 2)
+        That displacement, px.
     precision
         Of the lights, by which they count in an element; None: all alike.
     least
@@ -126,13 +108,14 @@ def matching_elements(
     ndarray, shape (E,), bool
     """
     mesh, constants = residual.reference.mesh, residual.reference.constants
-    fg, ff, gg = _centred_products(residual, _light_precision(residual, precision))
+    fg, ff, gg = _centred_products(residual, precision)
     own = correlation(fg, ff, gg)
     # a few speckles can match by chance; those of all elements around a node hardly
     around = correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
     coefficient = np.minimum(own, np.sort(around[mesh.elements], axis=1)[:, 1])
+    whole = ~torn_elements(mesh, displacement, constants)
     if least is not None:
-        return np.asarray(coefficient >= least)
+        return np.asarray(whole & (coefficient >= least))
     poor, good = constants.matched if precision is None else constants.matched_precise
     matched = np.asarray(coefficient >= good)
     between = ~matched & (coefficient >= poor)
@@ -143,7 +126,7 @@ def matching_elements(
         nearest = cKDTree(centre[textured]).query(centre[between], k=ranks)[1]
         typical = np.median(coefficient[textured][nearest], axis=1)
     matched[between] = coefficient[between] >= 1 - constants.worse * (1 - typical)
-    return matched
+    return matched & whole
 
 
 def torn_elements(mesh: Tri3Mesh, displacement: FloatArray, constants: SolverConstants = USUAL) -> BoolArray:
@@ -168,17 +151,8 @@ def correlation_around(residual: Residual) -> FloatArray:
     It is NaN where the states show no texture together.
     """
     mesh = residual.reference.mesh
-    fg, ff, gg = (mesh.to_nodes(part) for part in _centred_products(residual, _light_precision(residual, None)))
+    fg, ff, gg = (mesh.to_nodes(part) for part in _centred_products(residual, None))
     return np.where(ff > 1e-9 * ff.max(initial=0.0), correlation(fg, ff, gg), np.nan)
-
-
-def _light_precision(residual: Residual, precision: Precision | None) -> FloatArray:
-    """Mean precision (k, E) of each light in each element, over that of the most precise; 1 where it is not known."""
-    reference = residual.reference
-    if precision is None or len(residual.values) == 1:
-        return np.ones((len(residual.values), len(reference.mesh.elements)))
-    mean = reference.sums(precision.factor, precision.bend)[..., 0]
-    return np.asarray(mean / np.maximum(mean.max(axis=0), 1e-300))
 
 
 def misfit(mesh: Tri3Mesh, squares: FloatArray, measured: BoolArray) -> FloatArray:
@@ -203,9 +177,16 @@ def misfit(mesh: Tri3Mesh, squares: FloatArray, measured: BoolArray) -> FloatArr
     return np.sqrt(around / typical) if typical > 0 else np.ones_like(around)
 
 
-def _centred_products(residual: Residual, precision: FloatArray) -> FloatArray:
-    """Sum the centred products f g, f f and g g over the lights, each with its `precision` (k, E); (3, E)."""
-    return np.asarray([(precision * part).sum(axis=0) for part in residual.centred_products()])
+def _centred_products(residual: Residual, precision: Precision | None) -> FloatArray:
+    """Sum the centred products f g, f f and g g of each element over the lights; (3, E).
+
+    Lights count by their mean precision in the element over that of the most precise; alike where it is not known.
+    """
+    products = np.array(residual.centred_products())
+    if precision is not None and len(residual.values) > 1:
+        mean = residual.reference.sums(precision.factor, precision.bend)[..., 0]
+        products *= mean / np.maximum(mean.max(axis=0), 1e-300)
+    return np.asarray(products.sum(axis=1))
 
 
 def correlation(fg: FloatArray, ff: FloatArray, gg: FloatArray) -> FloatArray:

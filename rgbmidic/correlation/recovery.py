@@ -78,12 +78,6 @@ def functional_std(
     return np.sqrt(np.maximum(np.stack(variance, axis=1), 0))
 
 
-def displacement_functionals(nodes: int) -> list[Functional]:
-    """Return the displacements u and v themselves, as `functional_std` takes them."""
-    itself = sp.eye(nodes, format="csr")
-    return [(itself, None), (None, itself)]
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recovery:
     """Linear operators from the nodal values of the linear fit to the field at the nodes.
@@ -112,24 +106,15 @@ class Recovery:
         return cls(value=value, slope_x=slope_x, slope_y=slope_y, curvature=tuple(curvature), offset=offset)
 
     @property
-    def displacement_functionals(self) -> list[Functional]:
-        """Displacements u and v at the nodes, as `functional_std` takes them."""
-        return [(self.value, None), (None, self.value)]
-
-    @property
     def strain_functionals(self) -> list[Functional]:
         """Strains exx, eyy, exy at the nodes, as `functional_std` takes them."""
         half_x, half_y = (with_data(slope, slope.data / 2) for slope in (self.slope_x, self.slope_y))
         return [(self.slope_x, None), (None, self.slope_y), (half_y, half_x)]
 
-    def displacement(self, fitted: FloatArray) -> FloatArray:
-        """Displacement (N, 2) at the nodes for that of the linear fit (N, 2)."""
-        return np.asarray(self.value @ fitted)
-
-    def strain(self, fitted: FloatArray) -> FloatArray:
-        """Strain (N, 3) exx, eyy, exy at the nodes."""
-        x, y = self.slope_x @ fitted, self.slope_y @ fitted
-        return np.stack([x[:, 0], y[:, 1], (y[:, 0] + x[:, 1]) / 2], axis=1)
+    def field(self, u: FloatArray, v: FloatArray) -> FloatArray:
+        """u, v, exx, eyy, exy (..., 5) at the nodes for nodal values u and v of the linear fit, (N,) or (N, R)."""
+        shear = (self.slope_y @ u + self.slope_x @ v) / 2
+        return np.stack([self.value @ u, self.value @ v, self.slope_x @ u, self.slope_y @ v, shear], axis=-1)
 
     def bend(self, fitted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what the linear fit has at the nodes beyond the field (N, 2), and its second derivatives (N, 2, 3)."""

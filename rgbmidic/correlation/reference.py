@@ -23,13 +23,7 @@ from rgbmidic._kernels.threads import aside
 from rgbmidic._kernels.weights import gradient_of_others
 from rgbmidic.correlation.assembly import Assembly, unfitted_fraction
 from rgbmidic.correlation.constants import USUAL, SolverConstants
-from rgbmidic.correlation.images import (
-    WINDOW,
-    spline_coefficients,
-    spline_values,
-    usable_pixels,
-    usable_reach,
-)
+from rgbmidic.correlation.images import WINDOW, spline_coefficients, spline_values, usable_pixels, usable_reach
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -494,5 +488,5 @@ def _regression(products: FloatImage, pixels: PixelMap) -> tuple[FloatImage, flo
     known = (square > 0) & (power > 0)
     correlation = along[known] / np.sqrt(square[known] * power[known])
     contrast = np.divide(along, square, out=np.zeros_like(along), where=known)
-    around = WINDOW.spread(pixels, np.maximum(contrast, 0)[None])[0]
+    around = pixels.from_blocks(np.maximum(contrast, 0)[None], WINDOW.step)[0]
     return around, float(np.median(correlation)) if known.any() else 0.0

@@ -419,15 +419,7 @@ def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: floa
     return found
 
 
-def brought_nearer(
-    residual: Residual,
-    displacement: FloatArray,
-    *,
-    reduction: int = 2,
-    half: int = 6,
-    most: int = 4,
-    least: float = 0.5,
-) -> FloatArray:
+def brought_nearer(residual: Residual, displacement: FloatArray) -> FloatArray:
     """Bring an initial guess to within some tenths of a pixel by matching patches around the nodes.
 
     Both states are compared as the residual holds them, in the reference's axes, so that turn and strain of the guess
@@ -440,21 +432,17 @@ def brought_nearer(
         At the initial guess.
     displacement : ndarray, shape (N, 2)
         The guess, at most 8 px away in x and y.
-    reduction
-        Of the pictures in which patches are matched: a speckle of 4 px keeps 2, and they cost 16 times less.
-    half
-        Pixels of a patch to each side of its node there: 26 px hold some 40 speckles, of which chance reaches a
-        correlation of .3 in 81 places (derived).
-    most
-        Largest shift of a patch, px there: 8 px of the image, two speckles. Twice as many cost 3 times as much.
-    least
-        Correlation coefficient from which a patch has been found, as in `confidence`.
 
     Returns
     -------
     ndarray, shape (N, 2)
         px; the guess itself where too few patches are found.
     """
+    # Pictures are reduced: a speckle of 4 px keeps 2, and they cost 16 times less. A patch reaches so many pixels to
+    # each side of its node there: 26 px hold some 40 speckles, of which chance reaches a correlation of .3 in 81 places
+    # (derived). Its largest shift is 8 px of the image, two speckles: twice as many cost 3 times as much. It has been
+    # found from a correlation coefficient as in `Search.confidence`.
+    reduction, half, most, least = 2, 6, 4, 0.5
     mesh, pixels, reach = residual.reference.mesh, residual.reference.pixels, half + most
     f, g = _reduced(residual, reduction, reach)
     top, left = pixels.bounds[:2]
@@ -466,22 +454,20 @@ def brought_nearer(
         if patch.min() < patch.max():  # of a blank patch OpenCV says that it is everywhere
             around = g[y - reach : y + reach + 1, x - reach : x + reach + 1]
             out[:] = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
-    i, j = np.divmod(found.reshape(len(at), -1).argmax(axis=1), 2 * most + 1)
-    node = np.flatnonzero((i > 0) & (i < 2 * most) & (j > 0) & (j < 2 * most))
-    i, j, (shift, score) = i[node], j[node], (np.zeros((len(at), 2)), np.zeros(len(at)))
-    score[node] = here = found[node, i, j]
+    score, (i, j) = found.max(axis=(1, 2)), np.divmod(found.reshape(len(at), -1).argmax(axis=1), 2 * most + 1)
+    node = np.flatnonzero((score >= least) & (i > 0) & (i < 2 * most) & (j > 0) & (j < 2 * most))
+    if len(node) < _FITTED:
+        return displacement
+    i, j, here = i[node], j[node], score[node]
+    shift = np.stack([j, i], axis=1) - float(most)
     for axis, (di, dj) in enumerate(((0, 1), (1, 0))):
         before, after = found[node, i - di, j - dj], found[node, i + di, j + dj]
         bend = before - 2 * here + after
         # the crest of the parabola through three values, of which the middle one is the largest
-        shift[node, axis] = np.divide((before - after) / 2, bend, out=np.zeros_like(bend), where=bend < 0)
-    shift[node] += np.stack([j, i], axis=1) - most
-    agrees = score >= least
-    if agrees.sum() < _FITTED:
-        return displacement
+        shift[:, axis] += np.divide((before - after) / 2, bend, out=np.zeros_like(bend), where=bend < 0)
     shift *= reduction
-    beyond = shift + np.einsum("nij,nj->ni", mesh.nodal_gradient(displacement), shift)
-    return displacement + follow(mesh.nodes[agrees], beyond[agrees], mesh, 1.0)
+    beyond = shift + np.einsum("nij,nj->ni", mesh.nodal_gradient(displacement)[node], shift)
+    return displacement + follow(mesh.nodes[node], beyond, mesh, 1.0)
 
 
 def _reduced(residual: Residual, side: int, border: int) -> FloatImage:

@@ -16,20 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, UnsolvableError, compare, iterate
-from rgbmidic.correlation.light_bias import LightBias
-from rgbmidic.correlation.nodes import (
-    Evidence,
-    judge,
-    matching_elements,
-    misfit,
-    one_sided_texture,
-    torn_elements,
-)
+from rgbmidic.correlation.light_bias import light_bias
+from rgbmidic.correlation.nodes import judge, matching_elements, misfit, one_sided_texture
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual, brought_nearer, corrected_values
@@ -71,11 +63,6 @@ class Weighting:
     returned: int = 0
     learnt_at: FloatArray
 
-    @property
-    def seen(self) -> BoolArray:
-        """Which lights (k,) see an element that takes part."""
-        return np.asarray((self.residual.moments[:, self.matched, 0] > 0).any(axis=1))
-
     def weights(self, pixels: slice = slice(None)) -> FloatImage:
         """Weights (k, P) of pixels in the next pass."""
         given = self.given(pixels)
@@ -96,7 +83,7 @@ def first_weighting(problem: Problem, estimate: Estimate, residual: Residual | N
     return Weighting(
         residual=residual,
         values=corrected_values(residual, "global" if kind == "local" else kind),
-        matched=_matched(problem, residual, estimate, least=problem.constants.begun),
+        matched=matching_elements(residual, estimate.displacement, least=problem.constants.begun),
         learnt_at=estimate.displacement,
     )
 
@@ -109,7 +96,7 @@ def next_weighting(
     residual, method = compare(problem, last.values, estimate), problem.method
     # without the precision of the lights, which the first pass has not, an element half on another body may match
     precision = last.precision if number or method is None else method.precision(residual)
-    matched = _matched(problem, residual, estimate, precision)
+    matched = matching_elements(residual, estimate.displacement, precision)
     if not matched.all() or estimate.longest > problem.constants.first_pass:
         lost = _lost_nodes(problem, last, equations, residual, estimate, number)
         matched &= ~lost[problem.reference.mesh.elements].any(axis=1)
@@ -152,19 +139,6 @@ def _learnt_anew(last: Weighting, matched: BoolArray, equations: Equations, esti
     motion = np.hypot(*(estimate.displacement - last.learnt_at).T)[equations.textured]
     elsewhere = number == 1 < len(last.residual.values) and (motion > constants.elsewhere).mean() > constants.swinging
     return max(last.returned, number) if elsewhere else last.returned
-
-
-def _matched(
-    problem: Problem,
-    residual: Residual,
-    estimate: Estimate,
-    precision: Precision | None = None,
-    *,
-    least: float | None = None,
-) -> BoolArray:
-    """Elements (E,) that match and are whole."""
-    torn = torn_elements(problem.reference.mesh, estimate.displacement, problem.constants)
-    return matching_elements(residual, precision, least=least) & ~torn
 
 
 def settled(weighting: Weighting, equations: Equations) -> bool:
@@ -230,9 +204,10 @@ def solve(
         method=method,
         functions=rigid_functions(reference.mesh.nodes, options.rigid),
     )
+    rigid = np.zeros((len(reference.images), problem.functions.shape[1]))
     try:
         with one_blas_thread():
-            return _conclude(problem, *_passes(problem, Estimate.start(problem, initial), residual))
+            return _conclude(problem, *_passes(problem, Estimate(displacement=initial, rigid=rigid), residual))
     except UnsolvableError as error:
         return Solution.failed(reference.mesh, len(reference.images), str(error), error.history)
 
@@ -256,10 +231,9 @@ def _passes(problem: Problem, estimate: Estimate, residual: Residual | None) -> 
         matched = weighting.matched & ~swinging[problem.reference.mesh.elements].any(axis=1)
         few = 0 < swinging.mean() < problem.constants.swinging and matched.any()
         if few and len(estimate.increments) < problem.options.max_iterations:
-            residual = compare(problem, weighting.values, estimate)
-            weighting = replace(weighting, residual=residual, matched=matched)
+            weighting = replace(weighting, residual=compare(problem, weighting.values, estimate), matched=matched)
             equations = _equations(problem, weighting, estimate)
-            estimate = iterate(problem, equations, weighting.values, residual, estimate, tolerance)
+            estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance)
         weighting = replace(weighting, residual=compare(problem, weighting.values, estimate))
     return estimate, equations, weighting
 
@@ -270,11 +244,11 @@ def _begin(problem: Problem, estimate: Estimate, residual: Residual | None) -> t
     weighting = first_weighting(problem, estimate, residual)
     if weighting.matched.all():
         return estimate, weighting
-    moved = Estimate.start(problem, brought_nearer(weighting.residual, estimate.displacement))
+    moved = replace(estimate, displacement=brought_nearer(weighting.residual, estimate.displacement))
     nearer = first_weighting(problem, moved)
     if nearer.matched.sum() <= weighting.matched.sum():
         return estimate, weighting
-    return moved, replace(nearer, matched=_matched(problem, nearer.residual, moved))
+    return moved, replace(nearer, matched=matching_elements(nearer.residual, moved.displacement))
 
 
 @stage("equations")
@@ -286,7 +260,7 @@ def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Eq
     UnsolvableError
         Nothing is left to be measured.
     """
-    seen = weighting.seen
+    seen = np.any(weighting.residual.moments[:, weighting.matched, 0] > 0, axis=1)
     if not seen.any():
         raise UnsolvableError(_nothing_left(weighting), estimate)
     if problem.functions.shape[1] and not seen[0]:
@@ -319,19 +293,20 @@ def _nothing_left(weighting: Weighting) -> str:
 def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weighting: Weighting) -> Solution:
     """Conclude the solve: which nodes count as measured, their values and uncertainty."""
     reference, mesh = problem.reference, problem.reference.mesh
-    mismatched = np.zeros(len(mesh.nodes), dtype=bool)
-    mismatched[mesh.elements[~weighting.matched]] = True
     used = weighting.matched & equations.textured[mesh.elements].all(axis=1)
     recovery = Recovery.over(reference.material, used, equations.information(reference))
     fitted = estimate.displacement
     residual = weighting.residual.without(*recovery.bend(fitted))
     std = standard_uncertainty(residual, equations, weighting.precision, recovery)
     if weighting.precision is not None:
-        bias = LightBias.of(weighting.residual, equations.weights)
-        fitted = fitted + bias.values
-        std = np.hypot(std, bias.of_recovered())
-    squares = weighting.residual.squares(equations.weights)
-    node_status = _judged(estimate, equations, weighting, mismatched, std)
+        bias, bias_std = light_bias(weighting.residual, equations.weights)
+        fitted, std = fitted + bias, np.hypot(std, bias_std)
+    node_status = judge(equations, weighting.residual, weighting.matched, std[:, :2])
+    measured = np.asarray(node_status == NodeStatus.MEASURED)
+    if not measured.any():
+        along = one_sided_texture(equations, weighting.residual) & (node_status == NodeStatus.NOT_SEEN)
+        one_sided = "the texture runs in one direction only: what lies along it cannot be measured"
+        raise UnsolvableError(one_sided if along.any() else NO_MATCH, estimate)
     if equations.rigid is not None and equations.rigid.hidden.any():
         numbers = [str(number) for number in np.flatnonzero(equations.rigid.hidden)]
         named = f"lights {', '.join(numbers)} share" if len(numbers) > 1 else f"light {numbers[0]} shares"
@@ -341,20 +316,18 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
             'solver.rigid = "none"',
             estimate,
         )
-    measured = node_status == NodeStatus.MEASURED
     inner = measured & ~mesh.beside(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
+    squares, field = weighting.residual.squares(equations.weights), recovery.field(*fitted.T)
     square, total, _ = squares.sum(axis=1).T
-    history = estimate.history(measured)
+    some = equations.weights[:, :: max(1, equations.weights.shape[1] // 100_000)]
+    seen, history = some.sum(axis=0), estimate.history(measured)
     converged = bool(history[-1] <= problem.options.tolerance)
-    return Solution(
-        nodes=mesh.nodes,
-        elements=mesh.elements,
-        displacement=np.where(measured[:, None], recovery.displacement(fitted), np.nan),
+    return replace(
+        Solution.failed(mesh, len(reference.images), "", history),
+        displacement=np.where(measured[:, None], field[:, :2], np.nan),
         displacement_std=np.where(measured[:, None], std[:, :2], np.nan),
-        strain=np.where(inner[:, None], recovery.strain(fitted), np.nan),
+        strain=np.where(inner[:, None], field[:, 2:], np.nan),
         strain_std=np.where(inner[:, None], std[:, 2:], np.nan),
-        displacement_error=np.full((len(inner), 2), np.nan),
-        strain_error=np.full((len(inner), 3), np.nan),
         node_status=node_status,
         light_fraction=equations.light_fraction,
         misfit=np.where(measured, misfit(mesh, squares, equations.textured), np.nan),
@@ -362,40 +335,8 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         reason="" if converged else _unsettled(problem, estimate, measured),
         rigid=np.where(np.any(equations.weights, axis=1, keepdims=True), estimate.rigid, np.nan),
         residual=np.sqrt(np.divide(square, total, out=np.full(total.size, np.nan), where=total > 0)),
-        weight_fraction=_weight_fractions(equations.weights),
-        history=history,
+        weight_fraction=np.mean(some / np.where(seen > 0, seen, np.float32(1)), axis=1, dtype=np.float64),
     )
-
-
-def _judged(
-    estimate: Estimate,
-    equations: Equations,
-    weighting: Weighting,
-    mismatched: BoolArray,
-    std: FloatArray,
-) -> npt.NDArray[np.uint8]:
-    """Status of every node (N,).
-
-    Raises
-    ------
-    UnsolvableError
-        No node is measured.
-    """
-    evidence = Evidence(
-        textured=equations.textured,
-        one_sided=one_sided_texture(equations, weighting.residual),
-        mismatched=mismatched,
-        std=std[:, :2],
-        lost=weighting.residual.reference.constants.lost,
-    )
-    node_status = judge(evidence)
-    if not (node_status == NodeStatus.MEASURED).any():
-        one_sided = (evidence.one_sided & (node_status == NodeStatus.NOT_SEEN)).any()
-        raise UnsolvableError(
-            "the texture runs in one direction only: what lies along it cannot be measured" if one_sided else NO_MATCH,
-            estimate,
-        )
-    return node_status
 
 
 def _unsettled(problem: Problem, estimate: Estimate, measured: BoolArray) -> str:
@@ -407,10 +348,3 @@ def _unsettled(problem: Problem, estimate: Estimate, measured: BoolArray) -> str
         f"{int(measured.sum())} nodes by more than the tolerance of {tolerance:g} px, most the one at x {x:.0f}, "
         f"y {y:.0f}: by {motion.max():.3g} px"
     )
-
-
-def _weight_fractions(weights: FloatImage) -> FloatArray:
-    """Mean fraction (k,) of each light in the sum of the weights (k, P), over about 100 000 pixels."""
-    some = weights[:, :: max(1, weights.shape[1] // 100_000)]
-    total = some.sum(axis=0)
-    return np.asarray((some / np.where(total > 0, total, np.float32(1))).mean(axis=1, dtype=np.float64))

@@ -202,17 +202,16 @@ class Search:
         reference, around = residual.reference, correlation_around(residual)
         weight = reference.sums(reference.pixel_weights, reference.pixel_weights[0])[..., 0].sum(axis=0)
         seen = reference.mesh.to_nodes(weight) > 0
-        with np.errstate(invalid="ignore"):
-            agrees = around >= (self.agrees if least is None else least)
+        agrees = around >= (self.agrees if least is None else least)
         return float(agrees.sum() / max(int(np.isfinite(around).sum()), 0.1 * seen.sum(), 1))
 
     def _keypoints(
         self, images: FloatImage, weights: FloatImage, part: tuple[slice, slice], reduction: int, most: int
     ) -> Keypoints | None:
         """The `most` strongest keypoints in a part of a state's picture, where a weight (k, H, W) is not 0, if any."""
-        picture, seen = self._picture(images, weights, part, reduction)
-        if min(picture.shape) < 2 * self.normalise:
+        if min(side.stop - side.start for side in part) // reduction < 2 * self.normalise:
             return None
+        picture, seen = self._picture(images, weights, part, reduction)
         grey = np.clip(128 + self.grey * picture, 0, 255).astype(np.uint8)
         # the precise upscale keeps positions free of a bias of a quarter of a pixel
         sift = cv2.SIFT.create(contrastThreshold=self.contrast, enable_precise_upscale=True)
@@ -260,8 +259,6 @@ class Search:
         """Mean over the lights of the locally normalised images of a part, reduced, and the sum of the weights."""
         height, width = (size // reduction for size in images[0][part].shape)
         total, seen = np.zeros((2, height, width), dtype=np.float32)
-        if not total.size:
-            return total, seen
 
         def reduced(image: FloatImage) -> FloatImage:
             whole = image[: height * reduction, : width * reduction]

@@ -12,15 +12,16 @@ from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import numpy as np
+import scipy.sparse as sp
 
 from rgbmidic.correlation.assembly import RigidMotions, block_side
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.images import at_blocks, window_sums
-from rgbmidic.correlation.recovery import Functional, Recovery, displacement_functionals, functional_std
+from rgbmidic.correlation.recovery import Functional, Recovery, functional_std
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Precision, Residual
-from rgbmidic.typing import AnyArray, FloatArray, FloatImage
+from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
 
 def displacing_fraction(reference: Reference, difference: FloatImage, weight: FloatImage) -> FloatImage:
@@ -195,40 +196,6 @@ class BlockScores:
         return np.divide(product, scale, out=np.zeros_like(product), where=scale > 0)
 
 
-def nodal_std(residual: Residual, equations: Equations, recovery: Recovery | None = None) -> FloatArray:
-    """Evaluate the standard uncertainty of the linear fit's u and v, or of what a recovery gives.
-
-    The covariance is ``M^-1 S M^-1`` with S the covariance of the right-hand side (docs: uncertainty), and what the
-    rigid motions of the lights add. Displacement is stated at the textured nodes, strain where all nodes around are
-    textured, too.
-
-    Parameters
-    ----------
-    residual, equations
-        Of the last pass.
-    recovery
-        Of the field from the linear fit; None for the fit itself.
-
-    Returns
-    -------
-    ndarray, shape (N, 2) or (N, 5)
-        Of u and v (px); with a `recovery` of u, v, exx, eyy, exy.
-    """
-    reference, textured = residual.reference, equations.textured
-    covariance = reference.assembly.matrix(score_covariance(residual, equations.weights, equations.blocks))
-    if recovery is None:
-        asked = [(one, textured) for one in displacement_functionals(len(textured))]
-    else:
-        inner = textured & ~reference.mesh.beside(~textured)
-        asked = [(one, textured) for one in recovery.displacement_functionals]
-        asked += [(one, inner) for one in recovery.strain_functionals]
-    std = functional_std(equations.solve, covariance, reference.material, asked)
-    if equations.rigid is None:
-        return std
-    rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in asked])
-    return np.asarray(np.sqrt(np.maximum(std**2 + rigid, 0)))
-
-
 def _rigid_variance(
     residual: Residual, equations: Equations, rigid: RigidMotions, asked: Sequence[Functional]
 ) -> FloatArray:
@@ -260,23 +227,45 @@ def _rigid_variance(
 def standard_uncertainty(
     residual: Residual, equations: Equations, precision: Precision | None, recovery: Recovery | None = None
 ) -> FloatArray:
-    """Evaluate the standard uncertainty of the linear fit, (N, 2), or of what a `recovery` gives, (N, 5).
+    """Evaluate the standard uncertainty of the linear fit's u and v, or of what a recovery gives.
 
-    The latter holds the step, too, that the lights' channel-specific gradients would make from the solution: two
-    gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978). Where a reflection
-    does not follow the surface it pulls with them, and what it still pulls without is less than that
+    The covariance is ``M^-1 S M^-1`` with S the covariance of the right-hand side (docs: uncertainty), and what the
+    rigid motions of the lights add. Displacement is stated at the textured nodes, strain where all nodes around are
+    textured, too. That of a recovery holds the step, too, that the lights' channel-specific gradients would make from
+    the solution: two gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978).
+    Where a reflection does not follow the surface it pulls with them, and what it still pulls without is less than that
     (docs/explanation/uncertainty.md).
+
+    Parameters
+    ----------
+    residual, equations, precision
+        Of the last pass.
+    recovery
+        Of the field from the linear fit; None for the fit itself.
+
+    Returns
+    -------
+    ndarray, shape (N, 2) or (N, 5)
+        Of u and v (px); with a `recovery` of u, v, exx, eyy, exy.
     """
-    std = nodal_std(residual, equations, recovery)
+    reference, textured = residual.reference, equations.textured
+    value = sp.eye(len(textured), format="csr") if recovery is None else recovery.value
+    asked: list[tuple[Functional, BoolArray]] = [((value, None), textured), ((None, value), textured)]
+    if recovery is not None:
+        inner = textured & ~reference.mesh.beside(~textured)
+        asked += [(one, inner) for one in recovery.strain_functionals]
+    covariance = reference.assembly.matrix(score_covariance(residual, equations.weights, equations.blocks))
+    std = functional_std(equations.solve, covariance, reference.material, asked)
+    if equations.rigid is not None:
+        rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in asked])
+        std = np.sqrt(np.maximum(std**2 + rigid, 0))
     if precision is not None:
-        std = std * precision.robust_loss(residual.reference, equations.weights)[:, None]
+        std = std * precision.robust_loss(reference, equations.weights)[:, None]
     if recovery is None:
         return std
-    reference = residual.reference
     lights = zip(equations.weights, residual.difference, reference.channel_specific.swapaxes(0, 1), strict=False)
     pulls = np.array([reference.assembly.vector(reference.projected(*light)) for light in lights])
     pulls = pulls.reshape(-1, reference.assembly.size)  # none where there is but one light
     pull, rigid_pull = pulls.sum(axis=0), (pulls[1:] @ equations.functions).ravel()
     step, _ = equations.increment(pull, np.zeros_like(pull), rigid_pull)
-    disagreement = np.concatenate([recovery.displacement(step), recovery.strain(step)], axis=1)
-    return np.asarray(np.hypot(std, disagreement))
+    return np.hypot(std, recovery.field(*step.T))

@@ -298,7 +298,7 @@ class Levelling:
         moments = self._moments @ np.nan_to_num(displacement)
         unknown: FloatArray = np.asarray(np.isnan(displacement).any(axis=1), dtype=np.float64)
         lost = (abs(self._moments) @ unknown) > 0
-        recovered = self._recovery.displacement(self._factors.solve(moments)).T
+        recovered = (self._recovery.value @ self._factors.solve(moments)).T
         return np.where(self._covered & ~lost, recovered, np.nan)
 
 

@@ -100,7 +100,7 @@ def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -
     solve = assembly.factorise(assembled(np.maximum(information, 1e-3 * USUAL.seen * np.median(density[seen]))))
     used = np.asarray(seen[mesh.elements].all(axis=1))
     recovery = Recovery.over(mesh, used, density)
-    along_x = [(recovery.displacement_functionals[0], seen)]
+    along_x = [((recovery.value, None), seen)]
     std = np.stack([functional_std(solve, assembled(score), mesh, along_x)[:, 0] for score in scores])
     return np.where(seen & (std < USUAL.lost), std, np.nan)
 

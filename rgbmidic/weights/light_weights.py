@@ -397,11 +397,11 @@ class Statistics(ValidPixels):
         if typical <= 0:
             return Precision(factor=np.ones_like(weights), bend=np.ones_like(weights[0]))
         floor = np.float32(max(self.least_variance * typical, self.rounding * residual.contrast))
-        factor = self.window.spread(pixels, _best_fractions(covariance, floor, self.own))
+        factor = pixels.from_blocks(_best_fractions(covariance, floor, self.own), self.window.step)
         mean, used, bend = (np.empty_like(factor[0]) for _ in range(3))  # the last one stays
         best_mean(factor, weights, residual.difference, mean, used)
         variance, least = self.window.covariance(pixels, mean[None], used[None])[0], floor / len(factor)
-        around = self.window.spread(pixels, np.maximum(variance, least))[0]
+        around = pixels.from_blocks(np.maximum(variance, least), self.window.step)[0]
         displacing = displacing_fraction(residual.reference, mean, used / around)
         unit = max(np.float32(_typical(variance)), least)
         robust_weights(mean, around, displacing, unit, np.float32(self.freedom), factor, bend)

@@ -124,7 +124,7 @@ def test_a_linear_field_is_levelled_to_itself_and_one_of_the_mesh_to_its_recover
     field = random.normal(size=(NODES, 2))
     everywhere = np.ones(len(MESH.elements), dtype=bool)
     recovery = Recovery.over(MESH, everywhere, np.ones(NODES))
-    assert pytest.approx(recovery.displacement(field), abs=1e-9) == Levelling(MESH, MESH)(field).T
+    assert pytest.approx(recovery.value @ field, abs=1e-9) == Levelling(MESH, MESH)(field).T
 
 
 def test_a_finer_simulation_is_levelled_to_what_least_squares_makes_of_it():
@@ -141,7 +141,7 @@ def test_a_finer_simulation_is_levelled_to_what_least_squares_makes_of_it():
     fitted = np.linalg.solve(hats.T @ hats, hats.T @ seen)
     everywhere = np.ones(len(MESH.elements), dtype=bool)
     recovery = Recovery.over(MESH, everywhere, np.ones(NODES))
-    off = Levelling(MESH, fine)(wave).T - recovery.displacement(fitted)
+    off = Levelling(MESH, fine)(wave).T - recovery.value @ fitted
     assert np.sqrt(np.mean(off**2)) < 0.004  # of an amplitude of 1: the quadrature's error
 
 
