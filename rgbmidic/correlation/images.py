@@ -45,7 +45,7 @@ def as_light_stack(images: npt.ArrayLike, name: str) -> FloatImage:
     stack = unmasked(images)
     if stack.ndim not in (2, 3) or stack.dtype.kind not in "uif":
         raise InputError(f"{name} must be a real image (H, W) or (k, H, W), not {stack.dtype} of shape {stack.shape}")
-    stack = stack.reshape(-1, *stack.shape[-2:])
+    stack = stack if stack.ndim == 3 else stack[None]
     if stack.shape[0] == 0 or min(stack.shape[1:]) < 8:
         last = "; the lights come first: np.moveaxis(images, -1, 0)" if stack.shape[2] < 8 <= stack.shape[1] else ""
         raise InputError(
