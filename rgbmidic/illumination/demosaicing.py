@@ -105,32 +105,29 @@ flank is not the displaced texture alone. With 2 and 4 the error on raised dropl
 
 def prediction_filters(
     specific: FloatArray,
-    noise: npt.ArrayLike,
+    noise: FloatArray,
     texture: TextureModel,
     cfa: str,
     *,
-    size: int = SIZE,
-    seen: FloatArray | None = None,
-    displacement: FloatArray | None = None,
-) -> tuple[npt.NDArray[np.int32], FloatImage]:
+    seen: FloatArray,
+    displacement: FloatArray,
+) -> tuple[npt.NDArray[np.int32], FloatImage, int]:
     """Return the table of filters for tiles whose channels have some variance of their own.
 
     Parameters
     ----------
     specific : (3, h, w)
         Channel-specific variance in each tile, relative to the common one.
-    noise : (3,) or (3, h, w)
+    noise : (3, h, w)
         Variance of the camera noise of each channel relative to the channel's own variance.
     texture
         Autocorrelation of the common texture, and of the channel-specific component.
     cfa
         Bayer pattern.
-    size
-        Side of the square of samples, `SIZE` or `WIDE`.
-    seen : (3, k), or None
-        Fraction of each light in the slope of each channel (`seen_lights`); None: each channel sees a light of its own.
-    displacement : (k, 2, h, w), or None
-        Of each light's texture in x and y, px; None: none.
+    seen : (3, k)
+        Fraction of each light in the slope of each channel (`seen_lights`).
+    displacement : (k, 2, h, w)
+        Of each light's texture in x and y, px.
 
     Returns
     -------
@@ -138,12 +135,13 @@ def prediction_filters(
         Row of the table for each tile.
     taps : (T, 2, 3, size², 2) float32
         As `rgbmidic._kernels.demosaicing.predict` takes them, with one output for each channel.
+    size : int
+        Side of the square of samples.
     """
     tiles = specific.shape[1:]
+    # a colour left to itself has only every other sample, so it needs to look farther
+    size = SIZE if texture.specific < 0.5 else WIDE
     level = np.round(np.log2(np.clip(specific, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
-    seen = np.eye(3) if seen is None else seen
-    if displacement is None:
-        displacement = np.zeros((seen.shape[1], 2, *tiles))
     steps = np.clip(np.round(displacement / DISPLACEMENT_STEP), -_MOST_STEPS, _MOST_STEPS).astype(np.int64)
     code = np.zeros(tiles, dtype=np.int64)
     for one in (*level, *steps.reshape(-1, *tiles)):
@@ -156,8 +154,7 @@ def prediction_filters(
     # a specimen's colour has no slope on the common texture that could tell how the channels see it
     together = texture.specific * np.eye(3) + (1 - texture.specific) * _correlations(variance, seen)
     fraction = 1 / (1 + variance)
-    whole = np.broadcast_to(np.asarray(noise, dtype=np.float64).reshape(3, -1), (3, index.size))
-    noisy = np.stack([np.bincount(index, one) for one in whole], axis=1) / number[:, None]
+    noisy = np.stack([np.bincount(index, one) for one in noise.reshape(3, -1)], axis=1) / number[:, None]
     # glints are not the texture displaced alone
     alike = np.exp(-DISSIMILAR * ((moved[:, :, None] - moved[:, None]) ** 2).sum(axis=3))
     offset, phases = np.arange(size) - size // 2, list(np.ndindex(2, 2))
@@ -177,7 +174,7 @@ def prediction_filters(
         taps,
     )
     by_parity = taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2)
-    return index.reshape(tiles).astype(np.int32), np.ascontiguousarray(by_parity, dtype=np.float32)
+    return index.reshape(tiles).astype(np.int32), np.ascontiguousarray(by_parity, dtype=np.float32), size
 
 
 def _correlations(variance: FloatArray, seen: FloatArray) -> FloatArray:
@@ -280,14 +277,11 @@ def reconstruct(
     matrix = np.eye(3) if crosstalk is None else crosstalk.matrix
     factors = colour_factors(moments, texture.band, matrix, coloured=texture.specific)
     displacement = light_displacement(moments, factors, texture, matrix, mosaic.cfa)
-    # a colour left to itself has only every other sample, so it needs to look farther
-    size = SIZE if texture.specific < 0.5 else WIDE
-    index, taps = prediction_filters(
+    index, taps, size = prediction_filters(
         _per_tile(factors.specific),
         _per_tile(factors.noise / (1 + factors.specific)),
         texture,
         mosaic.cfa,
-        size=size,
         seen=seen_lights(matrix, np.median(factors.slope, axis=(1, 2))),
         displacement=_per_tile(displacement.significant),
     )

@@ -12,6 +12,7 @@ from rgbmidic.illumination.demosaicing import (
     DISSIMILAR,
     OFFSET_VARIANCE,
     SPARKLE_VARIANCE,
+    WIDE,
     prediction_filters,
 )
 from rgbmidic.illumination.separation import demosaic, separate
@@ -130,10 +131,15 @@ def test_camera_noise_is_not_taken_for_a_reflection(mat):
     assert np.median(factors.noise) > 0.005
 
 
+NOISE = np.full((3, 1, 1), 1e-4)
+STILL = {"seen": np.eye(3), "displacement": np.zeros((3, 2, 1, 1))}
+"""Each channel sees a light of its own, which is not displaced."""
+
+
 def test_filters_sum_to_one_and_follow_the_trust():
     texture = TextureModel.of_speckle(4.0)
-    _, alike = prediction_filters(np.full((3, 1, 1), 1e-3), (1e-4,) * 3, texture, "RGGB")
-    _, apart = prediction_filters(np.array([1e-3, 1.0, 1e-3]).reshape(3, 1, 1), (1e-4,) * 3, texture, "RGGB")
+    _, alike, _ = prediction_filters(np.full((3, 1, 1), 1e-3), NOISE, texture, "RGGB", **STILL)
+    _, apart, _ = prediction_filters(np.array([1e-3, 1.0, 1e-3]).reshape(3, 1, 1), NOISE, texture, "RGGB", **STILL)
     np.testing.assert_allclose(alike.sum(axis=3), 1, atol=0.02)
     site = site_channels((5, 5), "RGGB").ravel()
     # red at a blue pixel: what green tells counts for much less when green is in a reflection
@@ -143,8 +149,9 @@ def test_filters_sum_to_one_and_follow_the_trust():
 
 def test_filters_of_nothing_in_common_use_the_own_colour_alone():
     texture = TextureModel(**{**vars_of(TextureModel.of_speckle(4.0)), "specific": 1.0})
-    _, taps = prediction_filters(np.full((3, 1, 1), 2000.0), (1e-4,) * 3, texture, "RGGB")
-    site = site_channels((5, 5), "RGGB").ravel()
+    _, taps, size = prediction_filters(np.full((3, 1, 1), 2000.0), NOISE, texture, "RGGB", **STILL)
+    assert size == WIDE
+    site = site_channels((8, 8), "RGGB")[1:, 1:].ravel()  # a square of 7 around red begins at blue
     for channel in range(3):
         others = taps[0, 0, channel, site != channel, 0]
         assert abs(others).max() < 0.01
@@ -156,8 +163,8 @@ def test_filters_are_the_best_prediction_of_what_crosstalk_shows_of_lights(displ
     texture, noise, size = TextureModel.of_speckle(4.0), 0.01, 5
     seen, sparkle = np.array([[0.75, 0.25, 0], [0, 1, 0], [0, 0.5, 0.5]]), np.array([0, 0.5, 0])
     variance = seen**2 @ sparkle
-    options = {"size": size, "seen": seen, "displacement": displacement[:, :, None, None]}
-    _, taps = prediction_filters(variance.reshape(3, 1, 1), (noise,) * 3, texture, "RGGB", **options)
+    options = {"seen": seen, "displacement": displacement[:, :, None, None]}
+    _, taps, _ = prediction_filters(variance.reshape(3, 1, 1), np.full((3, 1, 1), noise), texture, "RGGB", **options)
     offset = np.arange(size) - size // 2
     points = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)  # x, y
 
