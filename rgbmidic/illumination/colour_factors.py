@@ -82,11 +82,6 @@ class ColourFactors:
         """Standard deviation (3, h, w) of each channel's contrast without camera noise, DN."""
         return np.asarray(self.slope * np.sqrt(1 + self.specific))
 
-    @property
-    def common_fraction(self) -> FloatArray:
-        """Fraction (3, h, w) of the common texture in each channel's variance, 0 to 1."""
-        return np.asarray(1 / (1 + self.specific))
-
 
 def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel | None) -> Moments:
     """Return local means, contrast and local moments of a mosaic.

@@ -95,11 +95,6 @@ class CrosstalkField:
         if self.std is not None:
             object.__setattr__(self, "std", np.asarray(self.std, dtype=np.float64).reshape(values.shape))
 
-    def departure(self, points: npt.ArrayLike) -> FloatArray:
-        """Return A(x, y) minus its mean at points (x, y), shape (..., C, k)."""
-        terms = legendre_products(points, self.shape, self.order)[..., 1:]
-        return np.asarray(np.tensordot(terms, self.coefficients, axes=1))
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Crosstalk:
@@ -147,10 +142,7 @@ class Crosstalk:
                 f"the matrix has {matrix.shape}"
             )
         object.__setattr__(self, "matrix", matrix)
-        self._set_uncertainty()
-
-    def _set_uncertainty(self) -> None:
-        std, size = self.std, self.matrix.size
+        std, size = self.std, matrix.size
         if self.covariance is not None:
             covariance = np.asarray(self.covariance, dtype=np.float64)
             if covariance.shape != (size, size) or not np.isfinite(covariance).all() or (np.diag(covariance) < 0).any():
@@ -161,7 +153,7 @@ class Crosstalk:
             object.__setattr__(self, "covariance", covariance)
             std = np.sqrt(np.diag(covariance))
         if std is not None:
-            object.__setattr__(self, "std", np.asarray(std, dtype=np.float64).reshape(self.matrix.shape))
+            object.__setattr__(self, "std", np.asarray(std, dtype=np.float64).reshape(matrix.shape))
 
     @classmethod
     def identity(cls, lights: tuple[str, ...]) -> Crosstalk:
@@ -188,10 +180,10 @@ class Crosstalk:
 
     def at(self, points: npt.ArrayLike) -> FloatArray:
         """Return A at points (x, y) in px of shape (..., 2): shape (..., C, k)."""
-        place = np.asarray(points, dtype=np.float64)
         if self.field is None:
-            return np.broadcast_to(self.matrix, (*place.shape[:-1], *self.matrix.shape))
-        return np.asarray(self.matrix + self.field.departure(place))
+            return np.broadcast_to(self.matrix, (*np.shape(points)[:-1], *self.matrix.shape))
+        terms = legendre_products(points, self.field.shape, self.field.order)[..., 1:]
+        return np.asarray(self.matrix + np.tensordot(terms, self.field.coefficients, axes=1))
 
     @property
     def unmixing(self) -> FloatArray:

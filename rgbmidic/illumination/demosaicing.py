@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -36,7 +35,6 @@ from rgbmidic.illumination.colour_factors import (
     BLOCK,
     MEAN_BLOCK,
     ColourFactors,
-    Moments,
     colour_factors,
     enlarged,
     gather_moments,
@@ -52,26 +50,13 @@ from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
-@runtime_checkable
-class Demosaicer(Protocol):
-    """Gives every pixel all three camera channels, from a mosaic that has one of them at each.
-
-    Calling it with a `LinearMosaic` of size (H, W) gives `LinearChannels` of shape (3, H, W), order R, G, B. A value
-    is invalid, and NaN, when a saturated sample took part in it.
-    """
-
-    def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
-        """Demosaic a linearised frame."""
-
-
 def red_position(cfa: str) -> tuple[int, int]:
     """Return row and column of red in the 2x2 cell of a Bayer pattern."""
     row, column = np.argwhere(cfa_channels(cfa) == 0)[0]
     return int(row), int(column)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MalvarDemosaicer:
+def malvar_demosaic(mosaic: LinearMosaic) -> LinearChannels:
     """Bilinear averages corrected by the Laplacian of the channel sampled at the pixel.
 
     Assumes that the channels share their texture: where a light reflects, that light's sparkle leaks into the others.
@@ -81,31 +66,24 @@ class MalvarDemosaicer:
     H. S. Malvar, L. He, R. Cutler, High-quality linear interpolation for demosaicing of Bayer-patterned color images,
     IEEE ICASSP 2004, figure 2.
     """
-
-    def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
-        """Demosaic; see `Demosaicer`."""
-        values = np.empty((3, *mosaic.values.shape), dtype=np.float32)
-        known = np.where(mosaic.saturated, np.float32(np.nan), mosaic.values)
-        padded = cv2.copyMakeBorder(known, PAD, PAD, PAD, PAD, cv2.BORDER_REFLECT_101)
-        malvar(padded, *red_position(mosaic.cfa), values)
-        return LinearChannels(values=values, valid=np.isfinite(values), full_scale=mosaic.full_scale)
+    values = np.empty((3, *mosaic.values.shape), dtype=np.float32)
+    known = np.where(mosaic.saturated, np.float32(np.nan), mosaic.values)
+    padded = cv2.copyMakeBorder(known, PAD, PAD, PAD, PAD, cv2.BORDER_REFLECT_101)
+    malvar(padded, *red_position(mosaic.cfa), values)
+    return LinearChannels(values=values, valid=np.isfinite(values), full_scale=mosaic.full_scale)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NormalisedMosaic:
-    """Each sample divided by its colour's local mean is the speckle, whatever its colour.
+def normalised_demosaic(mosaic: LinearMosaic) -> LinearChannels:
+    """Channels that show one image: each sample divided by its colour's local mean is the speckle, whatever its colour.
 
-    All channels then show one image, each with its own local mean: correlate one of them. With the prefilter [1 2 1]
-    the floor that a demosaicing must beat. A channel in a reflection has less contrast and leaves a pattern.
+    Each has its own local mean: correlate one of them. With the prefilter [1 2 1] the floor that a demosaicing must
+    beat. A channel in a reflection has less contrast and leaves a pattern.
     """
-
-    def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
-        """Return channels that show one image; see `Demosaicer`."""
-        values = np.where(mosaic.saturated, np.float32(np.nan), mosaic.values)
-        level = enlarged(local_means(values, red_position(mosaic.cfa)), MEAN_BLOCK, values.shape)
-        own = np.take_along_axis(level, sampled_channels(mosaic.cfa, values.shape)[None], axis=0)[0]
-        out = level * np.divide(values, own, out=np.full_like(values, np.nan), where=own > 0)
-        return LinearChannels(values=out, valid=np.isfinite(out), full_scale=mosaic.full_scale)
+    values = np.where(mosaic.saturated, np.float32(np.nan), mosaic.values)
+    level = enlarged(local_means(values, red_position(mosaic.cfa)), MEAN_BLOCK, values.shape)
+    own = np.take_along_axis(level, sampled_channels(mosaic.cfa, values.shape)[None], axis=0)[0]
+    out = level * np.divide(values, own, out=np.full_like(values, np.nan), where=own > 0)
+    return LinearChannels(values=out, valid=np.isfinite(out), full_scale=mosaic.full_scale)
 
 
 SIZE, WIDE = 5, 7
@@ -125,64 +103,45 @@ flank is not the displaced texture alone. With 2 and 4 the error on raised dropl
 (benchmarks/reflections.py)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FilterTable:
-    """Filters of the tiles of a frame.
-
-    Attributes
-    ----------
-    index : (h, w) int32
-        Row of `taps` for each tile.
-    taps : (T, 2, n, size², 2) float32
-        As `rgbmidic._kernels.demosaicing.predict` takes them.
-    size : int
-        Side of the square of samples.
-    """
-
-    index: npt.NDArray[np.int32]
-    taps: FloatImage
-    size: int = SIZE
-
-
 def prediction_filters(
     specific: FloatArray,
-    noise: npt.ArrayLike,
+    noise: FloatArray,
     texture: TextureModel,
     cfa: str,
     *,
-    size: int = SIZE,
-    seen: FloatArray | None = None,
-    displacement: FloatArray | None = None,
-) -> FilterTable:
+    seen: FloatArray,
+    displacement: FloatArray,
+) -> tuple[npt.NDArray[np.int32], FloatImage, int]:
     """Return the table of filters for tiles whose channels have some variance of their own.
 
     Parameters
     ----------
     specific : (3, h, w)
         Channel-specific variance in each tile, relative to the common one.
-    noise : (3,) or (3, h, w)
+    noise : (3, h, w)
         Variance of the camera noise of each channel relative to the channel's own variance.
     texture
         Autocorrelation of the common texture, and of the channel-specific component.
     cfa
         Bayer pattern.
-    size
-        Side of the square of samples, `SIZE` or `WIDE`.
-    seen : (3, k), or None
-        Fraction of each light in the slope of each channel (`seen_lights`); None: each channel sees a light of its own.
-    displacement : (k, 2, h, w), or None
-        Of each light's texture in x and y, px; None: none.
+    seen : (3, k)
+        Fraction of each light in the slope of each channel (`seen_lights`).
+    displacement : (k, 2, h, w)
+        Of each light's texture in x and y, px.
 
     Returns
     -------
-    FilterTable
-        With one output for each channel.
+    index : (h, w) int32
+        Row of the table for each tile.
+    taps : (T, 2, 3, size², 2) float32
+        As `rgbmidic._kernels.demosaicing.predict` takes them, with one output for each channel.
+    size : int
+        Side of the square of samples.
     """
     tiles = specific.shape[1:]
+    # a colour left to itself has only every other sample, so it needs to look farther
+    size = SIZE if texture.specific < 0.5 else WIDE
     level = np.round(np.log2(np.clip(specific, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
-    seen = np.eye(3) if seen is None else seen
-    if displacement is None:
-        displacement = np.zeros((seen.shape[1], 2, *tiles))
     steps = np.clip(np.round(displacement / DISPLACEMENT_STEP), -_MOST_STEPS, _MOST_STEPS).astype(np.int64)
     code = np.zeros(tiles, dtype=np.int64)
     for one in (*level, *steps.reshape(-1, *tiles)):
@@ -195,8 +154,7 @@ def prediction_filters(
     # a specimen's colour has no slope on the common texture that could tell how the channels see it
     together = texture.specific * np.eye(3) + (1 - texture.specific) * _correlations(variance, seen)
     fraction = 1 / (1 + variance)
-    whole = np.broadcast_to(np.asarray(noise, dtype=np.float64).reshape(3, -1), (3, index.size))
-    noisy = np.stack([np.bincount(index, one) for one in whole], axis=1) / number[:, None]
+    noisy = np.stack([np.bincount(index, one) for one in noise.reshape(3, -1)], axis=1) / number[:, None]
     # glints are not the texture displaced alone
     alike = np.exp(-DISSIMILAR * ((moved[:, :, None] - moved[:, None]) ** 2).sum(axis=3))
     offset, phases = np.arange(size) - size // 2, list(np.ndindex(2, 2))
@@ -216,8 +174,7 @@ def prediction_filters(
         taps,
     )
     by_parity = taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2)
-    table = np.ascontiguousarray(by_parity, dtype=np.float32)
-    return FilterTable(index=index.reshape(tiles).astype(np.int32), taps=table, size=size)
+    return index.reshape(tiles).astype(np.int32), np.ascontiguousarray(by_parity, dtype=np.float32), size
 
 
 def _correlations(variance: FloatArray, seen: FloatArray) -> FloatArray:
@@ -277,79 +234,73 @@ class Reconstruction:
     displacement: LightDisplacement
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReflectionAwareDemosaicer:
-    """Predicts every channel from all the samples around, each trusted as far as it shows the common texture.
+def reconstruct(
+    mosaic: LinearMosaic,
+    crosstalk: Crosstalk | None = None,
+    *,
+    texture: TextureModel | None = None,
+    mixing: FloatArray | None = None,
+) -> Reconstruction:
+    """Predict every channel from all the samples around, each trusted as far as it shows the common texture.
 
-    Attributes
+    Parameters
     ----------
-    crosstalk : Crosstalk or None
+    mosaic
+        The linearised frame.
+    crosstalk
         Distinguishes the sparkle of one light that several channels see from the common texture; None: no crosstalk.
-    texture : TextureModel or None
-        The speckle's autocorrelation; None learns it from each frame. Frames of one test should share one.
+    texture
+        The speckle's autocorrelation; None learns it from the frame. Frames of one test should share one.
+    mixing : (n, 3), or None
+        Mixtures of the channels to give instead of them; not valid where a channel that matters in one
+        (`rgbmidic.illumination.crosstalk.needed`) is not.
+
+    Returns
+    -------
+    Reconstruction
+
+    Raises
+    ------
+    InputError
+        The frame is smaller than 64 x 64 px.
     """
-
-    crosstalk: Crosstalk | None = None
-    texture: TextureModel | None = None
-
-    def __call__(self, mosaic: LinearMosaic) -> LinearChannels:
-        """Demosaic; see `Demosaicer`."""
-        return self.reconstruct(mosaic).channels
-
-    def reconstruct(self, mosaic: LinearMosaic, mixing: FloatArray | None = None) -> Reconstruction:
-        """Demosaic, and return also what was found out.
-
-        Parameters
-        ----------
-        mosaic
-            The linearised frame.
-        mixing : (n, 3), or None
-            Mixtures of the channels to give instead of them; not valid where a channel that matters in one
-            (`rgbmidic.illumination.crosstalk.needed`) is not.
-
-        Returns
-        -------
-        Reconstruction
-
-        Raises
-        ------
-        InputError
-            The frame is smaller than 64 x 64 px.
-        """
-        if min(mosaic.values.shape) < SMALLEST_FRAME:
-            raise InputError(
-                f"reflection-aware demosaicing needs at least {SMALLEST_FRAME} x {SMALLEST_FRAME} px to know the "
-                f'speckle; the frame has {mosaic.values.shape[1]} x {mosaic.values.shape[0]}: use method "malvar"'
-            )
-        values, damaged = mosaic.values, bool(mosaic.saturated.any())
-        if damaged:
-            values = np.where(mosaic.saturated, np.float32(np.nan), values)
-        moments = gather_moments(values, red_position(mosaic.cfa), mosaic.noise)
-        texture = learn_texture(moments) if self.texture is None else self.texture
-        matrix = np.eye(3) if self.crosstalk is None else self.crosstalk.matrix
-        factors = colour_factors(moments, texture.band, matrix, coloured=texture.specific)
-        displacement = light_displacement(moments, factors, texture, matrix, mosaic.cfa)
-        # a colour left to itself has only every other sample, so it needs to look farther
-        size = SIZE if texture.specific < 0.5 else WIDE
-        table = prediction_filters(
-            _per_tile(factors.specific),
-            _per_tile(factors.noise / (1 + factors.specific)),
-            texture,
-            mosaic.cfa,
-            size=size,
-            seen=seen_lights(matrix, np.median(factors.slope, axis=(1, 2))),
-            displacement=_per_tile(displacement.significant),
+    values, damaged, columns = mosaic.values, bool(mosaic.saturated.any()), mosaic.values.shape[1]
+    if min(values.shape) < SMALLEST_FRAME:
+        raise InputError(
+            f"reflection-aware demosaicing needs at least {SMALLEST_FRAME} x {SMALLEST_FRAME} px to know the "
+            f'speckle; the frame has {columns} x {values.shape[0]}: use method "malvar"'
         )
-        mixing = np.eye(3) if mixing is None else mixing
-        out, unknown = _predict(moments, factors, table, mixing, damaged=damaged)
-        valid = np.ones(out.shape, dtype=bool)
-        if damaged:
-            known = _validity(mosaic.saturated, unknown, mosaic.cfa)
-            valid = np.stack([known[matters].all(axis=0) for matters in needed(mixing)])
-        channels = LinearChannels(values=out, valid=valid, full_scale=mosaic.full_scale)
-        return Reconstruction(
-            channels=channels, texture=texture, factors=factors, mean=moments.mean, displacement=displacement
-        )
+    if damaged:
+        values = np.where(mosaic.saturated, np.float32(np.nan), values)
+    moments = gather_moments(values, red_position(mosaic.cfa), mosaic.noise)
+    texture = learn_texture(moments) if texture is None else texture
+    matrix = np.eye(3) if crosstalk is None else crosstalk.matrix
+    factors = colour_factors(moments, texture.band, matrix, coloured=texture.specific)
+    displacement = light_displacement(moments, factors, texture, matrix, mosaic.cfa)
+    index, taps, size = prediction_filters(
+        _per_tile(factors.specific),
+        _per_tile(factors.noise / (1 + factors.specific)),
+        texture,
+        mosaic.cfa,
+        seen=seen_lights(matrix, np.median(factors.slope, axis=(1, 2))),
+        displacement=_per_tile(displacement.significant),
+    )
+    spread, pad = factors.spread.astype(np.float32), size // 2
+    padded = scaled(moments, np.float32(1) / spread, pad=pad, width=index.shape[1] * TILE)
+    mixing = np.eye(3) if mixing is None else mixing
+    out = np.empty((len(mixing), *values.shape), dtype=np.float32)
+    valid = np.ones(out.shape, dtype=bool)
+    if damaged:
+        source, unknown = padded.copy(), np.zeros(padded.shape, dtype=bool)
+        fill_unknown(source, _per_tile(1 / (1 + factors.specific)), *moments.red, pad, padded, unknown)
+        known = _validity(mosaic.saturated, unknown[pad : pad + len(values), pad : pad + columns], mosaic.cfa)
+        valid = np.stack([known[matters].all(axis=0) for matters in needed(mixing)])
+    scale, mean = widened(spread, BLOCK, columns), widened(moments.mean, MEAN_BLOCK, columns)
+    predict(padded, index, taps, size, scale, BLOCK, mean, MEAN_BLOCK, mixing.astype(np.float32), out)
+    channels = LinearChannels(values=out, valid=valid, full_scale=mosaic.full_scale)
+    return Reconstruction(
+        channels=channels, texture=texture, factors=factors, mean=moments.mean, displacement=displacement
+    )
 
 
 def _per_tile(grid: FloatArray) -> FloatArray:
@@ -359,24 +310,6 @@ def _per_tile(grid: FloatArray) -> FloatArray:
     padded = np.pad(grid, missing, mode="edge") if np.any(missing) else grid
     parts = [padded[..., row::ratio, column::ratio] for row, column in np.ndindex(ratio, ratio)]
     return np.asarray(sum(parts) / ratio**2)
-
-
-def _predict(
-    moments: Moments, factors: ColourFactors, table: FilterTable, mixing: FloatArray, *, damaged: bool
-) -> tuple[FloatImage, BoolArray]:
-    """Return mixtures (n, H, W) of the channels and where samples stayed unknown (H, W)."""
-    spread, pad = factors.spread.astype(np.float32), table.size // 2
-    padded = scaled(moments, np.float32(1) / spread, pad=pad, width=table.index.shape[1] * TILE)
-    rows, columns = moments.contrast.shape
-    unknown = np.zeros(padded.shape, dtype=bool)
-    if damaged:
-        source = padded.copy()
-        fill_unknown(source, _per_tile(factors.common_fraction), *moments.red, pad, padded, unknown)
-    out = np.empty((len(mixing), rows, columns), dtype=np.float32)
-    scale, mean = widened(spread, BLOCK, columns), widened(moments.mean, MEAN_BLOCK, columns)
-    mixing = mixing.astype(np.float32)
-    predict(padded, table.index, table.taps, table.size, scale, BLOCK, mean, MEAN_BLOCK, mixing, out)
-    return out, unknown[pad : pad + rows, pad : pad + columns]
 
 
 def _validity(saturated: BoolArray, unknown: BoolArray, cfa: str) -> BoolArray:

@@ -22,7 +22,6 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.checks import Check, refused, reported
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.illumination.unevenness import SIGNIFICANCE, unevenness
 from rgbmidic.settings import FrameCheck
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -30,6 +29,11 @@ Frame = Mosaic | ChannelFrame
 
 BLOCK = 16
 """Side of blocks in px, twice that for the greens."""
+SIGNIFICANCE = 6.0
+"""Standard errors beyond which a departure is not chance: 24 planes and levels are looked at."""
+WINDOW = 9
+"""Grey levels over which the histogram is smooth (a parabola) where noise has a standard deviation of `SMOOTHED`."""
+SMOOTHED = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +172,7 @@ def contradictions(
 def _levels(samples: _Samples, again: _Samples | None, calibrated: float | None, full_scale: float) -> Iterator[Check]:
     """Check the histogram of the grey levels for levels that are missing or doubled, and where none are, the noise.
 
-    From 1000 levels of the full scale on, that is 10 bit, photon noise exceeds `unevenness.SMOOTHED` where a sensor is
+    From 1000 levels of the full scale on, that is 10 bit, photon noise exceeds `SMOOTHED` where a sensor is
     lit: with a full well of 4,000 electrons it is 8 levels at a third of the scale. 8-bit frames of real cameras reach
     an unevenness of .23, others without a table of their own .022, good scenes .006; a gain of 1.05 gives .05.
     """
@@ -190,6 +194,50 @@ def _levels(samples: _Samples, again: _Samples | None, calibrated: float | None,
         yield Check("levels", text, uneven, limit)
     if uneven <= limit:  # the count of small differences wants samples that take any whole value
         yield from _noise(samples, again, step)
+
+
+def unevenness(
+    samples: npt.NDArray[np.uint16], noise: NoiseModel | None = None, black: float = 0.0, step: int = 1
+) -> float:
+    """Return the relative variance of the histogram of raw samples about its smooth course, less that of counting.
+
+    It is 0 where the histogram is smooth over `WINDOW` levels as noise makes it, .05 where every 21st level is missing,
+    about 2 where every other one is; NaN where too few samples, or too little noise, leave it open.
+
+    Parameters
+    ----------
+    samples
+        Of one colour plane, none saturated.
+    noise
+        Calibrated noise: only levels at which it smooths the histogram are looked at; None: all.
+    black
+        Their black level.
+    step
+        What all samples of the frame are multiples of.
+
+    Returns
+    -------
+    float
+    """
+    if samples.size < 1000:
+        return float("nan")
+    count = np.bincount(samples // step).astype(np.float64)
+    if count.size < 30:
+        return float("nan")
+    count[: np.flatnonzero(count)[0] + 1] = 0  # what is clipped at the bottom
+    around = np.convolve(count, np.full(WINDOW, 1 / WINDOW), mode="same")
+    known = around >= 8
+    if noise is not None:
+        known &= noise.variance(step * np.arange(count.size) - black) >= (SMOOTHED * step) ** 2
+    if known.sum() < 30:
+        return float("nan")
+    middle = np.linalg.pinv(np.vander(np.arange(WINDOW) - WINDOW // 2, 3))[-1]  # of the parabola through a window
+    kept = 1 - middle[WINDOW // 2]  # of the variance of counting, by the residual of the parabola
+    square = (count - np.convolve(count, middle, mode="same"))[known] ** 2 / kept
+    chance = SIGNIFICANCE * np.sqrt(2 * known.sum())
+    if (square / around[known]).sum() - known.sum() < chance:
+        return 0.0
+    return float((square.sum() - around[known].sum()) / (around[known] ** 2).sum())
 
 
 def _noise(samples: _Samples, repeat: _Samples | None, step: int) -> Iterator[Check]:

@@ -39,9 +39,7 @@ def registration_basis(points: npt.ArrayLike, centre: tuple[float, float], radiu
     x, y = arm.T
     one, none = np.ones_like(x), np.zeros_like(x)
     growth = (x**2 + y**2) / radius**2
-    return np.stack([np.stack([one, none, -y, x, growth * x]), np.stack([none, one, x, y, growth * y])]).transpose(
-        2, 0, 1
-    )
+    return np.stack([[one, none, -y, x, growth * x], [none, one, x, y, growth * y]]).transpose(2, 0, 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -140,11 +140,6 @@ class Quantity:
         object.__setattr__(self, "value", value)
         object.__setattr__(self, "std", std)
 
-    @classmethod
-    def unknown(cls, count: int) -> Quantity:
-        """Return figures not measured, for `count` planes."""
-        return cls(np.full(count, np.nan), np.full(count, np.nan))
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraNoise:

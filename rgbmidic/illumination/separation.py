@@ -19,18 +19,17 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk, align, unmix
 from rgbmidic.illumination.demosaicing import (
     SMALLEST_FRAME,
-    Demosaicer,
-    MalvarDemosaicer,
-    NormalisedMosaic,
     Reconstruction,
-    ReflectionAwareDemosaicer,
+    malvar_demosaic,
+    normalised_demosaic,
+    reconstruct,
 )
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
 from rgbmidic.illumination.texture import TextureModel
 
 DEFAULT_METHOD = "reflection-aware"
-_BY_CHANNEL: dict[str, Demosaicer] = {"malvar": MalvarDemosaicer(), "normalised": NormalisedMosaic()}
+_BY_CHANNEL = {"malvar": malvar_demosaic, "normalised": normalised_demosaic}
 """Methods that know nothing of lights: demosaic, then unmix."""
 DEMOSAICERS = (DEFAULT_METHOD, *_BY_CHANNEL)
 """The methods by the name they have in the configuration, where ``"auto"`` means the one that suits the frame."""
@@ -84,7 +83,7 @@ def separate(
     if method != DEFAULT_METHOD:
         return unmix(_BY_CHANNEL[method](linear), crosstalk)
     mixing = crosstalk.unmixing if crosstalk.field is None else None
-    model = ReflectionAwareDemosaicer(crosstalk=crosstalk, texture=texture).reconstruct(linear, mixing)
+    model = reconstruct(linear, crosstalk, texture=texture, mixing=mixing)
     return reconstructed_lights(model, crosstalk, unmixed=mixing is not None)
 
 
@@ -104,7 +103,7 @@ def demosaic(
     method
         As in `separate`.
     crosstalk, texture
-        For the reflection-aware method: see `rgbmidic.illumination.demosaicing.ReflectionAwareDemosaicer`.
+        For the reflection-aware method: see `rgbmidic.illumination.demosaicing.reconstruct`.
 
     Returns
     -------
@@ -121,7 +120,7 @@ def demosaic(
         raise InputError(f"demosaicing takes a LinearMosaic, not {type(linear).__name__}")
     if (chosen := _chosen(method, linear)) != DEFAULT_METHOD:
         return _BY_CHANNEL[chosen](linear)
-    return ReflectionAwareDemosaicer(crosstalk=crosstalk, texture=texture)(linear)
+    return reconstruct(linear, crosstalk, texture=texture).channels
 
 
 def reconstructed_lights(model: Reconstruction, crosstalk: Crosstalk, *, unmixed: bool = False) -> IlluminationImages:

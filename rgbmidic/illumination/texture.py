@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -33,8 +34,7 @@ WHITE_ENERGY = float((_BINOMIAL[::2] ** 2).sum() ** 2)
 """Second moment of a low-passed plane for white noise of variance 1."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BandEnergy:
+class BandEnergy(NamedTuple):
     """Second moments of the planes' low-passed contrast, `cell_moments` of the kernels, for unit texture.
 
     Attributes
@@ -118,8 +118,7 @@ class TextureModel:
     @cached_property
     def band(self) -> BandEnergy:
         """Second moments of the low-passed planes of a Bayer mosaic for this texture."""
-        own, adjacent, diagonal = np.asarray(self.weights) @ _band_energies(self.widths) + self.offset
-        return BandEnergy(own=float(own), adjacent=float(adjacent), diagonal=float(diagonal))
+        return BandEnergy(*(np.asarray(self.weights) @ _band_energies(self.widths) + self.offset).tolist())
 
 
 @lru_cache(maxsize=64)

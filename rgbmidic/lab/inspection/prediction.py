@@ -24,7 +24,7 @@ from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.colour_factors import BLOCK, LEAST, MEAN_BLOCK, enlarged
 from rgbmidic.illumination.crosstalk import Crosstalk, unmix
-from rgbmidic.illumination.demosaicing import SPARKLE_VARIANCE, Reconstruction, ReflectionAwareDemosaicer
+from rgbmidic.illumination.demosaicing import SPARKLE_VARIANCE, Reconstruction, reconstruct
 from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
 from rgbmidic.illumination.separation import DEFAULT_METHOD, reconstructed_lights, separate
@@ -69,7 +69,7 @@ def separated(
     """
     first, crosstalk = frames[0], known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
     if isinstance(first, LinearMosaic):
-        model = ReflectionAwareDemosaicer(crosstalk=crosstalk).reconstruct(first)
+        model = reconstruct(first, crosstalk)
         images = reconstructed_lights(model, crosstalk)
         if method not in ("auto", DEFAULT_METHOD):
             other = separate(first, crosstalk, method)

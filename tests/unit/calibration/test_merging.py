@@ -30,7 +30,9 @@ def camera_noise():
     four = Quantity(np.full(4, 4.0), np.full(4, 0.1))
     names = ("gain", "read_noise", "black_level", "saturation", "linearity_error", "dsnu")
     figures = dict.fromkeys(names, four)
-    return CameraNoise(planes=("R", "G1", "G2", "B"), prnu=Quantity.unknown(4), defects=((3, 4, "hot"),), **figures)
+    return CameraNoise(
+        planes=("R", "G1", "G2", "B"), prnu=Quantity([np.nan] * 4, [np.nan] * 4), defects=((3, 4, "hot"),), **figures
+    )
 
 
 def registration(lights=LIGHTS):

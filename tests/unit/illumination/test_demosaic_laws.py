@@ -10,8 +10,7 @@ import pytest
 from naive_demosaic import site_channels
 
 from rgbmidic.frames.data import shift_cfa
-from rgbmidic.illumination.demosaicing import MalvarDemosaicer, NormalisedMosaic, ReflectionAwareDemosaicer
-from rgbmidic.illumination.separation import DEMOSAICERS, separate
+from rgbmidic.illumination.separation import DEMOSAICERS, demosaic, separate
 from rgbmidic.illumination.texture import TextureModel
 
 SHAPE = (160, 160)  # whole tiles: a flip must not move them
@@ -29,22 +28,21 @@ def lights():
 
 
 @pytest.mark.parametrize("flip", [(slice(None, None, -1), slice(None)), (slice(None), slice(None, None, -1))])
-@pytest.mark.parametrize("method", [MalvarDemosaicer(), NormalisedMosaic(), ReflectionAwareDemosaicer()])
+@pytest.mark.parametrize("method", ["malvar", "normalised", "reflection-aware"])
 def test_a_flipped_frame_gives_flipped_channels(method, flip, lights):
     mosaic = scenes.mosaic_of(lights, cfa="RGGB")
     # sizes are even, so a flip exchanges the rows or columns of the cell
     cfa = shift_cfa("RGGB", int(flip[0].step == -1), int(flip[1].step == -1))
     flipped = replace(mosaic, values=mosaic.values[flip].copy(), saturated=mosaic.saturated[flip].copy(), cfa=cfa)
-    expected = method(mosaic).values[(slice(None), *flip)]
+    expected = demosaic(mosaic, method).values[(slice(None), *flip)]
     # the reflection-aware texture is read from one half plane of distances: rounding of a fit, not of a sum
-    np.testing.assert_allclose(method(flipped).values[INSIDE], expected[INSIDE], atol=0.5, rtol=1e-3)
+    np.testing.assert_allclose(demosaic(flipped, method).values[INSIDE], expected[INSIDE], atol=0.5, rtol=1e-3)
 
 
 def test_a_frame_cropped_by_one_row_and_column_gives_the_same_channels(lights):
     mosaic = scenes.mosaic_of(lights)
     cropped = replace(mosaic, values=mosaic.values[1:, 1:], saturated=mosaic.saturated[1:, 1:], cfa="BGGR")
-    method = ReflectionAwareDemosaicer(texture=TEXTURE)
-    whole, part = method(mosaic).values[:, 1:, 1:], method(cropped).values
+    whole, part = demosaic(mosaic, texture=TEXTURE).values[:, 1:, 1:], demosaic(cropped, texture=TEXTURE).values
     # tiles and blocks lie elsewhere, so trust is rounded differently: small against the contrast
     difference = np.sqrt(np.mean((whole - part)[INSIDE] ** 2, axis=(1, 2)))
     assert (difference < 0.06 * whole[INSIDE].std(axis=(1, 2))).all()
@@ -55,15 +53,14 @@ def test_a_channels_gain_changes_that_channel_alone(colour, lights):
     mosaic = scenes.mosaic_of(lights, noise=None)
     gain = np.where(site_channels(SHAPE, "RGGB") == colour, np.float32(2), np.float32(1))
     louder = replace(mosaic, values=mosaic.values * gain)
-    method = ReflectionAwareDemosaicer(texture=TEXTURE)
-    before, after = method(mosaic).values, method(louder).values
+    before, after = (demosaic(frame, texture=TEXTURE).values for frame in (mosaic, louder))
     expected = before * np.where(np.arange(3) == colour, 2, 1)[:, None, None]
     np.testing.assert_allclose(after[INSIDE], expected[INSIDE], rtol=2e-3, atol=1)
 
 
 def test_own_samples_are_nearly_kept(lights):
     mosaic = scenes.mosaic_of(lights)
-    found = ReflectionAwareDemosaicer(crosstalk=scenes.CROSSTALK)(mosaic).values
+    found = demosaic(mosaic, crosstalk=scenes.CROSSTALK).values
     own = np.take_along_axis(found, site_channels(SHAPE, "RGGB")[None], axis=0)[0]
     moved = (own - mosaic.values)[16:-16, 16:-16]
     # what is taken off is camera noise, whose standard deviation is 13 to 25 DN here

@@ -12,11 +12,10 @@ from rgbmidic.illumination.demosaicing import (
     DISSIMILAR,
     OFFSET_VARIANCE,
     SPARKLE_VARIANCE,
-    Demosaicer,
-    ReflectionAwareDemosaicer,
+    WIDE,
     prediction_filters,
 )
-from rgbmidic.illumination.separation import separate
+from rgbmidic.illumination.separation import demosaic, separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.scene.camera import MEASURED_CROSSTALK
 from rgbmidic.settings import BAYER_PATTERNS
@@ -132,23 +131,29 @@ def test_camera_noise_is_not_taken_for_a_reflection(mat):
     assert np.median(factors.noise) > 0.005
 
 
+NOISE = np.full((3, 1, 1), 1e-4)
+STILL = {"seen": np.eye(3), "displacement": np.zeros((3, 2, 1, 1))}
+"""Each channel sees a light of its own, which is not displaced."""
+
+
 def test_filters_sum_to_one_and_follow_the_trust():
     texture = TextureModel.of_speckle(4.0)
-    alike = prediction_filters(np.full((3, 1, 1), 1e-3), (1e-4,) * 3, texture, "RGGB")
-    apart = prediction_filters(np.array([1e-3, 1.0, 1e-3]).reshape(3, 1, 1), (1e-4,) * 3, texture, "RGGB")
-    np.testing.assert_allclose(alike.taps.sum(axis=3), 1, atol=0.02)
+    _, alike, _ = prediction_filters(np.full((3, 1, 1), 1e-3), NOISE, texture, "RGGB", **STILL)
+    _, apart, _ = prediction_filters(np.array([1e-3, 1.0, 1e-3]).reshape(3, 1, 1), NOISE, texture, "RGGB", **STILL)
+    np.testing.assert_allclose(alike.sum(axis=3), 1, atol=0.02)
     site = site_channels((5, 5), "RGGB").ravel()
     # red at a blue pixel: what green tells counts for much less when green is in a reflection
-    share = [abs(table.taps[0, 0, 0, site == 1, 0]).sum() for table in (alike, apart)]
+    share = [abs(taps[0, 0, 0, site == 1, 0]).sum() for taps in (alike, apart)]
     assert share[1] < 0.3 * share[0]
 
 
 def test_filters_of_nothing_in_common_use_the_own_colour_alone():
     texture = TextureModel(**{**vars_of(TextureModel.of_speckle(4.0)), "specific": 1.0})
-    table = prediction_filters(np.full((3, 1, 1), 2000.0), (1e-4,) * 3, texture, "RGGB")
-    site = site_channels((5, 5), "RGGB").ravel()
+    _, taps, size = prediction_filters(np.full((3, 1, 1), 2000.0), NOISE, texture, "RGGB", **STILL)
+    assert size == WIDE
+    site = site_channels((8, 8), "RGGB")[1:, 1:].ravel()  # a square of 7 around red begins at blue
     for channel in range(3):
-        others = table.taps[0, 0, channel, site != channel, 0]
+        others = taps[0, 0, channel, site != channel, 0]
         assert abs(others).max() < 0.01
 
 
@@ -158,8 +163,8 @@ def test_filters_are_the_best_prediction_of_what_crosstalk_shows_of_lights(displ
     texture, noise, size = TextureModel.of_speckle(4.0), 0.01, 5
     seen, sparkle = np.array([[0.75, 0.25, 0], [0, 1, 0], [0, 0.5, 0.5]]), np.array([0, 0.5, 0])
     variance = seen**2 @ sparkle
-    options = {"size": size, "seen": seen, "displacement": displacement[:, :, None, None]}
-    table = prediction_filters(variance.reshape(3, 1, 1), (noise,) * 3, texture, "RGGB", **options)
+    options = {"seen": seen, "displacement": displacement[:, :, None, None]}
+    _, taps, _ = prediction_filters(variance.reshape(3, 1, 1), np.full((3, 1, 1), noise), texture, "RGGB", **options)
     offset = np.arange(size) - size // 2
     points = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)  # x, y
 
@@ -182,7 +187,7 @@ def test_filters_are_the_best_prediction_of_what_crosstalk_shows_of_lights(displ
         for channel in range(3):
             wanted = [covariance(x, a, np.zeros(2), channel) for x, a in zip(points, site, strict=True)]
             expected = np.linalg.solve(np.array(matrix) + noise * np.eye(size**2), wanted)
-            np.testing.assert_allclose(table.taps[0, p, channel, :, q], expected, atol=1e-4)
+            np.testing.assert_allclose(taps[0, p, channel, :, q], expected, atol=1e-4)
 
 
 def vars_of(model):
@@ -240,7 +245,7 @@ def test_saturated_samples_are_unknown_and_their_neighbours_survive(mat):
     lights = mat.copy()
     lights[1, 60:63, 80:84] += 9000
     mosaic = scenes.mosaic_of(lights)
-    channels = ReflectionAwareDemosaicer(crosstalk=scenes.CROSSTALK)(mosaic)
+    channels = demosaic(mosaic, crosstalk=scenes.CROSSTALK)
     site = site_channels(SHAPE, "RGGB")
     hit = mosaic.saturated & (site == 1)
     assert hit.any()
@@ -280,7 +285,5 @@ def test_fewer_lights_than_channels(albedo):
 
 
 def test_small_frames_are_refused_with_the_way_out():
-    method = ReflectionAwareDemosaicer()
-    assert isinstance(method, Demosaicer)
     with pytest.raises(InputError, match='use method "malvar"'):
-        method(scenes.mosaic_of(np.ones((3, 40, 80))))
+        demosaic(scenes.mosaic_of(np.ones((3, 40, 80))))
