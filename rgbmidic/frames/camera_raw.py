@@ -16,7 +16,7 @@ import numpy.typing as npt
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stored import StoredFrame, check_size, complaints, damaged
-from rgbmidic.frames.tiff import Tag, is_stored_as_is, missing_data, tag, tiff_pages
+from rgbmidic.frames.tiff_pages import Tag, is_stored_as_is, missing_data, tag, tiff_pages
 from rgbmidic.settings import BAYER_PATTERNS, regular
 from rgbmidic.typing import AnyArray, FloatArray
 

@@ -19,7 +19,8 @@ from rgbmidic.frames.movies import MRAW_ENDINGS, MrawFile, SeqFile
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile, split_dataset
 from rgbmidic.frames.stored import Camera
-from rgbmidic.frames.tiff import TIFF_ENDINGS, TiffFile, TiffStack, is_dng, is_tiff_stack
+from rgbmidic.frames.tiff import TIFF_ENDINGS, TiffFile, TiffStack, is_tiff_stack
+from rgbmidic.frames.tiff_pages import is_dng
 from rgbmidic.settings import FrameKind, FrameSettings
 
 logger = logging.getLogger(__name__)

@@ -1,0 +1,187 @@
+"""Pages and tags of TIFF files (DNG, NEF, ARW and other raws are TIFF inside), and whether their data is all there.
+
+LibRaw and tifffile both open some truncated files and fill what is missing with zeros, so the extents are checked
+first.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import IntEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal
+
+from rgbmidic.errors import FrameError
+from rgbmidic.frames.stored import (
+    damaged,
+    faults_of,
+)
+from rgbmidic.settings import regular
+
+if TYPE_CHECKING:
+    import tifffile
+
+# A file's faults come back as one FrameError; without a handler Python would print tifffile's log as well.
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
+
+_HEADERS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+"""Of TIFF and BigTIFF; several cameras' raws begin with II or MM, too, and are none."""
+UNCOMPRESSED = 1
+"""Code of the compression of samples that are not compressed."""
+
+
+class Tag(IntEnum):
+    """Codes of the tags that are read (TIFF 6.0; TIFF/EP; DNG 1.4, chapter 4)."""
+
+    NEW_SUBFILE_TYPE = 254
+    COLUMNS = 256
+    ROWS = 257
+    DESCRIPTION = 270
+    ORIENTATION = 274
+    COLOUR_MAP = 320
+    CFA_REPEAT = 33421
+    CFA_PATTERN = 33422
+    DNG_VERSION = 50706
+    BLACK_REPEAT = 50713
+    BLACK = 50714
+    BLACK_DELTA_H = 50715
+    BLACK_DELTA_V = 50716
+    ACTIVE_AREA = 50829
+
+
+Entries = dict[int, tuple[int, int, bytes]]
+"""Type, number of values, and the values or where they lie, of the entries of a page by their codes."""
+
+
+@contextmanager
+def tiff_pages(path: Path) -> Iterator[list[tifffile.TiffPage]]:
+    """Open the images of a TIFF file in full resolution, neither thumbnails nor previews.
+
+    Raises
+    ------
+    FrameError
+        It is no TIFF file, or what is done inside fails over a damaged header.
+    """
+    with opened_tiff(path) as tiff:
+        pages: dict[int, tifffile.TiffPage] = {}
+        for frame in tiff.pages:
+            page = frame.aspage()
+            if page.offset in pages:  # tifffile would go round for ever
+                raise ValueError("its list of images leads back to itself")
+            pages[page.offset] = page
+        found = (one for page in pages.values() for one in (page, *(child.aspage() for child in page.pages or ())))
+        yield [page for page in found if not int(page.subfiletype) & 1]  # not reduced
+
+
+@contextmanager
+def opened_tiff(path: Path) -> Iterator[tifffile.TiffFile]:
+    """Open a TIFF file; what is done inside and fails over a damaged header becomes a FrameError."""
+    import tifffile
+
+    with regular(path).open("rb") as file:
+        PageList(file, path)  # tifffile tries some camera raws that begin as a TIFF file does
+    with faults_of(path, OSError), tifffile.TiffFile(path) as tiff:
+        yield tiff
+
+
+def is_dng(path: Path) -> bool:
+    """Return whether the first image has the tag of DNG, whatever the file's name; False for what cannot be read."""
+    try:
+        with regular(path).open("rb") as file:
+            pages = PageList(file, path)
+            first = pages.page(pages.first) if pages.offset == 4 else None  # LibRaw reads no BigTIFF
+            return first is not None and Tag.DNG_VERSION in first[0]
+    except (OSError, FrameError):
+        return False
+
+
+class PageList:
+    """The pages of an open TIFF file, found without tifffile, which takes seconds for a hundred thousand of them.
+
+    Offsets have `offset` bytes, 4 or in BigTIFF 8, in the byte `order` of the file; the `first` page begins at one.
+    """
+
+    def __init__(self, file: BinaryIO, path: Path) -> None:
+        """Read the header; a FrameError where it is no TIFF file's."""
+        head = file.read(4)
+        if head not in _HEADERS:
+            raise damaged(path, "it is not a TIFF file")
+        self.file, self.offset = file, 8 if head in _HEADERS[2:] else 4
+        self.order: Literal["little", "big"] = "little" if head[:1] == b"I" else "big"
+        file.seek(self.offset)  # of both headers the offset of the first page is the last field
+        self.first = int.from_bytes(file.read(self.offset), self.order)
+        self.size = file.seek(0, 2)
+
+    def offsets(self, path: Path) -> tuple[list[int], bool]:
+        """Where the pages in full resolution begin, and whether their list leads out of the file."""
+        offset, found, seen = self.first, list[int](), set[int]()
+        while offset and (page := self.page(offset)) is not None:
+            if offset in seen:
+                raise damaged(path, "its list of images leads back to itself")
+            seen.add(offset)
+            entries, following = page
+            if not self.value(entries, Tag.NEW_SUBFILE_TYPE) & 1:
+                found.append(offset)
+            offset = following
+        if not found:
+            raise damaged(path, "its header leads to no image")
+        return found, offset > 0
+
+    def page(self, offset: int) -> tuple[Entries, int] | None:
+        """Read the entries of a page and the offset of the next one; None where the file ends before."""
+        counter, entry = (8, "HHQ8s") if self.offset == 8 else (2, "HHI4s")
+        if offset + counter > self.size:
+            return None
+        self.file.seek(offset)
+        number = int.from_bytes(self.file.read(counter), self.order)
+        length = number * (4 + 2 * self.offset)
+        # pages that are seen have a few dozen entries
+        if not 0 < number <= 4096 or offset + counter + length + self.offset > self.size:
+            return None
+        stored = struct.iter_unpack(("<" if self.order == "little" else ">") + entry, self.file.read(length))
+        entries = {code: (kind, many, place) for code, kind, many, place in stored}
+        return entries, int.from_bytes(self.file.read(self.offset), self.order)
+
+    def value(self, entries: Entries, code: int) -> int:
+        """Return the one value of an entry; 0 where there is none."""
+        short = 3  # the type of numbers of 16 bit
+        kind, _, place = entries.get(code, (short, 0, b""))
+        return int.from_bytes(place[: 2 if kind == short else 4], self.order)
+
+    def text(self, entries: Entries, code: int) -> str:
+        """Return the text of an entry; empty where there is none."""
+        _, number, content = entries.get(code, (0, 0, b""))
+        if number > self.offset:  # the entry holds where the text lies
+            self.file.seek(min(int.from_bytes(content, self.order), self.size))
+            content = self.file.read(min(number, 256 * 2**20))  # OME uses some 300 bytes for every frame
+        return content[:number].decode(errors="replace").rstrip("\0")
+
+
+def missing_data(page: tifffile.TiffPage, size: int) -> str | None:
+    """Describe what the page announces that a file of `size` bytes does not hold; None where all is there."""
+    parts = list(zip(page.dataoffsets, page.databytecounts, strict=False))
+    end = max((offset + count for offset, count in parts), default=0)
+    if end > size:
+        return f"the header announces image data up to byte {end}, the file has {size} bytes"
+    if any(count == 0 for _, count in parts):
+        return "a part of its image data has the length zero"
+    return None
+
+
+def is_stored_as_is(page: tifffile.TiffPage) -> bool:
+    """Return whether the page's samples are uncompressed and their bytes are all there."""
+    bits = page.bitspersample if isinstance(page.bitspersample, int) else page.bitspersample[0]
+    needed = math.ceil(page.imagewidth * page.imagelength * page.samplesperpixel * bits / 8)
+    return bool(page.compression == UNCOMPRESSED and sum(page.databytecounts) >= needed)
+
+
+def tag(page: tifffile.TiffPage, code: int) -> tuple[Any, ...] | None:
+    """Return the value of a tag as a tuple, or None where the page does not have it."""
+    if code not in page.tags:
+        return None
+    value = page.tags[code].value
+    return tuple(value) if isinstance(value, tuple | list | bytes) else (value,)
