@@ -1,19 +1,17 @@
 """Figures, reports and pages of text and pictures of a result."""
 
 from rgbmidic.report.curves import Curve, history_figure, profile_figure, wave_text
-from rgbmidic.report.document import render, write_batch_page, write_report
+from rgbmidic.report.document import write_batch_page, write_report
 from rgbmidic.report.figures import (
     MAPS,
-    REPORT,
     MapDrawer,
     brightness_figure,
     convergence_figure,
-    remove_pictures,
     residual_figure,
-    write_figures,
-    write_maps,
 )
+from rgbmidic.report.gallery import REPORT, remove_pictures, write_figures, write_maps
 from rgbmidic.report.movie import Movie, write_movie
+from rgbmidic.report.page import render
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
 
 __all__ = [

@@ -14,8 +14,8 @@ import numpy as np
 
 from rgbmidic.errors import optional
 from rgbmidic.report import style
-from rgbmidic.report.document import render
 from rgbmidic.report.figures import spread
+from rgbmidic.report.page import render
 from rgbmidic.results.comparison import QUANTITIES, WAYS, Comparison, FrameComparison
 from rgbmidic.results.files import write_complete, write_table, writing
 from rgbmidic.text import uncertain

@@ -1,11 +1,7 @@
-"""Pages as HTML in one file, by the templates beside this module: the report of a test, the table of a batch.
-
-A page of text, tables and pictures needs no other file and no network.
-"""
+"""Report of a test: one HTML page of text, tables and pictures that needs no other file and no network."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -16,17 +12,16 @@ from urllib.parse import quote
 import numpy as np
 
 from rgbmidic._version import __version__
-from rgbmidic.errors import InputError, legible
+from rgbmidic.errors import InputError
 from rgbmidic.report import curves, figures, style
+from rgbmidic.report.gallery import REPORT
+from rgbmidic.report.noise_floor import noise_floor
+from rgbmidic.report.page import render
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, Result, speckle_diameter
 from rgbmidic.results.files import check_file, write_complete
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.physical import Physical
-from rgbmidic.results.quantities import FAILED
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings, SetupSettings, TestSettings
-from rgbmidic.text import rounded, uncertain
-
-_TEMPLATES = Path(__file__).with_name("templates")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,58 +66,6 @@ class ReportConstants:
     blur: float = 1.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class NoiseFloor:
-    """Noise floor: standard deviation of the fields of static frames, as of a single frame against the reference.
-
-    Attributes
-    ----------
-    count
-        Number of static frames.
-    measured
-        Of u, v (in the unit of `Physical.units`), exx, eyy and exy: the rms over the nodes.
-    common
-        Of the same: the standard deviation of the mean over the nodes, which is what all nodes have in common, such as
-        vibration.
-    """
-
-    count: int
-    measured: dict[str, float]
-    common: dict[str, float]
-
-
-def noise_floor(physical: Physical, most: int = 50) -> NoiseFloor | None:
-    """Estimate the noise floor from the frames of the reference.
-
-    The reference is the mean of n frames; the differences of these frames among each other do not depend on it. Another
-    frame scatters against the mean by sqrt(1 + 1/n) more than they do around their own mean.
-
-    Parameters
-    ----------
-    physical
-        The result in the units of its scale.
-    most
-        Static frames that are read at most. A standard deviation over n frames and N nodes has the relative
-        uncertainty 1 / sqrt(2 n N) for independent nodes: below 1 % from 100 nodes on.
-
-    Returns
-    -------
-    NoiseFloor or None
-        None where fewer than two frames of the reference are measured.
-    """
-    result, names = physical.result, ("u", "v", "exx", "eyy", "exy")
-    static = [place for place in result.provenance["references"] if result.status[place] != FAILED][:most]
-    if len(static) < 2:
-        return None
-    fields = np.array([[values[name] for name in names] for values in map(physical.frame, static)], dtype=np.float64)
-    variances = np.ma.masked_invalid(fields.var(axis=0, ddof=1)).mean(axis=1)
-    common = np.ma.masked_invalid(fields).mean(axis=2).filled(np.nan).var(axis=0, ddof=1)
-    single = 1 + 1 / len(result.setting("frames", "reference", static))
-    both = np.sqrt(single * np.array([variances.filled(np.nan), common])).tolist()
-    measured, mean = (dict(zip(names, deviations, strict=True)) for deviations in both)
-    return NoiseFloor(count=len(static), measured=measured, common=mean)
-
-
 def speckle_size(result: Result) -> float | None:
     """Return the full width at half maximum (px) of the reference's autocorrelation; None where none was kept.
 
@@ -136,46 +79,6 @@ def speckle_size(result: Result) -> float | None:
     parts = result.reference[:, max(top, 0) : bottom, max(left, 0) : right].astype(np.float32)
     sizes = [size for part in parts if (size := speckle_diameter(part)) is not None]
     return float(np.median(sizes)) if sizes else None
-
-
-def render(template: str, folder: Path = _TEMPLATES, **values: Any) -> str:
-    """Fill a template in.
-
-    It has three filters beside those of jinja2: ``code`` writes words between backquotes as code, ``gaps`` writes a
-    paragraph on one line and marks words between brackets, ``embedded`` makes the address of a picture of a figure; and
-    `rgbmidic.text.rounded` and `uncertain`.
-
-    Parameters
-    ----------
-    template
-        Name of its file; what is filled into a file that ends in ``.html`` is escaped.
-    folder
-        Its folder; it may use the templates of this package.
-    **values
-        What it names.
-
-    Returns
-    -------
-    str
-        The page.
-    """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
-    from markupsafe import Markup, escape
-
-    environment = Environment(
-        loader=FileSystemLoader([folder, _TEMPLATES]),
-        autoescape=select_autoescape(),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {
-        "code": lambda text: Markup(re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(text)))),
-        "gaps": lambda text: Markup(re.sub(r"(\[[^\]]*\])", r"<mark>\1</mark>", " ".join(escape(text).split()))),
-        "embedded": style.embedded,
-    }
-    environment.globals |= {"rounded": rounded, "uncertain": uncertain}
-    return legible(environment.get_template(template).render(values))
 
 
 def write_report(
@@ -311,7 +214,7 @@ def write_batch_page(header: Sequence[str], rows: Sequence[Sequence[str]], path:
     """
     links = []
     for _, _, _, folder, *_ in rows:
-        report = Path(folder) / figures.REPORT
+        report = Path(folder) / REPORT
         links.append(quote(report.relative_to(path.parent).as_posix()) if folder and report.is_file() else "")
     text = render("batch.html", header=header, rows=rows, links=links, version=__version__)
     write_complete(path, lambda file: file.write(text.encode()))

@@ -29,7 +29,7 @@ from tornado.ioloop import IOLoop
 from tornado.web import ErrorHandler
 
 from rgbmidic.errors import ConfigurationError, InputError, ResultError, RgbmidicError
-from rgbmidic.report.document import render
+from rgbmidic.report.page import render
 from rgbmidic.results import Maps, Result
 from rgbmidic.results.provenance import PROVENANCE
 from rgbmidic.settings import read_table, read_toml

@@ -26,7 +26,7 @@ from rgbmidic.frames.series import open_series
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.lab.inspection import Inspection, inspect_frame
 from rgbmidic.mesh import Region
-from rgbmidic.report.document import render
+from rgbmidic.report.page import render
 from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.results import Result
 from rgbmidic.settings import ELEMENT_SIZE

@@ -20,6 +20,7 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.report import curves, document, remove_pictures, style, write_batch_page, write_report
+from rgbmidic.report.noise_floor import noise_floor
 from rgbmidic.results import UNKNOWN_TIME, FrameRecord, Maps, Result, ResultStore, read_profile
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import (
@@ -318,7 +319,7 @@ def test_the_noise_floor_is_what_a_frame_scatters_by_against_the_reference(tmp_p
     frames = FrameSettings(path=("a",), reference=tuple(range(count)))
     stated = TestSettings(frames=frames, region=RegionSettings(rectangle=(0, 0, 9, 9)))
     origin = {"references": range(count), "settings": stated}
-    floor = document.noise_floor(Physical.of(make(tmp_path / "r", records, **origin), ScaleSettings(mm_per_pixel=0.1)))
+    floor = noise_floor(Physical.of(make(tmp_path / "r", records, **origin), ScaleSettings(mm_per_pixel=0.1)))
     assert floor is not None
     assert floor.count == count
     accuracy = 4 / np.sqrt(2 * (count - 1) * NODES)
@@ -329,7 +330,7 @@ def test_the_noise_floor_is_what_a_frame_scatters_by_against_the_reference(tmp_p
 
 
 def test_one_static_frame_tells_no_noise(tmp_path: Path) -> None:
-    assert document.noise_floor(Physical.of(make(tmp_path / "r", [still(0, 0.0), still(1, 0.1)]))) is None
+    assert noise_floor(Physical.of(make(tmp_path / "r", [still(0, 0.0), still(1, 0.1)]))) is None
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
