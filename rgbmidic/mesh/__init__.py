@@ -1,6 +1,7 @@
 """Region of interest, TRI3 mesh and pixel map, and finite-element meshes of files with their placement."""
 
-from rgbmidic.mesh.finite_elements import FiniteElementMesh, read_mesh
+from rgbmidic.mesh.files import read_mesh
+from rgbmidic.mesh.finite_elements import FiniteElementMesh
 from rgbmidic.mesh.pixel_map import PixelMap
 from rgbmidic.mesh.placement import Placement
 from rgbmidic.mesh.region import Region

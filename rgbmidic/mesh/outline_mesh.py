@@ -16,6 +16,7 @@ import scipy.sparse as sp
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from rgbmidic.errors import InputError, RegionError
+from rgbmidic.mesh.finite_elements import cross
 from rgbmidic.typing import BoolArray, FloatArray
 
 EDGES = np.array([[0, 1], [1, 2], [2, 0]])
@@ -294,24 +295,3 @@ def uncrowded(points: FloatArray, distance: float) -> BoolArray:
         if keep[i]:
             keep[j] = False
     return keep
-
-
-def oriented(
-    points: npt.ArrayLike, elements: npt.ArrayLike, what: str
-) -> tuple[FloatArray, npt.NDArray[np.int32], FloatArray]:
-    """Copies of nodes and triangles, checked and of their types, with corners as the axes turn; and twice the areas."""
-    nodes = np.array(points, dtype=np.float64, order="C")
-    corners = np.array(elements, dtype=np.int32)
-    if nodes.ndim != 2 or nodes.shape[1] != 2 or corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
-        raise InputError(f"{what} has nodes (N, 2) and elements (E, 3), not {nodes.shape} and {corners.shape}")
-    if not np.isfinite(nodes).all() or corners.min() < 0 or corners.max() >= len(nodes):
-        raise InputError(f"{what}: nodes must be finite and elements must name existing nodes")
-    area = cross(nodes, corners)
-    corners[area < 0] = corners[area < 0][:, [0, 2, 1]]
-    return nodes, corners, np.abs(area)
-
-
-def cross(points: FloatArray, elements: npt.NDArray[np.integer]) -> FloatArray:
-    """Twice the signed area (...) of triangles (..., 3)."""
-    first, second = (points[elements[..., corner]] - points[elements[..., 0]] for corner in (1, 2))
-    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])

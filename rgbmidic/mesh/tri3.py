@@ -18,7 +18,8 @@ from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.mesh import colour_nodes
 from rgbmidic.errors import InputError, RegionError
-from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, oriented, outline_mesh
+from rgbmidic.mesh.finite_elements import oriented
+from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, outline_mesh
 from rgbmidic.mesh.region import Region
 from rgbmidic.typing import BoolArray, FloatArray
 
