@@ -10,7 +10,7 @@ import numpy as np
 from rgbmidic._kernels.texture import between
 from rgbmidic._kernels.threads import FAST, compiled, helper
 
-TILE = 32
+TILE = 16
 """Side in px of the squares within which the filters are the same."""
 _SIZE, _WIDE = 5, 7
 """Sides of the square of samples: the usual one, whose taps are added in one go, and the wide one."""
@@ -151,57 +151,65 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
 
 @compiled("out", least=0, fastmath=FAST)
 def prediction_taps(
-    start, stop, common, own, together, seen, alike, displacement, noise, texture, step, fine, offset, channels, out
+    start, stop, seen, spread, specific, coloured, alike, displacement, noise, texture, step, fine, offset, sites, out
 ):
     """Filters of the best linear prediction (simple kriging) from a square of samples, for T entries of a table.
 
-    The contrast of channel c over its standard deviation is ``common_c sum_l seen_cl (a_l + a_0) + own_c e_c`` and
-    noise: lights l show the texture displaced, with the covariance ``alike_lm C(x - y - d_l + d_m)``, a_0 is an unknown
-    constant of variance `offset`, and the channels' own components have the correlations `together`.
+    The contrast at site s over its channel's slope is ``sum_l seen_sl (a_l + a_0 + sqrt(specific_l) e_l)`` and noise:
+    lights l show the texture displaced, with the covariance ``alike_lm C(x - y - d_l + d_m)``, a_0 is an unknown
+    constant of variance `offset`, e_l the light's own component. Predicted are the channels, green as the mean of its
+    two sites. Samples and channels are divided by their channel's `spread`.
 
     Parameters
     ----------
     start, stop
         Range of entries that this call does.
-    common, own : (T, 3) float64
-        Roots of the fractions of a channel's variance.
-    together : (T, 3, 3) float64
-        Correlations of the channels' own components.
-    seen : (3, k) float64
-        The rows sum to 1.
+    seen : (4, k) float64
+        Of the sites red, green in red rows, green in blue rows, and blue.
+    spread : (T, 4) float64
+        Standard deviation of the sites' channels, without noise.
+    specific : (T, k) float64
+        Variance of the lights' own components.
+    coloured
+        Fraction of them that is the channels', which have nothing in common on a coloured specimen.
     alike : (T, k, k) float64
         Correlations of the lights' textures.
     displacement : (T, k, 2) float64
         d in x and y, px.
     noise : (T, 3) float64
-        Variance.
+        Variance of a sample of each channel.
     texture : (n,) float64
         C at the squared distances 0, `step`, 2 `step` ... px².
     step
         px².
     fine : (2 size - 1, 2 size - 1) float64
-        Covariance of a channel's own component by the distance in rows and columns.
+        Covariance of a light's own component by the distance in rows and columns.
     offset
         Variance.
-    channels : (4, size, size) int64
+    sites : (4, size, size) int64
         Of the samples, for each phase of the middle one in the 2 x 2 cell.
     out : (T, 4, 3, size, size) float64
         Written.
     """
-    lights, size, count = seen.shape[1], np.uint64(channels.shape[1]), np.uint64(channels[0].size)
-    one, sides = np.uint64(1), np.uint64(fine.shape[0])
-    reach, half = size - one, size // np.uint64(2)
-    covariance, lagged = np.empty((3, 3, fine.shape[0], fine.shape[0])), np.empty(fine.shape)
+    lights, size, count = seen.shape[1], np.uint64(sites.shape[1]), np.uint64(sites[0].size)
+    one, two, sides = np.uint64(1), np.uint64(2), np.uint64(fine.shape[0])
+    reach, half = size - one, size // two
+    covariance, lagged = np.empty((4, 4, fine.shape[0], fine.shape[0])), np.empty(fine.shape)
     matrix, factor, wanted = np.empty((count, count)), np.empty((count, count)), np.empty((3, count))
     per_step, last = 1 / step, texture.size - 1.001
     for entry in range(start, stop):
-        for c in range(3):
-            for e in range(3):
-                constant = common[entry, c] * common[entry, e] * offset
-                apart = own[entry, c] * own[entry, e] * together[entry, c, e]
+        for c in range(4):
+            for e in range(4):
+                constant = shown = 0.0
+                if (c + 1) // 2 == (e + 1) // 2:
+                    shown = coloured * (spread[entry, c] ** 2 - 1)
+                for a in range(lights):
+                    shown += (1 - coloured) * seen[c, a] * seen[e, a] * specific[entry, a]
+                    for b in range(lights):
+                        constant += seen[c, a] * seen[e, b] * offset
                 for i in range(sides):
                     for j in range(sides):
-                        covariance[c, e, i, j] = constant + apart * fine[i, j]
+                        covariance[c, e, i, j] = constant + shown * fine[i, j]
         for a in range(lights):
             for b in range(lights):
                 x = displacement[entry, b, 0] - displacement[entry, a, 0] - reach
@@ -211,23 +219,31 @@ def prediction_taps(
                         place = min(((x + j) ** 2 + (y + i) ** 2) * per_step, last)
                         low = np.uint64(place)
                         lagged[i, j] = texture[low] + (place - low) * (texture[low + one] - texture[low])
-                for c in range(3):
-                    for e in range(3):
-                        shown = common[entry, c] * seen[c, a] * common[entry, e] * seen[e, b] * alike[entry, a, b]
+                for c in range(4):
+                    for e in range(4):
+                        shown = seen[c, a] * seen[e, b] * alike[entry, a, b]
                         for i in range(sides):
                             for j in range(sides):
                                 covariance[c, e, i, j] += shown * lagged[i, j]
+        for c in range(4):
+            for e in range(4):
+                shown = 1 / (spread[entry, c] * spread[entry, e])
+                for i in range(sides):
+                    for j in range(sides):
+                        covariance[c, e, i, j] *= shown
         for phase in range(4):
             for m in range(count):
                 row, column = m // size, m % size
-                c = channels[phase, row, column]
+                c = sites[phase, row, column]
                 for other in range(row + one):
                     for n in range(size):
-                        e = channels[phase, other, n]
+                        e = sites[phase, other, n]
                         matrix[m, other * size + n] = covariance[c, e, row + reach - other, column + reach - n]
-                matrix[m, m] += noise[entry, c]
-                for e in range(3):
-                    wanted[e, m] = covariance[c, e, row + reach - half, column + reach - half]
+                matrix[m, m] += noise[entry, (c + 1) // 2]
+                i, j = row + reach - half, column + reach - half
+                wanted[0, m] = covariance[c, 0, i, j]
+                wanted[1, m] = (covariance[c, 1, i, j] + covariance[c, 2, i, j]) / 2
+                wanted[2, m] = covariance[c, 3, i, j]
             for q in range(count):  # Cholesky, column by column
                 scale = 1 / np.sqrt(matrix[q, q])
                 for m in range(q, count):
@@ -247,51 +263,3 @@ def prediction_taps(
                         value -= factor[p, m] * wanted[e, m]
                     wanted[e, p] = value / factor[p, p]
                     out[entry, phase, e, p // size, p % size] = wanted[e, p]
-
-
-@compiled("sums", axis=2, fastmath={"contract"})
-def displacement_sums(start, stop, padded, taps, block, red_row, red_column, sums):
-    """Sum ``r gx``, ``r gy``, ``(gx gx + gy gy) / 2``, ``r r`` and 1 over samples of each channel in each block.
-
-    What is not finite is left out.
-
-    Parameters
-    ----------
-    start, stop
-        Range of rows of blocks that this call does.
-    padded : (H + 4, W + 4) float32
-        Scaled contrast.
-    taps : (2, 3, 25, n) float32
-        Filters of r, gx and gy by row parity; the last axis runs over columns, which alternate between two phases. n is
-        a multiple of `block`.
-    block
-        Side of the blocks, px.
-    red_row, red_column
-        Position of red in the 2 x 2 cell.
-    sums : (3, 5, h, w) float32
-        Written.
-    """
-    rows, columns = padded.shape[0] - 4, padded.shape[1] - 4
-    strip = taps.shape[3]
-    made, total = np.empty((3, strip), np.float32), np.empty(5, np.float32)
-    for bi in range(start, stop):
-        sums[:, :, bi] = 0
-        for i in range(bi * block, min((bi + 1) * block, rows)):
-            for left in range(0, columns, strip):
-                number = min(strip, columns - left)
-                for n in range(3):
-                    _filtered(padded, i, left, taps[i % 2, n], made[n, :number])
-                for phase in range(2):
-                    channel = _channel(i, phase, red_row, red_column)
-                    for first in range(0, number, block):
-                        total[:] = 0
-                        for j in range(first + phase, min(first + block, number), 2):
-                            r, x, y = made[0, j], made[1, j], made[2, j]
-                            if np.isfinite(r):
-                                total[0] += r * x
-                                total[1] += r * y
-                                total[2] += np.float32(0.5) * (x * x + y * y)
-                                total[3] += r * r
-                                total[4] += np.float32(1.0)
-                        for n in range(5):
-                            sums[channel, n, bi, (left + first) // block] += total[n]

@@ -12,8 +12,8 @@ REACH = 3
 """Rows and columns beyond a cell that its binomial sums reach."""
 PLANE_PAIRS = tuple((p, q) for p in range(4) for q in range(p, 4))
 """Pairs of the planes of a mosaic; plane 2 a + b has the samples of row a and column b of the 2x2 cells."""
-_CELLS = 128
-"""Cells of a row at a time."""
+CELLS_OF_BLOCK = 4
+"""Side of a block of 8 px, cells."""
 
 
 @helper()
@@ -107,50 +107,109 @@ def _down(above, here, below, first, last, planes, number):
         planes[1, c] = first * above[j] + ten * here[j] + last * below[j]
 
 
-@compiled("sums", axis=1, fastmath={"contract"})
-def cell_moments(start, stop, contrast, block, sums):
-    """Second moments of the four planes' low-passed contrast, summed over the cells of each block.
+@compiled("low", axis=1, fastmath={"contract"})
+def low_passed_planes(start, stop, contrast, low):
+    """Low-pass the four planes of a mosaic at the middle of each 2x2 cell, `low` (4, H // 2, W // 2) float32.
 
-    At the middle of each 2x2 cell the binomial [1 5 10 10 5 1] along both axes takes from each plane its own share,
-    with the same weight and the same centroid. `sums` (11, h, w) float32 receives the products of the planes in the
-    order of `PLANE_PAIRS`, then the number of cells; a cell with a sample that is not finite in reach is left out.
+    There the binomial [1 5 10 10 5 1] along both axes takes from each plane its own share, with the same weight, 16²,
+    and the same centroid. A cell with a sample that is not finite in reach is NaN.
     """
     rows, columns = contrast.shape
-    half = block // 2
-    zero, one, five, ten = np.float32(0), np.float32(1), np.float32(5), np.float32(10)
-    planes, low = np.empty((4, _CELLS + 2), np.float32), np.empty((4, _CELLS), np.float32)
-    total = np.empty((11, _CELLS), np.float32)
+    one, five, ten, nan = np.float32(1), np.float32(5), np.float32(10), np.float32(np.nan)
+    planes = np.empty((4, columns // 2), np.float32)
+    number = np.uint64(max(columns // 2 - 2, 0))
+    for ci in range(start, stop):
+        low[:, ci] = nan
+        i = 2 * ci
+        if i < 2 or i >= rows - REACH:
+            continue
+        _down(contrast[i - 2], contrast[i], contrast[i + 2], one, five, planes[:2], columns // 2)
+        _down(contrast[i - 1], contrast[i + 1], contrast[i + 3], five, one, planes[2:], columns // 2)
+        for c in range(number):
+            d, e = c + np.uint64(1), c + np.uint64(2)
+            p0 = planes[0, c] + ten * planes[0, d] + five * planes[0, e]
+            p1 = five * planes[1, c] + ten * planes[1, d] + planes[1, e]
+            p2 = planes[2, c] + ten * planes[2, d] + five * planes[2, e]
+            p3 = five * planes[3, c] + ten * planes[3, d] + planes[3, e]
+            known = np.isfinite(p0 + p1 + p2 + p3)
+            low[0, ci, d], low[1, ci, d] = p0 if known else nan, p1 if known else nan
+            low[2, ci, d], low[3, ci, d] = p2 if known else nan, p3 if known else nan
+
+
+@helper()
+def lanczos_weights(fraction, weights):
+    """Weights of the eight neighbours of a place between the middle two (Duchon 1979), of unit sum."""
+    total = 0.0
+    for k in range(8):
+        x = np.pi * (k - 3 - fraction)
+        weights[k] = 4 * np.sin(x) * np.sin(x / 4) / (x * x) if abs(x) > 1e-6 else 1.0
+        total += weights[k]
+    for k in range(8):
+        weights[k] /= total
+
+
+@compiled("out", axis=1, grain=CELLS_OF_BLOCK, fastmath={"contract"})
+def register_planes(start, stop, planes, apart, out):
+    """Bring low-passed planes (k, H, W) of lights to one place, by interpolation (Lanczos 4).
+
+    `apart` (k, 2, h, w) float64: x and y, in cells, by which a light shows the texture farther on, in each block of
+    4 x 4 cells. `out`, like `planes`, is NaN where a sample is not finite or outside.
+    """
+    height, width = planes.shape[1:]
+    half = CELLS_OF_BLOCK
+    lines, wx, wy = np.empty((half + 7, half), np.float32), np.empty(8, np.float32), np.empty(8, np.float32)
+    for bi in range(start // half, -(-stop // half)):
+        for light in range(len(planes)):
+            for bj in range(apart.shape[3]):
+                x, y = apart[light, 0, bi, bj], apart[light, 1, bi, bj]
+                left, top = int(np.floor(x)), int(np.floor(y))
+                lanczos_weights(x - left, wx)
+                lanczos_weights(y - top, wy)
+                i0, j0 = bi * half + top - 3, bj * half + left - 3
+                for i in range(half + 7):
+                    for j in range(half):
+                        value = np.float32(np.nan)
+                        if 0 <= i0 + i < height and 0 <= j0 + j and j0 + j + 7 < width:
+                            value = np.float32(0)
+                            for k in range(8):
+                                value += wx[k] * planes[light, i0 + i, j0 + j + k]
+                        lines[i, j] = value
+                for i in range(min(half, height - bi * half)):
+                    for j in range(min(half, width - bj * half)):
+                        value = np.float32(0)
+                        for k in range(8):
+                            value += wy[k] * lines[i + k, j]
+                        out[light, bi * half + i, bj * half + j] = value
+
+
+@compiled("sums", axis=2, fastmath={"contract"})
+def displacement_scores(start, stop, planes, half, sums):
+    """Sum ``-r gx``, ``-r gy`` and ``(gx gx + gy gy) / 2`` of each light over blocks of `half` cells.
+
+    `planes` (k, H, W) float32: low-passed planes of the lights over their slopes; r is a light's minus the mean of the
+    others, g the central difference of that mean in a cell. `sums` (k, 3, h, w) float32; what is not finite is left out.
+    """
+    count, height, width = planes.shape
+    scale = np.float32(1 / (count - 1))
+    mean = np.empty((3, width), np.float32)
     for bi in range(start, stop):
-        for left in range(0, half * sums.shape[2], _CELLS):
-            total[:] = 0
-            first = max(left, 1)
-            number = min(left + _CELLS, columns // 2 - 1) - first
-            for i in range(max(bi * block, 2), min((bi + 1) * block, rows - REACH), 2):
-                j = 2 * first - 2
-                _down(contrast[i - 2, j:], contrast[i, j:], contrast[i + 2, j:], one, five, planes[:2], number + 2)
-                _down(contrast[i - 1, j:], contrast[i + 1, j:], contrast[i + 3, j:], five, one, planes[2:], number + 2)
-                for c in range(np.uint64(max(number, 0))):
-                    d, e = c + np.uint64(1), c + np.uint64(2)
-                    p0 = planes[0, c] + ten * planes[0, d] + five * planes[0, e]
-                    p1 = five * planes[1, c] + ten * planes[1, d] + planes[1, e]
-                    p2 = planes[2, c] + ten * planes[2, d] + five * planes[2, e]
-                    p3 = five * planes[3, c] + ten * planes[3, d] + planes[3, e]
-                    known = np.isfinite(p0 + p1 + p2 + p3)
-                    low[0, c], low[1, c] = p0 if known else zero, p1 if known else zero
-                    low[2, c], low[3, c] = p2 if known else zero, p3 if known else zero
-                    total[10, c] += one if known else zero
-                moment = 0
-                for p in range(4):
-                    for q in range(p, 4):
-                        for c in range(np.uint64(max(number, 0))):
-                            total[moment, c] += low[p, c] * low[q, c]
-                        moment += 1
-            for moment in range(11):
-                for b in range(left // half, min((left + _CELLS) // half, sums.shape[2])):
-                    value = np.float32(0)
-                    for c in range(np.uint64(max(b * half - first, 0)), np.uint64((b + 1) * half - first)):
-                        value += total[moment, c]
-                    sums[moment, bi, b] = value
+        sums[:, :, bi] = 0
+        for i in range(max(bi * half, 1), min((bi + 1) * half, height - 1)):
+            for light in range(count):
+                mean[:] = 0
+                for other in range(count):
+                    if other != light:
+                        for n in range(3):
+                            for j in range(width):
+                                mean[n, j] += scale * planes[other, i - 1 + n, j]
+                for j in range(1, width - 1):
+                    r = planes[light, i, j] - mean[1, j]
+                    gx = np.float32(0.5) * (mean[1, j + 1] - mean[1, j - 1])
+                    gy = np.float32(0.5) * (mean[2, j] - mean[0, j])
+                    if np.isfinite(r + gx + gy):
+                        sums[light, 0, bi, j // half] -= r * gx
+                        sums[light, 1, bi, j // half] -= r * gy
+                        sums[light, 2, bi, j // half] += np.float32(0.5) * (gx * gx + gy * gy)
 
 
 @compiled()

@@ -35,6 +35,8 @@ from rgbmidic.illumination.colour_factors import (
     BLOCK,
     MEAN_BLOCK,
     ColourFactors,
+    SiteModel,
+    channel_means,
     colour_factors,
     enlarged,
     gather_moments,
@@ -80,7 +82,7 @@ def normalised_demosaic(mosaic: LinearMosaic) -> LinearChannels:
     beat. A channel in a reflection has less contrast and leaves a pattern.
     """
     values = np.where(mosaic.saturated, np.float32(np.nan), mosaic.values)
-    level = enlarged(local_means(values, red_position(mosaic.cfa)), MEAN_BLOCK, values.shape)
+    level = enlarged(channel_means(local_means(values, red_position(mosaic.cfa))), MEAN_BLOCK, values.shape)
     own = np.take_along_axis(level, sampled_channels(mosaic.cfa, values.shape)[None], axis=0)[0]
     out = level * np.divide(values, own, out=np.full_like(values, np.nan), where=own > 0)
     return LinearChannels(values=out, valid=np.isfinite(out), full_scale=mosaic.full_scale)
@@ -88,14 +90,14 @@ def normalised_demosaic(mosaic: LinearMosaic) -> LinearChannels:
 
 SIZE, WIDE = 5, 7
 """Side of the square of samples that a value is predicted from, and where the colours have nothing in common."""
-LARGEST, SMALLEST = 10, -10
+LARGEST, SMALLEST = 10, int(__import__('os').environ.get('SM','-10'))
 """Range (powers of two, to which it is rounded) of the channel-specific variance relative to the common one: beyond it
 weights are 0 or 1, and twice as fine measures the same."""
 OFFSET_VARIANCE = 10.0
 """Variance of an unknown constant under the texture: makes the filter's coefficients sum to one."""
 SPARKLE_VARIANCE = 0.29
 """Variance (px²) of the aperture through which sparkle is seen: a square pixel, 1/12, and a lens blur of 0.45 px."""
-DISPLACEMENT_STEP, _MOST_STEPS = 0.02, 32
+DISPLACEMENT_STEP, _MOST_STEPS = float(__import__("os").environ.get("PSTEP", "0.02")), 32
 """Fineness (px) in which a light's displacement is rounded, and the most steps of it."""
 DISSIMILAR = 1.0
 """Fall (1/px²) of the logarithm of two lights' correlation with the square of their distance: a glint on a droplet's
@@ -111,82 +113,54 @@ def prediction_filters(
     *,
     seen: FloatArray,
     displacement: FloatArray,
+    alike: FloatArray,
 ) -> tuple[npt.NDArray[np.int32], FloatImage, int]:
-    """Return the table of filters for tiles whose channels have some variance of their own.
-
-    Parameters
-    ----------
-    specific : (3, h, w)
-        Channel-specific variance in each tile, relative to the common one.
-    noise : (3, h, w)
-        Variance of the camera noise of each channel relative to the channel's own variance.
-    texture
-        Autocorrelation of the common texture, and of the channel-specific component.
-    cfa
-        Bayer pattern.
-    seen : (3, k)
-        Fraction of each light in the slope of each channel (`seen_lights`).
-    displacement : (k, 2, h, w)
-        Of each light's texture in x and y, px.
-
-    Returns
-    -------
-    index : (h, w) int32
-        Row of the table for each tile.
-    taps : (T, 2, 3, size², 2) float32
-        As `rgbmidic._kernels.demosaicing.predict` takes them, with one output for each channel.
-    size : int
-        Side of the square of samples.
-    """
     tiles = specific.shape[1:]
-    # a colour left to itself has only every other sample, so it needs to look farther
+    lights = len(specific)
     size = SIZE if texture.specific < 0.5 else WIDE
+    if PSIZE:
+        size = PSIZE
     level = np.round(np.log2(np.clip(specific, 2.0**SMALLEST, 2.0**LARGEST))).astype(np.int64)
-    steps = np.clip(np.round(displacement / DISPLACEMENT_STEP), -_MOST_STEPS, _MOST_STEPS).astype(np.int64)
-    code = np.zeros(tiles, dtype=np.int64)
-    for one in (*level, *steps.reshape(-1, *tiles)):
-        code = code * (2 * _MOST_STEPS + 1) + one + _MOST_STEPS
-    _, first, index, number = np.unique(code, return_index=True, return_inverse=True, return_counts=True)
+    steps = np.round(displacement / DISPLACEMENT_STEP).astype(np.int64)
+    code = np.concatenate([level, steps.reshape(-1, *tiles), np.round(100 * alike).astype(np.int64).reshape(-1, *tiles)]).reshape(-1, tiles[0]*tiles[1])
+    _, first, index, number = np.unique(code, axis=1, return_index=True, return_inverse=True, return_counts=True)
     index = index.ravel()
-
-    variance: FloatArray = np.exp2(level.reshape(3, -1).T[first].astype(np.float64))
+    variance: FloatArray = np.exp2(level.reshape(lights, -1).T[first].astype(np.float64))
     moved = DISPLACEMENT_STEP * np.moveaxis(steps.reshape(*steps.shape[:2], -1)[..., first], -1, 0)
-    # a specimen's colour has no slope on the common texture that could tell how the channels see it
-    together = texture.specific * np.eye(3) + (1 - texture.specific) * _correlations(variance, seen)
-    fraction = 1 / (1 + variance)
     noisy = np.stack([np.bincount(index, one) for one in noise.reshape(3, -1)], axis=1) / number[:, None]
-    # glints are not the texture displaced alone
-    alike = np.exp(-DISSIMILAR * ((moved[:, :, None] - moved[:, None]) ** 2).sum(axis=3))
+    channels = np.stack([seen[0], (seen[1] + seen[2]) / 2, seen[3]])
+    spread = np.sqrt(1 + variance @ (channels**2).T)
+    noisy = noisy / spread**2
     offset, phases = np.arange(size) - size // 2, list(np.ndindex(2, 2))
-    channels = np.stack([cfa_channels(cfa)[np.ix_((offset + p) % 2, (offset + q) % 2)] for p, q in phases])
+    sites = np.stack([site_classes(cfa)[np.ix_((offset + p) % 2, (offset + q) % 2)] for p, q in phases])
     taps = np.empty((len(variance), 4, 3, size, size))
     prediction_taps(
-        np.sqrt(fraction),
-        np.sqrt(1 - fraction),
-        together,
         np.ascontiguousarray(seen, dtype=np.float64),
-        alike,
-        moved.astype(np.float64),
+        np.ascontiguousarray(spread[:, [0, 1, 1, 2]]),
+        variance,
+        texture.specific,
+        np.ascontiguousarray(np.moveaxis(alike.reshape(lights, lights, -1)[..., first], -1, 0)),
+        np.ascontiguousarray(moved.astype(np.float64)),
         np.maximum(noisy, 1e-8),
         *_covariances(texture, size),
         OFFSET_VARIANCE,
-        channels.astype(np.int64),
+        sites.astype(np.int64),
         taps,
     )
     by_parity = taps.reshape(-1, 2, 2, 3, size * size).transpose(0, 1, 3, 4, 2)
     return index.reshape(tiles).astype(np.int32), np.ascontiguousarray(by_parity, dtype=np.float32), size
 
 
-def _correlations(variance: FloatArray, seen: FloatArray) -> FloatArray:
-    """Correlations (T, 3, 3) of the channels' own components of `variance` (T, 3), which are those of the lights."""
-    lights = np.maximum(variance @ np.linalg.pinv(seen**2).T, 0)
-    products = np.einsum("cl,tl,dl->tcd", seen, lights, seen)
-    # what the lights do not explain is the channel's alone
-    of_lights = np.diagonal(products, axis1=1, axis2=2)
-    root = np.sqrt(np.maximum(of_lights, variance))
-    correlations = products / (root[:, :, None] * root[:, None])
-    correlations[:, range(3), range(3)] = 1
-    return np.asarray(correlations)
+import os
+PSIZE = int(os.environ.get("PSIZE", 0))
+
+def site_classes(cfa):
+    """0 R, 1 G in red rows, 2 G in blue rows, 3 B of the 2x2 cell."""
+    channel = cfa_channels(cfa)
+    red_row = np.argwhere(channel == 0)[0][0]
+    out = np.array([[0, 1, 3][c] for c in channel.ravel()]).reshape(2, 2)
+    out[1 - red_row][out[1 - red_row] == 1] = 2
+    return out
 
 
 @lru_cache(maxsize=64)
@@ -240,6 +214,7 @@ def reconstruct(
     *,
     texture: TextureModel | None = None,
     mixing: FloatArray | None = None,
+    registration=None,
 ) -> Reconstruction:
     """Predict every channel from all the samples around, each trusted as far as it shows the common texture.
 
@@ -272,18 +247,38 @@ def reconstruct(
         )
     if damaged:
         values = np.where(mosaic.saturated, np.float32(np.nan), values)
-    moments = gather_moments(values, red_position(mosaic.cfa), mosaic.noise)
-    texture = learn_texture(moments) if texture is None else texture
+    red = red_position(mosaic.cfa)
     matrix = np.eye(3) if crosstalk is None else crosstalk.matrix
-    factors = colour_factors(moments, texture.band, matrix, coloured=texture.specific)
-    displacement = light_displacement(moments, factors, texture, matrix, mosaic.cfa)
+    lights = matrix.shape[1]
+    difference = getattr(crosstalk, "green_difference", None)
+    difference = np.zeros(lights) if difference is None else difference
+    sites = np.stack([matrix[0], matrix[1] + difference / 2, matrix[1] - difference / 2, matrix[2]])
+    grid = tuple(-(-side // BLOCK) for side in values.shape)
+    apart = np.zeros((lights, 2, *grid))
+    if registration is not None:
+        y, x = np.mgrid[: grid[0], : grid[1]].reshape(2, -1) * BLOCK + (BLOCK - 1) / 2
+        rho = registration.displacement(np.stack([x, y], axis=1))
+        apart = (rho - rho.mean(axis=0)).reshape(lights, *grid, 2).transpose(0, 3, 1, 2)
+    model = SiteModel(sites=sites, apart=apart, texture=texture)
+    moments = gather_moments(values, red, mosaic.noise, model)
+    if texture is None and registration is not None:
+        from dataclasses import replace
+        for _ in range(int(os.environ.get("PIT", 1))):
+            model = replace(model, texture=learn_texture(moments, model))
+            moments = gather_moments(values, red, mosaic.noise, model)
+    texture = learn_texture(moments, model) if texture is None else texture
+    factors = colour_factors(moments, texture, model)
+    displacement = light_displacement(moments, factors, texture, matrix)
+    glints = _per_tile(displacement.significant)
+    alike = np.exp(-DISSIMILAR * (((_per_tile(displacement.significant)[:, None] - _per_tile(displacement.significant)[None])) ** 2).sum(axis=2))
     index, taps, size = prediction_filters(
-        _per_tile(factors.specific),
-        _per_tile(factors.noise / (1 + factors.specific)),
+        _per_tile(np.full_like(factors.of_lights, float(os.environ['PF'])) if os.environ.get('PF') else factors.of_lights * float(os.environ.get('PV','1'))),
+        _per_tile(factors.noise),
         texture,
         mosaic.cfa,
-        seen=seen_lights(matrix, np.median(factors.slope, axis=(1, 2))),
-        displacement=_per_tile(displacement.significant),
+        seen=factors.seen,
+        displacement=_per_tile(apart) + glints,
+        alike=alike,
     )
     spread, pad = factors.spread.astype(np.float32), size // 2
     padded = scaled(moments, np.float32(1) / spread, pad=pad, width=index.shape[1] * TILE)
@@ -295,11 +290,11 @@ def reconstruct(
         fill_unknown(source, _per_tile(1 / (1 + factors.specific)), *moments.red, pad, padded, unknown)
         known = _validity(mosaic.saturated, unknown[pad : pad + len(values), pad : pad + columns], mosaic.cfa)
         valid = np.stack([known[matters].all(axis=0) for matters in needed(mixing)])
-    scale, mean = widened(spread, BLOCK, columns), widened(moments.mean, MEAN_BLOCK, columns)
+    scale, mean = widened(spread, BLOCK, columns), widened(moments.channel_mean, MEAN_BLOCK, columns)
     predict(padded, index, taps, size, scale, BLOCK, mean, MEAN_BLOCK, mixing.astype(np.float32), out)
     channels = LinearChannels(values=out, valid=valid, full_scale=mosaic.full_scale)
     return Reconstruction(
-        channels=channels, texture=texture, factors=factors, mean=moments.mean, displacement=displacement
+        channels=channels, texture=texture, factors=factors, mean=moments.channel_mean, displacement=displacement if not os.environ.get("PD") else __import__('dataclasses').replace(displacement, values=displacement.values*0)
     )
 
 

@@ -41,6 +41,7 @@ def separate(
     method: str = DEFAULT_METHOD,
     *,
     texture: TextureModel | None = None,
+    registration=None,
 ) -> IlluminationImages:
     """One image per light from one raw colour frame: linearised, demosaiced, unmixed and, where calibrated, registered.
 
@@ -71,7 +72,7 @@ def separate(
         raise InputError("the calibration has no crosstalk, which colour frames need (rgbmidic-calibrate crosstalk)")
     if isinstance(calibration, Calibration):
         linear = linearise(frame, calibration.noise) if isinstance(frame, Mosaic | ChannelFrame) else frame
-        images = separate(linear, crosstalk, method, texture=texture)
+        images = separate(linear, crosstalk, method, texture=texture, registration=calibration.registration)
         return align(replace(images, registration=calibration.registration))
     linear = linearise(frame) if isinstance(frame, Mosaic | ChannelFrame) else frame
     if isinstance(linear, LinearChannels):
@@ -83,7 +84,7 @@ def separate(
     if method != DEFAULT_METHOD:
         return unmix(_BY_CHANNEL[method](linear), crosstalk)
     mixing = crosstalk.unmixing if crosstalk.field is None else None
-    model = reconstruct(linear, crosstalk, texture=texture, mixing=mixing)
+    model = reconstruct(linear, crosstalk, texture=texture, mixing=mixing, registration=registration)
     return reconstructed_lights(model, crosstalk, unmixed=mixing is not None)
 
 
@@ -231,7 +232,7 @@ class Separation:
             what = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
             raise ConfigurationError(f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk")
         else:
-            images = separate(linear[0], known.crosstalk, self.demosaic, texture=self.texture)
+            images = separate(linear[0], known.crosstalk, self.demosaic, texture=self.texture, registration=known.registration)
         return replace(images, registration=known.registration)
 
     def within(self, window: Window) -> Separation:

@@ -116,6 +116,22 @@ class TextureModel:
         return float(2 * r[below[0]]) if below.size else float("inf")
 
     @cached_property
+    def gradient_gain(self) -> float:
+        """Slope of a plane over its central difference, both per cell, by regression."""
+        taps = [(_BINOMIAL[p::2], _OFFSETS[p::2]) for p in (0, 1)]
+
+        def correlation(x):
+            total = 0.0
+            for t, o in taps:
+                for u, q in taps:
+                    apart = o[:, None] - o
+                    lines = [np.einsum("i,mij,j->m", t, np.exp(-0.5 * ((apart + x) / np.asarray(self.widths)[:, None, None]) ** 2), t), np.einsum("i,mij,j->m", u, np.exp(-0.5 * ((q[:, None] - q) / np.asarray(self.widths)[:, None, None]) ** 2), u)]
+                    total += 0.25 * (np.asarray(self.weights) @ (lines[0] * lines[1]) + self.offset)
+            return total
+        slope = (correlation(2.1) - correlation(1.9)) / 0.1  # per cell
+        return -slope / (correlation(0.0) - correlation(4.0)) * 2
+
+    @cached_property
     def band(self) -> BandEnergy:
         """Second moments of the low-passed planes of a Bayer mosaic for this texture."""
         return BandEnergy(*(np.asarray(self.weights) @ _band_energies(self.widths) + self.offset).tolist())
@@ -136,46 +152,78 @@ def _band_energies(widths: tuple[float, ...]) -> FloatArray:
     return np.stack([same * same, same * other, other * other], axis=1)
 
 
-def fit_texture(sums: FloatArray, counts: FloatArray, correlations: FloatArray, agreement: float) -> TextureModel:
-    """Fit a texture to the products of samples at `LAGS`.
+FRACTIONS = np.linspace(0, 2, 41)
 
-    Parameters
-    ----------
-    sums, counts : ndarray, shape (L, 6)
-        As `lag_products` of the kernels gives them, of contrast divided by the square root of the low-passed planes'
-        own moments.
-    correlations : ndarray, shape (3,)
-        Mean over the field of the low-passed planes' correlation, red-green, red-blue, green-blue.
-    agreement
-        Correlation that low-passed planes which are neighbours along a row or column reach where no colour shows
-        anything of its own: what it lacks to 1 is texture too fine for one colour's lattice.
 
-    Returns
-    -------
-    TextureModel
-    """
-    best = float(np.max(correlations))
+@lru_cache(maxsize=64)
+def interpolated_lines(widths: tuple[float, ...]):
+    """Along one axis: product of a plane with another, shown d px farther on and brought back by cubic interpolation."""
+    taps = [(_BINOMIAL[p::2], _OFFSETS[p::2]) for p in (0, 1)]
+
+    def positions(p, d):
+        x = np.arange(-3, 5) - d / 2
+        h = np.sinc(x) * np.sinc(x / 4)
+        return np.outer(h / h.sum(), taps[p][0]).ravel(), (2 * x[:, None] + taps[p][1]).ravel()
+
+    def line(p, q):
+        out = np.zeros((len(widths), FRACTIONS.size, FRACTIONS.size))
+        for i, d in enumerate(FRACTIONS):
+            a, x = positions(p, d)
+            for j, e in enumerate(FRACTIONS):
+                b, y = positions(q, e)
+                out[:, i, j] = np.exp(-0.5 * ((x[:, None] - y) / np.asarray(widths)[:, None, None]) ** 2) @ b @ a
+        return out
+
+    return (line(0, 0) + line(1, 1)) / 2, (line(0, 1) + line(1, 0)) / 2
+
+
+def fit_texture(
+    sums: FloatArray, counts: FloatArray, correlations: FloatArray, agreement: float, seen: FloatArray, apart: FloatArray
+) -> TextureModel:
+    """Fit; sums, counts (cells, L, 6), correlations (cells, 3), seen (4, k), apart (cells, k, 2)."""
     distance = np.hypot(*LAGS.T)
+    met = counts[..., :3].sum(axis=0) > 0
+    r = np.broadcast_to(distance[:, None], met.shape)[met]
+    # one colour's samples are two pixels apart and show nothing of what is finer
+    coarse = WIDTHS[WIDTHS > 1]
+    w = np.stack([seen[0], (seen[1] + seen[2]) / 2, seen[3]])
+    count = seen.shape[1]
+
+    whole = correlations.mean(axis=0)
+    best = float(np.max(whole))
     if best < COLOURED:
-        met = counts[:, :3] > 0
-        r = np.broadcast_to(distance[:, None], met.shape)[met]
-        # one colour's samples are two pixels apart and show nothing of what is finer
-        coarse = WIDTHS[WIDTHS > 1]
-        return _mixture(r, sums[:, :3][met] / counts[:, :3][met], best, widths=coarse, specific=1.0)
-    pairs = counts[:, 3:] * correlations
-    adjacent, diagonal = pairs[:, 0] + pairs[:, 2], pairs[:, 1]
+        return _mixture(r, (sums.sum(axis=0)[:, :3][met] / counts.sum(axis=0)[:, :3][met]), best, widths=coarse, specific=1.0)
     parity = LAGS.sum(axis=1) % 2 == 1
-    odd, even = parity & (adjacent > 0), ~parity & (diagonal > 0)
-    product = np.concatenate([(sums[odd, 3] + sums[odd, 5]) / adjacent[odd], sums[even, 4] / diagonal[even]])
     energies = _band_energies(tuple(WIDTHS.tolist()))
-    # products come in units of the band's energy, which the same unknown weights make up
-    unit = np.concatenate([np.tile(energies[:, 1], (odd.sum(), 1)), np.tile(energies[:, 2], (even.sum(), 1))])
+    rows = []
+    for pair, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
+        lags = parity if pair != 1 else ~parity
+        kind = 1 if pair != 1 else 2
+        for cell in range(len(sums)):
+            use = lags & (counts[cell, :, 3 + pair] > 0)
+            if not use.any():
+                continue
+            product = sums[cell, use, 3 + pair] / (counts[cell, use, 3 + pair] * correlations[cell, pair])
+            gaussians = np.zeros((use.sum(), len(WIDTHS)))
+            for l in range(count):
+                for m in range(count):
+                    share = w[a, l] * w[b, m]
+                    shift = apart[cell, l] - apart[cell, m]
+                    # which of the two samples a lag begins at is either
+                    for sign in (1, -1):
+                        x, y = LAGS[use, 1] + sign * shift[0], LAGS[use, 0] + sign * shift[1]
+                        gaussians += share / 2 * np.exp(-0.5 * (x**2 + y**2)[:, None] / WIDTHS**2)
+            unit = energies[:, kind]
+            weight = counts[cell, use, 3 + pair] * correlations[cell, pair]
+            rows.append((gaussians, np.tile(unit, (use.sum(), 1)), product, distance[use], weight, np.flatnonzero(use)))
+    gaussians, unit, product, r, weight, lag = (np.concatenate(part) for part in zip(*rows))
+    importance = np.sqrt(weight / np.bincount(lag, weight, minlength=len(LAGS))[lag]) / (1 + r)
     # what a lattice cannot see is hardly in the products: the fit would extrapolate it to distance 0
     finest, coarsest = (energies[:, 1] / energies[:, 0])[[0, -1]]
-    ratio = float(np.clip(agreement, finest, coarsest))
-    fine = np.append(energies[:, 1] - ratio * energies[:, 0], ratio - 1)
-    model = _mixture(np.concatenate([distance[odd], distance[even]]), product, best, band=(unit, fine))
-    return replace(model, specific=_coarse_fraction(model, sums, counts, correlations))
+    between = float(np.clip(agreement, finest, coarsest))
+    fine = np.append(energies[:, 1] - between * energies[:, 0], between - 1)
+    model = _mixture(r, product, best, band=(unit, fine), gaussians=gaussians, importance=importance)
+    return replace(model, specific=_coarse_fraction(model, sums.sum(axis=0), counts.sum(axis=0), whole))
 
 
 def _mixture(
@@ -186,14 +234,17 @@ def _mixture(
     widths: FloatArray = WIDTHS,
     band: tuple[FloatArray, FloatArray] | None = None,
     specific: float = 0.0,
+    gaussians=None,
+    importance=None,
 ) -> TextureModel:
     """Fit weights w >= 0 and offset c <= 0 of a texture by least squares.
 
     ``sum w g(r) + c = product`` up to a factor, or, with unit (R, M) and fine (M + 1,) of the `band`,
     ``sum w (g(r) - product unit) + c (1 - product) = 0`` with ``sum w + c = 1`` and ``fine . (w, -c) = 0``.
     """
-    gaussians = np.exp(-0.5 * (r[:, None] / widths) ** 2)
-    importance = 1 / (1 + r)
+    if gaussians is None:
+        gaussians = np.exp(-0.5 * (r[:, None] / widths) ** 2)
+        importance = 1 / (1 + r)
     if band is None:
         system = np.column_stack([gaussians, -np.ones(r.size)]) * importance[:, None]
         wanted = product * importance
