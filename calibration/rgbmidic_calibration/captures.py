@@ -429,11 +429,10 @@ class BlockMeans:
         return np.stack([self.planes[0], 0.5 * (self.planes[1] + self.planes[2]), self.planes[3]])
 
     @property
-    def green_difference(self) -> FloatArray | None:
-        """Block averages (R, S) of the greens in rows with red minus those in rows with blue; None for one green."""
-        if (greens := self.camera.greens) is None:
-            return None
-        return np.asarray(self.planes[greens[0]] - self.planes[greens[1]])
+    def signals(self) -> FloatArray:
+        """Block averages of the channels R, G, B and, of a mosaic, of G in red rows minus G in blue rows."""
+        greens = self.camera.greens
+        return np.stack([*self.channels, *([self.planes[greens[0]] - self.planes[greens[1]]] if greens else [])])
 
     @property
     def centres(self) -> FloatArray:

@@ -70,13 +70,7 @@ LIMITS = CrosstalkConstants()
 
 
 GREENS = 3
-"""Channel of the difference of the greens (`channel_means`)."""
-
-
-def channel_means(frame: BlockMeans) -> FloatArray:
-    """Block averages (3 or 4, R, S) of R, G, B and, of a mosaic, of the greens' difference."""
-    difference = frame.green_difference
-    return frame.channels if difference is None else np.stack([*frame.channels, difference])
+"""Channel of the difference of the greens (`BlockMeans.signals`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +81,7 @@ class LightSignal:
     ----------
     name : str
     values : ndarray, shape (N, C, R, S)
-        Above dark, of N captures: R, G, B and, of a mosaic, the difference of the greens (`channel_means`).
+        Above dark, of N captures: R, G, B and, of a mosaic, the difference of the greens (`BlockMeans.signals`).
     valid : ndarray, shape (N, R, S), bool
         Blocks without saturated samples.
     reference : int
@@ -102,7 +96,7 @@ class LightSignal:
     @classmethod
     def of(cls, name: str, captures: Sequence[BlockMeans], dark: FloatArray) -> LightSignal:
         """The averages of captures above the dark level."""
-        values = np.stack([channel_means(frame) for frame in captures]) - dark
+        values = np.stack([frame.signals for frame in captures]) - dark
         valid = ~np.stack([frame.saturated for frame in captures])
         return cls(name, values, valid, int(np.median(values[:, :3].transpose(0, 2, 3, 1)[valid], axis=0).argmax()))
 
@@ -257,9 +251,7 @@ class Variation:
     rms: float
 
 
-def variation(
-    signal: LightSignal, design: FloatArray, known: int, channels: Sequence[int] | None = None
-) -> Variation:
+def variation(signal: LightSignal, design: FloatArray, known: int, channels: Sequence[int] | None = None) -> Variation:
     """Test whether the Legendre products after the first `known` ones are needed in any channel.
 
     A score test with random signs: the model of the first terms is fitted, its residuals are correlated with the other
@@ -393,11 +385,11 @@ def estimate_crosstalk(
     warnings = judged(capture_checks(lights, dark), allow)
     like = next(iter(lights.values()))[0]
     shape, centres = like.camera.shape, like.centres
-    count = len(channel_means(like))
+    count = len(like.signals)
     level, of_frame = np.zeros((count, *like.saturated.shape)), np.zeros((count, count))
     of_mean = LIMITS.black_level_std**2 * np.eye(count)
     if dark:
-        frames = np.stack([channel_means(frame) for frame in dark])
+        frames = np.stack([frame.signals for frame in dark])
         level = frames.mean(axis=0)
         of_frame = np.cov(frames.mean(axis=(2, 3)), rowvar=False) if len(frames) > 1 else of_mean
         of_mean = of_frame / len(frames)
