@@ -202,7 +202,10 @@ def registration(
     captures: Any,
     out: Path,
     region: Region = None,
-    element_size: Annotated[float, Option(help="Side of the elements, px; several speckles.")] = 25.0,
+    element_size: Annotated[
+        float | None,
+        Option(help="Side of the elements, px: several speckles. Else the smallest of 25 to 120 that match."),
+    ] = None,
 ) -> None:
     """Measure lateral colour: the shift of each light's image relative to that of the first light."""
     from rgbmidic_calibration import display, jobs

@@ -56,7 +56,8 @@ def registration(estimate: RegistrationEstimate, out: Path) -> None:
         f"{100 * float(match.used.mean()):.0f} % of the nodes used"
         for match in estimate.matches
     )
-    _print([*_marked(estimate.warnings), _registration(estimate.registration), *fits, _written(out)])
+    size = f"elements of {estimate.element_size:g} px"
+    _print([*_marked(estimate.warnings), _registration(estimate.registration), *fits, size, _written(out)])
 
 
 def camera(found: CameraCalibration, file: Path, *, written: bool = True) -> None:

@@ -17,7 +17,7 @@ from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.fields.plane import CameraCalibration
 from rgbmidic.frames.data import Mosaic
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.settings import ELEMENT_SIZE, FrameSettings
+from rgbmidic.settings import FrameSettings
 from rgbmidic_calibration.camera import LIMITS, CameraEstimate, estimate_lens, estimate_plane
 from rgbmidic_calibration.captures import CaptureFiles, Captures, provenance
 from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk
@@ -73,7 +73,7 @@ def calibrate_noise(dark: str, flats: Sequence[str], stated: FrameSettings) -> t
 
 
 def calibrate_registration(
-    captures: Captures, *, region: Sequence[float] | None = None, element_size: float = ELEMENT_SIZE
+    captures: Captures, *, region: Sequence[float] | None = None, element_size: float | None = None
 ) -> tuple[Calibration, RegistrationEstimate]:
     """Registration section from captures of a speckled target; the first light is the reference."""
     lights, dark = captures.stacks()
@@ -81,7 +81,7 @@ def calibrate_registration(
     uneven = [stack.uneven for stack in lights.values()]
     details = {
         "region": None if region is None else list(region),
-        "element_size": element_size,
+        "element_size": estimate.element_size,
         "residual_rms_px": {match.name: match.rms for match in estimate.matches},
     }
     return _calibration("registration", captures.groups, uneven, details, estimate), estimate
