@@ -217,8 +217,10 @@ def registration(
 
 @app.command()
 @command.gather("stated", command.FRAME_OPTIONS, _frames)
+@command.gather("photographed", command.TARGET_LIGHT_OPTIONS, command.read_target_lights)
 def camera(
     stated: Any,
+    photographed: Any,
     target: Annotated[
         str | None,
         Option(
@@ -253,13 +255,16 @@ def camera(
         check_output(picture, overwrite=overwrite, option="--picture")
     if (corners is None) != (size is None):
         raise ConfigurationError("--corners and --size belong together: state both")
+    if views is not None and lens is not None:
+        raise ConfigurationError("--views calibrate a lens, --lens takes one from a file: state one of them")
+    if plane is not None and corners is not None:
+        raise ConfigurationError("--plane and --corners both state the plane: state one of them")
     estimate = jobs.calibrate_camera(
         stated,
         None if target is None else Target.parse(target),
-        views=views,
-        plane=plane,
-        lens=None if lens is None else CameraCalibration.read(lens),
-        corners=None if corners is None or size is None else (corners, size, corner_std),
+        lens=views if lens is None else CameraCalibration.read(lens),
+        plane=plane if corners is None or size is None else (corners, size, corner_std),
+        lights=photographed,
     )
     estimate.camera.write(out)
     display.camera(estimate.camera, out)
