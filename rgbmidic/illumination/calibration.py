@@ -334,8 +334,13 @@ class TargetLights:
         CalibrationError
             The photograph does not fit the calibration.
         """
-        registration = self.calibration.registration
+        registration, whole = self.calibration.registration, self.calibration.shape
         if shape is not None:
+            if self.crop_origin is None and whole is not None and shape != whole:
+                raise CalibrationError(
+                    f"{self.calibration.name} was made with frames of {_size(whole)} px, the photograph has "
+                    f"{_size(shape)} px: state --crop-origin, where it begins in the calibrated frame"
+                )
             registration = self.calibration.cropped(self.crop_origin, shape).registration
         elif self.crop_origin is not None and registration is not None:
             registration = registration.cropped(self.crop_origin)
