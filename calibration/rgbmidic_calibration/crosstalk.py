@@ -426,7 +426,7 @@ def _green_checks(signals: Sequence[LightSignal], design: FloatArray, crosstalk:
     for signal, test, amplitude in zip(signals, tests, left, strict=True):
         text = (
             f"light {signal.name}: the difference of the greens varies over the field; its mean, which is used, leaves "
-            f"a checkerboard of ±{100 * amplitude:.2g} % rms of the light's level"
+            f"a checkerboard of {100 * amplitude:.2g} % rms of the light's level"
         )
         yield warning(text, amplitude if test.p_value < LIMITS.significance else 0.0, above=LIMITS.checkerboard)
 

@@ -247,7 +247,16 @@ class Calibration:
         dict
         """
         document = self.to_document()
-        kept = {"lights", "matrix", "std", "noise_amplification", "gain", "read_noise", "parameters"}
+        kept = {
+            "lights",
+            "matrix",
+            "std",
+            "green_difference",
+            "noise_amplification",
+            "gain",
+            "read_noise",
+            "parameters",
+        }
         figures: dict[str, Any] = {
             section: {key: value for key, value in document[section].items() if key in kept}
             for section in ("crosstalk", "noise", "registration")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import numpy as np
@@ -84,7 +85,7 @@ def test_difference_of_the_greens_that_varies_over_the_field_is_reported():
     found = estimate(lights, [expose(0 * picture, np.ones(3), rng) for _ in range(2)])
     (said,) = [text for text in found.warnings if "greens" in text]
     rms = 100 * 0.05 / np.sqrt(3) * np.abs(found.crosstalk.unmixing[:, 1]).max()  # half of their difference
-    assert float(re.search(r"±([\d.]+) %", said)[1]) == pytest.approx(rms, rel=0.1)
+    assert float(re.search(r"of ([\d.]+) %", said)[1]) == pytest.approx(rms, rel=0.1)
     assert found.crosstalk.field is None
 
 
@@ -292,6 +293,27 @@ def test_file_keeps_matrix_and_covariance(scene, tmp_path):
     assert (again.matrix == found.matrix).all()
     assert (again.covariance == found.covariance).all()
     assert again.std == pytest.approx(found.std)
+    assert (again.sites == found.sites).all()
+    assert (again.green_difference_std == found.green_difference_std).all()
+
+
+def test_file_of_three_rows_is_one_of_equal_greens(tmp_path):
+    Calibration(crosstalk=Crosstalk(matrix=MATRIX, lights=("r", "g", "b"))).write(tmp_path / "c.json")
+    document = json.loads((tmp_path / "c.json").read_text())
+    for key in ("green_difference", "green_difference_std"):
+        document["crosstalk"].pop(key, None)
+    (tmp_path / "c.json").write_text(json.dumps(document))
+    read = Calibration.read(tmp_path / "c.json")
+    assert (read.crosstalk.sites == MATRIX[[0, 1, 1, 2]]).all()
+    for wrong, reason in (
+        ({"green_difference": [0.1, 0.2]}, "one finite number per light"),
+        ({"green_difference_std": [0.1, 0.2, 0.1]}, "belongs to a green_difference"),
+        ({"green_difference": [0.1, 0.2, 0], "green_difference_std": [-1, 0, 0]}, "not negative"),
+    ):
+        changed = {**document, "crosstalk": {**document["crosstalk"], **wrong}}
+        (tmp_path / "c.json").write_text(json.dumps(changed))
+        with pytest.raises(CalibrationError, match=f"c.json is damaged: .*{reason}"):
+            Calibration.read(tmp_path / "c.json")
 
 
 def varying_capture(picture, rng):
