@@ -422,8 +422,8 @@ def estimate_crosstalk(
 def _green_checks(signals: Sequence[LightSignal], design: FloatArray, crosstalk: Crosstalk) -> Iterator[Check]:
     """Check that the mean of the greens' difference over the field is enough."""
     tests = [variation(signal, design, 1, [GREENS]) for signal in signals]
-    left = np.abs(crosstalk.checkerboard(np.array([test.rms for test in tests]))).max(axis=0)
-    for signal, test, amplitude in zip(signals, tests, left, strict=True):
+    amplitudes = np.abs(crosstalk.checkerboard(np.array([test.rms for test in tests]))).max(axis=0)
+    for signal, test, amplitude in zip(signals, tests, amplitudes, strict=True):
         text = (
             f"light {signal.name}: the difference of the greens varies over the field; its mean, which is used, leaves "
             f"a checkerboard of {100 * amplitude:.2g} % rms of the light's level"
