@@ -73,7 +73,7 @@ def _calibrate_demo_camera(test: Path) -> None:
 
     stated = FrameSettings(path=("photographs",), kind="monochrome", white_level=65535)
     found = calibrate_camera(
-        stated, Target.parse("chessboard:9x7:5mm"), views=str(test / "target/*.png"), plane=str(test / "plane/*.png")
+        stated, Target.parse("chessboard:9x7:5mm"), lens=str(test / "target/*.png"), plane=str(test / "plane/*.png")
     )
     found.camera.write(test / "camera.json")
 

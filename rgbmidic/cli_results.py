@@ -147,15 +147,23 @@ def compare(
 
 
 @app.command()
+@command.gather("photographed", command.TARGET_LIGHT_OPTIONS, command.read_target_lights)
 def scale(
     points: Annotated[str, Argument(metavar="X0,Y0:X1,Y1", help="Two points with a known distance, px.")],
     length: Annotated[float, Option(metavar="MM", help="Their distance in mm.")],
     length_std: Annotated[float, Option(metavar="MM", help="Its standard uncertainty.")] = 0.0,
     point_std: Annotated[float, Option(metavar="PX", help="Uncertainty of each point, px.")] = 0.5,
+    photographed: Any = None,
 ) -> None:
-    """Millimetres per pixel, with its uncertainty, from two points on an image and their distance."""
+    """Millimetres per pixel of the first light's image, with its uncertainty, from two points and their distance."""
     from rgbmidic.fields import Units
 
     x0, y0, x1, y1 = command.read_place(points, "the points", "X0,Y0:X1,Y1")
-    units = Units.from_points([[x0, y0], [x1, y1]], length, length_std=length_std, point_std=point_std)
+    ends: Any = [[x0, y0], [x1, y1]]
+    factor, remark = None, "the image that the points are of; results are in px of the first light's (--light)"
+    if photographed is not None:
+        ends, factor = photographed.on_first_light(ends)
+        remark = f"the image of light {photographed.first}, from points in that of {' + '.join(photographed.names)}"
+    units = Units.from_points(ends, length, length_std=length_std, point_std=point_std, factor=factor)
+    print(f"# mm per px of {remark}")
     print(f"[scale]\nmm_per_pixel = {units.mm_per_pixel:.6g}\nmm_per_pixel_std = {units.mm_per_pixel_std:.2g}")

@@ -27,9 +27,10 @@ from rich.console import Console
 from typer import Argument, Option
 from typer.core import TyperGroup
 
-from rgbmidic.errors import InputError, RgbmidicError, disk_reason, shortened
+from rgbmidic.errors import ConfigurationError, InputError, RgbmidicError, disk_reason, shortened
 
 if TYPE_CHECKING:
+    from rgbmidic.illumination.calibration import TargetLights
     from rgbmidic.results import Maps, Result
     from rgbmidic.settings import ScaleSettings, TestSettings
 
@@ -55,6 +56,50 @@ FRAME_OPTIONS: dict[str, Any] = {
     "dtype": Annotated[str | None, Option(help="uint8, uint16 or >u2, of a headerless file.")],
 }
 """Options that state what the files of frames do not, by the keys of ``[frames]``."""
+
+
+TARGET_LIGHT_OPTIONS: dict[str, Any] = {
+    "light": Annotated[
+        list[str] | None,
+        Option(help="NAME of the light under which the target was photographed; once per light where several were on."),
+    ],
+    "calibration": Annotated[
+        Path | None, Option(help="Calibration file: its registration carries the scale to the first light's pixels.")
+    ],
+    "crop_origin": Annotated[
+        str | None, Option(metavar="X,Y", help="Column and row of the calibrated frame at which the photograph begins.")
+    ],
+}
+"""Options that state the light of a photograph from which a scale is taken."""
+
+
+def read_target_lights(options: Mapping[str, Any]) -> TargetLights | None:
+    """The lights that `TARGET_LIGHT_OPTIONS` state, with their calibration; None where they state nothing.
+
+    Raises
+    ------
+    ConfigurationError
+        Some are stated without the others.
+    CalibrationError
+        The calibration cannot be read, or has no registration of these lights.
+    """
+    names, file, crop = options["light"] or [], options["calibration"], options["crop_origin"]
+    if names and file is not None:
+        from rgbmidic.illumination.calibration import Calibration, TargetLights
+
+        origin = None
+        if crop is not None:
+            x, y = read_place(crop, "--crop-origin", "X,Y")
+            if min(x, y) < 0 or x % 1 or y % 1:
+                raise ConfigurationError(f"--crop-origin takes whole numbers from 0, not {crop!r}")
+            origin = (int(x), int(y))
+        return TargetLights(names=tuple(names), calibration=Calibration.read(file), crop_origin=origin)
+    if names:
+        raise ConfigurationError("--light needs --calibration, the file whose registration has that light")
+    if file is not None or crop is not None:
+        stated = "--calibration" if file is not None else "--crop-origin"
+        raise ConfigurationError(f"{stated} is of use only with --light, the light of the photograph: state it too")
+    return None
 
 
 def application(name: str, cls: type[TyperGroup] = TyperGroup) -> typer.Typer:

@@ -33,10 +33,17 @@ def speckle_target(shape, rng, size=4.2):
 def expose(
     picture, column, rng, cfa="RGGB", *, gain=GAIN, read=READ, black=BLACK, white=WHITE, kind="bayer", offset=0.0
 ):
-    """One raw frame of a light whose picture (H, W), or (C, H, W) for one per channel, is in DN of its best channel."""
-    channels = np.asarray(column, float).reshape(3, *([1] * (picture.ndim if picture.ndim == 2 else 2))) * picture
+    """One raw frame of a light whose picture (H, W), or (C, H, W) for one per channel, is in DN of its best channel.
+
+    A column of four entries is that of the sites R, G in rows with red, G in rows with blue, B.
+    """
+    channels = (
+        np.reshape(np.asarray(column, float), (-1, *([1] * (picture.ndim if picture.ndim == 2 else 2)))) * picture
+    )
     if kind == "bayer":
         cell = cfa_channels(cfa)
+        if len(column) == 4:
+            cell = cell + (cell == 2) + ((cell == 1) & (cell == 2).any(axis=1, keepdims=True))
         y, x = np.indices(channels.shape[1:])
         channels = np.take_along_axis(channels, cell[y % 2, x % 2][None], axis=0)[0]
     electrons = rng.poisson(np.maximum(channels, 0) * gain) + rng.normal(0, read * gain, channels.shape)

@@ -318,6 +318,9 @@ def estimate_plane(view: View, camera: CameraCalibration, std: float | None = No
         covariance[8:, :8] = follows @ known
         covariance[:8, 8:] = covariance[8:, :8].T
         covariance[8:, 8:] += follows @ known @ follows.T
+    if view.factor is not None:
+        follows = np.linalg.lstsq(slopes, view.factor.reshape(len(slopes), -1), rcond=None)[0]
+        covariance[8:, 8:] += follows @ follows.T
     plane = replace(camera, homography=np.r_[entries, 1.0].reshape(3, 3), covariance=covariance)
     details = {**camera.details, **_plane_details(plane, view, rms)}
     return CameraEstimate(camera=replace(plane, details=details), residuals=((view.pixels, residual.reshape(-1, 2)),))

@@ -202,7 +202,10 @@ def registration(
     captures: Any,
     out: Path,
     region: Region = None,
-    element_size: Annotated[float, Option(help="Side of the elements, px; several speckles.")] = 25.0,
+    element_size: Annotated[
+        float | None,
+        Option(help="Side of the elements, px: several speckles. Else the smallest of 25 to 120 that match."),
+    ] = None,
 ) -> None:
     """Measure lateral colour: the shift of each light's image relative to that of the first light."""
     from rgbmidic_calibration import display, jobs
@@ -214,8 +217,10 @@ def registration(
 
 @app.command()
 @command.gather("stated", command.FRAME_OPTIONS, _frames)
+@command.gather("photographed", command.TARGET_LIGHT_OPTIONS, command.read_target_lights)
 def camera(
     stated: Any,
+    photographed: Any,
     target: Annotated[
         str | None,
         Option(
@@ -250,13 +255,16 @@ def camera(
         check_output(picture, overwrite=overwrite, option="--picture")
     if (corners is None) != (size is None):
         raise ConfigurationError("--corners and --size belong together: state both")
+    if views is not None and lens is not None:
+        raise ConfigurationError("--views calibrate a lens, --lens takes one from a file: state one of them")
+    if plane is not None and corners is not None:
+        raise ConfigurationError("--plane and --corners both state the plane: state one of them")
     estimate = jobs.calibrate_camera(
         stated,
         None if target is None else Target.parse(target),
-        views=views,
-        plane=plane,
-        lens=None if lens is None else CameraCalibration.read(lens),
-        corners=None if corners is None or size is None else (corners, size, corner_std),
+        lens=views if lens is None else CameraCalibration.read(lens),
+        plane=plane if corners is None or size is None else (corners, size, corner_std),
+        lights=photographed,
     )
     estimate.camera.write(out)
     display.camera(estimate.camera, out)
@@ -273,7 +281,8 @@ def check(
         list[str] | None, Option(help="NAME+NAME=FILES: the same scene with these lights on together.")
     ] = None,
     limit: Annotated[
-        list[str] | None, Option(help="NAME=VALUE: leakage, additivity, strength, noise (in %), registration (in px).")
+        list[str] | None,
+        Option(help="NAME=VALUE: leakage, checkerboard, additivity, strength, noise (in %), registration (in px)."),
     ] = None,
     region: Region = None,
 ) -> None:

@@ -16,8 +16,8 @@ import numpy as np
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.fields.plane import CameraCalibration
 from rgbmidic.frames.data import Mosaic
-from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.settings import ELEMENT_SIZE, FrameSettings
+from rgbmidic.illumination.calibration import Calibration, TargetLights
+from rgbmidic.settings import FrameSettings
 from rgbmidic_calibration.camera import LIMITS, CameraEstimate, estimate_lens, estimate_plane
 from rgbmidic_calibration.captures import CaptureFiles, Captures, provenance
 from rgbmidic_calibration.crosstalk import CrosstalkEstimate, estimate_crosstalk
@@ -73,7 +73,7 @@ def calibrate_noise(dark: str, flats: Sequence[str], stated: FrameSettings) -> t
 
 
 def calibrate_registration(
-    captures: Captures, *, region: Sequence[float] | None = None, element_size: float = ELEMENT_SIZE
+    captures: Captures, *, region: Sequence[float] | None = None, element_size: float | None = None
 ) -> tuple[Calibration, RegistrationEstimate]:
     """Registration section from captures of a speckled target; the first light is the reference."""
     lights, dark = captures.stacks()
@@ -81,7 +81,7 @@ def calibrate_registration(
     uneven = [stack.uneven for stack in lights.values()]
     details = {
         "region": None if region is None else list(region),
-        "element_size": element_size,
+        "element_size": estimate.element_size,
         "residual_rms_px": {match.name: match.rms for match in estimate.matches},
     }
     return _calibration("registration", captures.groups, uneven, details, estimate), estimate
@@ -160,10 +160,9 @@ def calibrate_camera(
     stated: FrameSettings,
     target: Target | None,
     *,
-    views: str | None = None,
-    plane: str | None = None,
-    lens: CameraCalibration | None = None,
-    corners: tuple[str, str, float] | None = None,
+    lens: str | CameraCalibration | None = None,
+    plane: str | tuple[str, str, float] | None = None,
+    lights: TargetLights | None = None,
 ) -> CameraEstimate:
     """Calibrate lens and plane, or either, from capture files.
 
@@ -172,60 +171,81 @@ def calibrate_camera(
     stated
         What is stated of the files.
     target
-        The target; None where only `corners` are given.
-    views
-        Pattern of the photographs of the lens.
-    plane
-        Pattern of the photograph of the target on the specimen's plane; of several the points are averaged.
+        The target; None where there are no photographs.
     lens
-        An earlier calibration, for its lens.
-    corners
-        In place of `plane`: arguments of `read_corners`.
+        Pattern of the photographs of the lens, or an earlier calibration, for its lens.
+    plane
+        Pattern of the photograph of the target on the specimen's plane (of several the points are averaged), or the
+        first three arguments of `read_corners`.
+    lights
+        Lights under which all of these were photographed: the camera is then that of the first light's image, whose
+        pixels the results are in. The covariance of the registration is part of that of the plane.
 
     Raises
     ------
     CalibrationError
         The photographs do not allow it.
     ConfigurationError
-        Neither views nor a plane are given, or both of what excludes one another.
+        Neither photographs of the lens nor a plane are given, or photographs without their target.
     """
-    if (views or plane) and target is None:
+    if (isinstance(lens, str) or isinstance(plane, str)) and target is None:
         raise ConfigurationError("--views and --plane need --target, what the photographs show")
-    if not (views or plane or corners):
-        raise ConfigurationError("nothing to calibrate: state --views, --plane or --corners")
-    if views and lens is not None:
-        raise ConfigurationError("--views calibrate a lens, --lens takes one from a file: state one of them")
-    if plane and corners:
-        raise ConfigurationError("--plane and --corners both state the plane: state one of them")
     groups, parts = list[CaptureFiles](), list[CameraEstimate]()
-    # of an earlier calibration the lens, its plane left out
-    camera = lens and replace(
-        lens,
-        homography=None,
-        covariance=np.pad(lens.covariance[:8, :8], (0, 8)),
-        details={"lens": lens.details.get("lens")},
-    )
-    if views and target:
-        groups.append(CaptureFiles.find("views", views, stated))
-        parts.append(estimate_lens(*find_views(groups[-1], target)))
+    camera, view = None, None
+    if isinstance(lens, str) and target:
+        groups.append(CaptureFiles.find("views", lens, stated))
+        views, reasons = find_views(groups[-1], target)
+        parts.append(estimate_lens([_on_first_light(one, lights) for one in views], reasons))
         camera = parts[-1].camera
-    view = None
-    if plane and target:
+    elif isinstance(lens, CameraCalibration):
+        camera = _lens_of(lens, lights)
+    if isinstance(plane, str) and target:
         groups.append(CaptureFiles.find("plane", plane, stated))
         view = _mean_view(groups[-1], target)
-    elif corners:
+    elif isinstance(plane, tuple):
         shape = camera.shape if camera is not None else stated.shape
         if shape is None:
             raise ConfigurationError("--corners need the frames' size: --shape ROWSxCOLUMNS, or --lens")
-        view = read_corners(*corners, shape)
+        view = read_corners(*plane, shape)
     if view is not None:
         camera = camera or CameraCalibration(shape=view.shape)
-        parts.append(estimate_plane(view, camera, corners[2] if corners else None))
+        std = plane[2] if isinstance(plane, tuple) else None
+        parts.append(estimate_plane(_on_first_light(view, lights), camera, std))
         camera = parts[-1].camera
-    assert camera is not None
+    if camera is None or not parts:
+        raise ConfigurationError("nothing to calibrate: state --views, --plane or --corners")
     details = {**camera.details, "provenance": provenance("camera", groups, {})}
+    if lights is not None:
+        details |= {"lights": list(lights.names), "first_light": lights.first}
     residuals = tuple(points for part in parts for points in part.residuals)
     return CameraEstimate(camera=replace(camera, details=details), residuals=residuals)
+
+
+def _on_first_light(view: View, lights: TargetLights | None) -> View:
+    """Return the target's points in px of the first light's image; as they are where no light is stated."""
+    if lights is None:
+        return view
+    pixels, factor = lights.on_first_light(view.pixels, view.shape)
+    return replace(view, pixels=pixels, factor=factor)
+
+
+def _lens_of(camera: CameraCalibration, lights: TargetLights | None) -> CameraCalibration:
+    """Return an earlier calibration without its plane.
+
+    Raises
+    ------
+    CalibrationError
+        It is of the image of another light.
+    """
+    before, now = camera.details.get("first_light"), None if lights is None else lights.first
+    if before is not None and before != now:
+        image = "with no light stated" if now is None else f"of light {now}'s image"
+        raise CalibrationError(
+            f"{camera.name} (--lens) is of light {before}'s image, the plane {image}: state --light and --calibration "
+            "as for the lens"
+        )
+    covariance = np.pad(camera.covariance[:8, :8], (0, 8))
+    return replace(camera, homography=None, covariance=covariance, details={"lens": camera.details.get("lens")})
 
 
 def _mean_view(files: CaptureFiles, target: Target) -> View:

@@ -213,6 +213,8 @@ class View:
     radius : float
         Of the circles that the points are the centres of, mm; `pixels` are then the centroids of their images. 0:
         corners.
+    factor : ndarray, shape (m, 2, P), or None
+        Errors of `pixels` per unit of P independent errors that they have in common, px.
     """
 
     name: str
@@ -220,6 +222,7 @@ class View:
     pixels: FloatArray
     shape: tuple[int, int]
     radius: float = 0.0
+    factor: FloatArray | None = None
 
 
 def photograph(frame: Mosaic | ChannelFrame) -> tuple[FloatImage, BoolArray]:

@@ -11,6 +11,7 @@ pixel is (0, 0) mm, and in the middle of the frame x runs along the rows.
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,10 +22,13 @@ import numpy as np
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.fields.units import Units
 from rgbmidic.illumination.calibration import read_document, write_document
+from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.text import uncertain
 from rgbmidic.typing import FloatArray
+
+logger = logging.getLogger(__name__)
 
 LENS_PARAMETERS = ("f", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """Focal length and principal point in px, then the distortion in OpenCV's order."""
@@ -317,6 +321,43 @@ class CameraCalibration:
             )
         _ = self.parameters
 
+    def check_light(self, registration: Registration | None) -> None:
+        """Refuse a test whose first light, in px of whose image it measures, is not that of the camera.
+
+        A warning where the camera states no light, but another light's magnification differs from the first one's by
+        more than the uncertainty of the scale; or where it states one and the test has no registration.
+
+        Parameters
+        ----------
+        registration
+            That of the test's lights; None: there is none.
+
+        Raises
+        ------
+        CalibrationError
+            The camera is of the image of a light that is not the first.
+        """
+        of_camera = self.details.get("first_light")
+        if registration is None:
+            if of_camera is not None:
+                text = "%s (scale.camera) is of light %s's image; without a registration in calibration.file the "
+                logger.warning(text + "images of all lights are taken to lie on that one", self.name, of_camera)
+            return
+        first, *others = registration.lights
+        if of_camera not in (None, first):
+            raise CalibrationError(
+                f"{self.name} (scale.camera) is of light {of_camera}'s image, the test measures in px of that of light "
+                f"{first}, the first of calibration.file: calibrate both with the lights in one order"
+            )
+        (scale, std), magnification = self.scale(self.centre), np.abs(registration.parameters[1:, 3])
+        if of_camera is None and others and magnification.max() > std / scale:
+            other, percent = others[int(magnification.argmax())], 100 * magnification.max()
+            logger.warning(
+                f"{self.name} (scale.camera) states no light: if its target was photographed under {other}, lengths in "
+                f"mm are {percent:.2g} % off, because px are those of light {first}'s image (rgbmidic-calibrate camera "
+                "--light)"
+            )
+
     def summary(self) -> str:
         """Return scale in the middle of the frame and tilt, with their standard uncertainties, as text.
 
@@ -326,7 +367,8 @@ class CameraCalibration:
         """
         (scale, scale_std), (tilt, tilt_std) = self.scale(self.centre), self.tilt_deg
         known = f"tilt {uncertain(tilt, tilt_std, 'degrees')}" if np.isfinite(tilt) else "tilt not known without a lens"
-        return f"{uncertain(scale, scale_std, 'mm per px')} in the middle of the frame, {known}"
+        light = f" of light {first}'s image" if (first := self.details.get("first_light")) else ""
+        return f"{uncertain(scale, scale_std, 'mm per px')}{light} in the middle of the frame, {known}"
 
     def jacobian_std(self, points: FloatArray) -> FloatArray:
         """Standard uncertainty (N,) that the calibration leaves in a displacement of one px at points (N, 2), mm.

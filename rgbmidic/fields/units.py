@@ -33,7 +33,13 @@ class Units:
 
     @classmethod
     def from_points(
-        cls, points: Sequence[Sequence[float]], length: float, *, length_std: float = 0.0, point_std: float = 0.5
+        cls,
+        points: Sequence[Sequence[float]] | FloatArray,
+        length: float,
+        *,
+        length_std: float = 0.0,
+        point_std: float = 0.5,
+        factor: FloatArray | None = None,
     ) -> Self:
         """Find the scale from two points on an image and their distance.
 
@@ -47,6 +53,9 @@ class Units:
             Its standard uncertainty in mm.
         point_std
             Standard uncertainty of a point along either axis in px: half a pixel where it is read off by eye.
+        factor : ndarray, shape (2, 2, P), optional
+            Errors of both points per unit of P independent errors that they have in common, px
+            (`rgbmidic.illumination.calibration.TargetLights.on_first_light`).
 
         Returns
         -------
@@ -66,7 +75,9 @@ class Units:
         if not (length_std >= 0 and point_std >= 0):
             raise InputError(f"uncertainties must be at least 0, not {length_std:g} mm and {point_std:g} px")
         scale = length / distance
-        relative = math.hypot(length_std / length, math.sqrt(2) * point_std / distance)
+        along = (ends[1] - ends[0]) / distance
+        common = 0.0 if factor is None else float(np.linalg.norm(along @ (factor[1] - factor[0])))
+        relative = math.hypot(length_std / length, math.sqrt(2) * point_std / distance, common / distance)
         return cls(mm_per_pixel=scale, mm_per_pixel_std=scale * relative)
 
     @property

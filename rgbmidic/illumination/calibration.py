@@ -14,12 +14,15 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import numpy.typing as npt
+
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import shift_cfa
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise, NoiseModel
 from rgbmidic.settings import BAYER_PATTERNS, FrameKind, plain, read_section, read_table, regular, unique_keys
+from rgbmidic.typing import FloatArray
 
 _Section = TypeVar("_Section")
 
@@ -244,7 +247,16 @@ class Calibration:
         dict
         """
         document = self.to_document()
-        kept = {"lights", "matrix", "std", "noise_amplification", "gain", "read_noise", "parameters"}
+        kept = {
+            "lights",
+            "matrix",
+            "std",
+            "green_difference",
+            "noise_amplification",
+            "gain",
+            "read_noise",
+            "parameters",
+        }
         figures: dict[str, Any] = {
             section: {key: value for key, value in document[section].items() if key in kept}
             for section in ("crosstalk", "noise", "registration")
@@ -271,6 +283,78 @@ class Calibration:
             The file cannot be written.
         """
         write_document(path, self.to_document())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetLights:
+    """Lights under which a target of known size was photographed, and the calibration that has their registration.
+
+    Results are in px of the first light's image. A lens magnifies each colour a little differently, so that a scale
+    from an image under another light is one for other pixels.
+
+    Attributes
+    ----------
+    names : tuple of str
+        One light, or several that were on together.
+    calibration : Calibration
+        With a registration.
+    crop_origin : tuple of int, or None
+        Column and row of the calibrated frame at which the photographs begin; None: not cropped.
+    """
+
+    names: tuple[str, ...]
+    calibration: Calibration
+    crop_origin: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        """Check that the calibration has the lights registered."""
+        if self.calibration.registration is None:
+            raise CalibrationError(
+                f"{self.calibration.name} has no registration, which carries the scale from light "
+                f"{' + '.join(self.names)} to the first light: rgbmidic-calibrate registration, or merge"
+            )
+        self.calibration.registration.on_first_light([[0.0, 0.0]], self.names)
+
+    @property
+    def first(self) -> str:
+        """The light in whose pixels results are."""
+        assert self.calibration.registration is not None
+        return self.calibration.registration.lights[0]
+
+    def on_first_light(
+        self, points: npt.ArrayLike, shape: tuple[int, int] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return points (M, 2) of the photograph in px of the first light's image, and the factor of their covariance.
+
+        Parameters
+        ----------
+        points : array_like, shape (M, 2)
+            Points (x, y) in px of the photograph.
+        shape
+            Rows and columns of the photograph, which must fit the calibration; None: not known.
+
+        Returns
+        -------
+        points, factor : ndarray, shapes (M, 2) and (M, 2, 5)
+            See `Registration.on_first_light`.
+
+        Raises
+        ------
+        CalibrationError
+            The photograph does not fit the calibration.
+        """
+        registration, whole = self.calibration.registration, self.calibration.shape
+        if shape is not None:
+            if self.crop_origin is None and whole is not None and shape != whole:
+                raise CalibrationError(
+                    f"{self.calibration.name} was made with frames of {_size(whole)} px, the photograph has "
+                    f"{_size(shape)} px: state --crop-origin, where it begins in the calibrated frame"
+                )
+            registration = self.calibration.cropped(self.crop_origin, shape).registration
+        elif self.crop_origin is not None and registration is not None:
+            registration = registration.cropped(self.crop_origin)
+        assert registration is not None
+        return registration.on_first_light(points, self.names)
 
 
 def _size(shape: tuple[int, int]) -> str:

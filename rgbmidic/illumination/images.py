@@ -130,6 +130,51 @@ class Registration:
         basis = registration_basis(_checked(points), self.centre, self.radius)
         return np.asarray(np.sqrt(np.einsum("mdp,kpq,mdq->kmd", basis, self.covariance, basis)))
 
+    def on_first_light(self, points: npt.ArrayLike, lights: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """Return where the first light's image shows what an image under some of the lights shows at points.
+
+        What each of k lights together contributes is not known. With any contributions equally probable (uniform on
+        the simplex) the mean of their parameters p is taken, and to their covariance ``sum of d d^T / (k (k + 1))`` is
+        added with ``d = p - mean``.
+
+        Parameters
+        ----------
+        points : array_like, shape (M, 2)
+            Points (x, y) in px of the image under `lights`.
+        lights
+            Their names.
+
+        Returns
+        -------
+        points : ndarray, shape (M, 2)
+            In px of the first light's image.
+        factor : ndarray, shape (M, 2, 5)
+            Errors of the points per unit of five independent errors of the registration; zero where its covariance is
+            not known.
+
+        Raises
+        ------
+        CalibrationError
+            The registration has no such light.
+        """
+        if unknown := [name for name in lights if name not in self.lights]:
+            raise CalibrationError(
+                f"the registration is of the lights {', '.join(self.lights)}, not {', '.join(unknown)}"
+            )
+        index = [self.lights.index(name) for name in dict.fromkeys(lights)]
+        parameters = self.parameters[index].mean(axis=0)
+        apart = self.parameters[index] - parameters
+        covariance = apart.T @ apart / (len(index) * (len(index) + 1))
+        if self.covariance is not None:
+            covariance = covariance + self.covariance[index].mean(axis=0)
+        seen = _checked(points)
+        origin = seen
+        for _ in range(10):  # each gains a factor of the magnification, some thousandths
+            basis = registration_basis(origin, self.centre, self.radius)
+            origin = seen - basis @ parameters
+        variances, axes = np.linalg.eigh(covariance)
+        return origin, basis @ (axes * np.sqrt(np.maximum(variances, 0)))
+
 
 def _checked(points: npt.ArrayLike) -> FloatArray:
     place = np.asarray(points, dtype=np.float64)

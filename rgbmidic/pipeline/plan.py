@@ -188,9 +188,11 @@ class Plan:
         camera = None if settings.calibration.file is None else Calibration.read(settings.calibration.file)
         series = open_frames(settings, source, camera)
         frame = series.shape
-        if settings.scale.camera is not None:
-            CameraCalibration.read(settings.scale.camera).check(frame)
         calibration = camera and camera.cropped(settings.frames.crop_origin, frame)
+        if settings.scale.camera is not None:
+            plane = CameraCalibration.read(settings.scale.camera)
+            plane.check(frame)
+            plane.check_light(None if calibration is None else calibration.registration)
         separate = separation or Separation(calibration=calibration, demosaic=settings.illumination.demosaic)
         given = any(one is not None for one in (source, weights, mesh, region))
         finite_elements, placement = None, None

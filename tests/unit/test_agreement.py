@@ -167,6 +167,16 @@ def _camera_of_another_size(folder: Path, out: Path) -> tuple[list[str], Sequenc
     return _changed(test, '[scale]\ncamera = "camera.json"\n', out), [r"scale\.camera", "120 x 100 px", "144 x 144 px"]
 
 
+def _camera_of_another_light(folder: Path, out: Path) -> tuple[list[str], Sequence[str]]:
+    test = _colour(folder)
+    file = test.folder / "calibration.json"
+    replace(Calibration.read(file), registration=Registration.identity(LIGHTS, SHAPE)).write(file)
+    camera = CameraCalibration(shape=SHAPE, homography=np.diag([0.1, 0.1, 1]), details={"first_light": "green"})
+    camera.write(test.folder / "camera.json")
+    words = [r"scale\.camera", "light green", "light red, the first of calibration.file"]
+    return _changed(test, '[scale]\ncamera = "camera.json"\n', out), words
+
+
 def _two_scales(folder: Path, out: Path) -> tuple[list[str], Sequence[str]]:
     scale = '[scale]\ncamera = "camera.json"\nmm_per_pixel = 0.1\n'
     return _changed(_colour(folder), scale, out), [r"scale\.camera", r"scale\.mm_per_pixel"]
@@ -200,6 +210,7 @@ CASES: Mapping[tuple[str, str, str], Case] = {
     ("size of the mask", "the file", "`region.mask`"): _mask_of_another_size,
     ("size of the scene", "the file", "SCENE.toml"): _scene_of_another_size,
     ("size of lens and plane", "the file", "`scale.camera`"): _camera_of_another_size,
+    ("first light", "the calibration", "`scale.camera`"): _camera_of_another_light,
     ("scale", "`scale.mm_per_pixel`", "`scale.camera`"): _two_scales,
     ("the mesh", "`mesh.file`", "`mesh.element_size`"): _two_meshes,
     ("the test", "the result", "`run --resume`"): _another_test_than_the_result,
@@ -209,7 +220,7 @@ CASES: Mapping[tuple[str, str, str], Case] = {
 def test_every_pair_of_the_table_is_walked_through() -> None:
     pairs = {(row, *pair) for row, sayers in ROWS.items() for pair in combinations(sayers, 2)}
     assert pairs == set(CASES)
-    assert len(ROWS) == 15
+    assert len(ROWS) == 16
 
 
 @pytest.mark.parametrize("pair", CASES, ids=lambda pair: "-".join(pair).replace("`", ""))

@@ -13,7 +13,7 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames import open_series, open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.crosstalk import align
+from rgbmidic.illumination.crosstalk import Crosstalk, align
 from rgbmidic.illumination.demosaicing import SMALLEST_FRAME
 from rgbmidic.illumination.frame_check import Frame, check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
@@ -187,9 +187,7 @@ def inspect_frame(
     first, greens = linear[0], 0.0
     single = not isinstance(first, LinearMosaic) and len(first.values) == 1
     if isinstance(first, LinearMosaic):
-        green = sampled_channels(first.cfa, first.values.shape) == 1
-        means = [float(first.values[row::2][green[row::2]].mean()) for row in (0, 1)]
-        greens = abs(means[0] - means[1]) / max(sum(means) / 2, 1e-6)
+        greens = _unexpected_green_difference(first, state, known.crosstalk)
     return Inspection(
         name=name,
         kind="bayer" if isinstance(first, LinearMosaic) else "monochrome" if single else "rgb",
@@ -213,6 +211,19 @@ def inspect_frame(
         prediction=prediction,
         greens=greens,
     )
+
+
+def _unexpected_green_difference(
+    mosaic: LinearMosaic, lights: IlluminationImages, crosstalk: Crosstalk | None
+) -> float:
+    """Difference of the means of the greens beyond the calibrated one, over their mean."""
+    channel = sampled_channels(mosaic.cfa, mosaic.values.shape)
+    with_red = int((channel[1] == 0).any())  # row
+    red, blue = (float(mosaic.values[row::2][channel[row::2] == 1].mean()) for row in (with_red, 1 - with_red))
+    expected = 0.0
+    if crosstalk is not None and crosstalk.green_difference is not None:
+        expected = float(crosstalk.green_difference @ np.nanmean(lights.values, axis=(1, 2)))
+    return abs(red - blue - expected) / max((red + blue) / 2, 1e-6)
 
 
 def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) -> FrameSettings:

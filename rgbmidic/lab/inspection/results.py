@@ -143,7 +143,8 @@ class Inspection:
     prediction : Prediction
         Standard uncertainty to expect at its nodes, px.
     greens : float
-        Difference of the means of the two greens of a mosaic over their mean; 0 for other cameras.
+        Difference of the means of the two greens of a mosaic beyond the calibrated one, over their mean; 0 for other
+        cameras.
     """
 
     name: str
@@ -188,7 +189,7 @@ class Inspection:
 def _of_set_up(inspection: Inspection) -> Iterator[Check]:
     for found in inspection.contradictions:
         yield Check(f"not calibrated: {found.name}", found.text)
-    differ = f"the two greens of the pattern differ by {inspection.greens:.0%}: check cfa, they are one colour"
+    differ = f"the two greens of the pattern differ by {inspection.greens:.0%} more than calibrated: check cfa"
     yield Check("pattern", differ, inspection.greens, CONSTANTS.greens)
     if not inspection.crosstalk_known:
         why = "the camera's channels stand for the lights, and a reflection of one light shows in the others too"

@@ -19,6 +19,8 @@ from rgbmidic import command
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.fields.plane import CameraCalibration, distorted, undistorted
 from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.illumination.calibration import Calibration, TargetLights
+from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic.settings import FrameSettings
 from rgbmidic.text import uncertain
 from rgbmidic_calibration.camera import estimate_lens, estimate_plane
@@ -178,13 +180,68 @@ def test_axes_of_the_plane_are_those_of_the_image() -> None:
 
 def test_four_corners_of_the_specimen_make_a_plane() -> None:
     corners = "100,80:540,90:530,400:110,390"
-    found = calibrate_camera(FrameSettings(path=("x",), shape=SHAPE), None, corners=(corners, "44x31mm", 0.5))
+    found = calibrate_camera(FrameSettings(path=("x",), shape=SHAPE), None, plane=(corners, "44x31mm", 0.5))
     places = found.camera.to_mm(np.array([[100.0, 80], [540, 90], [530, 400], [110, 390]]))
     sides = np.linalg.norm(np.roll(places, -1, axis=0) - places, axis=1)
     assert sides == pytest.approx([44, 31, 44, 31], abs=1e-6)
     scale, std = found.camera.scale(found.camera.centre)
     assert scale == pytest.approx(0.1, rel=0.03)
     assert 1e-4 < std / scale < 5e-3
+
+
+def test_a_plane_under_another_light_is_that_of_the_first_light_s_image() -> None:
+    """The scale is that of red's image, the registration's error part of its uncertainty."""
+    random, lights = np.random.default_rng(9), ("red", "green")
+    parameters = np.array([[0.0] * 5, [2.0, -1.0, 5e-4, -0.006, 5e-4]])
+    covariance = np.zeros((2, 5, 5))
+    covariance[1, 3, 3] = 2e-4**2
+    centre, radius = frame_geometry(SHAPE)
+    registration = Registration(
+        lights=lights, parameters=parameters, centre=centre, radius=radius, covariance=covariance
+    )
+    green = TargetLights(names=("green",), calibration=Calibration(registration=registration, shape=SHAPE))
+    red_view = view_of(pose(2, 1), random)
+    seen = replace(red_view, pixels=red_view.pixels + registration.displacement(red_view.pixels, 1))
+    pixels, factor = green.on_first_light(seen.pixels, SHAPE)
+    assert pixels == pytest.approx(red_view.pixels, abs=1e-9)
+    lens = CameraCalibration(shape=SHAPE, lens=LENS)
+    true = estimate_plane(red_view, lens).camera
+    found = estimate_plane(replace(seen, pixels=pixels, factor=factor), lens).camera
+    scale, std = true.scale(true.centre)
+    assert found.scale(found.centre)[0] == pytest.approx(scale, rel=1e-7)
+    assert found.scale(found.centre)[1] == pytest.approx(np.hypot(std, 2e-4 * scale), rel=0.02)
+    assert estimate_plane(seen, lens).camera.scale(true.centre)[0] / scale == pytest.approx(1.006, abs=3e-4)
+
+
+def test_the_command_carries_the_scale_between_the_lights(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    centre, radius = frame_geometry((480, 640))
+    parameters = np.array([[0.0] * 5, [0, 0, 0, -0.006, 0]])
+    registration = Registration(
+        lights=("red", "green"), parameters=parameters, centre=centre, radius=radius, covariance=np.zeros((2, 5, 5))
+    )
+    Calibration(registration=registration, shape=(480, 640)).write(tmp_path / "calibration.json")
+    options = ["camera", "--shape", "480x640", "--corners", "100,80:540,80:540,400:100,400", "--size", "44x32mm"]
+    cameras = []
+    for light in ("red", "green", None):
+        out = tmp_path / f"{light}.json"
+        stated = ["--light", light, "--calibration", str(tmp_path / "calibration.json")] if light else []
+        assert command.execute(app, [*options, *stated, "--out", str(out)]) == 0
+        cameras.append(CameraCalibration.read(out))
+    red, green, unknown = (camera.scale(camera.centre)[0] for camera in cameras)
+    assert (red, green) == pytest.approx((0.1, 0.0994), rel=1e-6)
+    assert unknown == red
+    assert "of light red's image" in cameras[1].summary()
+    cameras[1].check_light(registration)
+    cameras[2].check_light(None)
+    assert not caplog.messages
+    cameras[2].check_light(registration)
+    assert "lengths in mm are 0.6 % off" in caplog.messages[-1]
+    cameras[1].check_light(None)
+    assert "without a registration" in caplog.messages[-1]
+    with pytest.raises(CalibrationError, match="of light red's image, the test measures in px of that of light blue"):
+        cameras[1].check_light(replace(registration, lights=("blue", "green")))
+    again = [*options, "--lens", str(tmp_path / "green.json"), "--out", str(tmp_path / "again.json")]
+    assert command.execute(app, again) == 2
 
 
 @pytest.mark.parametrize(
@@ -198,7 +255,7 @@ def test_four_corners_of_the_specimen_make_a_plane() -> None:
 )
 def test_corners_that_are_no_rectangle_are_refused(corners: str, size: str) -> None:
     with pytest.raises(ConfigurationError, match="--corners"):
-        calibrate_camera(FrameSettings(path=("x",), shape=SHAPE), None, corners=(corners, size, 0.5))
+        calibrate_camera(FrameSettings(path=("x",), shape=SHAPE), None, plane=(corners, size, 0.5))
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ def held_back():
 
 def test_true_matrix_leaves_nothing(held_back):
     found = leakage(Crosstalk(matrix=MATRIX, lights=LIGHTS), *held_back)
-    assert len(found) == 6
+    assert len(found) == 9  # six of one light in another, three checkerboards
     assert all(abs(check.value) < min(0.3, 5 * check.std) for check in found)
     assert all(check.passed for check in found)
 
@@ -43,6 +43,18 @@ def test_wrong_entry_shows_as_leakage(held_back):
     expected = -np.linalg.solve(wrong, [0, 0.01, 0])
     assert [check.value for check in found[:2]] == pytest.approx(100 * expected[1:], abs=0.1)
     assert [check.name for check in found if not check.passed] == ["red left in green"]
+
+
+def test_greens_taken_as_equal_show_as_a_checkerboard():
+    truth = Crosstalk(matrix=MATRIX, lights=LIGHTS, green_difference=[0.02, 0.0, 0.0])
+    lights, dark = captures(truth.sites, np.random.default_rng(22), target=speckle_target, shape=SHAPE, count=2)
+    reduced = {n: [block_means(f) for f in frames] for n, frames in lights.items()}, [block_means(f) for f in dark]
+    assert all(check.passed for check in leakage(truth, *reduced))
+    found = leakage(Crosstalk(matrix=MATRIX, lights=LIGHTS), *reduced)
+    (failed,) = [check for check in found if not check.passed]
+    assert failed.name == "checkerboard of red"
+    expected = 100 * 0.01 * np.abs(truth.unmixing[:, 1]).max()
+    assert failed.value == pytest.approx(expected, abs=4 * failed.std)
 
 
 def test_swapped_and_unknown_lights(held_back):

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import re
+
 import numpy as np
 import pytest
 from calibration_scene import BLACK, MATRICES, WHITE, captures, expose, speckle_target, white_target
 
 from rgbmidic.errors import CalibrationError
+from rgbmidic.frames import read_frame
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.settings import BAYER_PATTERNS
 from rgbmidic_calibration.captures import block_means
 from rgbmidic_calibration.crosstalk import estimate_crosstalk
@@ -60,6 +65,46 @@ def test_matrix_is_found_on_white_and_speckled_targets(cfa, target):
     assert (found.crosstalk.matrix.max(axis=0) == 1).all()
 
 
+@pytest.mark.parametrize("cfa", BAYER_PATTERNS)
+def test_difference_of_the_greens_is_found_within_its_uncertainty(cfa):
+    truth = Crosstalk(matrix=MATRIX, lights=("red", "green", "blue"), green_difference=[0.03, 0.0, -0.02])
+    lights, dark = captures(truth.sites, np.random.default_rng(8), target=speckle_target, cfa=cfa, shape=(160, 192))
+    found = estimate(lights, dark).crosstalk
+    error = np.abs(found.green_difference - truth.green_difference)
+    assert (error < 4 * found.green_difference_std).all()  # of twelve normal numbers none in a thousand runs
+    assert (found.green_difference_std < 0.0022).all()  # .0015, of the texture
+    assert np.abs(found.sites - truth.sites).max() < 0.002
+
+
+def test_difference_of_the_greens_that_varies_over_the_field_is_reported():
+    rng = np.random.default_rng(6)
+    picture = 2000 * speckle_target((160, 192), rng)
+    slope = 0.05 * np.linspace(-1, 1, 192) * np.array([0, 1, -1, 0])[:, None, None]
+    sites = (np.insert(MATRIX[:, 0], 1, MATRIX[1, 0])[:, None, None] + slope) * picture
+    lights = {"red": [expose(sites, np.ones(4), rng) for _ in range(2)]}
+    found = estimate(lights, [expose(0 * picture, np.ones(3), rng) for _ in range(2)])
+    (said,) = [text for text in found.warnings if "greens" in text]
+    rms = 100 * 0.05 / np.sqrt(3) * np.abs(found.crosstalk.unmixing[:, 1]).max()  # half of their difference
+    assert float(re.search(r"of ([\d.]+) %", said)[1]) == pytest.approx(rms, rel=0.1)
+    assert found.crosstalk.field is None
+
+
+def test_real_sensor_has_two_greens(real_data):
+    """Of its four sites: the greens in rows with blue, which come first in GBRG, see more red and less blue."""
+    folder = real_data("real_disks_three_bands")
+    files = {"red": "650nm_250ms", "green": "550nm_25ms", "blue": "450nm_50ms"}
+    lights = {name: [read_frame(folder / f"disks_{file}.tif", cfa="GBRG")] for name, file in files.items()}
+    found = estimate(lights, [read_frame(folder / f"dark_250ms_{index}.tif", cfa="GBRG") for index in (0, 1)])
+    first, second = found.crosstalk.sites[[2, 1]]
+    ratio = first / second
+    std = found.crosstalk.green_difference_std / second
+    for light, name in enumerate(files):
+        planes = lights[name][0].values.astype(float)
+        exact = planes[0::2, 0::2].mean() / planes[1::2, 1::2].mean()
+        assert ratio[light] == pytest.approx(exact, abs=0.003 + 3 * std[light])
+    assert ratio == pytest.approx([1.157, 1.001, 0.949], abs=0.003)
+
+
 def test_matrix_of_a_three_chip_camera():
     rng = np.random.default_rng(5)
     picture = 2000 * speckle_target((128, 128), rng)
@@ -67,6 +112,7 @@ def test_matrix_of_a_three_chip_camera():
     dark = [expose(0 * picture, MATRIX[:, 0], rng, kind="rgb") for _ in range(2)]
     found = estimate(lights, dark).crosstalk
     assert np.abs(found.matrix - MATRIX).max() < 5 * found.std.max() < 0.002
+    assert found.green_difference is None
 
 
 def test_two_lights_and_other_names():
@@ -247,6 +293,27 @@ def test_file_keeps_matrix_and_covariance(scene, tmp_path):
     assert (again.matrix == found.matrix).all()
     assert (again.covariance == found.covariance).all()
     assert again.std == pytest.approx(found.std)
+    assert (again.sites == found.sites).all()
+    assert (again.green_difference_std == found.green_difference_std).all()
+
+
+def test_file_of_three_rows_is_one_of_equal_greens(tmp_path):
+    Calibration(crosstalk=Crosstalk(matrix=MATRIX, lights=("r", "g", "b"))).write(tmp_path / "c.json")
+    document = json.loads((tmp_path / "c.json").read_text())
+    for key in ("green_difference", "green_difference_std"):
+        document["crosstalk"].pop(key, None)
+    (tmp_path / "c.json").write_text(json.dumps(document))
+    read = Calibration.read(tmp_path / "c.json")
+    assert (read.crosstalk.sites == MATRIX[[0, 1, 1, 2]]).all()
+    for wrong, reason in (
+        ({"green_difference": [0.1, 0.2]}, "one finite number per light"),
+        ({"green_difference_std": [0.1, 0.2, 0.1]}, "belongs to a green_difference"),
+        ({"green_difference": [0.1, 0.2, 0], "green_difference_std": [-1, 0, 0]}, "not negative"),
+    ):
+        changed = {**document, "crosstalk": {**document["crosstalk"], **wrong}}
+        (tmp_path / "c.json").write_text(json.dumps(changed))
+        with pytest.raises(CalibrationError, match=f"c.json is damaged: .*{reason}"):
+            Calibration.read(tmp_path / "c.json")
 
 
 def varying_capture(picture, rng):

@@ -7,6 +7,7 @@ import pytest
 from calibration_scene import BLACK, MATRICES, WHITE, expose, registered_pictures, wave_texture, white_target
 
 from rgbmidic.errors import CalibrationError, InputError
+from rgbmidic.frames import read_frame
 from rgbmidic.frames.data import Mosaic
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.images import Registration, frame_geometry, registration_basis
@@ -108,6 +109,35 @@ def test_region_restricts_the_comparison(pictures):
     match = estimate_registration(lights, dark, region=(40, 50, 200, 180)).matches[0]
     assert match.nodes.min(axis=0) == pytest.approx([40, 50], abs=1)
     assert match.nodes.max(axis=0) == pytest.approx([200, 180], abs=1)
+
+
+def test_printed_dots_take_larger_elements_and_are_not_a_period_off():
+    shape, period, truth = (300, 340), 68.0, np.array([[0] * 5, [-1.6, -1.4, 0, 0, 0]])
+    y, x = np.indices(shape, dtype=float)
+    pictures = []
+    for dx, dy in truth[:, :2]:
+        away = np.hypot((x - dx + 20) % period - period / 2, (y - dy + 15) % period - period / 2)
+        pictures.append(0.1 + 0.7 / (1 + np.exp(15 - away)))
+    lights, dark = stacks(pictures, np.random.default_rng(8), count=1)
+    found = estimate_registration(lights, dark)
+    assert found.element_size > 25
+    error = np.abs(found.registration.parameters[1, :2] - truth[1, :2])
+    assert (error < 0.03).all(), error
+    with pytest.raises(CalibrationError, match=r"match in \d+ % of the field only"):
+        estimate_registration(lights, dark, element_size=25)
+
+
+def test_real_print_of_dots_is_registered(real_data):
+    folder = real_data("real_disks_three_bands")
+    files = {"red": "650nm_250ms", "green": "550nm_25ms", "blue": "450nm_50ms"}
+    lights = {
+        name: stack_frames([read_frame(folder / f"disks_{file}.tif", cfa="GBRG")]) for name, file in files.items()
+    }
+    darks = [read_frame(folder / f"dark_25ms_{index}.tif", cfa="GBRG") for index in (0, 1)]
+    found = estimate_registration(lights, stack_frames(darks, drifts=False))
+    assert found.element_size == 40
+    # with elements of 80 px -1.60 -1.38 and -2.72 -1.80, SOURCE.txt says -1.6 -1.2 and -2.8 -1.8
+    assert found.registration.parameters[1:, :2] == pytest.approx(np.array([[-1.6, -1.3], [-2.8, -1.8]]), abs=0.12)
 
 
 def test_mistakes_are_errors(pictures):

@@ -354,6 +354,21 @@ def test_without_calibration_the_channels_stand_for_the_lights():
     np.testing.assert_allclose([light.mean * FULL_SCALE for light in seen.lights], level, rtol=0.01)
 
 
+def test_greens_that_differ_as_calibrated_are_no_wrong_pattern():
+    """A strong red lamp leaks into the greens in rows with red more than into those in rows with blue."""
+    lights = mat_lights().copy() * np.array([1.6, 0.25, 0.25], dtype=np.float32)[:, None, None]
+    frame, half = raw(lights), np.rint(0.015 * lights[0]).astype(int)
+    values = frame.values.astype(int)
+    values[0::2, 1::2] += half[0::2, 1::2]  # RGGB
+    values[1::2, 0::2] -= half[1::2, 0::2]
+    frame = replace(frame, values=values.astype(np.uint16))
+    assert "pattern" in codes(inspect_frame(frame, calibration=CALIBRATION))
+    four = replace(CROSSTALK, green_difference=np.array([0.03, 0, 0]))
+    seen = inspect_frame(frame, calibration=replace(CALIBRATION, crosstalk=four))
+    assert seen.greens < 0.005
+    assert "pattern" not in codes(seen)
+
+
 def test_a_wrong_pattern_is_told():
     lights = mat_lights().copy() * np.array([1.0, 0.6, 0.4], dtype=np.float32)[:, None, None]
     wrong = replace(raw(lights), cfa="GRBG")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,9 @@ from rgbmidic.command import execute
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.fields import History, Units
 from rgbmidic.fields.history import rate_words
+from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.report import history_figure
 from rgbmidic.results import (
@@ -425,11 +429,51 @@ def test_the_command_scale_gives_lines_for_the_settings(capsys: pytest.CaptureFi
     arguments = ["scale", "10,10:410,310", "--length", "25", "--length-std", "0.05"]
     assert execute(cli.app, arguments) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines == ["[scale]", "mm_per_pixel = 0.05", "mm_per_pixel_std = 0.00012"]
+    assert lines[0].startswith("# mm per px of the image that the points are of")
+    assert lines[1:] == ["[scale]", "mm_per_pixel = 0.05", "mm_per_pixel_std = 0.00012"]
     assert execute(cli.app, ["scale", "10,10:10,10", "--length", "25"]) == 2
     assert "two different points" in capsys.readouterr().err
     assert execute(cli.app, ["scale", "10,10:10,20", "--length", "0"]) == 2
     assert "must be above 0 mm, not 0" in capsys.readouterr().err
+
+
+def test_a_scale_from_another_light_s_image_is_carried_to_the_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lights = ("red", "green", "blue")
+    covariance = np.zeros((3, 5, 5))
+    covariance[1, 3, 3] = 1e-4**2
+    parameters = np.array([[0] * 5, [0.5, -1, 0, -0.006, 0], [1, 0, 0, 0.003, 0]])
+    registration = Registration(
+        lights=lights, parameters=parameters, centre=(210, 160), radius=250, covariance=covariance
+    )
+    calibration = Calibration(registration=registration, crosstalk=Crosstalk.identity(lights))
+    calibration.write(file := tmp_path / "calibration.json")
+    replace(calibration, registration=None).write(without := tmp_path / "crosstalk.json")
+    points = ["scale", "10,10:410,310", "--length", "25", "--point-std", "0"]
+
+    def scale(*options: object) -> tuple[float, float]:
+        assert execute(cli.app, [*points, *map(str, options)]) == 0
+        read = tomllib.loads(capsys.readouterr().out)["scale"]
+        return read["mm_per_pixel"], read["mm_per_pixel_std"]
+
+    # green's image is .6 % smaller: the same length spans more of red's pixels
+    assert scale("--light", "green", "--calibration", file) == pytest.approx((0.05 * 0.994, 0.05 * 1e-4), rel=0.01)
+    assert scale("--light", "green", "--calibration", file)[0] == pytest.approx(0.05 * 0.994, rel=1e-5)
+    assert scale("--light", "red", "--calibration", file) == pytest.approx((0.05, 0), abs=1e-9)
+    both, std = scale("--light", "green", "--light", "blue", "--calibration", file)
+    assert both == pytest.approx(0.05 * 0.9985, rel=1e-5)
+    assert std == pytest.approx(0.05 * 0.009 / np.sqrt(12), rel=0.02)  # any between them
+    for wrong, reason in (
+        (["--light", "green"], "--light needs --calibration"),
+        (["--calibration", file], "only with --light"),
+        (["--light", "violet", "--calibration", file], "lights red, green, blue, not violet"),
+        (["--light", "green", "--calibration", without], "no registration"),
+        (["--light", "green", "--calibration", file, "--crop-origin", "1.5,2"], "whole numbers"),
+    ):
+        assert execute(cli.app, [*points, *map(str, wrong)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert reason in line
 
 
 CRACKED = Tri3Mesh.from_region(Region.from_rectangle((5, 5, 194, 194), (200, 200)), 10, [[(0, 100), (100, 100)]])
