@@ -10,7 +10,7 @@ import numpy as np
 from rgbmidic._kernels.texture import between
 from rgbmidic._kernels.threads import FAST, compiled, helper
 
-TILE = 16
+TILE = 32
 """Side in px of the squares within which the filters are the same."""
 _SIZE, _WIDE = 5, 7
 """Sides of the square of samples: the usual one, whose taps are added in one go, and the wide one."""
@@ -151,7 +151,22 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
 
 @compiled("out", least=0, fastmath=FAST)
 def prediction_taps(
-    start, stop, seen, spread, specific, coloured, alike, displacement, noise, texture, step, fine, offset, sites, out
+    start,
+    stop,
+    seen,
+    spread,
+    specific,
+    coloured,
+    alike,
+    displacement,
+    noise,
+    held,
+    texture,
+    step,
+    fine,
+    offset,
+    sites,
+    out,
 ):
     """Filters of the best linear prediction (simple kriging) from a square of samples, for T entries of a table.
 
@@ -178,6 +193,8 @@ def prediction_taps(
         d in x and y, px.
     noise : (T, 3) float64
         Variance of a sample of each channel.
+    held
+        Variance that the sample in the middle has besides: a large one leaves it out.
     texture : (n,) float64
         C at the squared distances 0, `step`, 2 `step` ... px².
     step
@@ -239,7 +256,7 @@ def prediction_taps(
                     for n in range(size):
                         e = sites[phase, other, n]
                         matrix[m, other * size + n] = covariance[c, e, row + reach - other, column + reach - n]
-                matrix[m, m] += noise[entry, (c + 1) // 2]
+                matrix[m, m] += noise[entry, (c + 1) // 2] + (held if m == count // two else 0.0)
                 i, j = row + reach - half, column + reach - half
                 wanted[0, m] = covariance[c, 0, i, j]
                 wanted[1, m] = (covariance[c, 1, i, j] + covariance[c, 2, i, j]) / 2

@@ -10,9 +10,7 @@ from rgbmidic._kernels.threads import compiled, helper
 
 REACH = 3
 """Rows and columns beyond a cell that its binomial sums reach."""
-PLANE_PAIRS = tuple((p, q) for p in range(4) for q in range(p, 4))
-"""Pairs of the planes of a mosaic; plane 2 a + b has the samples of row a and column b of the 2x2 cells."""
-CELLS_OF_BLOCK = 4
+CELLS = 4
 """Side of a block of 8 px, cells."""
 
 
@@ -108,16 +106,17 @@ def _down(above, here, below, first, last, planes, number):
 
 
 @compiled("low", axis=1, fastmath={"contract"})
-def low_passed_planes(start, stop, contrast, low):
-    """Low-pass the four planes of a mosaic at the middle of each 2x2 cell, `low` (4, H // 2, W // 2) float32.
+def low_passed_planes(start, stop, contrast, order, low):
+    """Low-pass the four planes of a mosaic at the middle of each 2x2 cell.
 
     There the binomial [1 5 10 10 5 1] along both axes takes from each plane its own share, with the same weight, 16²,
-    and the same centroid. A cell with a sample that is not finite in reach is NaN.
+    and the same centroid. `low` (4, H // 2, W // 2) float32 receives the planes ``2 a + b`` of row a and column b of
+    the cells in their `order` (4,); a cell with a sample that is not finite in reach is NaN.
     """
     rows, columns = contrast.shape
     one, five, ten, nan = np.float32(1), np.float32(5), np.float32(10), np.float32(np.nan)
     planes = np.empty((4, columns // 2), np.float32)
-    number = np.uint64(max(columns // 2 - 2, 0))
+    first, second, third, fourth = order
     for ci in range(start, stop):
         low[:, ci] = nan
         i = 2 * ci
@@ -125,15 +124,51 @@ def low_passed_planes(start, stop, contrast, low):
             continue
         _down(contrast[i - 2], contrast[i], contrast[i + 2], one, five, planes[:2], columns // 2)
         _down(contrast[i - 1], contrast[i + 1], contrast[i + 3], five, one, planes[2:], columns // 2)
-        for c in range(number):
+        for c in range(np.uint64(max(columns // 2 - 2, 0))):
             d, e = c + np.uint64(1), c + np.uint64(2)
             p0 = planes[0, c] + ten * planes[0, d] + five * planes[0, e]
             p1 = five * planes[1, c] + ten * planes[1, d] + planes[1, e]
             p2 = planes[2, c] + ten * planes[2, d] + five * planes[2, e]
             p3 = five * planes[3, c] + ten * planes[3, d] + planes[3, e]
             known = np.isfinite(p0 + p1 + p2 + p3)
-            low[0, ci, d], low[1, ci, d] = p0 if known else nan, p1 if known else nan
-            low[2, ci, d], low[3, ci, d] = p2 if known else nan, p3 if known else nan
+            low[first, ci, d], low[second, ci, d] = p0 if known else nan, p1 if known else nan
+            low[third, ci, d], low[fourth, ci, d] = p2 if known else nan, p3 if known else nan
+
+
+@compiled("sums", axis=1, fastmath={"contract"})
+def plane_products(start, stop, planes, half, sums):
+    """Sum the products of any two of n planes over blocks of `half` cells.
+
+    `planes` (n, H, W) float32; `sums` (n (n + 1) / 2 + 1, h, w) float32 receives the products of planes 00, 01 ... 11,
+    12 ..., then the number of cells. A cell at which a plane is not finite is left out.
+    """
+    count, height, width = planes.shape
+    total = np.empty((len(sums), width), np.float32)
+    value = np.empty((count, width), np.float32)
+    for bi in range(start, stop):
+        total[:] = 0
+        for i in range(bi * half, min((bi + 1) * half, height)):
+            for j in range(width):
+                known = np.float32(0)
+                for n in range(count):
+                    known += planes[n, i, j]
+                finite = np.isfinite(known)
+                total[-1, j] += np.float32(1) if finite else np.float32(0)
+                for n in range(count):
+                    value[n, j] = planes[n, i, j] if finite else np.float32(0)
+            moment = 0
+            for a in range(count):
+                for b in range(a, count):
+                    line, first, second = total[moment], value[a], value[b]
+                    for j in range(width):
+                        line[j] += first[j] * second[j]
+                    moment += 1
+        for moment in range(len(sums)):
+            for b in range(sums.shape[2]):
+                value_sum = np.float32(0)
+                for j in range(b * half, min((b + 1) * half, width)):
+                    value_sum += total[moment, j]
+                sums[moment, bi, b] = value_sum
 
 
 @helper()
@@ -148,62 +183,84 @@ def lanczos_weights(fraction, weights):
         weights[k] /= total
 
 
-@compiled("out", axis=1, grain=CELLS_OF_BLOCK, fastmath={"contract"})
-def register_planes(start, stop, planes, apart, out):
-    """Bring low-passed planes (k, H, W) of lights to one place, by interpolation (Lanczos 4).
+@compiled("out", axis=1, grain=CELLS, fastmath={"contract"})
+def register_planes(start, stop, planes, displacement, out):
+    """Read low-passed planes (k, H, W) where each shows the texture, by interpolation (Lanczos 4).
 
-    `apart` (k, 2, h, w) float64: x and y, in cells, by which a light shows the texture farther on, in each block of
-    4 x 4 cells. `out`, like `planes`, is NaN where a sample is not finite or outside.
+    `displacement` (k, 2, h, w) float64: x and y, in cells, by which a plane shows it farther on, in each block of 4 x 4
+    cells. `out`, like `planes`, is NaN where a sample is not finite or outside.
     """
     height, width = planes.shape[1:]
-    half = CELLS_OF_BLOCK
-    lines, wx, wy = np.empty((half + 7, half), np.float32), np.empty(8, np.float32), np.empty(8, np.float32)
-    for bi in range(start // half, -(-stop // half)):
+    lines = np.empty((CELLS + 7, width), np.float32)
+    wx, wy, tall = np.empty((8, width), np.float32), np.empty((8, width), np.float32), np.empty(8, np.float32)
+    out[:, start:stop] = np.nan
+    for bi in range(start // CELLS, -(-stop // CELLS)):
         for light in range(len(planes)):
-            for bj in range(apart.shape[3]):
-                x, y = apart[light, 0, bi, bj], apart[light, 1, bi, bj]
-                left, top = int(np.floor(x)), int(np.floor(y))
-                lanczos_weights(x - left, wx)
-                lanczos_weights(y - top, wy)
-                i0, j0 = bi * half + top - 3, bj * half + left - 3
-                for i in range(half + 7):
-                    for j in range(half):
-                        value = np.float32(np.nan)
-                        if 0 <= i0 + i < height and 0 <= j0 + j and j0 + j + 7 < width:
+            for bj in range(-(-width // CELLS)):
+                for axis in range(2):
+                    at = displacement[light, axis, bi, bj]
+                    lanczos_weights(at - np.floor(at), tall)
+                    for j in range(bj * CELLS, min((bj + 1) * CELLS, width)):
+                        for k in range(8):
+                            (wx if axis == 0 else wy)[k, j] = tall[k]
+            first = 0
+            while first < width:  # a run of blocks whose places lie between the same samples
+                left, top = np.floor(displacement[light, :, bi, first // CELLS])
+                last = first
+                while last < width:
+                    x, y = displacement[light, :, bi, last // CELLS]
+                    if np.floor(x) != left or np.floor(y) != top:
+                        break
+                    last += CELLS
+                i0, j0 = bi * CELLS + int(top) - 3, int(left) - 3
+                begin, end = max(first, -j0), min(min(last, width), width - j0 - 7)
+                if i0 >= 0 and i0 + CELLS + 7 <= height:
+                    for i in range(CELLS + 7):
+                        source, line = planes[light, i0 + i], lines[i]
+                        for j in range(begin, end):
                             value = np.float32(0)
                             for k in range(8):
-                                value += wx[k] * planes[light, i0 + i, j0 + j + k]
-                        lines[i, j] = value
-                for i in range(min(half, height - bi * half)):
-                    for j in range(min(half, width - bj * half)):
-                        value = np.float32(0)
-                        for k in range(8):
-                            value += wy[k] * lines[i + k, j]
-                        out[light, bi * half + i, bj * half + j] = value
+                                value += wx[k, j] * source[j0 + j + k]
+                            line[j] = value
+                    for i in range(CELLS):
+                        target = out[light, bi * CELLS + i]
+                        for j in range(begin, end):
+                            value = np.float32(0)
+                            for k in range(8):
+                                value += wy[k, j] * lines[i + k, j]
+                            target[j] = value
+                first = last
 
 
 @compiled("sums", axis=2, fastmath={"contract"})
-def displacement_scores(start, stop, planes, half, sums):
+def displacement_scores(start, stop, planes, slope, half, sums):
     """Sum ``-r gx``, ``-r gy`` and ``(gx gx + gy gy) / 2`` of each light over blocks of `half` cells.
 
-    `planes` (k, H, W) float32: low-passed planes of the lights over their slopes; r is a light's minus the mean of the
-    others, g the central difference of that mean in a cell. `sums` (k, 3, h, w) float32; what is not finite is left out.
+    `planes` (k, H, W) float32: low-passed planes of the lights, `slope` (k, h, W) float32 their slopes: rows of a grid
+    of blocks, widened to the cells. r is a light's plane over its slope minus the mean of the others, g the central
+    difference of that mean in a cell. `sums` (k, 3, h, w) float32; what is not finite is left out.
     """
     count, height, width = planes.shape
-    scale = np.float32(1 / (count - 1))
-    mean = np.empty((3, width), np.float32)
+    fraction = np.float32(1 / (count - 1))
+    texture, mean = np.empty((count, 3, width), np.float32), np.empty((3, width), np.float32)
     for bi in range(start, stop):
         sums[:, :, bi] = 0
         for i in range(max(bi * half, 1), min((bi + 1) * half, height - 1)):
+            for n in range(3):
+                low, high, part = between(i - 1 + n, half, slope.shape[1])
+                for light in range(count):
+                    above, below, line = slope[light, low], slope[light, high], planes[light, i - 1 + n]
+                    for j in range(width):
+                        texture[light, n, j] = line[j] / (above[j] + part * (below[j] - above[j]))
             for light in range(count):
                 mean[:] = 0
                 for other in range(count):
                     if other != light:
                         for n in range(3):
                             for j in range(width):
-                                mean[n, j] += scale * planes[other, i - 1 + n, j]
+                                mean[n, j] += fraction * texture[other, n, j]
                 for j in range(1, width - 1):
-                    r = planes[light, i, j] - mean[1, j]
+                    r = texture[light, 1, j] - mean[1, j]
                     gx = np.float32(0.5) * (mean[1, j + 1] - mean[1, j - 1])
                     gy = np.float32(0.5) * (mean[2, j] - mean[0, j])
                     if np.isfinite(r + gx + gy):

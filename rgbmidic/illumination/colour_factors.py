@@ -17,18 +17,20 @@ import numpy.typing as npt
 
 from rgbmidic._kernels import texture as kernels
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.illumination.texture import FRACTIONS, interpolated_lines, LAGS, WHITE_ENERGY, BandEnergy, TextureModel, fit_texture
+from rgbmidic.illumination.mosaic_model import BLOCK, CHANNEL, MosaicModel, channel_means
+from rgbmidic.illumination.texture import LAGS, PAIRS, WHITE_ENERGY, LagProducts, TextureModel, fit_texture
 from rgbmidic.typing import FloatArray, FloatImage
 
-DEBUG = False
-WHITE = TextureModel(weights=(1.0,), widths=(0.1,))
-MEAN_BLOCK, BLOCK = 4, 8
-"""Side of the blocks (px) of the local means and of the moments."""
+MEAN_BLOCK = 4
+"""Side of the blocks (px) of the local means."""
 MEAN_WIDTH, MOMENT_WIDTH = 8.0, 14.0
 """Standard deviation (px) of the windows over which means and moments are taken: several speckles wide."""
 LEAST = 0.001
-"""Least such variance: how well two colours can agree."""
-_PAIRS = ((0, 1), (0, 2), (1, 2))
+"""Least channel-specific variance: how well two colours can agree."""
+FAINTEST = 0.02
+"""Least contrast of a light, relative to the largest one: what a filter is made for."""
+EQUALLY_APART = 0.2
+"""Range (px) of the lights' displacement within the squares whose products of samples are taken together."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,19 +39,21 @@ class Moments:
 
     Attributes
     ----------
-    mean : (3, h, w) float32
-        Local mean of each channel on a grid of `MEAN_BLOCK` px.
+    mean : (4, h, w) float32
+        Local mean of each kind of site on a grid of `MEAN_BLOCK` px.
     contrast : (H, W) float32
-        Samples minus their channel's local mean; NaN where not known.
+        Samples minus their site's local mean; NaN where not known.
     own, shared : (3, h, w) float64
-        Local moments of the low-passed planes on a grid of `BLOCK` px: red², green², blue² without camera noise, and
-        red green, red blue, green blue.
+        Local moments of the low-passed planes on a grid of `BLOCK` px, as they would be with the lights in register and
+        one kind of green: red², green², blue² without camera noise, and red green, red blue, green blue.
     greens : (h, w) float64
         Shared moment of the two green planes: what a colour that agrees with itself shows of the coarse lattice.
     noise : (3, h, w) float64
         Variance of the camera noise of one sample of each channel (DN²).
     red : (int, int)
         Position of red in the 2x2 cell.
+    lights : (k, H // 2, W // 2) float32
+        Low-passed planes of the lights, in register.
     """
 
     mean: FloatImage
@@ -60,45 +64,11 @@ class Moments:
     noise: FloatArray
     red: tuple[int, int]
     lights: FloatImage
-    white: FloatArray
 
     @property
-    def channel_mean(self):
+    def channel_mean(self) -> FloatImage:
+        """Local mean (3, h, w) of each channel."""
         return channel_means(self.mean)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SiteModel:
-    """How the four sites of a mosaic see the lights, and where each light shows the texture."""
-
-    sites: FloatArray
-    apart: FloatArray
-    texture: TextureModel | None = None
-
-    def energy(self, a, b, texture=None):
-        """Expected registered product over that of the channels' planes at rest."""
-        shown = np.linalg.pinv(self.sites) * self.sites.T  # of a light's plane, that of each site
-        f, g = (np.round(np.mod(self.apart[one], 2) / FRACTIONS[1]).astype(int) for one in (a, b))
-        texture = texture or self.texture
-        lines = interpolated_lines(texture.widths)
-        weights = np.asarray(texture.weights)
-        total = [0.0, 0.0]
-        for s, t in np.ndindex(4, 4):
-            kinds = int(s % 2 != t % 2), int(s // 2 != t // 2)  # along x and y
-            share = shown[a, s] * shown[b, t]
-            for n, (i, j) in enumerate(((f, g), (0 * f, 0 * g))):
-                parts = lines[kinds[0]][:, i[0], j[0]] * lines[kinds[1]][:, i[1], j[1]]
-                total[n] = total[n] + share * (np.tensordot(weights, parts, axes=1) + texture.offset)
-        return (total[0] / total[1]) if not DEBUG else total[0]
-
-    @property
-    def matrix(self):
-        return channel_means(self.sites)
-
-    def seen(self, lights):
-        """Fraction (4, k) of lights of some contrast (k,) in the slope of each site's channel."""
-        lights = np.maximum(lights, 0.02 * lights.max())
-        return self.sites * lights / (self.matrix @ lights)[[0, 1, 1, 2], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,12 +83,17 @@ class ColourFactors:
         Variance of e_c without camera noise, relative to alpha_c².
     noise : (3, h, w) float64
         Variance of the camera noise, relative to alpha_c².
+    light_slope, light_specific : (k, h, w) float64
+        The same of the lights.
+    seen : (4, k) float64
+        Fraction of each light in the slope of each site's channel, over the frame.
     """
 
     slope: FloatArray
     specific: FloatArray
     noise: FloatArray
-    of_lights: FloatArray
+    light_slope: FloatArray
+    light_specific: FloatArray
     seen: FloatArray
 
     @property
@@ -127,7 +102,13 @@ class ColourFactors:
         return np.asarray(self.slope * np.sqrt(1 + self.specific))
 
 
-def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel | None, model: SiteModel) -> Moments:
+def gather_moments(
+    values: FloatImage,
+    red: tuple[int, int],
+    noise: NoiseModel | None,
+    model: MosaicModel,
+    texture: TextureModel | None = None,
+) -> Moments:
     """Return local means, contrast and local moments of a mosaic.
 
     Parameters
@@ -138,6 +119,10 @@ def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel |
         Position of red in the 2x2 cell.
     noise
         Camera noise; None: it counts as channel-specific.
+    model
+        How the sites see the lights, and where each shows the texture.
+    texture
+        With which what the lattices cannot see of displaced lights is taken into account; None: it is not.
 
     Returns
     -------
@@ -147,62 +132,51 @@ def gather_moments(values: FloatImage, red: tuple[int, int], noise: NoiseModel |
     contrast = np.empty_like(values)
     kernels.subtract_mean(values, of_mosaic(mean, MEAN_BLOCK, values.shape[1], red), MEAN_BLOCK, contrast)
     height, width = (-(-side // BLOCK) for side in values.shape)
-    low = np.empty((4, values.shape[0] // 2, values.shape[1] // 2), dtype=np.float32)
-    kernels.low_passed_planes(contrast, low)
-    low = low[list(_planes(red))]
-    known = np.isfinite(low).all(axis=0)
-
-    def block(x):
-        full = np.zeros((height * BLOCK // 2, width * BLOCK // 2), np.float32)
-        full[: x.shape[0], : x.shape[1]] = np.where(known, x, 0)
-        return full.reshape(height, BLOCK // 2, width, BLOCK // 2).sum(axis=(1, 3))
-
-    count = block(np.ones(known.shape, np.float32))[None]
-    def products(f):
-        return np.stack([block(f[a] * f[b]) for a in range(len(f)) for b in range(a, len(f))])
-    def square(p, n):
-        out = np.empty((n, n, *p.shape[1:]))
-        for m, (a, b) in enumerate((a, b) for a in range(n) for b in range(a, n)):
-            out[a, b] = out[b, a] = p[m]
-        return out
-    sites = square(_smooth(products(low), count, MOMENT_WIDTH / BLOCK).astype(np.float64) / 256**2, 4)
+    planes = np.empty((4, values.shape[0] // 2, values.shape[1] // 2), dtype=np.float32)
+    kernels.low_passed_planes(contrast, np.argsort(_planes(red)), planes)
     to_lights = np.linalg.pinv(model.sites)
-    apart_ = np.einsum("ls,stij,mt->lmij", to_lights, sites, to_lights)
-    met = apart_.copy()
-    white = np.float64(1)
-    lights = registered = np.tensordot(to_lights, low, axes=1).astype(np.float32)
-    if model.apart.any():
-        registered = np.empty_like(lights)
-        kernels.register_planes(lights, model.apart / 2, registered)
-        known = np.isfinite(registered).all(axis=0)
-        n = len(lights)
-        met = square(_smooth(products(registered), block(np.ones(known.shape, np.float32))[None], MOMENT_WIDTH / BLOCK).astype(np.float64) / 256**2, n)
-        if model.texture:
-            white = []
-            for a in range(n):
-                for b in range(n):
-                    met[a, b] /= model.energy(a, b)
-                white.append(model.energy(a, a, WHITE) / model.energy(a, a))
-            # of each channel, by the light that it sees best
-            white = np.stack(white)[np.argmax(model.matrix, axis=1)]
-    def colours(m):
-        return np.stack([m[0, 0], (m[1, 1] + m[2, 2]) / 2, m[3, 3], (m[0, 1] + m[0, 2]) / 2, m[0, 3], (m[3, 1] + m[3, 2]) / 2, m[1, 2]])
-    mean_rows = model.matrix[[0, 1, 1, 2]]
-    moments = colours(sites) + colours(np.einsum("al,lmij,bm->abij", mean_rows, met, mean_rows)) - colours(np.einsum("al,lmij,bm->abij", model.sites, apart_, model.sites))
-    level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in channel_means(mean)]).astype(np.float64)
-    variance = np.zeros_like(level) if noise is None else np.asarray(noise.variance(level), dtype=np.float64)
+    lights = (to_lights.astype(np.float32) @ planes.reshape(4, -1)).reshape(-1, *planes.shape[1:])
+    by_site = _second_moments(planes, (height, width))
+    moments = _channel_moments(by_site)
+    if not model.in_register:
+        by_light = np.einsum("ls,sthw,mt->lmhw", to_lights, by_site, to_lights)
+        apart = np.einsum("sl,lmhw,tm->sthw", model.sites, by_light, model.sites)
+        if model.displacement.any():
+            registered = np.empty_like(lights)
+            kernels.register_planes(lights, model.displacement / 2, registered)
+            lights, by_light = registered, _second_moments(registered, (height, width))
+            if texture is not None:
+                by_light /= model.registered_energy(texture)
+        rows = model.matrix[list(CHANNEL)]
+        moments += _channel_moments(np.einsum("sl,lmhw,tm->sthw", rows, by_light, rows) - apart)
+    level = [cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in channel_means(mean)]
+    variance = np.zeros((3, height, width))
+    if noise is not None:
+        variance = np.asarray(noise.variance(np.stack(level).astype(np.float64)))
     # where nothing is seen but noise, a third of it stands for the contrast that there may be
-    white = white * np.ones_like(variance)
     floor = np.maximum(variance * (WHITE_ENERGY / 3), 1e-6 * moments[:3].max() + 1e-12)
-    own = np.maximum(moments[:3] - variance * white * WHITE_ENERGY, floor)
-    shared, greens = moments[3:6], moments[6]
-    return Moments(mean=mean, contrast=contrast, own=own, shared=shared, greens=greens, noise=variance, red=red, lights=registered, white=white)
+    return Moments(
+        mean=mean,
+        contrast=contrast,
+        own=np.maximum(moments[:3] - variance * WHITE_ENERGY, floor),
+        shared=moments[3:6],
+        greens=moments[6],
+        noise=variance,
+        red=red,
+        lights=lights,
+    )
 
 
-def moved(grid, apart):
-    """Interpolate a grid (h, w) at places `apart` (2, h, w) blocks from the blocks' own."""
-    y, x = np.mgrid[: grid.shape[0], : grid.shape[1]]
-    return cv2.remap(grid.astype(np.float32), (x + apart[0]).astype(np.float32), (y + apart[1]).astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
+def _second_moments(planes: FloatImage, grid: tuple[int, int]) -> FloatArray:
+    """Return the local moments (n, n, h, w) of any two of n low-passed planes."""
+    count = len(planes)
+    sums = np.empty((count * (count + 1) // 2 + 1, *grid), dtype=np.float32)
+    kernels.plane_products(planes, kernels.CELLS, sums)
+    # the binomial weights of a plane sum to 256 in the kernel
+    moments = _smooth(sums[:-1], sums[-1:], MOMENT_WIDTH / BLOCK).astype(np.float64) / 256**2
+    pairs = np.zeros((count, count), dtype=np.intp)
+    pairs[np.triu_indices(count)] = np.arange(len(moments))
+    return np.asarray(moments[np.maximum(pairs, pairs.T)])
 
 
 def enlarged(grid: npt.NDArray[np.floating], block: int, shape: tuple[int, ...], step: int = 1) -> FloatImage:
@@ -227,50 +201,40 @@ def widened(grid: npt.NDArray[np.floating], block: int, columns: int) -> FloatIm
 
 
 def of_mosaic(grid: npt.NDArray[np.floating], block: int, columns: int, red: tuple[int, int]) -> FloatImage:
-    """Interpolate a grid (3, h, w) of the channels to the columns of a mosaic, for its even and odd rows, (2, h, W).
+    """Interpolate a grid (4, h, w) of the sites to the columns of a mosaic, for its even and odd rows, (2, h, W).
 
-    At each column it is the grid of the channel sampled there.
+    At each column it is the grid of the site there. A grid (3, h, w) is of the channels.
     """
     wide = widened(grid, block, columns)
     out = np.empty((2, *wide.shape[1:]), dtype=np.float32)
-    for row, column in np.ndindex(2, 2):
-        site = (row != red[0]) * 2 + (column != red[1]) * (1 if row == red[0] else 1)
-        site = {(0, 0): 0, (0, 1): 1, (1, 0): 2, (1, 1): 3}[int(row != red[0]), int(column != red[1])]
-        if len(wide) == 3:
-            site = (site + 1) // 2
-        out[row, :, column::2] = wide[site, :, column::2]
+    for site, plane in enumerate(_planes(red)):
+        row, column = divmod(plane, 2)
+        out[row, :, column::2] = wide[site if len(grid) == 4 else CHANNEL[site], :, column::2]
     return out
 
 
 def local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
-    """Return the local mean (3, h, w) of each channel of a mosaic, NaN if not known, on a grid of `MEAN_BLOCK` px."""
+    """Return the local mean (4, h, w) of each site of a mosaic, NaN if not known, on a grid of `MEAN_BLOCK` px."""
     sums = np.empty((8, *(-(-side // MEAN_BLOCK) for side in values.shape)), dtype=np.float32)
     kernels.block_sums(values, MEAN_BLOCK, sums)
-    planes = list(_planes(red))
-    return _smooth(sums[:4][planes], sums[4:][planes], MEAN_WIDTH / MEAN_BLOCK)
-
-
-def channel_means(sites):
-    return np.stack([sites[0], (sites[1] + sites[2]) / 2, sites[3]])
+    order = list(_planes(red))
+    return _smooth(sums[:4][order], sums[4:][order], MEAN_WIDTH / MEAN_BLOCK)
 
 
 def _planes(red: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Return the planes (`PLANE_PAIRS`) of red, of green in red rows, of green in blue rows and of blue."""
+    """Return the planes ``2 a + b`` of red, of green in red rows, of green in blue rows and of blue."""
     row, column = red
     return 2 * row + column, 2 * row + 1 - column, 2 - 2 * row + column, 3 - 2 * row - column
 
 
-def colour_moments(sums: FloatImage, red: tuple[int, int]) -> FloatImage:
-    """Return the moments of the colours (7, h, w) from those of the planes (10, h, w).
+def _channel_moments(sites: FloatArray) -> FloatArray:
+    """Return the moments of the channels (7, h, w) from those of any two sites (4, 4, h, w).
 
     red², green², blue², red green, red blue, green blue, the greens averaged after multiplying, and the product of the
     two greens.
     """
-    of = {frozenset(pair): moment for pair, moment in zip(kernels.PLANE_PAIRS, sums, strict=True)}
-    r, g, h, b = _planes(red)
-    both = [(of[frozenset((n, g))] + of[frozenset((n, h))]) / 2 for n in (r, b)]
-    own = [of[frozenset((r,))], (of[frozenset((g,))] + of[frozenset((h,))]) / 2, of[frozenset((b,))]]
-    return np.stack([*own, both[0], of[frozenset((r, b))], both[1], of[frozenset((g, h))]])
+    (rr, rg, rh, rb), (_, gg, gh, gb), (_, _, hh, hb), (*_, bb) = sites
+    return np.stack([rr, (gg + hh) / 2, bb, (rg + rh) / 2, rb, (gb + hb) / 2, gh])
 
 
 def blurred(grid: FloatImage, sigma: float) -> FloatImage:
@@ -297,34 +261,40 @@ def _smooth(sums: FloatImage, counts: FloatImage, sigma: float) -> FloatImage:
     return out
 
 
-def learn_texture(moments: Moments, model: SiteModel, *, samples: int = 80_000) -> TextureModel:
+def learn_texture(moments: Moments, model: MosaicModel, *, samples: int = 80_000) -> TextureModel:
     """Learn the texture of a specimen from one mosaic; about `samples` pixels are looked at."""
     root = np.sqrt(moments.own)
     padded = scaled(moments, (1 / root).astype(np.float32), pad=0)
-    local = np.stack([moments.shared[n] / (root[a] * root[b]) for n, (a, b) in enumerate(_PAIRS)])
+    local = np.stack([moments.shared[n] / (root[a] * root[b]) for n, (a, b) in enumerate(PAIRS)])
     # red and blue, diagonal neighbours as the two greens, lack 1.85 to 1.95 times as much; the best pair of each place
     # is free of reflections, and of the specimen's colour where it is the greens
     greens = moments.greens / moments.own[1]
     lacking = np.min([1 - local[0], (1 - local[1]) / 1.9, 1 - local[2], (1 - greens) / 1.9], axis=0)
-    step = max(1, padded.size // samples)
-    seen = model.seen(np.linalg.pinv(model.matrix) @ channel_means(moments.mean).mean(axis=(1, 2)))
-    # squares over which the lights are about equally far apart
-    extent = np.ptp(model.apart, axis=(2, 3)).max() / CELL_RANGE
-    side = max(int(max(padded.shape) / max(extent, 1)) // 16 * 16, 64)
-    sums, counts, correlations, apart = [], [], [], []
-    for top in range(0, max(padded.shape[0] - 32, 1), side):
-        for left in range(0, max(padded.shape[1] - 32, 1), side):
-            part = padded[top : top + side, left : left + side]
-            blocks = (slice(None),) * 1 + (slice(top // BLOCK, -(-(top + side) // BLOCK)), slice(left // BLOCK, -(-(left + side) // BLOCK)))
-            sums.append(np.zeros((len(LAGS), 6)))
-            counts.append(np.zeros((len(LAGS), 6)))
-            kernels.lag_products(np.ascontiguousarray(part), *moments.red, LAGS, step, sums[-1], counts[-1])
-            correlations.append(np.maximum(local[blocks].mean(axis=(1, 2)), 1e-3))
-            apart.append(model.apart[(slice(None), *blocks)].mean(axis=(2, 3)))
-    return fit_texture(np.stack(sums), np.stack(counts), np.stack(correlations), 1 - float(np.median(lacking)), seen, np.stack(apart))
+    # whole blocks, of some 64 px at least
+    extent = float(np.ptp(model.displacement, axis=(2, 3)).max())
+    side = max(8, int(max(local.shape[1:]) * min(EQUALLY_APART / max(extent, 1e-9), 1.0)))
+    corners = [(i, j) for i in range(0, local.shape[1], side) for j in range(0, local.shape[2], side)]
+    sums, counts = np.zeros((2, len(corners), len(LAGS), 6))
+    step, correlations, displacement = max(1, padded.size // samples), [], []
+    for (i, j), total, number in zip(corners, sums, counts, strict=True):
+        square = padded[BLOCK * i : BLOCK * (i + side), BLOCK * j : BLOCK * (j + side)]
+        kernels.lag_products(np.ascontiguousarray(square), *moments.red, LAGS, step, total, number)
+        correlations.append(np.maximum(local[:, i : i + side, j : j + side].mean(axis=(1, 2)), 1e-3))
+        displacement.append(model.displacement[:, :, i : i + side, j : j + side].mean(axis=(2, 3)))
+    products = LagProducts(
+        sums=sums,
+        counts=counts,
+        correlations=np.array(correlations),
+        displacement=np.array(displacement),
+        seen=channel_means(model.seen(_light_levels(moments, model))),
+    )
+    return fit_texture(products, 1 - float(np.median(lacking)))
 
 
-CELL_RANGE = 0.2
+def _light_levels(moments: Moments, model: MosaicModel) -> FloatArray:
+    """Return the mean grey level (k,) of each light: their contrasts are about as these."""
+    levels = np.linalg.pinv(model.sites) @ moments.mean.mean(axis=(1, 2), dtype=np.float64)
+    return np.asarray(np.maximum(levels, FAINTEST * levels.max()))
 
 
 def scaled(moments: Moments, scale: FloatImage, *, pad: int, width: int | None = None) -> FloatImage:
@@ -335,17 +305,32 @@ def scaled(moments: Moments, scale: FloatImage, *, pad: int, width: int | None =
     return out
 
 
-def colour_factors(moments: Moments, texture: TextureModel, model: SiteModel) -> ColourFactors:
+def colour_factors(moments: Moments, texture: TextureModel, model: MosaicModel) -> ColourFactors:
+    """Return the slopes of channels and lights on the common texture and their specific variances.
+
+    Parameters
+    ----------
+    moments
+        See `gather_moments`.
+    texture
+        Its `band` gives the second moments of low-passed planes of unit texture; on a coloured specimen no colour shows
+        the common texture alone.
+    model
+        One light's sparkle is seen by all channels, which is taken out of their moments.
+
+    Returns
+    -------
+    ColourFactors
+    """
     crosstalk, band = model.matrix, texture.band
-    seen = model.seen(np.linalg.pinv(crosstalk) @ channel_means(moments.mean).mean(axis=(1, 2)))
     energy = np.array([band.adjacent, band.diagonal, band.adjacent])[:, None, None]
-    to_lights, to_pairs = np.linalg.pinv(crosstalk**2), np.stack([crosstalk[a] * crosstalk[b] for a, b in _PAIRS])
-    sparkle = np.zeros_like(moments.own)
+    own = moments.own / band.own
+    sparkle = np.zeros_like(own)
     # own moment beyond the common one, relative to it, that the aliasing of the coarse colour lattices may cause
     allowed = 0.05 * (1 - texture.specific)
-    for _ in range(3):  # the correction is small and settles at once
-        own = moments.own / band.own
-        least_shared = 1e-4 * own.min(axis=0)
+    least_shared = 1e-4 * own.min(axis=0)
+    to_lights, to_pairs = np.linalg.pinv(crosstalk**2), np.stack([crosstalk[a] * crosstalk[b] for a, b in PAIRS])
+    for _ in range(2):  # the correction is small and settles at once
         # moments of two channels that come from the sparkle of lights, given each channel's own
         leaked = np.tensordot(to_pairs, np.maximum(np.tensordot(to_lights, sparkle, axes=1), 0), axes=1)
         red_green, red_blue, green_blue = np.maximum((moments.shared - leaked) / energy, least_shared)
@@ -358,13 +343,20 @@ def colour_factors(moments: Moments, texture: TextureModel, model: SiteModel) ->
         # at least one channel is free of reflections at each place, unless it shows too much of its own for that
         specific = excess - least + np.maximum(least - 1 - allowed, 0)
         sparkle = specific * square * band.own
-        seen = model.seen(np.linalg.pinv(crosstalk) @ np.median(np.sqrt(square), axis=(1, 2)))
     # as if all of it were sparkle: a specimen's colour lies within the band and is trusted too little, the safe side;
     # the window cannot tell .003 from none
-    variance = np.maximum(specific / moments.white * (band.own / WHITE_ENERGY) - 0.003, 0)
-    # every channel sees at least what its crosstalk lets through of the lights that sparkle
+    variance = np.maximum(specific * (band.own / WHITE_ENERGY) - 0.003, 0)
     lights = np.maximum(np.tensordot(to_lights, variance * square, axes=1), 0)
+    # every channel sees at least what its crosstalk lets through of the lights that sparkle
     variance = np.maximum(variance, np.tensordot(crosstalk**2, lights, axes=1) / square) + LEAST
-    contrast = np.tensordot(np.linalg.pinv(crosstalk), np.sqrt(square), axes=1)
-    contrast = np.maximum(contrast, 0.02 * contrast.max(axis=0))
-    return ColourFactors(slope=np.sqrt(square), specific=variance, noise=moments.noise / square, of_lights=lights / contrast**2 + LEAST, seen=seen)
+    slope = np.sqrt(square)
+    light_slope = np.tensordot(np.linalg.pinv(crosstalk), slope, axes=1)
+    least_slope = np.maximum(light_slope, FAINTEST * light_slope.max(axis=0))
+    return ColourFactors(
+        slope=slope,
+        specific=variance,
+        noise=moments.noise / square,
+        light_slope=light_slope,
+        light_specific=lights / least_slope**2 + LEAST,
+        seen=model.seen(np.median(least_slope, axis=(1, 2))),
+    )

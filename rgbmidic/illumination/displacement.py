@@ -2,8 +2,8 @@
 
 Where paint reflects, glints sit on the flanks of raised droplets: the light that is reflected shows the common texture
 displaced by some tenths of a pixel, and the displacement slides as the surface turns. Its variance hardly shows that.
-Each sample minus its best prediction from the samples of the other colours around it is regressed on the gradient
-predicted likewise; the crosstalk turns the channels' displacements into those of the lights.
+The difference of each light's low-passed plane from the mean of the others, all read where the registration says that
+they show the texture, is regressed on the gradient of that mean.
 
 Which of several lights shows the texture where it is, is a question of agreement (`agreement`): a light counts by its
 precision and by the precision of the others that show it at the same place.
@@ -13,11 +13,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from rgbmidic._kernels.texture import displacement_scores
-from rgbmidic.illumination.colour_factors import BLOCK, ColourFactors, Moments, blurred
+from rgbmidic._kernels.texture import CELLS, displacement_scores
+from rgbmidic.illumination.colour_factors import FAINTEST, ColourFactors, Moments, blurred, widened
+from rgbmidic.illumination.mosaic_model import BLOCK
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import FloatArray
 
@@ -96,7 +96,7 @@ def agreement(
 
 
 def light_displacement(
-    moments: Moments, factors: ColourFactors, texture: TextureModel, matrix: FloatArray, *, window: float = 20.0
+    moments: Moments, factors: ColourFactors, texture: TextureModel, *, window: float = 20.0
 ) -> LightDisplacement:
     """Displacement of the lights' textures against each other, beyond their registration.
 
@@ -104,8 +104,6 @@ def light_displacement(
     ----------
     moments, factors, texture
         Of the mosaic.
-    matrix : ndarray, shape (3, k)
-        Crosstalk.
     window
         Standard deviation (px) of the window in which a displacement is taken: glints change their place over some
         50 px.
@@ -114,29 +112,21 @@ def light_displacement(
     -------
     LightDisplacement
     """
-    slope = np.tensordot(np.linalg.pinv(matrix), factors.slope, axes=1)
-    slope = np.maximum(slope, 0.02 * slope.max())
-    height, width = moments.lights.shape[1:]
-    planes = np.stack([p / cv2.resize((256 * s).astype(np.float32), (s.shape[1] * 4, s.shape[0] * 4), interpolation=cv2.INTER_LINEAR)[:height, :width] for p, s in zip(moments.lights, slope)])
-    sums = np.empty((len(slope), 3, *slope.shape[1:]), dtype=np.float32)
-    displacement_scores(planes, BLOCK // 2, sums)
+    count, width = len(moments.lights), moments.lights.shape[2]
+    # the binomial weights of a plane sum to 256
+    slope = 256 * np.maximum(factors.light_slope, FAINTEST * factors.light_slope.max())
+    scale = widened(slope, CELLS, width)
+    sums = np.empty((count, 3, *slope.shape[1:]), dtype=np.float32)
+    displacement_scores(moments.lights, scale, CELLS, sums)
     blocks = window / BLOCK
-    around = np.array([[blurred(grid, blocks) for grid in one] for one in sums], np.float64)
+    around = np.array([[blurred(grid, blocks) for grid in one] for one in sums], dtype=np.float64)
     information = around[:, 2:] + 1e-12
     found = around[:, :2] / information
     # by the scatter of the blocks' scores, which are nearly independent
     scatter = ((sums[:, :2] - found * sums[:, 2:]) ** 2).mean(axis=1).astype(np.float32)
-    chance = np.array([blurred(grid, blocks / np.sqrt(2)) for grid in scatter], np.float64) / (4 * np.pi * blocks**2)
-    # px per cell, and a light against the mean of all for one against the mean of the others
-    unit = 2 / texture.gradient_gain * (len(slope) - 1) / len(slope)
+    chance = np.array([blurred(grid, blocks / np.sqrt(2)) for grid in scatter]) / (4 * np.pi * blocks**2)
+    # cells of 2 px; a light against the mean of all, not of the others
+    unit = 2 / texture.gradient_gain * (count - 1) / count
     return LightDisplacement(
         values=unit * (found - found.mean(axis=0)), std=unit * np.sqrt(np.maximum(chance, 1e-12)) / information[:, 0]
     )
-
-
-def seen_lights(matrix: FloatArray, slope: FloatArray) -> FloatArray:
-    """Fraction (3, k, ...) of each light in the slope (3, ...) of each channel on the common texture."""
-    lights = np.tensordot(np.linalg.pinv(matrix), slope, axes=1)
-    lights = np.maximum(lights, 0.02 * lights.max())
-    parts = matrix.reshape(*matrix.shape, *(1,) * (slope.ndim - 1)) * lights
-    return np.asarray(parts / parts.sum(axis=1, keepdims=True))

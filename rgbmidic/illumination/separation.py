@@ -7,7 +7,7 @@ is the protocol that it and a function of the user's follow.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
 import cv2
@@ -26,6 +26,7 @@ from rgbmidic.illumination.demosaicing import (
 )
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
+from rgbmidic.illumination.prediction_filters import FilterTables
 from rgbmidic.illumination.texture import TextureModel
 
 DEFAULT_METHOD = "reflection-aware"
@@ -41,7 +42,6 @@ def separate(
     method: str = DEFAULT_METHOD,
     *,
     texture: TextureModel | None = None,
-    registration=None,
 ) -> IlluminationImages:
     """One image per light from one raw colour frame: linearised, demosaiced, unmixed and, where calibrated, registered.
 
@@ -67,14 +67,24 @@ def separate(
     InputError
         Unknown method, a frame too small for it, no crosstalk, or one that is not for the frame's channels.
     """
-    crosstalk = calibration if isinstance(calibration, Crosstalk) else calibration.crosstalk
+    if isinstance(calibration, Crosstalk):
+        calibration = Calibration(crosstalk=calibration)
+    linear = linearise(frame, calibration.noise) if isinstance(frame, Mosaic | ChannelFrame) else frame
+    images = _separated(linear, calibration, method, texture, None)
+    return align(replace(images, registration=calibration.registration))
+
+
+def _separated(
+    linear: LinearMosaic | LinearChannels,
+    calibration: Calibration,
+    method: str,
+    texture: TextureModel | None,
+    tables: FilterTables | None,
+) -> IlluminationImages:
+    """One image per light, each where the lens put it."""
+    crosstalk = calibration.crosstalk
     if crosstalk is None:
         raise InputError("the calibration has no crosstalk, which colour frames need (rgbmidic-calibrate crosstalk)")
-    if isinstance(calibration, Calibration):
-        linear = linearise(frame, calibration.noise) if isinstance(frame, Mosaic | ChannelFrame) else frame
-        images = separate(linear, crosstalk, method, texture=texture, registration=calibration.registration)
-        return align(replace(images, registration=calibration.registration))
-    linear = linearise(frame) if isinstance(frame, Mosaic | ChannelFrame) else frame
     if isinstance(linear, LinearChannels):
         return unmix(linear, crosstalk)
     method = _chosen(method, linear)
@@ -84,7 +94,9 @@ def separate(
     if method != DEFAULT_METHOD:
         return unmix(_BY_CHANNEL[method](linear), crosstalk)
     mixing = crosstalk.unmixing if crosstalk.field is None else None
-    model = reconstruct(linear, crosstalk, texture=texture, mixing=mixing, registration=registration)
+    model = reconstruct(
+        linear, crosstalk, registration=calibration.registration, texture=texture, mixing=mixing, tables=tables
+    )
     return reconstructed_lights(model, crosstalk, unmixed=mixing is not None)
 
 
@@ -132,7 +144,7 @@ def reconstructed_lights(model: Reconstruction, crosstalk: Crosstalk, *, unmixed
     """
     height, width = model.factors.slope.shape[1:]
     level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in model.mean])
-    slope, light = (np.tensordot(crosstalk.unmixing, seen, axes=1) for seen in (model.factors.slope, level))
+    slope, light = model.factors.light_slope, np.tensordot(crosstalk.unmixing, level, axes=1)
     contrast = np.divide(slope, light, out=np.zeros_like(slope), where=light > 1e-3 * light.max())
     best = contrast.max(axis=0)
     relative = np.divide(contrast, best, out=np.ones_like(contrast), where=best > 0)
@@ -207,11 +219,14 @@ class Separation:
         Method for Bayer frames, as in `IlluminationSettings`.
     texture
         The speckle's autocorrelation, shared by all frames of a test; None: each frame tells its own.
+    tables
+        The filters that its frames have needed so far.
     """
 
     calibration: Calibration | None = None
     demosaic: str = "auto"
     texture: TextureModel | None = None
+    tables: FilterTables = field(default_factory=FilterTables, repr=False, compare=False)
 
     def __call__(self, frames: tuple[Mosaic | ChannelFrame, ...]) -> IlluminationImages:
         """Illumination images of one state from its frame, or its frames if lights fired in succession.
@@ -232,7 +247,7 @@ class Separation:
             what = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
             raise ConfigurationError(f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk")
         else:
-            images = separate(linear[0], known.crosstalk, self.demosaic, texture=self.texture, registration=known.registration)
+            images = _separated(linear[0], known, self.demosaic, self.texture, self.tables)
         return replace(images, registration=known.registration)
 
     def within(self, window: Window) -> Separation:

@@ -67,6 +67,10 @@ class TextureModel:
         reflections, towards 1 for a coloured specimen.
     correlation : float
         Mean correlation of the two colours that agree best, about 1 for a black and white speckle.
+    common : bool
+        Whether the samples bear out that the lights have the texture in common as far as their contrast says: those
+        left out are predicted better so than if each light had as much of its own. False: a print of sharp edges, or a
+        lens that blurs one light more than another; the separation then takes each channel by itself.
     """
 
     weights: tuple[float, ...]
@@ -74,6 +78,7 @@ class TextureModel:
     offset: float = 0.0
     specific: float = 0.0
     correlation: float = 1.0
+    common: bool = True
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -117,19 +122,12 @@ class TextureModel:
 
     @cached_property
     def gradient_gain(self) -> float:
-        """Slope of a plane over its central difference, both per cell, by regression."""
-        taps = [(_BINOMIAL[p::2], _OFFSETS[p::2]) for p in (0, 1)]
-
-        def correlation(x):
-            total = 0.0
-            for t, o in taps:
-                for u, q in taps:
-                    apart = o[:, None] - o
-                    lines = [np.einsum("i,mij,j->m", t, np.exp(-0.5 * ((apart + x) / np.asarray(self.widths)[:, None, None]) ** 2), t), np.einsum("i,mij,j->m", u, np.exp(-0.5 * ((q[:, None] - q) / np.asarray(self.widths)[:, None, None]) ** 2), u)]
-                    total += 0.25 * (np.asarray(self.weights) @ (lines[0] * lines[1]) + self.offset)
-            return total
-        slope = (correlation(2.1) - correlation(1.9)) / 0.1  # per cell
-        return -slope / (correlation(0.0) - correlation(4.0)) * 2
+        """Slope of a low-passed plane by regression on its central difference over two cells, both per cell."""
+        weights = np.asarray(self.weights)
+        ends, whole = (
+            weights @ _plane_moments(self.widths, d) + self.offset for d in (np.array([1.9, 2.1]), [0.0, 4.0])
+        )
+        return float(-20 * (ends[1] - ends[0]) / (whole[0] - whole[1]))
 
     @cached_property
     def band(self) -> BandEnergy:
@@ -137,116 +135,168 @@ class TextureModel:
         return BandEnergy(*(np.asarray(self.weights) @ _band_energies(self.widths) + self.offset).tolist())
 
 
+def _line(widths: tuple[float, ...], p: int, q: int, distance: npt.ArrayLike = 0.0) -> FloatArray:
+    """Second moments (M, ...) along one axis of planes of parity p and q, `distance` px apart: Gaussians factorise."""
+    apart = _OFFSETS[p::2, None] - _OFFSETS[q::2] + np.asarray(distance, dtype=np.float64)[..., None, None]
+    gaussians = np.exp(-0.5 * (apart / np.asarray(widths).reshape(-1, *[1] * apart.ndim)) ** 2)
+    return np.asarray(_BINOMIAL[p::2] @ gaussians @ _BINOMIAL[q::2])
+
+
 @lru_cache(maxsize=64)
 def _band_energies(widths: tuple[float, ...]) -> FloatArray:
     """Return the moments (M, 3) own, adjacent and diagonal of the low-passed planes for Gaussian autocorrelations."""
-    taps = [(_BINOMIAL[p::2], _OFFSETS[p::2]) for p in (0, 1)]
-
-    def line(p: int, q: int) -> FloatArray:
-        """Sum along one axis, over planes of parity p and q: Gaussians factorise."""
-        apart = taps[p][1][:, None] - taps[q][1][None]
-        gaussians = np.exp(-0.5 * (apart[None] / np.asarray(widths)[:, None, None]) ** 2)
-        return np.asarray(np.einsum("i,mij,j->m", taps[p][0], gaussians, taps[q][0]))
-
-    same, other = (line(0, 0) + line(1, 1)) / 2, line(0, 1)
+    same, other = (_line(widths, 0, 0) + _line(widths, 1, 1)) / 2, _line(widths, 0, 1)
     return np.stack([same * same, same * other, other * other], axis=1)
 
 
-FRACTIONS = np.linspace(0, 2, 41)
+def _plane_moments(widths: tuple[float, ...], distance: npt.ArrayLike) -> FloatArray:
+    """Return the moments (M, D) of a plane with itself some px farther along one axis."""
+    at_rest, apart = ((_line(widths, 0, 0, d) + _line(widths, 1, 1, d)) / 2 for d in ([0.0], distance))
+    return np.asarray(at_rest * apart)
 
 
-@lru_cache(maxsize=64)
-def interpolated_lines(widths: tuple[float, ...]):
-    """Along one axis: product of a plane with another, shown d px farther on and brought back by cubic interpolation."""
-    taps = [(_BINOMIAL[p::2], _OFFSETS[p::2]) for p in (0, 1)]
+DISPLACEMENTS = np.linspace(0, 2, 41)
+"""Of a plane (px, modulo its lattice) at which `registered_lines` is tabulated."""
 
-    def positions(p, d):
-        x = np.arange(-3, 5) - d / 2
-        h = np.sinc(x) * np.sinc(x / 4)
-        return np.outer(h / h.sum(), taps[p][0]).ravel(), (2 * x[:, None] + taps[p][1]).ravel()
 
-    def line(p, q):
-        out = np.zeros((len(widths), FRACTIONS.size, FRACTIONS.size))
-        for i, d in enumerate(FRACTIONS):
-            a, x = positions(p, d)
-            for j, e in enumerate(FRACTIONS):
-                b, y = positions(q, e)
-                out[:, i, j] = np.exp(-0.5 * ((x[:, None] - y) / np.asarray(widths)[:, None, None]) ** 2) @ b @ a
-        return out
+@lru_cache(maxsize=8)
+def registered_lines(widths: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """Second moments of two low-passed planes along one axis, each read where it shows the texture displaced.
+
+    Parameters
+    ----------
+    widths
+        Standard deviations (px) of M Gaussian autocorrelations.
+
+    Returns
+    -------
+    tuple of ndarray, shape (M, D, D)
+        Of planes of the same and of different parity, by the `DISPLACEMENTS` of both.
+    """
+
+    def samples(parity: int) -> tuple[FloatArray, FloatArray]:
+        """Weights and places (D, S) of the samples that Lanczos interpolation and the binomial take."""
+        cells = np.arange(-3, 5) - DISPLACEMENTS[:, None] / 2
+        weights = np.sinc(cells) * np.sinc(cells / 4)
+        weights /= weights.sum(axis=1, keepdims=True)
+        shape = len(cells), -1
+        places = 2 * cells[:, :, None] + _OFFSETS[parity::2]
+        return (weights[:, :, None] * _BINOMIAL[parity::2]).reshape(shape), places.reshape(shape)
+
+    def line(p: int, q: int) -> FloatArray:
+        (first, x), (second, y) = samples(p), samples(q)
+        square = (x[:, None, :, None] - y[None, :, None, :]) ** 2
+        moments = [
+            np.einsum("as,bt,abst->ab", first, second, np.exp(-0.5 * square / s**2), optimize=True) for s in widths
+        ]
+        return np.array(moments)
 
     return (line(0, 0) + line(1, 1)) / 2, (line(0, 1) + line(1, 0)) / 2
 
 
-def fit_texture(
-    sums: FloatArray, counts: FloatArray, correlations: FloatArray, agreement: float, seen: FloatArray, apart: FloatArray
-) -> TextureModel:
-    """Fit; sums, counts (cells, L, 6), correlations (cells, 3), seen (4, k), apart (cells, k, 2)."""
-    distance = np.hypot(*LAGS.T)
-    met = counts[..., :3].sum(axis=0) > 0
-    r = np.broadcast_to(distance[:, None], met.shape)[met]
-    # one colour's samples are two pixels apart and show nothing of what is finer
-    coarse = WIDTHS[WIDTHS > 1]
-    w = np.stack([seen[0], (seen[1] + seen[2]) / 2, seen[3]])
-    count = seen.shape[1]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LagProducts:
+    """Products of samples at `LAGS` in n squares of a mosaic, in each of which the lights are about equally far apart.
 
-    whole = correlations.mean(axis=0)
-    best = float(np.max(whole))
+    Attributes
+    ----------
+    sums, counts : ndarray, shape (n, L, 6)
+        As `lag_products` of the kernels gives them, of contrast divided by the square root of the low-passed planes'
+        own moments.
+    correlations : ndarray, shape (n, 3)
+        Mean correlation of the low-passed planes with the lights in register, red-green, red-blue, green-blue.
+    displacement : ndarray, shape (n, k, 2)
+        Place (x, y) at which each light shows the texture, px.
+    seen : ndarray, shape (3, k)
+        Fraction of each light in the slope of each channel.
+    """
+
+    sums: FloatArray
+    counts: FloatArray
+    correlations: FloatArray
+    displacement: FloatArray
+    seen: FloatArray
+
+
+PAIRS = ((0, 1), (0, 2), (1, 2))
+"""Of channels."""
+
+
+def fit_texture(products: LagProducts, agreement: float) -> TextureModel:
+    """Fit a texture to the products of samples at `LAGS`.
+
+    Parameters
+    ----------
+    products
+        Of the mosaic.
+    agreement
+        Correlation that low-passed planes which are neighbours along a row or column reach where no colour shows
+        anything of its own: what it lacks to 1 is texture too fine for one colour's lattice.
+
+    Returns
+    -------
+    TextureModel
+    """
+    sums, counts, correlations = products.sums.sum(axis=0), products.counts.sum(axis=0), products.correlations
+    overall = correlations.mean(axis=0)
+    best, distance = float(overall.max()), np.hypot(*LAGS.T)
     if best < COLOURED:
-        return _mixture(r, (sums.sum(axis=0)[:, :3][met] / counts.sum(axis=0)[:, :3][met]), best, widths=coarse, specific=1.0)
-    parity = LAGS.sum(axis=1) % 2 == 1
+        met = counts[:, :3] > 0
+        # one colour's samples are two pixels apart and show nothing of what is finer
+        coarse = WIDTHS[WIDTHS > 1]
+        r = np.broadcast_to(distance[:, None], met.shape)[met]
+        gaussians, product = np.exp(-0.5 * (r[:, None] / coarse) ** 2), sums[:, :3][met] / counts[:, :3][met]
+        return _mixture(gaussians, product, 1 / (1 + r), best, widths=coarse, specific=1.0)
     energies = _band_energies(tuple(WIDTHS.tolist()))
     rows = []
-    for pair, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
-        lags = parity if pair != 1 else ~parity
-        kind = 1 if pair != 1 else 2
-        for cell in range(len(sums)):
-            use = lags & (counts[cell, :, 3 + pair] > 0)
-            if not use.any():
-                continue
-            product = sums[cell, use, 3 + pair] / (counts[cell, use, 3 + pair] * correlations[cell, pair])
-            gaussians = np.zeros((use.sum(), len(WIDTHS)))
-            for l in range(count):
-                for m in range(count):
-                    share = w[a, l] * w[b, m]
-                    shift = apart[cell, l] - apart[cell, m]
-                    # which of the two samples a lag begins at is either
-                    for sign in (1, -1):
-                        x, y = LAGS[use, 1] + sign * shift[0], LAGS[use, 0] + sign * shift[1]
-                        gaussians += share / 2 * np.exp(-0.5 * (x**2 + y**2)[:, None] / WIDTHS**2)
-            unit = energies[:, kind]
-            weight = counts[cell, use, 3 + pair] * correlations[cell, pair]
-            rows.append((gaussians, np.tile(unit, (use.sum(), 1)), product, distance[use], weight, np.flatnonzero(use)))
-    gaussians, unit, product, r, weight, lag = (np.concatenate(part) for part in zip(*rows))
-    importance = np.sqrt(weight / np.bincount(lag, weight, minlength=len(LAGS))[lag]) / (1 + r)
+    for pair, kind in enumerate((1, 2, 1)):
+        weight = products.counts[..., 3 + pair] * correlations[:, pair, None]
+        # neighbours along a row or column are an odd number of rows and columns apart
+        met = (weight > 0) & ((LAGS.sum(axis=1) + kind) % 2 == 0)
+        # products come in units of the band's energy, which the same unknown weights make up
+        unit = np.broadcast_to(energies[:, kind], (met.sum(), len(WIDTHS)))
+        product = products.sums[..., 3 + pair][met] / weight[met]
+        rows.append((_gaussians(products, pair)[met], product, unit, weight[met], np.nonzero(met)[1]))
+    gaussians, product, unit, weight, lag = (np.concatenate(part) for part in zip(*rows, strict=True))
+    importance = np.sqrt(weight / np.bincount(lag, weight)[lag]) / (1 + distance[lag])
     # what a lattice cannot see is hardly in the products: the fit would extrapolate it to distance 0
     finest, coarsest = (energies[:, 1] / energies[:, 0])[[0, -1]]
-    between = float(np.clip(agreement, finest, coarsest))
-    fine = np.append(energies[:, 1] - between * energies[:, 0], between - 1)
-    model = _mixture(r, product, best, band=(unit, fine), gaussians=gaussians, importance=importance)
-    return replace(model, specific=_coarse_fraction(model, sums.sum(axis=0), counts.sum(axis=0), whole))
+    ratio = float(np.clip(agreement, finest, coarsest))
+    fine = np.append(energies[:, 1] - ratio * energies[:, 0], ratio - 1)
+    model = _mixture(gaussians, product, importance, best, band=(unit, fine))
+    return replace(model, specific=_coarse_fraction(model, sums, counts, overall))
+
+
+def _gaussians(products: LagProducts, pair: int) -> FloatArray:
+    """Return what each of the `WIDTHS` gives (n, L, M) for the products of two channels, which see displaced lights."""
+    first, second = PAIRS[pair]
+    total = np.zeros((*products.sums.shape[:2], len(WIDTHS)))
+    for a, b in np.ndindex(products.displacement.shape[1], products.displacement.shape[1]):
+        apart = (products.displacement[:, a] - products.displacement[:, b])[:, None]
+        fraction = products.seen[first, a] * products.seen[second, b] / 2
+        for sign in (1, -1):  # a lag begins at either of the two
+            square = ((LAGS[:, ::-1] + sign * apart) ** 2).sum(axis=2)
+            total += fraction * np.exp(-0.5 * square[..., None] / WIDTHS**2)
+    return total
 
 
 def _mixture(
-    r: FloatArray,
+    gaussians: FloatArray,
     product: FloatArray,
+    importance: FloatArray,
     correlation: float,
     *,
     widths: FloatArray = WIDTHS,
     band: tuple[FloatArray, FloatArray] | None = None,
     specific: float = 0.0,
-    gaussians=None,
-    importance=None,
 ) -> TextureModel:
-    """Fit weights w >= 0 and offset c <= 0 of a texture by least squares.
+    """Fit weights w >= 0 and offset c <= 0 of a texture by least squares, rows weighted by their importance.
 
-    ``sum w g(r) + c = product`` up to a factor, or, with unit (R, M) and fine (M + 1,) of the `band`,
-    ``sum w (g(r) - product unit) + c (1 - product) = 0`` with ``sum w + c = 1`` and ``fine . (w, -c) = 0``.
+    ``sum w g + c = product`` up to a factor, or, with unit (R, M) and fine (M + 1,) of the `band`,
+    ``sum w (g - product unit) + c (1 - product) = 0`` with ``sum w + c = 1`` and ``fine . (w, -c) = 0``.
     """
-    if gaussians is None:
-        gaussians = np.exp(-0.5 * (r[:, None] / widths) ** 2)
-        importance = 1 / (1 + r)
     if band is None:
-        system = np.column_stack([gaussians, -np.ones(r.size)]) * importance[:, None]
+        system = np.column_stack([gaussians, -np.ones(product.size)]) * importance[:, None]
         wanted = product * importance
     else:
         unit, fine = band
@@ -256,7 +306,7 @@ def _mixture(
         # products) of .05; the true one is -0.02 to -0.15
         small_offset = np.append(np.zeros(len(widths)), 0.05)
         system = np.vstack([system, 1e3 * sum_to_one, 1e3 * fine, small_offset])
-        wanted = np.concatenate([np.zeros(r.size), [1e3, 0.0, 0.0]])
+        wanted = np.concatenate([np.zeros(product.size), [1e3, 0.0, 0.0]])
     from scipy.optimize import nnls  # half a second to import
 
     solution = nnls(system, wanted)[0]
