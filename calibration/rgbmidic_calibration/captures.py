@@ -222,6 +222,13 @@ class Sampling:
         levels, white = tuple(black.tolist()), frame.white_level
         return cls(names, shape, levels, white, white - float(np.mean(levels)), origins, step)
 
+    @property
+    def greens(self) -> tuple[int, int] | None:
+        """Planes of the greens in rows with red and in rows with blue; None where there is one green."""
+        if self.step == 1:
+            return None
+        return (1, 2) if self.origins[1][0] == self.origins[0][0] else (2, 1)
+
     def __str__(self) -> str:
         planes = f"{self.shape[1]} x {self.shape[0]} px with planes {' '.join(self.names)}"
         return f"{planes} and a range of {self.full_scale:g} DN from black to white level {self.white:g}"
@@ -420,6 +427,12 @@ class BlockMeans:
         if len(self.planes) == 3:
             return self.planes
         return np.stack([self.planes[0], 0.5 * (self.planes[1] + self.planes[2]), self.planes[3]])
+
+    @property
+    def signals(self) -> FloatArray:
+        """Block averages of the channels R, G, B and, of a mosaic, of G in red rows minus G in blue rows."""
+        greens = self.camera.greens
+        return np.stack([*self.channels, *([self.planes[greens[0]] - self.planes[greens[1]]] if greens else [])])
 
     @property
     def centres(self) -> FloatArray:

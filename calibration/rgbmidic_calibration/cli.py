@@ -273,7 +273,8 @@ def check(
         list[str] | None, Option(help="NAME+NAME=FILES: the same scene with these lights on together.")
     ] = None,
     limit: Annotated[
-        list[str] | None, Option(help="NAME=VALUE: leakage, additivity, strength, noise (in %), registration (in px).")
+        list[str] | None,
+        Option(help="NAME=VALUE: leakage, checkerboard, additivity, strength, noise (in %), registration (in px)."),
     ] = None,
     region: Region = None,
 ) -> None:

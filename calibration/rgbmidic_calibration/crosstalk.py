@@ -3,7 +3,8 @@
 For each light the channel that sees it best is the reference; the entries of the other channels are ratios to it,
 estimated from block averages (`rgbmidic_calibration.captures.block_means`). The covariance of A adds to the scatter of
 the blocks the error of the dark level, which is common to all blocks and all lights, and the scatter of the captures
-beyond their noise. The fitted columns are then checked against the names of the lights and against each other.
+beyond their noise. The fitted columns are then checked against the names of the lights and against each other. The
+difference of a mosaic's two greens is fitted as a fourth channel.
 
 *Ratios of sums.* With x the reference channel's block average, y another channel's and phi the Legendre products over
 the field, the entry a(position) = sum_t a_t phi_t solves
@@ -52,6 +53,9 @@ class CrosstalkConstants:
     tolerance
         Variation of an entry over the field (rms), or between captures, that is accepted, however significant: it leaks
         0.05 % at most.
+    checkerboard
+        Checkerboard in a separated light, as a fraction of the light's level, about which nothing is reported: a third
+        of what `check` allows (`verify.Limits.checkerboard`).
     """
 
     black_level_std: float = 0.3
@@ -59,9 +63,14 @@ class CrosstalkConstants:
     largest_order: int = 4
     significance: float = 1e-3
     tolerance: float = 5e-4
+    checkerboard: float = 1e-3
 
 
 LIMITS = CrosstalkConstants()
+
+
+GREENS = 3
+"""Channel of the difference of the greens (`BlockMeans.signals`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +81,7 @@ class LightSignal:
     ----------
     name : str
     values : ndarray, shape (N, C, R, S)
-        Above dark, of N captures.
+        Above dark, of N captures: R, G, B and, of a mosaic, the difference of the greens (`BlockMeans.signals`).
     valid : ndarray, shape (N, R, S), bool
         Blocks without saturated samples.
     reference : int
@@ -87,9 +96,9 @@ class LightSignal:
     @classmethod
     def of(cls, name: str, captures: Sequence[BlockMeans], dark: FloatArray) -> LightSignal:
         """The averages of captures above the dark level."""
-        values = np.stack([frame.channels for frame in captures]) - dark
+        values = np.stack([frame.signals for frame in captures]) - dark
         valid = ~np.stack([frame.saturated for frame in captures])
-        return cls(name, values, valid, int(np.median(values.transpose(0, 2, 3, 1)[valid], axis=0).argmax()))
+        return cls(name, values, valid, int(np.median(values[:, :3].transpose(0, 2, 3, 1)[valid], axis=0).argmax()))
 
     @property
     def base(self) -> FloatArray:
@@ -98,8 +107,8 @@ class LightSignal:
 
     @property
     def others(self) -> list[int]:
-        """The channels but the reference."""
-        return [c for c in range(self.values.shape[1]) if c != self.reference]
+        """The channels R, G, B but the reference."""
+        return [c for c in range(3) if c != self.reference]
 
     def residual(self, design: FloatArray, coefficients: FloatArray) -> FloatArray:
         """Residuals y - a x, (N, C, R, S)."""
@@ -242,7 +251,7 @@ class Variation:
     rms: float
 
 
-def variation(signal: LightSignal, design: FloatArray, known: int) -> Variation:
+def variation(signal: LightSignal, design: FloatArray, known: int, channels: Sequence[int] | None = None) -> Variation:
     """Test whether the Legendre products after the first `known` ones are needed in any channel.
 
     A score test with random signs: the model of the first terms is fitted, its residuals are correlated with the other
@@ -256,17 +265,20 @@ def variation(signal: LightSignal, design: FloatArray, known: int) -> Variation:
         See `fit_column`; `design` has all terms.
     known
         How many of the terms the null hypothesis has.
+    channels
+        Channels that are tested together; None: R, G, B but the reference.
     """
+    channels = signal.others if channels is None else channels
     null = fit_column(signal, design[..., :known])
     moment = _moment(null.weights * signal.base, design)
     # What the fitted terms cannot imitate of the others.
     extra = design[..., known:] - design[..., :known] @ np.linalg.solve(moment[:known, :known], moment[:known, known:])
-    sums = _cluster_sums(np.einsum("crs,rst->ctrs", null.residual[:, signal.others].sum(axis=0), extra))
+    sums = _cluster_sums(np.einsum("crs,rst->ctrs", null.residual[:, channels].sum(axis=0), extra))
     inverse = np.linalg.pinv(sums.T @ sums)
     flips = np.random.default_rng(0).choice((-1.0, 1.0), (4999, len(sums))) @ sums
     flipped = ((flips @ inverse) * flips).sum(axis=1)
     observed = sums.sum(axis=0) @ inverse @ sums.sum(axis=0)
-    coefficients = fit_column(signal, design).coefficients[known:, signal.others]
+    coefficients = fit_column(signal, design).coefficients[known:, channels]
     norms = (design[..., known:] ** 2).mean(axis=(0, 1))
     return Variation(
         p_value=float((1 + (flipped >= observed).sum()) / (1 + len(flipped))),
@@ -373,9 +385,11 @@ def estimate_crosstalk(
     warnings = judged(capture_checks(lights, dark), allow)
     like = next(iter(lights.values()))[0]
     shape, centres = like.camera.shape, like.centres
-    level, of_mean, of_frame = np.zeros_like(like.channels), LIMITS.black_level_std**2 * np.eye(3), np.zeros((3, 3))
+    count = len(like.signals)
+    level, of_frame = np.zeros((count, *like.saturated.shape)), np.zeros((count, count))
+    of_mean = LIMITS.black_level_std**2 * np.eye(count)
     if dark:
-        frames = np.stack([frame.channels for frame in dark])
+        frames = np.stack([frame.signals for frame in dark])
         level = frames.mean(axis=0)
         of_frame = np.cov(frames.mean(axis=(2, 3)), rowvar=False) if len(frames) > 1 else of_mean
         of_mean = of_frame / len(frames)
@@ -388,14 +402,33 @@ def estimate_crosstalk(
     warnings += judged(matrix_checks(fits, design), allow)
     matrices = np.stack([fit.coefficients for fit in fits], axis=-1)
     covariance = _covariance(fits, of_mean, of_frame)
-    field, size = None, matrices[0].size
+    std = np.sqrt(np.einsum("tcktck->tck", covariance))
+    field, size = None, matrices[0, :3].size
     if order:
-        std = np.sqrt(np.einsum("tcktck->tck", covariance))
-        field = CrosstalkField(order=order, coefficients=matrices[1:], shape=shape, std=std[1:])
+        field = CrosstalkField(order=order, coefficients=matrices[1:, :3], shape=shape, std=std[1:, :3])
+    greens = {"green_difference": matrices[0, GREENS], "green_difference_std": std[0, GREENS]} if count > 3 else {}
     crosstalk = Crosstalk(
-        matrix=matrices[0], lights=tuple(lights), covariance=covariance[0, :, :, 0].reshape(size, size), field=field
+        matrix=matrices[0, :3],
+        lights=tuple(lights),
+        covariance=covariance[0, :3, :, 0, :3].reshape(size, size),
+        field=field,
+        **greens,
     )
+    if count > 3:
+        warnings += judged(_green_checks(signals, asked, crosstalk))
     return CrosstalkEstimate(crosstalk=crosstalk, lights=fits, variations=variations, warnings=tuple(warnings))
+
+
+def _green_checks(signals: Sequence[LightSignal], design: FloatArray, crosstalk: Crosstalk) -> Iterator[Check]:
+    """Check that the mean of the greens' difference over the field is enough."""
+    tests = [variation(signal, design, 1, [GREENS]) for signal in signals]
+    left = np.abs(crosstalk.checkerboard(np.array([test.rms for test in tests]))).max(axis=0)
+    for signal, test, amplitude in zip(signals, tests, left, strict=True):
+        text = (
+            f"light {signal.name}: the difference of the greens varies over the field; its mean, which is used, leaves "
+            f"a checkerboard of ±{100 * amplitude:.2g} % rms of the light's level"
+        )
+        yield warning(text, amplitude if test.p_value < LIMITS.significance else 0.0, above=LIMITS.checkerboard)
 
 
 def _needed_degree(signal: LightSignal, design: FloatArray) -> tuple[int, Variation]:
@@ -450,7 +483,7 @@ def matrix_checks(fits: Sequence[LightFit], design: FloatArray) -> Iterator[Chec
             yield Check("same-channel", text)
     for fit in fits:
         yield from _fit_checks(fit, design)
-    condition = float(np.linalg.cond(np.column_stack([fit.coefficients[0] for fit in fits])))
+    condition = float(np.linalg.cond(np.column_stack([fit.coefficients[0, :3] for fit in fits])))
     text = (
         f"the matrix has condition number {condition:.1f}: unmixing amplifies noise strongly. Are two lamps close in "
         "colour, or did a second lamp or daylight shine in the captures of one?"

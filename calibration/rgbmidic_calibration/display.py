@@ -130,6 +130,8 @@ def calibration(result: Calibration, path: Path) -> None:
     parts.append(f"camera: {', '.join(stated) or 'nothing stated'}")
     if result.crosstalk is not None:
         parts += _matrix(result.crosstalk)
+        if result.crosstalk.green_difference is None and "bayer" in result.kinds:
+            parts.append("the two greens are taken as equal: measure the crosstalk again to know their difference")
     if result.camera_noise is not None:
         parts += _noise(result.camera_noise)
     elif result.noise is not None:
@@ -188,6 +190,13 @@ def _matrix(result: Crosstalk) -> tuple[Table, str]:
         cells = map(uncertain, values, np.where(values == 1, 0, 0 if std is None else std[row]))
         table.add_row(CHANNELS[row] if len(result.matrix) == 3 else str(row + 1), *cells)
     table.add_section()
+    if (difference := result.green_difference) is not None:
+        std = np.zeros_like(difference) if result.green_difference_std is None else result.green_difference_std
+        table.add_row("G red rows - blue rows", *map(uncertain, difference, std))
+        for name, figures in (("checkerboard if equal", difference), ("  with both rows of G", std)):
+            amplitudes = 100 * np.abs(result.checkerboard(figures)).max(axis=0)
+            table.add_row(f"{name}, %", *(f"{value:.2g}" for value in amplitudes))
+        table.add_section()
     table.add_row("noise amplification", *(f"{value:.2f}" for value in result.noise_amplification))
     field = "is the same everywhere" if result.field is None else f"varies over the field (degree {result.field.order})"
     words = f"condition number {result.condition_number:.2f}; A {field}"

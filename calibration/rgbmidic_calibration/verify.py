@@ -29,6 +29,8 @@ class Limits:
     ----------
     leakage
         Light left where it should not be, % of the light that is alone.
+    checkerboard
+        Amplitude of the checkerboard that the two greens leave in any light's image, % of the light that is alone.
     additivity
         Departure of all lights together from the sum of the single ones, % of the signal, once offset and strengths
         are taken out.
@@ -41,6 +43,7 @@ class Limits:
     """
 
     leakage: float = 0.3
+    checkerboard: float = 0.3
     additivity: float = 0.5
     strength: float = 5.0
     registration: float = 0.03
@@ -58,6 +61,8 @@ def leakage(
 ) -> list[Check]:
     """Fraction of a light that unmixing leaves in the images of the other lights, from captures with one light on.
 
+    Of a Bayer mosaic also the checkerboard that it leaves where the greens differ by something else than calibrated.
+
     Parameters
     ----------
     crosstalk
@@ -73,6 +78,7 @@ def leakage(
     -------
     list of Check
         For every light that is on and every other one: ratio of the sums over the field and its standard uncertainty.
+        For every light that is on: the checkerboard in the image that shows it most.
 
     Raises
     ------
@@ -83,15 +89,16 @@ def leakage(
         raise CalibrationError(
             f"the calibration knows the lights {', '.join(crosstalk.lights)}, not {', '.join(unknown)}"
         )
-    level = np.mean([frame.channels for frame in dark], axis=0) if dark else np.float64(0)
+    level = np.mean([frame.signals for frame in dark], axis=0) if dark else np.float64(0)
+    greens = crosstalk.green_difference
     unmixing = crosstalk.unmixing_at(next(iter(lights.values()))[0].centres)
     checks = []
     for name, captures in lights.items():
         clear = ~np.any([frame.saturated for frame in captures], axis=0)
         if clear.sum() < 4:
             raise CalibrationError(f"light {name}: nearly every block holds saturated samples; shorten the exposure")
-        channels = np.mean([frame.channels for frame in captures], axis=0) - level
-        values = np.einsum("rskc,crs->krs", unmixing, channels)[:, clear]
+        signals = np.mean([frame.signals for frame in captures], axis=0) - level
+        values = np.einsum("rskc,crs->krs", unmixing, signals[:3])[:, clear]
         lit, brightest = crosstalk.lights.index(name), int(values.sum(axis=1).argmax())
         total = float(values[lit].sum())
         if total <= 0 or brightest != lit:
@@ -106,6 +113,12 @@ def leakage(
             for row, light in enumerate(crosstalk.lights)
             if light != name
         ]
+        if len(signals) > 3:  # what the greens differ by beyond the calibration
+            difference = signals[3][clear] - values[lit] * (0 if greens is None else greens[lit])
+            relative = float(difference.sum()) / total
+            scatter = np.sqrt(((difference - relative * values[lit]) ** 2).sum()) / total
+            amplitude, std = 100 * np.abs(crosstalk.checkerboard(np.array([relative, scatter]))).max(axis=0)
+            checks.append(Check(f"checkerboard of {name}", "", amplitude, limits.checkerboard, std=std, unit="%"))
     return checks
 
 

@@ -4,6 +4,9 @@ A varies over the field where the light falls on the colour filters at an angle 
 ``A(x, y) = matrix + sum of coefficients x Legendre products``: the products average to zero over the field, so `matrix`
 stays the mean and whoever ignores the variation makes the smallest error.
 
+The two greens of a Bayer mosaic, in rows with red and in rows with blue, see red and blue light differently: their
+neighbours leak into them. `Crosstalk.sites` has a row for each; `Crosstalk.matrix` has their mean.
+
 From the spectra of lights and camera follows ``A[c, l] = sum over wavelengths of S_c E_l``.
 
 The lights are ``A^-1 channels`` at every pixel (`unmix`). Light j sees
@@ -112,6 +115,11 @@ class Crosstalk:
         Standard uncertainty of every entry; from the covariance where that is given.
     field : CrosstalkField or None
         How A varies over the field; None: it is the same everywhere.
+    green_difference : ndarray, shape (k,), or None
+        Entries of the greens in rows with red minus those of the greens in rows with blue, whose mean `matrix` has;
+        its mean over the field. None: the greens are equal, or there is one only (3-CCD).
+    green_difference_std : ndarray, shape (k,), or None
+        Its standard uncertainty.
     """
 
     matrix: FloatArray
@@ -119,6 +127,8 @@ class Crosstalk:
     std: FloatArray | None = None
     covariance: FloatArray | None = None
     field: CrosstalkField | None = None
+    green_difference: FloatArray | None = None
+    green_difference_std: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Check the values and convert them to their types."""
@@ -154,6 +164,21 @@ class Crosstalk:
             std = np.sqrt(np.diag(covariance))
         if std is not None:
             object.__setattr__(self, "std", np.asarray(std, dtype=np.float64).reshape(matrix.shape))
+        self._check_greens()
+
+    def _check_greens(self) -> None:
+        for name in ("green_difference", "green_difference_std"):
+            if (figures := getattr(self, name)) is None:
+                continue
+            values = np.asarray(figures, dtype=np.float64)
+            if len(self.matrix) != 3 or values.shape != (len(self.lights),) or not np.isfinite(values).all():
+                raise CalibrationError(
+                    f"{name} of a crosstalk of three camera channels has one finite number per light "
+                    f"({', '.join(self.lights)}); given is shape {values.shape} for {len(self.matrix)} channels"
+                )
+            if name == "green_difference_std" and (self.green_difference is None or (values < 0).any()):
+                raise CalibrationError("green_difference_std belongs to a green_difference and is not negative")
+            object.__setattr__(self, name, values)
 
     @classmethod
     def identity(cls, lights: tuple[str, ...]) -> Crosstalk:
@@ -184,6 +209,13 @@ class Crosstalk:
             return np.broadcast_to(self.matrix, (*np.shape(points)[:-1], *self.matrix.shape))
         terms = legendre_products(points, self.field.shape, self.field.order)[..., 1:]
         return np.asarray(self.matrix + np.tensordot(terms, self.field.coefficients, axes=1))
+
+    @property
+    def sites(self) -> FloatArray:
+        """The matrix (4, k) of the sites of a Bayer cell: R, G in rows with red, G in rows with blue, B."""
+        red, green, blue = self.matrix
+        half = 0.0 if self.green_difference is None else self.green_difference / 2
+        return np.stack([red, green + half, green - half, blue])
 
     @property
     def unmixing(self) -> FloatArray:
@@ -218,6 +250,20 @@ class Crosstalk:
         blocks = self.covariance.reshape(channels, lights, channels, lights)
         variance = np.einsum("ic,cjdj,id->ij", self.unmixing, blocks, self.unmixing)
         return np.asarray(np.sqrt(np.maximum(variance, 0)))
+
+    def checkerboard(self, green_difference: FloatArray) -> FloatArray:
+        """Return the checkerboard (k, k) that light j (column), alone at level 1, leaves in the image of light i (row).
+
+        Unmixing with one row for both greens leaves plus this at the greens in rows with red, minus this at those in
+        rows with blue.
+
+        Parameters
+        ----------
+        green_difference : ndarray, shape (k,)
+            What the row does not take into account: all of `green_difference` where the greens are taken as equal, its
+            uncertainty where they are not.
+        """
+        return np.outer(self.unmixing[:, 1], green_difference) / 2
 
 
 HALF_MAXIMUM = 0.921823
