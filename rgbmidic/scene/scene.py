@@ -227,15 +227,18 @@ class Scene:
 
     @property
     def pixel(self) -> float:
-        """Pixel size on the object, mm per px, at the body's front point."""
-        return self.body.front[2] / self.camera.focal_px
+        """Pixel size on the object, mm per px of the first light's image, at the body's front point."""
+        return self.body.front[2] / float(self.camera.lenses(self.lights)[0, 0])
 
     def __post_init__(self) -> None:
         """Check the values."""
         names = [light.name for light in self.lights]
         if not names or len(set(names)) < len(names):
             raise InputError(f"a scene has at least one light, and every light its own name; given are {names}")
-        self.camera.response(self.lights)
+        if self.camera.kind == "monochrome":
+            self.camera.response(self.lights)
+        else:
+            self.camera.true_crosstalk(self.lights)
 
     def light(self, name: str) -> Light:
         """Return the light of that name.

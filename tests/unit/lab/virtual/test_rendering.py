@@ -68,7 +68,8 @@ def test_tracing_equals_its_naive_twin(body):
     turn, origin = state.pose(scene.body)
     frame = np.concatenate([-turn.T @ origin, turn.T.ravel()])
     lights = [[*(turn.T @ (np.array(li.position) - origin)), li.power * NOMINAL_DISTANCE**2] for li in near]
-    lens = np.array([camera.focal_px, *camera.centre, 1e-3, 0.1, -0.2])
+    lens = camera.lenses(near)[0]
+    assert np.allclose(lens, [1.001 * camera.focal_px, 2.1, 1.3])
     pad, taps = _aperture(0.2, 2)
     affine = field.inverse() if field else np.array([1.0, 0, 0, 1, 0, 0])
     expected = trace(
