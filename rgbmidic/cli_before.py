@@ -54,15 +54,17 @@ def demo(out: Annotated[Path, Option(help="Output folder; must be empty or new."
 
 
 def _calibrate_demo(test: Path) -> None:
-    """The crosstalk of a virtual test from its captures, as `rgbmidic-calibrate crosstalk` computes it."""
+    """Calibrate a virtual test from its captures: `rgbmidic-calibrate crosstalk`, `registration` and `merge`."""
     from rgbmidic.settings import FrameSettings
     from rgbmidic_calibration.captures import Captures
-    from rgbmidic_calibration.jobs import calibrate_crosstalk
+    from rgbmidic_calibration.jobs import calibrate_crosstalk, calibrate_registration, merge_files
 
     lights = {name: str(test / f"light_{name}") for name in ("red", "green", "blue")}
-    captures = Captures.find(lights, str(test / "dark"), FrameSettings(path=("captures",)))
-    calibration, _ = calibrate_crosstalk(captures)
-    calibration.write(test / "calibration.json")
+    captures, parts = Captures.find(lights, str(test / "dark"), FrameSettings(path=("captures",))), []
+    for name, calibrate in (("crosstalk", calibrate_crosstalk), ("registration", calibrate_registration)):
+        parts.append(test / f"{name}.json")
+        calibrate(captures)[0].write(parts[-1])
+    merge_files(parts).write(test / "calibration.json")
 
 
 def _calibrate_demo_camera(test: Path) -> None:

@@ -91,9 +91,7 @@ def calibrate(folder: Path, element_size: float = ELEMENT) -> Calibration:
     captures = Captures.find(lights, str(folder / DARK["blue"]), STATED)
     crosstalk, _ = calibrate_crosstalk(captures)
     registration, _ = calibrate_registration(captures, element_size=element_size)
-    return replace(
-        crosstalk, registration=registration.registration, noise=NOISE, black_level=None, white_level=None
-    )
+    return replace(crosstalk, registration=registration.registration, noise=NOISE, black_level=None, white_level=None)
 
 
 def lights(

@@ -334,7 +334,7 @@ class DatasetSettings(PartOfScene):
     calibration_frames
         Frames per light, and dark frames.
     target
-        Target in the calibration frames.
+        Target in the calibration frames; a registration needs a speckled one.
     region
         (x0, y0, x1, y1) px for test.toml; None: everything that stays in view, minus a margin.
     element_size
@@ -346,7 +346,7 @@ class DatasetSettings(PartOfScene):
     format: Literal["dng", "tiff"] = "dng"
     seed: int = bounded(0, at_least=0)
     calibration_frames: int = bounded(3, at_least=1)
-    target: Target = "white"
+    target: Target = "speckled"
     region: tuple[float, float, float, float] | None = None
     element_size: float = bounded(ELEMENT_SIZE, above=0)
     noise_free: bool = False
