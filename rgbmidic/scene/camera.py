@@ -189,8 +189,8 @@ class Camera(PartOfScene):
     green_difference
         Response of the greens in rows with red minus that of the greens in rows with blue, per light, in the unit of
         the crosstalk (1: the channel that sees the light best); the crosstalk has their mean. Empty: the greens are
-        equal. A sensor had -.018, .01 and -.006 under 650, 550 and 450 nm (docs/explanation/real-captures.md): 17 % of
-        what green sees of red, 1 and 3 % of green and blue. It depends on the make, hence no default.
+        equal. One sensor had -.015, -.001 and .010 under 650, 550 and 450 nm (docs/explanation/real-captures.md): it
+        depends on the make, and on rendered speckle 15 % cost nothing (docs/explanation/when-not.md).
     exposure
         Fraction of full scale of an ideal white under a light of power 1 at its nominal distance, in the
         channel that sees the light best.
