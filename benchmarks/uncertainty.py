@@ -22,6 +22,7 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.measures import area_stds
 from rgbmidic.lab.virtual import render, strained_plate, truth
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.settings import LOCAL_MEAN
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.weights.threshold import threshold_weights
 
@@ -54,10 +55,7 @@ def square(size: int) -> tuple[int, int]:
 def solve_pair(
     pair: Pair, images: tuple[IlluminationImages, IlluminationImages], threshold: float | None = None, **options: Any
 ) -> Solution:
-    """Default solve, or the paper's binary masks with a threshold; started within half a pixel of the truth.
-
-    Lights that have a registration are measured as a test is: with defaults and a search for the start.
-    """
+    """Default solve, or the paper's binary masks with a threshold; started within half a pixel of the truth."""
     low, high = square(pair.size)
     region = Region.from_rectangle((low, low, high, high), (pair.size, pair.size))
     nodes = Tri3Mesh.from_region(region, 25).nodes
@@ -65,10 +63,21 @@ def solve_pair(
     if threshold is not None:
         first, second = (threshold_weights(image, threshold=threshold) for image in images)
         options |= {"weights": first, "deformed_weights": second, "statistics": False}
+    return correlated(images, region, **options)
+
+
+def correlated(images: tuple[IlluminationImages, IlluminationImages], region: Region, **options: Any) -> Solution:
+    """Solution of two states; lights that have a registration are measured as a test is, from a search for the start.
+
+    Raises
+    ------
+    ValueError
+        Lights with a registration and options beyond the defaults.
+    """
     if images[0].registration is None:
         return correlate(images[0].values, images[1].values, region=region, **options)
-    if threshold is not None or options.keys() != {"initial", "normalise"}:
-        raise ValueError("lights with a registration are measured by defaults only")
+    if options.keys() != {"initial", "normalise"} or options["normalise"] != LOCAL_MEAN:
+        raise ValueError(f"lights with a registration are measured by defaults only, not with {list(options)}")
     (solution,) = measure_sequence([images[1]], reference=images[0], region=region)
     return solution
 
@@ -319,7 +328,8 @@ def corrupted(quick: bool) -> Iterator[Row]:
 
 @table("areas", page="explanation/uncertainty", cost=40, keys=2, own_quick=True)
 def areas(quick: bool) -> Iterator[Row]:
-    """The paper's sphere, whose green reflection crosses the areas A4 and A3, in one shot: perturbation P of area A0,
+    """The paper's sphere behind a lens with lateral colour of half a pixel at the corners from one lamp to the next,
+    whose green reflection crosses the areas A4 and A3, in one shot: perturbation P of area A0,
     which no reflection reaches, P of the other areas over it (root mean square of both components), and their stated
     uncertainty over that of A0.
     """
@@ -334,10 +344,10 @@ def areas(quick: bool) -> Iterator[Row]:
         for title, (kind, matrix) in list(cases.items())[: 2 if quick else 3]:
             camera = bench.scene.camera if matrix is None else replace(bench.scene.camera, crosstalk=matrix)
             scene = replace(bench.scene, camera=camera)
-            pair = [images_of(frame(i, scene, kind, n), scene).values for n, i in enumerate(rendered)]
+            first, second = (images_of(frame(i, scene, kind, n), scene) for n, i in enumerate(rendered))
             mesh = Tri3Mesh.from_region(bench.region, 25)
             start = at_nodes(exact, mesh.nodes) + 0.2
-            found = correlate(*pair, region=bench.region, initial=start, normalise=10)
+            found = correlated((first, second), bench.region, initial=start, normalise=10.0)
             fields = at_pixels(mesh, found.displacement, camera.shape) - exact
             std = at_pixels(mesh, found.displacement_std, camera.shape)
             p, stated = (
