@@ -60,11 +60,13 @@ def _calibrate_demo(test: Path) -> None:
     from rgbmidic_calibration.jobs import calibrate_crosstalk, calibrate_registration, merge_files
 
     lights = {name: str(test / f"light_{name}") for name in ("red", "green", "blue")}
-    captures, parts = Captures.find(lights, str(test / "dark"), FrameSettings(path=("captures",))), []
-    for name, calibrate in (("crosstalk", calibrate_crosstalk), ("registration", calibrate_registration)):
-        parts.append(test / f"{name}.json")
-        calibrate(captures)[0].write(parts[-1])
-    merge_files(parts).write(test / "calibration.json")
+    captures = Captures.find(lights, str(test / "dark"), FrameSettings(path=("captures",)))
+    sections = {"crosstalk": calibrate_crosstalk(captures), "registration": calibrate_registration(captures)}
+    folder = test / "calibration"
+    folder.mkdir()
+    for name, (calibration, _) in sections.items():
+        calibration.write(folder / f"{name}.json")
+    merge_files([folder / f"{name}.json" for name in sections]).write(test / "calibration.json")
 
 
 def _calibrate_demo_camera(test: Path) -> None:
