@@ -11,6 +11,7 @@ import numpy as np
 from bench import SMALLEST, Bench
 from rgbmidic.fields import at_nodes
 from rgbmidic.illumination import IlluminationImages
+from rgbmidic.illumination.crosstalk import align
 from rgbmidic.pipeline import correlated
 from rgbmidic.typing import AnyArray, FloatArray
 from run import run_scene
@@ -39,7 +40,8 @@ LOST = 2.0
     "reflections", page="explanation/polarisers", cost=200, own_quick=True, within={"areas within 1.3 A0 [%]": 200 / 4}
 )
 def reflections(quick: bool) -> Iterator[Row]:
-    """A sphere turning by 0.33 to 8 degrees under a reflection: the paper's perturbation P and the error."""
+    """A sphere turning by 0.33 to 8 degrees under a reflection: the paper's perturbation P and the error. The coloured
+    lamps are seen through a lens with lateral colour of half a pixel at the corners from one lamp to the next."""
     angles = (1.0,) if quick else ANGLES
     for name in ("sequential",) if quick else LIGHTS:
         studies = [
@@ -123,8 +125,8 @@ def with_peers(quick: bool) -> Iterator[Row]:
 
 
 def seen(images: IlluminationImages) -> FloatArray:
-    """8-bit pictures (4, H, W) of the lights and of their mean, each divided by its local mean."""
-    lights = correlated(images)
+    """8-bit pictures (4, H, W) of the lights on the first one's grid and of their mean, over their local mean."""
+    lights = correlated(align(images))
     every = np.concatenate([lights, lights.mean(axis=0, keepdims=True)])
     return np.asarray(np.nan_to_num(every * 110, nan=110.0).clip(0, 255).round(), dtype=np.float64)
 

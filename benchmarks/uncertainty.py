@@ -15,13 +15,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rgbmidic import Status, correlate
+from rgbmidic import Status, correlate, measure_sequence
 from rgbmidic.correlation import Solution
 from rgbmidic.fields import at_nodes, at_pixels, field_rms, high_pass
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.measures import area_stds
 from rgbmidic.lab.virtual import render, strained_plate, truth
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.settings import LOCAL_MEAN
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.weights.threshold import threshold_weights
 
@@ -62,7 +63,23 @@ def solve_pair(
     if threshold is not None:
         first, second = (threshold_weights(image, threshold=threshold) for image in images)
         options |= {"weights": first, "deformed_weights": second, "statistics": False}
-    return correlate(images[0].values, images[1].values, region=region, **options)
+    return correlated(images, region, **options)
+
+
+def correlated(images: tuple[IlluminationImages, IlluminationImages], region: Region, **options: Any) -> Solution:
+    """Solution of two states; lights that have a registration are measured as a test is, from a search for the start.
+
+    Raises
+    ------
+    ValueError
+        Lights with a registration and options beyond the defaults.
+    """
+    if images[0].registration is None:
+        return correlate(images[0].values, images[1].values, region=region, **options)
+    if options.keys() != {"initial", "normalise"} or options["normalise"] != LOCAL_MEAN:
+        raise ValueError(f"lights with a registration are measured by defaults only, not with {list(options)}")
+    (solution,) = measure_sequence([images[1]], reference=images[0], region=region)
+    return solution
 
 
 @dataclass(frozen=True)
@@ -139,6 +156,8 @@ def best_threshold(
     return threshold, error
 
 
+LENS = 0.5
+"""Lateral colour (px at the corner from one light to the next) of a real lens: the default of a SCENE.toml."""
 ANGLES = (0.33, 1.0, 2.0, 4.0, 8.0)
 SPHERES = [
     *(("3-CCD", crosstalk, "smooth", 4.2) for crosstalk in ("mild", "measured")),
@@ -149,16 +168,17 @@ SPHERES = [
 
 @table("sphere", page="explanation/uncertainty", cost=200, keys=4, seed=11, own_quick=True)
 def sphere(quick: bool) -> Iterator[Row]:
-    """Turning sphere: rms error of the displacement over the field after a turn; then, over all angles and nodes, error
-    over stated uncertainty (also within reflections alone), errors within 1.96 stated uncertainties, and the same of
-    strain.
+    """Turning sphere behind a lens with lateral colour of half a pixel at the corners from one lamp to the next: rms
+    error of the displacement over the field after a turn; then, over all angles and nodes, error over stated
+    uncertainty (also within reflections alone), errors within 1.96 stated uncertainties, and the same of strain.
     """
     for camera, crosstalk, paint, speckle in SPHERES[2:4] if quick else SPHERES:
         errors: dict[str, object] = {}
         ratios, strains, inside = list[FloatArray](), list[FloatArray](), list[BoolArray]()
         for angle in ANGLES[1::2] if quick else ANGLES:
             size = 256 if quick else 640
-            pair = pair_of(Setting(body="sphere", state=turn(angle), size=size, speckle=speckle, **PAINTS[paint]))
+            paints = {"speckle": speckle, **PAINTS[paint]}
+            pair = pair_of(Setting(body="sphere", state=turn(angle), size=size, lateral_colour=LENS, **paints))
             solution = solve_pair(pair, both(pair, KINDS[camera], crosstalk=crosstalk))
             verdict = Verdict.of(solution, pair)
             errors[f"{angle:g}° [px]"] = verdict.rms
@@ -308,7 +328,8 @@ def corrupted(quick: bool) -> Iterator[Row]:
 
 @table("areas", page="explanation/uncertainty", cost=40, keys=2, own_quick=True)
 def areas(quick: bool) -> Iterator[Row]:
-    """The paper's sphere, whose green reflection crosses the areas A4 and A3, in one shot: perturbation P of area A0,
+    """The paper's sphere behind a lens with lateral colour of half a pixel at the corners from one lamp to the next,
+    whose green reflection crosses the areas A4 and A3, in one shot: perturbation P of area A0,
     which no reflection reaches, P of the other areas over it (root mean square of both components), and their stated
     uncertainty over that of A0.
     """
@@ -323,10 +344,10 @@ def areas(quick: bool) -> Iterator[Row]:
         for title, (kind, matrix) in list(cases.items())[: 2 if quick else 3]:
             camera = bench.scene.camera if matrix is None else replace(bench.scene.camera, crosstalk=matrix)
             scene = replace(bench.scene, camera=camera)
-            pair = [images_of(frame(i, scene, kind, n), scene).values for n, i in enumerate(rendered)]
+            first, second = (images_of(frame(i, scene, kind, n), scene) for n, i in enumerate(rendered))
             mesh = Tri3Mesh.from_region(bench.region, 25)
             start = at_nodes(exact, mesh.nodes) + 0.2
-            found = correlate(*pair, region=bench.region, initial=start, normalise=10)
+            found = correlated((first, second), bench.region, initial=start, normalise=10.0)
             fields = at_pixels(mesh, found.displacement, camera.shape) - exact
             std = at_pixels(mesh, found.displacement_std, camera.shape)
             p, stated = (

@@ -14,11 +14,10 @@ import cv2
 import numpy as np
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic
-from rgbmidic.illumination.crosstalk import unmix
 from rgbmidic.illumination.images import IlluminationImages
-from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, linearise
-from rgbmidic.illumination.separation import separate
 from rgbmidic.lab.virtual import Cylinder, Scene, State, plate_scene, record, render, sphere_scene, truth
+from rgbmidic.lab.virtual.dataset import true_calibration
+from rgbmidic.pipeline import Separation
 from rgbmidic.scene.camera import MEASURED_CROSSTALK, PIXEL, REFERENCE_CROSSTALK
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -56,10 +55,12 @@ class Setting:
     gloss: float = 1.5
     speckle: float = 4.2
     wrinkles: float = 0.025  # their spacing in mm
+    lateral_colour: float = 0.0  # of the lens, px at the corner from one light to the next
 
     def scene(self, gloss: float | None = None) -> Scene:
         """The scene; another `gloss` for its mat twin."""
         options: dict[str, Any] = {"size": self.size, "seed": self.seed, "droplet": self.speckle * PIXEL}
+        options["lateral_colour"] = self.lateral_colour
         options["gloss"] = self.gloss if gloss is None else gloss
         if self.body == "plate":
             scene = plate_scene(glare="green", tilt_deg=TILT, **options)
@@ -117,13 +118,8 @@ def frame(lights: FloatImage, scene: Scene, kind: Kind, seed: int) -> Mosaic | C
 
 
 def images_of(raw: Mosaic | ChannelFrame, scene: Scene) -> IlluminationImages:
-    """One image per light from a raw frame, by the defaults."""
-    crosstalk = scene.camera.true_crosstalk(scene.lights)
-    linear = linearise(raw, scene.camera.noise)
-    if isinstance(linear, LinearChannels):
-        return unmix(linear, crosstalk)
-    assert isinstance(linear, LinearMosaic)
-    return separate(linear, crosstalk)
+    """One image per light from a raw frame, by the defaults and with the true calibration."""
+    return Separation(calibration=true_calibration(scene))((raw,))
 
 
 def both(

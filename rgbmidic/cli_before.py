@@ -54,15 +54,19 @@ def demo(out: Annotated[Path, Option(help="Output folder; must be empty or new."
 
 
 def _calibrate_demo(test: Path) -> None:
-    """The crosstalk of a virtual test from its captures, as `rgbmidic-calibrate crosstalk` computes it."""
+    """Calibrate a virtual test from its captures: `rgbmidic-calibrate crosstalk`, `registration` and `merge`."""
     from rgbmidic.settings import FrameSettings
     from rgbmidic_calibration.captures import Captures
-    from rgbmidic_calibration.jobs import calibrate_crosstalk
+    from rgbmidic_calibration.jobs import calibrate_crosstalk, calibrate_registration, merge_files
 
     lights = {name: str(test / f"light_{name}") for name in ("red", "green", "blue")}
     captures = Captures.find(lights, str(test / "dark"), FrameSettings(path=("captures",)))
-    calibration, _ = calibrate_crosstalk(captures)
-    calibration.write(test / "calibration.json")
+    sections = {"crosstalk": calibrate_crosstalk(captures), "registration": calibrate_registration(captures)}
+    folder = test / "calibration"
+    folder.mkdir()
+    for name, (calibration, _) in sections.items():
+        calibration.write(folder / f"{name}.json")
+    merge_files([folder / f"{name}.json" for name in sections]).write(test / "calibration.json")
 
 
 def _calibrate_demo_camera(test: Path) -> None:

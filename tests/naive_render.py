@@ -139,8 +139,7 @@ def trace(shape, samples, weights, pad, lens, frame, body, affine, lights, surfa
             for a, wx in enumerate(weights):
                 x = column - pad + (a + 0.5) / samples - 0.5
                 y = row - pad + (b + 0.5) / samples - 0.5
-                scale = lens[0] * (1 + lens[3])
-                pin = np.array([(x - lens[1] - lens[4]) / scale, (y - lens[2] - lens[5]) / scale, 1.0])
+                pin = np.array([(x - lens[1]) / lens[0], (y - lens[2]) / lens[0], 1.0])
                 ray = setup.origin, setup.turn @ pin
                 for j, light in enumerate(lights):
                     out[j, row, column] += wx * wy * radiance(ray, body, affine, light, paint, counts, int(seed))

@@ -54,6 +54,13 @@ def _camera_strain(table: Table) -> None:
     between(both, 0, 10)
 
 
+def _real_captures(table: Table) -> None:
+    """Few nodes and one reference: rms over stated of correlated errors; 12-bit noise gives some hundredths of a px."""
+    for method in ("default", "Malvar"):
+        between(column(table, f"{method}: error/stated"), 0.5, 1.4)
+        between(column(table, f"{method} [px]"), 0.002, 0.05)
+
+
 def _star(table: Table) -> None:
     """Linear elements show a wave between pixels as their interpolant or better, and at most as their best fit.
 
@@ -215,6 +222,7 @@ LAWS: dict[str, Law] = {
     "noise": _noise,
     "polarisers": _polarisers,
     "probes": _probes,
+    "real_captures": _real_captures,
     "reflections": _reflections,
     "reflections_areas": _reflections_areas,
     "sphere": _sphere,

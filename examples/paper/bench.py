@@ -15,7 +15,7 @@ import numpy as np
 
 from rgbmidic import Calibration, Region
 from rgbmidic.errors import InputError
-from rgbmidic.illumination import IlluminationImages
+from rgbmidic.illumination import IlluminationImages, separate
 from rgbmidic.lab.measures import (
     Area,
     Goniometry,
@@ -67,7 +67,9 @@ LAMP = 700.0
 """Distance (mm) of the lamps from the surface."""
 DSLR: dict[str, object] = {"kind": "monochrome", "bits": 14, "black_level": 0, "gain": 1.6, "read_noise": 12.0}
 """A 14-bit camera of the class of the paper's: 26,000 electrons at full scale."""
-CAMERAS: dict[str, dict[str, object]] = {"sequential": DSLR, "bayer": {}, "3-CCD": {"kind": "rgb"}}
+LENS: dict[str, object] = {"lateral_colour": 0.5}
+"""A real lens: half a pixel of lateral colour at the corners from one coloured lamp to the next."""
+CAMERAS: dict[str, dict[str, object]] = {"sequential": DSLR, "bayer": LENS, "3-CCD": {"kind": "rgb"} | LENS}
 TILT_DEG = 15.0
 """Tilt of the flat specimen's normal against the camera's axis (degrees): light from as far beyond it is reflected."""
 DISTANCE = 600.0
@@ -167,6 +169,8 @@ class Bench:
     def photograph(self, images: np.ndarray, shot: int, demosaic: str = "malvar") -> IlluminationImages:
         """Illumination images from the shots of a state: one per light, or one mosaic of all, to be demosaiced.
 
+        With ``"auto"`` they lie where the lens puts them and have a registration, as our solver takes them; else they
+        are brought onto the first light's grid, as the paper's methods need them.
         `images` are noise-free and exposed, (k, H, W); every number of a shot has its own noise.
         """
         camera, lights = self.scene.camera, self.scene.lights
@@ -182,10 +186,16 @@ class Bench:
             )
             for number, on in enumerate(shots)
         )
-        calibration = None
-        if self.name != "sequential":
-            calibration = Calibration(crosstalk=camera.true_crosstalk(lights), noise=camera.noise)
-        return replace(Separation(calibration=calibration, demosaic=demosaic)(frames), names=names)
+        if self.name == "sequential":
+            return replace(Separation()(frames), names=names)
+        calibration = Calibration(
+            crosstalk=camera.true_crosstalk(lights),
+            noise=camera.noise,
+            registration=camera.true_registration(lights),
+        )
+        if demosaic != "auto":
+            return separate(frames[0], calibration, demosaic)
+        return Separation(calibration=calibration)(frames)
 
 
 def lamp_for_reflection(

@@ -106,6 +106,7 @@ class Competitor:
             weights,
             mesh=Tri3Mesh.from_region(region, element_size),
             prefilter=SolverSettings().prefilter if settings.default else prefilter,
+            registration=images.registration,
         )
         return cls(method=method, lights=lights, reference=reference, threshold=limit)
 

@@ -5,7 +5,7 @@ Paint is a function of the material point alone. Droplets are discs hashed from 
 on a rotated three-dimensional lattice: plate, cylinder and sphere carry the same paint, without chart or seam.
 
 Parameter vectors (float64)
-    lens    [focal length px, centre x, centre y, magnification, shift x, shift y]
+    lens    [focal length px, centre x, centre y]
     frame   [camera centre in the body's frame (3), rotation camera -> body row by row (9)]
     body    [kind, radius, half width, half height]; limits are material, along x and y
     affine  [m00, m01, m10, m11, t0, t1], spatial -> material point of a plate
@@ -284,7 +284,7 @@ def _paint(work, place, count, middle, found, body, paint, counts, seed):
 @helper()
 def _locate(work, place, rows, span, samples, x0, y0, lens, frame, body, affine):
     """Where the rays through the sub-pixels (x0 + i, y0 + r) meet the body; `_SEEN` is 1 or 0."""
-    scale = 1.0 / (lens[0] * (1.0 + lens[3]) * samples)
+    scale = 1.0 / (lens[0] * samples)
     # the surface is quadric . (x², y², z²) = 1 along the axes it curves about, or the plane z = 0
     flat = body[0] == PLATE
     ax, ay = 0.0 if flat else 1.0, 1.0 if body[0] == SPHERE else 0.0
@@ -389,7 +389,7 @@ def trace_rows(
     work, place = np.empty(15 * _ROW, dtype=np.float32), np.empty(3 * _ROW)
     found = np.empty(4 * MAX_CANDIDATES, dtype=np.float32)
     energy = np.empty(lights.shape[0] * side * across, dtype=np.float32).reshape(lights.shape[0], side, across)
-    x0, y0 = 0.5 - samples * (0.5 + lens[1] + lens[4] + pad), 0.5 - samples * (0.5 + lens[2] + lens[5]) + first_row
+    x0, y0 = 0.5 - samples * (0.5 + lens[1] + pad), 0.5 - samples * (0.5 + lens[2]) + first_row
     for block in range(start, stop, TILE):
         top, rows = block * samples, min(side, (stop - block) * samples)
         for left in range(0, across, side):

@@ -36,13 +36,13 @@ from rgbmidic.typing import FloatArray, FloatImage, Progress
 
 _SCENE = """\
 # The paper's sphere (82.5 mm) turning about its front point under a red, a green and a blue lamp, all at once.
-# Body, paint, lamps and camera are those that stand in where a scene states none (docs/how-to/planning.md).
+# Body, paint, lamps and camera are those that stand in where a scene states none (docs/how-to/planning.md); the lens
+# has half a pixel of lateral colour at the corners from one lamp to the next.
 [camera]
 shape = [{size}, {size}]
 
 [output]
 seed = 2026
-target = "speckled"
 """
 ANGLES = (0.33, 1.0, 2.0, 8.0)
 """Rotations of the sphere, degrees."""
@@ -159,7 +159,7 @@ def run_demo(
     with kernels_compiled_meanwhile():
         settings_file = write_dataset(scene, test, progress)
         (test / "calibration.json").rename(test / "true_calibration.json")
-        report("2 of 7: calibration, 1 s, as rgbmidic-calibrate crosstalk does from captures with one light at a time")
+        report("2 of 7: calibration, 2 s, as rgbmidic-calibrate crosstalk, registration and merge do from captures")
         calibrate(test)
     settings = read_test(settings_file)
     report(f"3 of 7: measurement, some 3 s: rgbmidic run {settings_file} --out {out / 'result'}")

@@ -1,7 +1,7 @@
 """Point lights, polarisers and the camera of a scene.
 
-Lights have a position, a power, a spectrum and the aberration of the lens in their colour; the camera has a pin-hole
-projection, a lens blur, colour channels, noise and quantisation.
+Lights have a position, a power, a spectrum and the magnification of the lens in their colour; the camera has a
+pin-hole projection, lateral colour, a lens blur, colour channels, noise and quantisation.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy.typing as npt
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities, spectral_response
+from rgbmidic.illumination.images import PARAMETERS, Registration, frame_geometry
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.scene.checked import PartOfScene
 from rgbmidic.settings.conversion import bounded
@@ -48,16 +49,17 @@ class Light(PartOfScene):
     spectrum
         Needed where the crosstalk follows from spectra.
     magnification
-        Relative radial magnification of the lens in this colour (lateral chromatic aberration).
+        Relative magnification of the lens about the principal point in this colour: its focal length is
+        ``focal_px (1 + magnification)``. None: that of the camera's lateral colour.
     shift
-        Further shift (x, y) of this colour's image, px.
+        Shift (x, y) of the principal point in this colour, px.
     """
 
     name: str
     position: Vector
     power: float = bounded(1.0, at_least=0)
     spectrum: Led | None = None
-    magnification: float = bounded(0.0, above=-0.1, below=0.1)
+    magnification: float | None = bounded(None, above=-0.1, below=0.1)
     shift: tuple[float, float] = (0.0, 0.0)
 
     def aimed(self, target: Vector, irradiance: float = 1.0) -> Light:
@@ -141,18 +143,10 @@ def rotation(angle_deg: float, axis: Vector) -> FloatArray:
     return turn
 
 
-def three_lights(
-    target: Vector = (0.0, 0.0, NOMINAL_DISTANCE), aberration: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> tuple[Light, ...]:
-    """Red, green and blue lamps left, right and above the camera, all equally bright at the target.
-
-    `aberration`: relative magnification of the lens in red, green and blue.
-    """
+def three_lights(target: Vector = (0.0, 0.0, NOMINAL_DISTANCE)) -> tuple[Light, ...]:
+    """Red, green and blue lamps left, right and above the camera, all equally bright at the target."""
     places = {"red": (-190.0, -12.0, 90.0), "green": (200.0, 15.0, 90.0), "blue": (10.0, -220.0, 60.0)}
-    return tuple(
-        Light(name=name, position=position, magnification=magnification).aimed(target)
-        for (name, position), magnification in zip(places.items(), aberration, strict=True)
-    )
+    return tuple(Light(name=name, position=position).aimed(target) for name, position in places.items())
 
 
 REFERENCE_CROSSTALK = ((1.0, 0.10, 0.02), (0.14, 1.0, 0.16), (0.03, 0.12, 1.0))
@@ -175,6 +169,12 @@ class Camera(PartOfScene):
         Rows and columns of the frame.
     focal_px
         Focal length in px: distance / (mm per px at that distance).
+    lateral_colour
+        Lateral colour of the lens, px at the corner of the frame: by so much each light's image of it lies further
+        from the principal point than that of the light before, in the order of the lights. It is a magnification, so
+        it grows from the middle outwards; displacements are in px of the first light's image, which has `focal_px`. A
+        light that states its `magnification` has that instead. The lamps before a monochrome camera count as of one
+        colour: there it is 0. An 8 mm lens had 1 to 2 px (docs/explanation/real-captures.md).
     lens_blur
         Standard deviation of the Gaussian lens blur (px), on top of the pixel's square aperture.
     kind
@@ -186,6 +186,11 @@ class Camera(PartOfScene):
         lights' spectra, or without these the identity (all ones for a monochrome camera).
     sensitivities
         Spectral sensitivities, for a crosstalk that follows from physics.
+    green_difference
+        Response of the greens in rows with red minus that of the greens in rows with blue, per light, in the unit of
+        the crosstalk (1: the channel that sees the light best); the crosstalk has their mean. Empty: the greens are
+        equal. One sensor had -.015, -.001 and .010 under 650, 550 and 450 nm (docs/explanation/real-captures.md): it
+        depends on the make, and on rendered speckle 15 % cost nothing (docs/explanation/when-not.md).
     exposure
         Fraction of full scale of an ideal white under a light of power 1 at its nominal distance, in the
         channel that sees the light best.
@@ -206,11 +211,13 @@ class Camera(PartOfScene):
 
     shape: tuple[int, int] = bounded(at_least=2)
     focal_px: float = bounded(DISTANCE / PIXEL, above=0)
+    lateral_colour: float = bounded(0.5, above=-20, below=20)
     lens_blur: float = bounded(0.45, at_least=0, at_most=20)
     kind: Literal["bayer", "rgb", "monochrome"] = "bayer"
     cfa: str = "RGGB"
     crosstalk: FloatArray | None = None
     sensitivities: Sensitivities | None = None
+    green_difference: tuple[float, ...] = ()
     exposure: float = bounded(0.5, above=0)
     bits: int = bounded(12, at_least=8, at_most=16)
     black_level: int = bounded(64, at_least=0)
@@ -223,6 +230,8 @@ class Camera(PartOfScene):
         cfa_channels(self.cfa)
         if not self.black_level < self.white_level:
             yield f"black_level must be below saturation at {self.white_level}, not {self.black_level}"
+        if self.green_difference and self.kind != "bayer":
+            yield f'green_difference is of a camera of kind "bayer", not "{self.kind}"'
         if self.crosstalk is not None:
             object.__setattr__(self, "crosstalk", np.asarray(self.crosstalk, dtype=np.float64))
 
@@ -312,14 +321,68 @@ class Camera(PartOfScene):
         Returns
         -------
         Crosstalk
+
+        Raises
+        ------
+        InputError
+            The difference of the greens does not fit the lights, or is more than what they see.
         """
-        return Crosstalk(matrix=self.mixing(lights), lights=tuple(light.name for light in lights))
+        matrix, names = self.mixing(lights), tuple(light.name for light in lights)
+        if not (difference := self.green_difference):
+            return Crosstalk(matrix=matrix, lights=names)
+        if len(difference) != len(lights) or (np.abs(difference) > 2 * matrix[1]).any():
+            raise InputError(
+                f"green_difference has one number per light ({', '.join(names)}), of at most twice its crosstalk in G "
+                f"({', '.join(f'{entry:.3g}' for entry in matrix[1])}); not {list(difference)}"
+            )
+        return Crosstalk(matrix=matrix, lights=names, green_difference=np.array(difference))
+
+    def lenses(self, lights: tuple[Light, ...]) -> FloatArray:
+        """Return focal length and principal point (x, y) of the lens in the colour of each light, px.
+
+        Parameters
+        ----------
+        lights
+            k lights.
+
+        Returns
+        -------
+        ndarray, shape (k, 3)
+        """
+        step = 0.0 if self.kind == "monochrome" else self.lateral_colour / math.hypot(*self.centre)
+        steps = np.arange(len(lights)) * step
+        growth = [one if li.magnification is None else li.magnification for li, one in zip(lights, steps, strict=True)]
+        centres = np.array([light.shift for light in lights]) + self.centre
+        return np.column_stack([self.focal_px * (1 + np.array(growth)), centres])
+
+    def true_registration(self, lights: tuple[Light, ...]) -> Registration | None:
+        """Return the registration that a perfect calibration would find; None: the lens images all colours alike.
+
+        Parameters
+        ----------
+        lights
+            k lights.
+
+        Returns
+        -------
+        Registration or None
+        """
+        lenses = self.lenses(lights)
+        if (lenses == lenses[0]).all():
+            return None
+        parameters = np.zeros((len(lights), len(PARAMETERS)))
+        parameters[:, :2] = lenses[:, 1:] - lenses[0, 1:]
+        parameters[:, PARAMETERS.index("scale")] = lenses[:, 0] / lenses[0, 0] - 1
+        centre, (_, radius) = (float(lenses[0, 1]), float(lenses[0, 2])), frame_geometry(self.shape)
+        names = tuple(light.name for light in lights)
+        return Registration(lights=names, parameters=parameters, centre=centre, radius=radius)
 
 
 def reference_camera(shape: tuple[int, int], **changes: object) -> Camera:
     """RGGB, 12 bit, 4 e-/DN, read noise 12 e-, lens blur 0.45 px, 0.055 mm per px; `changes` to any setting.
 
-    A monochrome camera has no crosstalk of its own.
+    Its lens has no lateral colour unless `changes` state it, so that a scene shows one cause at a time; a camera of a
+    SCENE.toml has. A monochrome camera has no crosstalk of its own.
 
     Parameters
     ----------
@@ -334,9 +397,17 @@ def reference_camera(shape: tuple[int, int], **changes: object) -> Camera:
     """
     if changes.get("kind") != "monochrome" and "sensitivities" not in changes:
         changes = {"crosstalk": np.array(REFERENCE_CROSSTALK), **changes}
+    changes = {"lateral_colour": 0.0, **changes}
     return Camera(shape=shape, **changes)  # type: ignore[arg-type]
 
 
 def mosaic_samples(channels: npt.NDArray[Floating], cfa: str) -> npt.NDArray[Floating]:
     """Return the samples (H, W) that a colour filter array takes of channels (3, H, W)."""
     return np.asarray(np.take_along_axis(channels, sampled_channels(cfa, channels.shape[1:])[None], axis=0)[0])
+
+
+def green_signs(cfa: str, shape: tuple[int, int]) -> npt.NDArray[np.float32]:
+    """Return 1 at the greens in rows with red, -1 at those in rows with blue and 0 elsewhere, (H, W)."""
+    channels = sampled_channels(cfa, (2, 2))
+    cell = np.where(channels == 1, np.where((channels == 0).any(axis=1, keepdims=True), 1, -1), 0)
+    return np.tile(cell, (-(-shape[0] // 2), -(-shape[1] // 2)))[: shape[0], : shape[1]].astype(np.float32)

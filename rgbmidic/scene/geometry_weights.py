@@ -228,7 +228,7 @@ def surface_from_heights(heights: npt.ArrayLike, scene: Scene) -> tuple[FloatArr
     if not np.nanmin(depth, initial=np.inf) > 0:
         raise InputError(f"heights must stay below the distance of {distance:g} mm to the camera")
     rows, columns = np.indices(depth.shape)
-    x0, y0 = camera.centre
-    points = np.stack([depth * (columns - x0) / camera.focal_px, depth * (rows - y0) / camera.focal_px, depth])
+    focal, x0, y0 = camera.lenses(scene.lights)[0]
+    points = np.stack([depth * (columns - x0) / focal, depth * (rows - y0) / focal, depth])
     down, right = np.gradient(points, axis=(1, 2))
     return points, unit(np.cross(down, right, axis=0))

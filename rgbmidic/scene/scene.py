@@ -227,15 +227,18 @@ class Scene:
 
     @property
     def pixel(self) -> float:
-        """Pixel size on the object, mm per px, at the body's front point."""
-        return self.body.front[2] / self.camera.focal_px
+        """Pixel size on the object, mm per px of the first light's image, at the body's front point."""
+        return self.body.front[2] / float(self.camera.lenses(self.lights)[0, 0])
 
     def __post_init__(self) -> None:
         """Check the values."""
         names = [light.name for light in self.lights]
         if not names or len(set(names)) < len(names):
             raise InputError(f"a scene has at least one light, and every light its own name; given are {names}")
-        self.camera.response(self.lights)
+        if self.camera.kind == "monochrome":
+            self.camera.response(self.lights)
+        else:
+            self.camera.true_crosstalk(self.lights)
 
     def light(self, name: str) -> Light:
         """Return the light of that name.
@@ -331,7 +334,7 @@ class DatasetSettings(PartOfScene):
     calibration_frames
         Frames per light, and dark frames.
     target
-        Target in the calibration frames.
+        Target in the calibration frames; a registration needs a speckled one.
     region
         (x0, y0, x1, y1) px for test.toml; None: everything that stays in view, minus a margin.
     element_size
@@ -343,7 +346,7 @@ class DatasetSettings(PartOfScene):
     format: Literal["dng", "tiff"] = "dng"
     seed: int = bounded(0, at_least=0)
     calibration_frames: int = bounded(3, at_least=1)
-    target: Target = "white"
+    target: Target = "speckled"
     region: tuple[float, float, float, float] | None = None
     element_size: float = bounded(ELEMENT_SIZE, above=0)
     noise_free: bool = False

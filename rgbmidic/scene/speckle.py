@@ -67,7 +67,7 @@ def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tupl
     Parameters
     ----------
     scene
-        Bayer camera and lights.
+        Bayer camera and lights; the greens count as equal, the lens as without lateral colour.
     texture : ndarray, shape (n, n)
         Of a `SpecklePatch`.
     demosaic
@@ -81,7 +81,7 @@ def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tupl
         Of the part that stays with the mosaic when the texture moves, for its three carriers (alternating along x, y
         and both), in units of each light's mean; lights of equal brightness.
     """
-    camera, crosstalk = scene.camera, scene.camera.true_crosstalk(scene.lights)
+    camera, crosstalk = scene.camera, replace(scene.camera.true_crosstalk(scene.lights), green_difference=None)
     level, amplitude = 0.25 * camera.full_scale, 0.005 * camera.full_scale  # no sample saturates
     channels = level * crosstalk.matrix.sum(axis=1)[:, None, None] * texture
 

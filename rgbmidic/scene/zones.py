@@ -33,7 +33,7 @@ REFLECTS = 0.2
 def material_points(
     scene: Scene, state: State | None = None, pixels: tuple[FloatArray, FloatArray] | None = None
 ) -> FloatArray:
-    """Material point (mm, body axes) that an ideal lens sees at every pixel centre, shape (3, H, W); NaN off it.
+    """Material point (mm, body axes) seen at every pixel centre of the first light's image; NaN off the body.
 
     `pixels`: image points (x, y) in px, two arrays of one shape, instead of the pixel centres.
 
@@ -97,7 +97,7 @@ def placed(scene: Scene, material: FloatArray, state: State | None = None) -> tu
 def truth(
     scene: Scene, state: State, reference: State | None = None, pixels: tuple[FloatArray, FloatArray] | None = None
 ) -> FloatArray:
-    """Exact displacement of the material point seen at every pixel of the reference image.
+    """Exact displacement of the material point seen at every pixel of the first light's reference image, px of it.
 
     Parameters
     ----------
@@ -121,17 +121,20 @@ def truth(
     camera = scene.camera
     if pixels is None:
         pixels = np.arange(camera.shape[1], dtype=float), np.arange(camera.shape[0], dtype=float)[:, None]
-    x = camera.focal_px * point[0] / point[2] + camera.centre[0] - pixels[0]
-    y = camera.focal_px * point[1] / point[2] + camera.centre[1] - pixels[1]
+    focal, *centre = camera.lenses(scene.lights)[0]
+    x = focal * point[0] / point[2] + centre[0] - pixels[0]
+    y = focal * point[1] / point[2] + centre[1] - pixels[1]
     return np.where(hidden, np.nan, np.stack([x, y]))
 
 
 def intersect(scene: Scene, state: State, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Point (3, ...) in body axes where the rays through image points (px) meet the body's front; NaN beside it."""
-    camera, (turn, origin) = scene.camera, state.pose(scene.body)
-    rays = np.stack(
-        [(x - camera.centre[0]) / camera.focal_px, (y - camera.centre[1]) / camera.focal_px, np.ones_like(x)]
-    )
+    """Point (3, ...) in body axes where the rays through points (px) of the first light's image meet the body; or NaN.
+
+    Of the body only its front is seen.
+    """
+    focal, *centre = scene.camera.lenses(scene.lights)[0]
+    turn, origin = state.pose(scene.body)
+    rays = np.stack([(x - centre[0]) / focal, (y - centre[1]) / focal, np.ones_like(x)])
     direction = np.einsum("ji,j...->i...", turn, rays)
     start = -turn.T @ origin
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -29,6 +29,12 @@ WANTED = {
         "Sample14 L3 Amp0.1b.tif",
         "Sample14 L5 Amp0.1b.tif",
     ),
+    "real_disks_three_bands": (
+        "disks_650nm_250ms.tif",
+        "disks_550nm_25ms.tif",
+        "disks_450nm_50ms.tif",
+        *(f"dark_{time}ms_{number}.tif" for time in (250, 25, 50) for number in (0, 1)),
+    ),
 }
 """Files of a folder, where not all are used or may be given on."""
 COPYRIGHT = {
@@ -39,6 +45,7 @@ COPYRIGHT = {
     "ladisk/pyMRAW": "MIT, Copyright (c) 2024 LADISK",
     "ladisk/pyidi": "MIT, Copyright (c) 2018 - 2019 Domen Gorjup, Janko Slavič, Klemen Zaletelj (in alphabetic order)",
     "syoyo/tinydngloader": "MIT (stated in its README), by Syoyo Fujita",
+    "bllanos/chromatic-aberration": "BSL-1.0, by Bernard Llanos, University of Alberta (its README)",
     "LineageOS/android_external_skia": "BSD-3-Clause, Copyright 2011 Google Inc., Copyright 2017 Google LLC",
 }
 NAMED = {"led_and_camera_spectra": ["BSD-3-Clause, Copyright 2013 Colour Developers"]}

@@ -24,7 +24,7 @@ from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import Frame
 from rgbmidic.lab.virtual.rendering import render
 from rgbmidic.results.files import writing
-from rgbmidic.scene.camera import Camera, Light, mosaic_samples
+from rgbmidic.scene.camera import Camera, Light, green_signs, mosaic_samples
 from rgbmidic.scene.scene import DatasetSettings, Plate, Scene, State, Target, read_scene
 from rgbmidic.scene.surface import Finish, Surface
 from rgbmidic.scene.zones import region_in_view, truth
@@ -141,6 +141,7 @@ def true_calibration(scene: Scene) -> Calibration:
     camera = scene.camera
     return Calibration(
         crosstalk=None if camera.kind == "monochrome" else camera.true_crosstalk(scene.lights),
+        registration=camera.true_registration(scene.lights),
         noise=camera.noise,
         cfa=camera.cfa if camera.kind == "bayer" else None,
         black_level=float(camera.black_level),
@@ -282,9 +283,13 @@ def record(
             raise InputError(f"no light {', '.join(sorted(unknown))}; there are {', '.join(names)}")
         signal = signal * np.array([name in on for name in names], dtype=signal.dtype)[:, None, None]
     mixing = camera.mixing(lights).astype(np.float32)
-    signal = np.einsum("cl,lyx->cyx", mixing, signal.astype(np.float32, copy=False))
+    illumination = signal.astype(np.float32, copy=False)
+    signal = np.einsum("cl,lyx->cyx", mixing, illumination)
     if camera.kind == "bayer":
         signal = mosaic_samples(signal, camera.cfa)
+        if camera.green_difference:
+            half = np.float32(0.5) * np.array(camera.green_difference, dtype=np.float32)
+            signal += green_signs(camera.cfa, signal.shape) * np.tensordot(half, illumination, axes=1)
     generator = np.random.default_rng(seed)
     electrons = generator.poisson(np.maximum(signal, 0) * camera.gain).astype(np.float64)
     if camera.read_noise > 0:

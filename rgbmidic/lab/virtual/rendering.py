@@ -65,25 +65,23 @@ def render(scene: Scene, state: State | None = None) -> FloatImage:
 def _trace(scene: Scene, state: State) -> FloatImage:
     """One pose: lights that the lens images alike are traced together."""
     out = np.empty((len(scene.lights), *scene.camera.shape), dtype=np.float32)
-    groups: dict[tuple[float, float, float], list[int]] = {}
-    for index, light in enumerate(scene.lights):
-        groups.setdefault((light.magnification, *light.shift), []).append(index)
-    for indices in groups.values():
-        out[indices] = _trace_together(scene, state, tuple(scene.lights[index] for index in indices))
+    lenses, kinds = np.unique(scene.camera.lenses(scene.lights), axis=0, return_inverse=True)
+    for number, lens in enumerate(lenses):
+        indices = np.flatnonzero(kinds.ravel() == number)
+        out[indices] = _trace_together(scene, state, tuple(scene.lights[index] for index in indices), lens)
     camera = scene.camera
     levels = camera.full_scale * camera.exposure * camera.response(scene.lights).max(axis=0)
     out *= levels.astype(np.float32)[:, None, None]
     return out
 
 
-def _trace_together(scene: Scene, state: State, lights: tuple[Light, ...]) -> FloatImage:
+def _trace_together(scene: Scene, state: State, lights: tuple[Light, ...], lens: FloatArray) -> FloatImage:
     camera, n = scene.camera, samples_needed(scene)
     turn, origin = state.pose(scene.body)
     frame = np.concatenate([-turn.T @ origin, turn.T.ravel()])
     positions = np.array(
         [[*(turn.T @ (np.array(li.position) - origin)), li.power * NOMINAL_DISTANCE**2] for li in lights]
     )
-    lens = np.array([camera.focal_px, *camera.centre, lights[0].magnification, *lights[0].shift])
     field = AffineField() if state.displacement is None else state.displacement
     affine = field.inverse() if isinstance(field, AffineField) else None
     pad, taps = _aperture(camera.lens_blur, n)
@@ -96,7 +94,7 @@ def _trace_together(scene: Scene, state: State, lights: tuple[Light, ...]) -> Fl
         first = n * (top - pad)
         material = np.empty((0, 0, 2))
         if affine is None:
-            material = _subpixel_material(scene, state, lights[0], first, n * rows.shape[1], pad)
+            material = _subpixel_material(scene, state, lens, (first, n * rows.shape[1]), pad)
         body, identity = scene.body.parameters(), np.array([1.0, 0, 0, 1, 0, 0])
         trace_rows(
             rows, first, taps, pad, lens, frame, body, identity if affine is None else affine, material, positions,
@@ -119,15 +117,17 @@ def _aperture(blur: float, samples: int) -> tuple[int, FloatArray]:
     return pad, (weights / weights.sum()).astype(np.float32)
 
 
-def _subpixel_material(scene: Scene, state: State, light: Light, first: int, count: int, pad: int) -> FloatArray:
-    """Material point (count, columns, 2) of every sub-pixel sample; NaN off the plate."""
-    n, camera = samples_needed(scene), scene.camera
-    zoom = 1 + light.magnification
-    x = (np.arange(n * (camera.shape[1] + 2 * pad)) + 0.5) / n - 0.5 - pad
+def _subpixel_material(
+    scene: Scene, state: State, lens: FloatArray, sample_rows: tuple[int, int], pad: int
+) -> FloatArray:
+    """Material point (count, columns, 2) of the samples in so many rows from the first; NaN off the plate."""
+    n, (first, count) = samples_needed(scene), sample_rows
+    x = (np.arange(n * (scene.camera.shape[1] + 2 * pad)) + 0.5) / n - 0.5 - pad
     y = (np.arange(first, first + count) + 0.5) / n - 0.5
-    x = (x - camera.centre[0] - light.shift[0]) / zoom + camera.centre[0]
-    y = (y - camera.centre[1] - light.shift[1]) / zoom + camera.centre[1]
-    columns, rows = np.meshgrid(x, y)
+    focal, *centre = scene.camera.lenses(scene.lights)[0]
+    columns, rows = np.meshgrid(
+        (x - lens[1]) * (focal / lens[0]) + centre[0], (y - lens[2]) * (focal / lens[0]) + centre[1]
+    )
     return np.ascontiguousarray(np.moveaxis(material_points(scene, state, (columns, rows))[:2], 0, -1))
 
 
@@ -146,7 +146,6 @@ def sphere_scene(
     seed: int = 0,
     droplet: float = 0.23,
     gloss: float = 1.5,
-    aberration: tuple[float, float, float] = (0.0, 0.0, 0.0),
     **camera: object,
 ) -> Scene:
     """Return the speckled 82.5 mm sphere under three coloured lamps; `turned` gives its states.
@@ -161,10 +160,8 @@ def sphere_scene(
         Median diameter of the black droplets (mm; 0.055 mm is one pixel).
     gloss
         Specular peak in units of an ideal white; 0: no reflection.
-    aberration
-        Relative magnification of the lens in red, green and blue.
     **camera
-        Changed settings of the camera (`Camera`), for instance ``cfa="GBRG"`` or ``kind="rgb"``.
+        Changed settings of the camera (`Camera`), for instance ``cfa="GBRG"`` or ``lateral_colour=0.5``.
 
     Returns
     -------
@@ -177,7 +174,7 @@ def sphere_scene(
     """
     return Scene(
         body=Sphere(),
-        lights=three_lights(aberration=aberration),
+        lights=three_lights(),
         camera=reference_camera((size, size), **camera),
         surface=paint(droplet=droplet, gloss=gloss, seed=seed),
     )

@@ -76,7 +76,8 @@ def test_shots_fill_the_range_without_saturation_and_differ_in_noise_only(name):
     exposed = clean * np.float32(bench.exposure_gain(bench.brightest(clean)))
     first, again, other = (bench.photograph(exposed, shot) for shot in (0, 0, 1))
     assert first.values.shape == clean.shape
-    assert first.valid.mean() > 0.999  # the noise of a few pixels reaches saturation
+    inside = first.valid[:, 2:-2, 2:-2]  # the lens shows the frame's edge in blue from beyond it
+    assert inside.mean() > 0.999  # the noise of a few pixels reaches saturation
     assert first.names == tuple(light.name for light in bench.scene.lights)
     np.testing.assert_array_equal(first.values, again.values)  # NaN where the noise saturates
     difference = (first.values - other.values)[:, 110:190, 110:190]

@@ -54,6 +54,28 @@ def test_every_bayer_phase_samples_its_channel(cfa):
     assert mosaic.cfa == cfa
 
 
+@pytest.mark.parametrize("cfa", BAYER_PATTERNS)
+def test_the_two_greens_differ_as_stated(cfa):
+    """Each sample is that of its row of the true crosstalk's four sites."""
+    difference = (-0.018, 0.012, -0.006)
+    camera = Camera(shape=(6, 8), cfa=cfa, crosstalk=CROSSTALK, green_difference=difference, read_noise=0.0, gain=1e8)
+    images = np.random.default_rng(0).uniform(100, 2000, (3, 6, 8)).astype(np.float32)
+    values = record(images, camera, LIGHTS, seed=0).values - 64.0
+    sites = np.einsum("cl,lyx->cyx", camera.true_crosstalk(LIGHTS).sites, images)
+    for row, column in np.ndindex(2, 2):
+        name = cfa[2 * row + column]
+        site = {"R": 0, "G": 1 if "R" in cfa[2 * row : 2 * row + 2] else 2, "B": 3}[name]
+        place = np.s_[row::2, column::2]
+        assert np.abs(values[place] - sites[site][place]).max() <= 0.6
+
+
+@pytest.mark.parametrize("difference", [(0.1,), (0.3, 0.0, 0.0)])
+def test_a_difference_of_the_greens_is_of_what_they_see(difference):
+    camera = Camera(shape=(6, 8), crosstalk=CROSSTALK, green_difference=difference)
+    with pytest.raises(InputError, match=r"green_difference has one number per light \(red, green, blue\)"):
+        camera.true_crosstalk(LIGHTS)
+
+
 def test_three_ccd_has_every_channel_and_lights_can_be_switched():
     camera = Camera(shape=(4, 4), kind="rgb", crosstalk=CROSSTALK, read_noise=0.0, gain=1e8)
     images = np.ones((3, 4, 4), dtype=np.float32) * np.array([1000, 2000, 500], dtype=np.float32)[:, None, None]

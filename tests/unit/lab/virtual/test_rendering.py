@@ -24,10 +24,12 @@ from rgbmidic.lab.virtual import (
     render,
     sphere_scene,
     strained_plate,
+    truth,
     turned,
 )
+from rgbmidic.lab.virtual.dataset import true_calibration
 from rgbmidic.lab.virtual.rendering import _aperture, paint, samples_needed
-from rgbmidic.scene.camera import NOMINAL_DISTANCE
+from rgbmidic.scene.camera import NOMINAL_DISTANCE, three_lights
 
 FULL = 4095 - 64
 FRONT = (0.0, 0.0, 600.0)
@@ -68,7 +70,8 @@ def test_tracing_equals_its_naive_twin(body):
     turn, origin = state.pose(scene.body)
     frame = np.concatenate([-turn.T @ origin, turn.T.ravel()])
     lights = [[*(turn.T @ (np.array(li.position) - origin)), li.power * NOMINAL_DISTANCE**2] for li in near]
-    lens = np.array([camera.focal_px, *camera.centre, 1e-3, 0.1, -0.2])
+    lens = camera.lenses(near)[0]
+    assert np.allclose(lens, [1.001 * camera.focal_px, 2.1, 1.3])
     pad, taps = _aperture(0.2, 2)
     affine = field.inverse() if field else np.array([1.0, 0, 0, 1, 0, 0])
     expected = trace(
@@ -251,6 +254,34 @@ def test_reflection_is_erratic_inside_the_lobe_and_smooth_outside():
     assert peak[0] > 0.005
     assert flank[0] > 0.02
     assert peak[1] > 2 * outside[1]
+
+
+def test_lateral_colour_is_so_many_px_at_the_corner_from_light_to_light():
+    scene = plate_scene(size=60, lateral_colour=0.5)
+    registration = scene.camera.true_registration(scene.lights)
+    corners = np.array([[0.0, 0.0], [59.0, 0.0], [59.0, 59.0], [29.5, 29.5]])
+    outwards = (corners - 29.5) / np.hypot(29.5, 29.5)
+    for light in range(3):
+        assert np.allclose(registration.displacement(corners)[light], 0.5 * light * outwards, atol=1e-12)
+    stored = true_calibration(scene).registration
+    assert stored is not None
+    assert np.array_equal(stored.parameters, registration.parameters)
+    grey = replace(scene.camera, kind="monochrome", crosstalk=None)
+    assert grey.true_registration(scene.lights) is None
+    own = (replace(scene.lights[0], magnification=0.01), *scene.lights[1:])
+    assert scene.camera.true_registration(own).parameters[1, 3] == pytest.approx((1 + 0.5 / 41.72) / 1.01 - 1, abs=1e-6)
+
+
+def test_truth_and_pixel_are_of_the_first_lights_image():
+    """A magnification of the first light's image is that of the camera: rendered, followed and scaled alike."""
+    scene = replace(sphere_scene(size=40, samples=3, kind="monochrome"), lights=three_lights()[:1])
+    longer = replace(scene, camera=replace(scene.camera, focal_px=1.01 * scene.camera.focal_px))
+    zoomed = scene.with_light(replace(scene.lights[0], magnification=0.01))
+    assert zoomed.pixel == pytest.approx(longer.pixel)
+    assert np.allclose(truth(zoomed, turned(1.0)), truth(longer, turned(1.0)), atol=1e-9)
+    assert np.allclose(render(zoomed), render(longer), rtol=1e-5)
+    shifted = scene.with_light(replace(scene.lights[0], shift=(2.0, -1.0)))
+    assert np.allclose(truth(shifted, turned(1.0))[:, :-1, 2:], truth(scene, turned(1.0))[:, 1:, :-2], atol=1e-9)
 
 
 def test_lateral_aberration_moves_each_colour_along_the_radius():
