@@ -256,11 +256,13 @@ def prediction_taps(
                     for n in range(size):
                         e = sites[phase, other, n]
                         matrix[m, other * size + n] = covariance[c, e, row + reach - other, column + reach - n]
-                matrix[m, m] += noise[entry, (c + 1) // 2] + (held if m == count // two else 0.0)
+                matrix[m, m] += noise[entry, (c + 1) // 2]
                 i, j = row + reach - half, column + reach - half
                 wanted[0, m] = covariance[c, 0, i, j]
                 wanted[1, m] = (covariance[c, 1, i, j] + covariance[c, 2, i, j]) / 2
                 wanted[2, m] = covariance[c, 3, i, j]
+            middle = count // two
+            matrix[middle, middle] += held
             for q in range(count):  # Cholesky, column by column
                 scale = 1 / np.sqrt(matrix[q, q])
                 for m in range(q, count):

@@ -123,12 +123,12 @@ class MosaicModel:
         lines, weights = registered_lines(texture.widths), np.asarray(texture.weights)
         energy = np.empty((count, count, rows, columns))
         for a, b in np.ndindex(count, count):
-            met, rest = np.zeros(size[::-1]), 0.0
+            met, rest = np.zeros(size[::-1]), np.zeros(())
             for s, t in np.ndindex(4, 4):
                 along_x, along_y = lines[int(s % 2 != t % 2)], lines[int(s // 2 != t // 2)]
                 fraction = fractions[a, s] * fractions[b, t]
                 parts = along_x[:, entry[a, 0], entry[b, 0]] * along_y[:, entry[a, 1], entry[b, 1]]
                 met += fraction * (np.tensordot(weights, parts, axes=1) + texture.offset)
-                rest += fraction * (weights @ (along_x[:, 0, 0] * along_y[:, 0, 0]) + texture.offset)
+                rest = rest + fraction * (weights @ (along_x[:, 0, 0] * along_y[:, 0, 0]) + texture.offset)
             energy[a, b] = cv2.resize(met / rest, (columns, rows), interpolation=cv2.INTER_LINEAR)
         return energy

@@ -22,11 +22,13 @@ from scipy.ndimage import median_filter
 
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.colour_factors import BLOCK, LEAST, MEAN_BLOCK, enlarged
+from rgbmidic.illumination.colour_factors import LEAST, MEAN_BLOCK, enlarged
 from rgbmidic.illumination.crosstalk import Crosstalk, unmix
-from rgbmidic.illumination.demosaicing import SPARKLE_VARIANCE, Reconstruction, reconstruct
+from rgbmidic.illumination.demosaicing import Reconstruction, reconstruct
 from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
+from rgbmidic.illumination.mosaic_model import BLOCK
+from rgbmidic.illumination.prediction_filters import SPARKLE_VARIANCE
 from rgbmidic.illumination.separation import DEFAULT_METHOD, reconstructed_lights, separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection.channels import CONSTANTS
