@@ -30,7 +30,7 @@ import h5py
 import numpy as np
 import tifffile
 from cine_files import write_cine
-from frames import noisy_mosaic
+from frames import noisy_mosaic, write_lossless_dng
 from mraw_files import write_mraw
 from seq_files import write_seq
 
@@ -91,6 +91,7 @@ WRITERS: dict[str, tuple[Callable[[Path], object], FrameSettings]] = {
     "one_page.tif": (_behind_one_page, STATED),
     "grey.png": (_by_opencv, STATED),
     "bayer.dng": (lambda path: write_dng(path, GREY), FILE),
+    "lossless.dng": (lambda path: write_lossless_dng(path, GREY), FILE),
     "samples.raw": (lambda path: GREY.values.tofile(path), replace(STATED, shape=SHAPE, dtype="uint16")),
     "grey.cine": (_cine(bits=8), FILE),
     "colour.cine": (_cine(bits=16, cfa="GBRG", annotation=b"noted"), FILE),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import math
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +19,7 @@ from rgbmidic.errors import FrameError
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stored import StoredFrame, check_size, complaints, damaged
 from rgbmidic.frames.tiff_pages import Tag, is_stored_as_is, missing_data, tag, tiff_pages
-from rgbmidic.settings import BAYER_PATTERNS, regular
+from rgbmidic.settings import BAYER_PATTERNS, FrameKind, regular
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
@@ -41,6 +43,13 @@ _BROKEN_JPEG = ("Corrupt JPEG data", "Premature end of JPEG file", "Inconsistent
 _ODD_JPEG = ("Invalid SOS parameters", "Unknown Adobe color transform code", "Warning: unknown JFIF revision")
 """And those of headers that it can read all the same."""
 
+_MALLOPT = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+"""Sets what allocated memory is filled with; only glibc has it."""
+_PERTURB = -6
+"""The option of `mallopt` that does so (M_PERTURB in malloc.h)."""
+_MARKS = (0xFE, 0x53)
+"""Bytes that memory is filled with before a raw is decoded into it; samples of two such bytes are rare."""
+
 
 class CameraRaw(FrameSource):
     """The visible part of a camera raw: the mosaic of a Bayer camera or the image of a monochrome one.
@@ -57,25 +66,46 @@ class CameraRaw(FrameSource):
 
     def _stored(self, index: int) -> StoredFrame:
         stored_as_is, black_by_tags = _tags(self.path)
-        with _libraw(self.path) as raw:
-            cell = _colour_cell(raw, self.path)
-            values = np.array(raw.raw_image_visible, dtype=np.uint16)
-            black = np.asarray(raw.black_level_per_channel, dtype=np.float64)[cell]
-            white, sizes, names = float(raw.white_level), raw.sizes, _names(raw, cell)
-            monochrome = raw.num_colors == 1
-        if values.shape != (sizes.height, sizes.width):
-            raise damaged(self.path, f"its visible part ({sizes.height} x {sizes.width}) reaches beyond its samples")
+        values, black, white, cfa, margin = self._decoded(_MARKS[0])
+        if _MALLOPT is None or (values == 257 * _MARKS[0]).any():
+            # LibRaw returns from some damage without an error: what it did not write is what memory held
+            undecoded = values != self._decoded(_MARKS[1])[0]
+            if undecoded.any():
+                raise damaged(self.path, f"LibRaw does not decode {undecoded.mean():.2%} of its samples")
         if black_by_tags is not None:
             # LibRaw moves odd margins to the next even row and column without moving the black levels along
-            black = np.roll(black_by_tags, (-sizes.top_margin, -sizes.left_margin), axis=(0, 1))
+            black = np.roll(black_by_tags, margin, axis=(0, 1))
         _check_filled(values, black, white, stored_as_is=stored_as_is, path=self.path)
-        return StoredFrame(
-            values=values,
-            kind="monochrome" if monochrome else "bayer",
-            cfa=None if monochrome else names,
-            black_level=black,
-            white_level=white,
-        )
+        kind: FrameKind = "bayer" if cfa else "monochrome"
+        return StoredFrame(values=values, kind=kind, cfa=cfa, black_level=black, white_level=white)
+
+    def _decoded(self, mark: int) -> tuple[AnyArray, FloatArray, float, str | None, tuple[int, int]]:
+        """Decode the samples into memory filled with the byte `mark`: samples, levels, pattern, minus the margins."""
+        with _libraw(self.path) as raw:
+            with _filled_memory(mark):
+                raw.unpack()
+            cell = _colour_cell(raw, self.path)
+            values, sizes = np.array(raw.raw_image_visible, dtype=np.uint16), raw.sizes
+            black = np.asarray(raw.black_level_per_channel, dtype=np.float64)[cell]
+            white, cfa = float(raw.white_level), None if raw.num_colors == 1 else _names(raw, cell)
+            if _MALLOPT is None:
+                raw.raw_image[...] = ~raw.raw_image  # the next raw of this size is mostly decoded into this memory
+        if values.shape != (sizes.height, sizes.width):
+            raise damaged(self.path, f"its visible part ({sizes.height} x {sizes.width}) reaches beyond its samples")
+        return values, black, white, cfa, (-sizes.top_margin, -sizes.left_margin)
+
+
+@contextmanager
+def _filled_memory(byte: int) -> Iterator[None]:
+    """Have the memory that is allocated inside filled with a byte, where the C library can."""
+    if _MALLOPT is None:
+        yield
+        return
+    _MALLOPT(_PERTURB, byte ^ 0xFF)  # glibc fills with the complement
+    try:
+        yield
+    finally:
+        _MALLOPT(_PERTURB, 0)
 
 
 def _tags(path: Path) -> tuple[bool, FloatArray | None]:

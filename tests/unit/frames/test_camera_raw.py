@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import rawpy
 import tifffile
-from frames import colour_mosaic, noisy_mosaic, write_cropped_dng, write_monochrome_dng
+from frames import colour_mosaic, noisy_mosaic, write_cropped_dng, write_lossless_dng, write_monochrome_dng
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from real_files import CROPS, RealData
@@ -286,3 +286,25 @@ def test_rows_without_noise_mean_that_nothing_was_decoded(black: int, fill: int)
                 camera_raw._check_filled(broken, level, 4095.0, stored_as_is=False, path=Path("x.rw2"))
         else:
             camera_raw._check_filled(broken, level, 4095.0, stored_as_is=False, path=Path("x.rw2"))
+
+
+@pytest.mark.parametrize("fills_memory", [True, False], ids=["glibc", "another C library"])
+@pytest.mark.parametrize("shape", [(40, 50), (300, 320)], ids=str)
+def test_a_raw_that_libraw_does_not_decode_is_refused_whatever_memory_holds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int], fills_memory: bool
+) -> None:
+    """A lossless JPEG without its start of scan: LibRaw raises nothing, and its buffer holds the file read before."""
+    if not fills_memory:
+        monkeypatch.setattr(camera_raw, "_MALLOPT", None)
+    whole, bad = tmp_path / "whole.dng", tmp_path / "bad.dng"
+    values = noisy_mosaic(shape).values.copy()
+    values[:, :7] = 257 * camera_raw._MARKS[0]  # grey levels, too
+    write_lossless_dng(whole, Mosaic(values=values, cfa="RGGB", black_level=64, white_level=65535))
+    np.testing.assert_array_equal(read_frame(whole).values, values)
+    content = bytearray(whole.read_bytes())
+    content[content.index(b"\xff\xda")] = 191
+    bad.write_bytes(content)
+    for _ in range(3):
+        read_frame(whole)
+        with pytest.raises(FrameError, match=r"bad\.dng is damaged or truncated"):
+            read_frame(bad)
