@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import StoredFrame, check_size, complaints, damaged
+from rgbmidic.frames.stored import BROKEN_JPEG, StoredFrame, check_size, complaints, damaged
 from rgbmidic.frames.tiff_pages import Tag, is_stored_as_is, missing_data, tag, tiff_pages
 from rgbmidic.settings import BAYER_PATTERNS, FrameKind, regular
 from rgbmidic.typing import AnyArray, FloatArray
@@ -38,10 +38,8 @@ _CAMERA_HEADERS = (
     *(b"\0MRM", b"FUJIFILM", b"FOVb"),  # Minolta, Fujifilm, Sigma
 )
 _CR3_HEADER = b"ftypcrx "
-_BROKEN_JPEG = ("Corrupt JPEG data", "Premature end of JPEG file", "Inconsistent progression sequence")
-"""How libjpeg's warnings begin (JWRN in its jerror.h) after which it goes on with invented samples."""
 _ODD_JPEG = ("Invalid SOS parameters", "Unknown Adobe color transform code", "Warning: unknown JFIF revision")
-"""And those of headers that it can read all the same."""
+"""How libjpeg's warnings begin of headers that it can read all the same."""
 
 _MALLOPT = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
 """Sets what allocated memory is filled with; only glibc has it."""
@@ -161,7 +159,7 @@ def _libraw(path: Path) -> Iterator[rawpy.RawPy]:
     import rawpy
 
     try:
-        starts = (os.fsencode(path), *(start.encode() for start in _BROKEN_JPEG + _ODD_JPEG))
+        starts = (os.fsencode(path), *(start.encode() for start in BROKEN_JPEG + _ODD_JPEG))
         with complaints(*starts) as lines, rawpy.imread(str(path)) as raw:
             needed = 2 * raw.sizes.raw_height * raw.sizes.raw_width
             check_size(path, needed=needed, stored=path.stat().st_size)
@@ -175,7 +173,7 @@ def _libraw(path: Path) -> Iterator[rawpy.RawPy]:
         reason = reason.decode(errors="replace") if isinstance(reason, bytes) else reason
         raise damaged(path, f"LibRaw reports: {reason}") from None
     for line in lines:
-        if line.startswith(_BROKEN_JPEG):
+        if line.startswith(BROKEN_JPEG):
             raise damaged(path, f"libjpeg reports: {line}")
         logger.warning("LibRaw reports: %s", line)
 

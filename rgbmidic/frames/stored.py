@@ -129,6 +129,9 @@ def unpack_bits(packed: bytes | AnyArray, bits: int) -> AnyArray:
     return values.reshape(*lines.shape[:-1], -1)
 
 
+BROKEN_JPEG = ("Corrupt JPEG data", "Premature end of JPEG file", "Inconsistent progression sequence")
+"""How libjpeg's warnings begin (JWRN in its jerror.h) after which it goes on with invented samples."""
+
 _LOCK = threading.Lock()
 
 

@@ -205,6 +205,19 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {file.name: file for file in folder.iterdir()}
 
 
+def test_a_jpeg_in_a_tiff_that_libjpeg_fills_up_is_refused(tmp_path: Path) -> None:
+    path, values = tmp_path / "f.tif", np.random.default_rng(0).integers(0, 200, (64, 96)).astype(np.uint8)
+    assert cv2.imwrite(str(path), values, [cv2.IMWRITE_TIFF_COMPRESSION, 7])
+    assert read_frame(path, kind="monochrome").values.shape == (1, 64, 96)
+    with tifffile.TiffFile(path) as tiff:
+        start, length = tiff.pages.first.dataoffsets[0], tiff.pages.first.databytecounts[0]
+    content = bytearray(path.read_bytes())
+    content[start + length // 2 : start + length - 2] = bytes(length - 2 - length // 2)
+    path.write_bytes(content)
+    with pytest.raises(FrameError, match=r"f\.tif is damaged .*Corrupt JPEG data"):
+        read_frame(path, kind="monochrome")
+
+
 @pytest.mark.parametrize("name", ["plain.tif", "zip.tif", "lzw.tif", "grey.png"])
 @given(share=st.floats(0, 1, exclude_max=True))
 @settings(max_examples=40, deadline=None)
