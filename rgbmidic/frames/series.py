@@ -5,24 +5,24 @@
 
 from __future__ import annotations
 
-import glob
 import hashlib
 import logging
 import math
 import os
-import re
 from bisect import bisect_right
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from rgbmidic.errors import ConfigurationError, FrameError, InputError, disk_faults, legible
+from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.formats import advice, known_formats, open_source
+from rgbmidic.frames.formats import known_formats, open_source
 from rgbmidic.frames.images import write_tiff
+from rgbmidic.frames.names import NamedFiles, list_frames
 from rgbmidic.frames.source import FrameSource, file_fingerprint
 from rgbmidic.frames.stacks import split_dataset
 from rgbmidic.frames.stored import Camera
@@ -283,6 +283,10 @@ def open_series(
     if len(set(counts)) > 1:
         numbers_given = ", ".join(f"{text}: {count}" for text, count in zip(settings.path, counts, strict=True))
         raise FrameError(f"lights fired in succession need equal numbers of frames; given are {numbers_given}")
+    for text, paths in zip(settings.path, files, strict=True):
+        named = NamedFiles.ordered([Path(split_dataset(path)[0]) for path in paths])
+        if in_order and named.doubt:
+            logger.warning("the order of %s is uncertain (%s): taken as %s", text, named.doubt, named.listed)
     begins: Sequence[int] = ()
     numbers = _numbers(settings, lights) if in_order else ()
     if settings.lights > 1:
@@ -333,12 +337,12 @@ def _numbers(settings: FrameSettings, lights: Sequence[Sequence[FrameSource]]) -
     found: dict[str, tuple[int, ...]] = {}
     for text, sources in zip(settings.path, lights, strict=True):
         if counts := _counts(sources):
-            step = math.gcd(*(count - counts[0] for count in counts)) or 1
-            found[text] = tuple((count - counts[0]) // step for count in counts)
-            expected = range(counts[0], counts[-1] + 1, step)
+            scale = math.lcm(*(count.denominator for count in counts))
+            step = Fraction(math.gcd(*(int(scale * (count - counts[0])) for count in counts)) or 1, scale)
+            numbers = found[text] = tuple(int((count - counts[0]) / step) for count in counts)
             # where more numbers are missing than there are, somebody chose some frames
-            if len(counts) < len(expected) <= 2 * len(counts):
-                missing = sorted(set(expected) - set(counts))
+            if len(counts) <= numbers[-1] < 2 * len(counts):
+                missing = [counts[0] + step * number for number in sorted(set(range(numbers[-1])) - set(numbers))]
                 gaps = f"{len(missing)} in the numbering, {_listed(missing)}; the frames after keep their numbers"
                 logger.warning("frames are missing from %s: %s", text, gaps)
     if len(set(found.values())) > 1:
@@ -347,77 +351,18 @@ def _numbers(settings: FrameSettings, lights: Sequence[Sequence[FrameSource]]) -
     return next(iter(found.values()), ())
 
 
-def _counts(sources: Sequence[FrameSource]) -> tuple[int, ...]:
-    """Return the camera's numbers in a movie's header, else those in the names.
-
-    Empty where there are none: a counter is the only thing in which the names differ.
-    """
+def _counts(sources: Sequence[FrameSource]) -> tuple[Fraction, ...]:
+    """Return the camera's numbers in a movie's header, else those in the names; empty where there are none."""
     if len(sources) == 1 and len(sources[0]) > 1:
-        return tuple(sources[0].recording.numbered.tolist())
-    names = [re.split(r"([0-9]+)", str(source.path)) for source in sources]
-    if any(len(source) > 1 for source in sources) or len({len(name) for name in names}) > 1:
+        return tuple(map(Fraction, sources[0].recording.numbered.tolist()))
+    if any(len(source) > 1 for source in sources):
         return ()
-    differing = [part for part in zip(*names, strict=True) if len(set(part)) > 1]
-    if len(differing) != 1 or not differing[0][0].isdecimal():
-        return ()
-    counts = tuple(int(part) for part in differing[0])
-    return counts if len(set(counts)) == len(counts) else ()
+    return NamedFiles.ordered([source.path for source in sources]).counts
 
 
-def _listed(numbers: Sequence[int], most: int = 10) -> str:
-    return ", ".join(map(str, numbers[:most])) + (", ..." if len(numbers) > most else "")
-
-
-def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]:
-    """List frame files in natural order (frame9 before frame10).
-
-    Parameters
-    ----------
-    pattern
-        A file, a folder (its files with the ending of a frame), or a pattern with ``*``, ``?``, ``[...]`` or ``**``;
-        behind an HDF5 file or a pattern of them the dataset may be named, as in ``run.h5:/entry/data``.
-    base
-        Folder that a relative pattern starts from.
-
-    Returns
-    -------
-    tuple of Path
-
-    Raises
-    ------
-    FrameError
-        Nothing matches.
-    """
-    text, dataset = split_dataset(pattern)
-    place = Path(base) / text
-    with disk_faults(FrameError, f"the frames {pattern} cannot be looked for"):
-        if place.is_dir():
-            found = sorted(file for file in place.iterdir() if file.name[0] != ".")
-            endings = {ending for known in known_formats() for ending in known.endings}
-            files = [file for file in found if file.suffix.lower() in endings]
-        else:
-            found = files = _matching(Path(text), Path(base))
-        files = [file for file in files if not file.is_dir()]  # what else is no file is reported when it is read
-    if not files:
-        what = "a folder without frames" if place.is_dir() else "no file matches"
-        other = next((f"; {file.name} is {text}" for file in found if (text := advice(file))), "")
-        raise FrameError(f"no frames: {what}: {pattern} (looked for in {Path(base).resolve()}){other}")
-
-    def natural(file: Path) -> tuple[list[tuple[int, str]], str]:
-        parts = re.split(r"([0-9]+)", str(file).casefold())
-        return [(int(part), "") if place % 2 else (0, part) for place, part in enumerate(parts)], str(file)
-
-    return tuple(Path(f"{file}:{dataset}") if dataset else file for file in sorted(files, key=natural))
-
-
-def _matching(pattern: Path, base: Path) -> list[Path]:
-    """Find files that match; what exists of the pattern's beginning is taken literally, brackets included."""
-    parts = list(pattern.parts)
-    while parts and (base / parts[0]).exists():
-        base /= parts.pop(0)
-    if not parts:
-        return [base]
-    return [base / match for match in glob.glob(str(Path(*parts)), root_dir=base, recursive=True)]  # noqa: PTH207
+def _listed(numbers: Sequence[int | Fraction], most: int = 10) -> str:
+    texts = [str(number) if number == int(number) else str(float(number)) for number in numbers[:most]]
+    return ", ".join(texts) + (", ..." if len(numbers) > most else "")
 
 
 def describe(settings: FrameSettings) -> dict[str, Any]:
