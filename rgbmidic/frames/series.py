@@ -279,6 +279,12 @@ def open_series(
     opened = [[open_source(path, settings, camera) for path in paths] for paths in files]
     # a movie in two files, samples and header, is one source where a pattern matches both
     lights = tuple(tuple({source.path: source for source in sources}.values()) for sources in opened)
+    for text, sources in zip(settings.path, lights, strict=True):
+        kinds = {source.path.with_suffix(""): source.path for source in sources}
+        for path in (source.path for source in sources):
+            if (other := kinds[path.with_suffix("")]) != path:
+                pair = f"{text} stands for {path.name} and {other.name}: is that one frame in two files?"
+                raise FrameError(f"{pair} State the pattern of one kind of them, as in *{path.suffix}")
     counts = [sum(map(len, sources)) for sources in lights]
     if len(set(counts)) > 1:
         numbers_given = ", ".join(f"{text}: {count}" for text, count in zip(settings.path, counts, strict=True))

@@ -156,6 +156,18 @@ def test_signs_and_fractions_count_where_the_series_has_them(
     assert all(doubt in text and f"taken as {ordered[0]}, {ordered[1]}" in text for text in doubts)
 
 
+def test_a_frame_in_two_formats_is_not_measured_twice(tmp_path: Path) -> None:
+    _write(tmp_path, ["f1.tif", "f2.tif"])
+    for index in (1, 2):
+        write_dng(tmp_path / f"f{index}.dng", noisy_mosaic((24, 30), seed=index))
+    with pytest.raises(
+        FrameError, match=r"f1\.dng and f1\.tif: is that one frame in two files\? .*\*\.dng"
+    ):
+        open_series(FrameSettings(path=(str(tmp_path),), cfa="RGGB"))
+    assert len(open_series(FrameSettings(path=("*.dng",)), tmp_path)) == 2
+    assert len(open_series(FrameSettings(path=("*.dng", "*.tif"), kind="monochrome"), tmp_path)) == 2
+
+
 def test_captures_in_no_order_have_no_gaps(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     series = _series(tmp_path, ["f0.tif", "f1.tif", "f3.tif"], in_order=False)
     assert list(series.numbers) == [0, 1, 2]
