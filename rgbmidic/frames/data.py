@@ -265,8 +265,15 @@ class Recording:
         they would be off by a quarter of a frame at a million frames a second.
     numbers : ndarray, shape (count,), int64, or None
         The camera's own numbers, with gaps where frames are lost.
+    planes
+        Number of frames that belong to one time, such as the channels of a hyperstack, each an image of one light.
+    planes_in_words
+        What these are.
+    count_is_certain
+        Whether the file holds no other frames: False where the list of them leads out of it.
     remarks
-        What else in the header a user should know.
+        What else in the header a user should know. Times that do not rise from frame to frame are left out, with a
+        remark; so is one made of a frame rate that is not theirs.
     """
 
     count: int = 1
@@ -276,7 +283,30 @@ class Recording:
     trigger: int | None = None
     times_ns: Integers | None = None
     numbers: Integers | None = None
+    planes: int = 1
+    planes_in_words: str = ""
+    count_is_certain: bool = True
     remarks: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Leave out times that cannot be."""
+        times = None if self.times_ns is None else np.asarray(self.times_ns)[:: self.planes]
+        if times is None or len(times) < 2:
+            return
+        # lost frames change the mean of the steps, uneven ones their median; stamps may be whole microseconds
+        rate, steps = self.frame_rate, np.diff(times)
+        periods = np.array([np.median(steps), np.mean(steps)])
+        if (falls := (times[1:] <= times[:-1]) | (times[:-1] == np.iinfo(np.int64).min)).any():
+            remark = (
+                f"its time stamps do not rise (at frame {self.planes * (int(np.argmax(falls)) + 1)}): they are not used"
+            )
+            object.__setattr__(self, "times_ns", None)
+        elif rate and (np.abs(periods * rate / SECOND - 1) > max(0.01, rate * 1e-6)).all():
+            stamped = SECOND / periods[0]
+            remark = f"it states {rate:g} frames per second, its time stamps {stamped:.6g}: these are taken"
+        else:
+            return
+        object.__setattr__(self, "remarks", (*self.remarks, remark))
 
     @property
     def numbered(self) -> Integers:
@@ -287,7 +317,7 @@ class Recording:
         """
         if self.numbers is not None:
             return np.asarray(self.numbers - self.numbers[0])
-        if self.times_ns is not None and self.count > 2:
+        if self.times_ns is not None and self.count > 2 and self.planes == 1:
             steps = np.diff(self.times_ns)
             period = float(np.median(steps))
             periods = np.round(steps / max(period, 1.0))

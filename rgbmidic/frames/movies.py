@@ -225,7 +225,7 @@ def _seq_header(path: Path) -> EvenFrames:
 
 
 def _stamps_ns(file: BinaryIO, header: EvenFrames, stamp: str) -> Integers | None:
-    """Read the time of every frame from the first; None where the file ends before the last or they do not grow."""
+    """Read the time of every frame from the first; None where the file ends before the last."""
     size, count, end = struct.calcsize(stamp), header.recording.count, file.seek(0, 2)
     if header.gap < size or end < header.start + count * (header.size + header.gap) - header.gap + size:
         return None
@@ -234,5 +234,4 @@ def _stamps_ns(file: BinaryIO, header: EvenFrames, stamp: str) -> Integers | Non
         file.seek(header.begin(index) + header.size)
         seconds, *parts = struct.unpack(stamp, file.read(size))
         times[index] = seconds * SECOND + sum(part * 10**power for part, power in zip(parts, (6, 3), strict=False))
-    times -= times[0]
-    return times if (np.diff(times) > 0).all() else None
+    return np.asarray(times - times[0])

@@ -92,6 +92,16 @@ class FrameSeries:
         return self.lights[0][0].recording
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the headers state that a user should know, each once, with the file or files."""
+        found: dict[str, list[str]] = {}
+        for source in (source for sources in self.lights for source in sources):
+            for remark in source.recording.remarks:
+                found.setdefault(remark, []).append(legible(source.path.name))
+        more = {remark: f" and {len(names) - 1} more" if len(names) > 1 else "" for remark, names in found.items()}
+        return tuple(f"{names[0]}{more[remark]}: {remark}" for remark, names in found.items())
+
+    @property
     def lost(self) -> int:
         """Number of frames missing between the first and the last of those that are chosen."""
         numbers = [self.numbers[index] for index in self.chosen]
@@ -280,11 +290,7 @@ def open_series(
     # a movie in two files, samples and header, is one source where a pattern matches both
     lights = tuple(tuple({source.path: source for source in sources}.values()) for sources in opened)
     for text, sources in zip(settings.path, lights, strict=True):
-        kinds = {source.path.with_suffix(""): source.path for source in sources}
-        for path in (source.path for source in sources):
-            if (other := kinds[path.with_suffix("")]) != path:
-                pair = f"{text} stands for {path.name} and {other.name}: is that one frame in two files?"
-                raise FrameError(f"{pair} State the pattern of one kind of them, as in *{path.suffix}")
+        _check_sources(text, sources, settings.lights)
     counts = [sum(map(len, sources)) for sources in lights]
     if len(set(counts)) > 1:
         numbers_given = ", ".join(f"{text}: {count}" for text, count in zip(settings.path, counts, strict=True))
@@ -307,6 +313,33 @@ def open_series(
                     f"{first.path} has {rows} of {columns}"
                 )
     return replace(series, chosen=chosen_frames(settings, len(series)))
+
+
+def _check_sources(text: str, sources: Sequence[FrameSource], lights: int) -> None:
+    """Refuse a frame in two files, planes that are not the lights', and files after an unknown number of frames.
+
+    Raises
+    ------
+    FrameError
+        So they are.
+    """
+    kinds = {source.path.with_suffix(""): source.path for source in sources}
+    for source in sources:
+        if (other := kinds[source.path.with_suffix("")]) != source.path:
+            pair = f"{text} stands for {source.path.name} and {other.name}: is that one frame in two files?"
+            raise FrameError(f"{pair} State the pattern of one kind of them, as in *{source.path.suffix}")
+        if (planes := source.recording.planes) not in (1, lights):
+            raise FrameError(
+                f"{source.path} holds {source.recording.planes_in_words} of {len(source) // planes} times: state "
+                f"frames.lights = {planes} where each shows one light, else save one of them alone; lights is {lights}"
+            )
+    if max(map(len, sources)) > 1:
+        for source in sources[:-1]:
+            if source.shape and not source.recording.count_is_certain:  # a header that cannot be read raises an error
+                raise FrameError(
+                    f"{source.path} is truncated or still being written: its list of frames ends early, so the numbers "
+                    f"of the frames in {sources[-1].path.name} are not known; leave it out, or read it alone"
+                )
 
 
 def _turns(numbers: Sequence[int], lights: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -402,7 +435,9 @@ def describe(settings: FrameSettings) -> dict[str, Any]:
     stored = source.stored(0)
     frame, *_ = series.read(0)
     cfa, levels = getattr(frame, "cfa", None), tuple(frame.black_level.ravel().tolist())
-    warnings = list(recording.remarks)
+    warnings = list(series.remarks)
+    if recording.planes > 1:
+        warnings.append(f"it holds {recording.planes_in_words} of each time: frames.lights = {recording.planes}")
     try:
         series.read(len(series) - 1)
     except FrameError as error:  # a movie that is truncated, or still being written
@@ -463,6 +498,9 @@ def save_frame(settings: FrameSettings, index: int, path: Path, *, overwrite: bo
 
 def _opened(settings: FrameSettings) -> FrameSeries:
     """Open the frames; a mosaic whose pattern nobody states is read as it is, one grey level at every pixel."""
+    first = open_source(list_frames(settings.path[0])[0], settings)
+    if (planes := first.recording.planes) > 1:
+        settings = replace(settings, kind="monochrome", lights=planes)
     series = open_series(settings)
     if settings.kind is None and settings.cfa is None:
         stored = series.lights[0][0].stored(0)

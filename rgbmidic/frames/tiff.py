@@ -6,20 +6,19 @@ ImageJ's hyperstacks and OME-TIFF are read as they store their frames and times.
 from __future__ import annotations
 
 import lzma
-import re
+import math
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from fractions import Fraction
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from xml.etree import ElementTree
 
 import numpy as np
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.data import SECOND, Integers, Recording, even_times, fraction
+from rgbmidic.frames.data import Integers, Recording
+from rgbmidic.frames.hyperstacks import Hyperstack
 from rgbmidic.frames.images import decode
 from rgbmidic.frames.source import FrameSource, Movie, remembered
 from rgbmidic.frames.stored import (
@@ -52,6 +51,8 @@ TIFF_ENDINGS = (".tif", ".tiff")
 _BY_TIFFFILE: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
 """Compressions (deflate, LZMA) that tifffile undoes, without a limit, and what undoes them up to one."""
 _MIN_IS_WHITE, _PALETTE = 0, 3
+_MISSING = -1
+"""In place of the offset of a page that is announced, and that the list of pages does not lead to."""
 
 
 class TiffFile(FrameSource):
@@ -167,17 +168,12 @@ def _check_unpacked(page: tifffile.TiffPage, path: Path) -> None:
         raise damaged(path, f"its image data unpack to {total} bytes, too few for its size")
 
 
-_UNITS = {"s": 1, "sec": 1, "seconds": 1}
-_UNITS |= {"ms": 10**3, "msec": 10**3, "µs": 10**6, "us": 10**6, "usec": 10**6, "ns": SECOND}
-"""Of time, by how many make a second."""
-
-
 class TiffStack(Movie):
     """A TIFF file of several frames of one size, in the order of the file."""
 
     packages = ("tifffile",)
 
-    def _header(self) -> _Hyperstack:
+    def _header(self) -> _Pages:
         return _stack(self.path)
 
 
@@ -190,22 +186,18 @@ def is_tiff_stack(path: Path) -> bool:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Hyperstack(MovieHeader):
+class _Pages(MovieHeader):
     """Where the pages begin (one, where ImageJ stored all frames behind it), of which the first has the `shape`."""
 
     offsets: Integers
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame."""
-        import tifffile
-
-        if index >= len(self.offsets) > 1:
-            raise FrameError(f"{path}: its list of frames ends after {index - 1}: truncated or still being written")
-        count = self.recording.count
-        behind = len(self.offsets) == 1  # all frames lie behind the first, as ImageJ stores more than 4 GB
-        with opened_tiff(path) as tiff:
-            tiff.filehandle.seek(int(self.offsets[0 if behind else index]))
-            page = tifffile.TiffPage(tiff, index=0)
+        count, readable = self.recording.count, int((self.offsets != _MISSING).sum())
+        behind = len(self.offsets) == 1 and self.recording.count_is_certain  # as ImageJ stores more than 4 GB
+        if not behind and (index >= len(self.offsets) or self.offsets[index] == _MISSING):
+            raise FrameError(f"{path}: its list of frames ends after {readable - 1}: truncated or still being written")
+        with _page_at(path, int(self.offsets[0 if behind else index])) as page:
             _check_page(page, path)
             if (page.imagelength, page.imagewidth) != self.shape:
                 here = f"{page.imagelength} rows of {page.imagewidth} pixels"
@@ -220,50 +212,44 @@ class _Hyperstack(MovieHeader):
 
 
 @remembered
-def _stack(path: Path) -> _Hyperstack:
+def _stack(path: Path) -> _Pages:
     with regular(path).open("rb") as file:
         pages = PageList(file, path)
         offsets, ends_early = pages.offsets(path)
         entries, _ = pages.page(offsets[0]) or ({}, 0)
         text = pages.text(entries, Tag.DESCRIPTION)
         shape = (pages.value(entries, Tag.ROWS), pages.value(entries, Tag.COLUMNS))
-    images = re.search(r"^images=([0-9]{1,9})$", text, re.MULTILINE) if text.startswith("ImageJ=") else None
-    count = int(images[1]) if images and len(offsets) == 1 else len(offsets) + (ends_early and len(offsets) > 1)
+        samples = math.prod(shape) * (pages.value(entries, Tag.SAMPLES_PER_PIXEL) or 1)
+    stack, count, remarks = Hyperstack.parse(text, samples), len(offsets) + ends_early, list[str]()
+    if stack and stack.by_imagej and len(offsets) == 1 < stack.count and _goes_on_behind(path, offsets[0]):
+        count = stack.count
+    elif stack and ends_early and stack.count > len(offsets):
+        count, ends_early = stack.count, False
+        offsets += [_MISSING] * (count - len(offsets))
     check_count(path, count)
-    times = _imagej_times(text, count) if images else _ome_times(text, count)
-    return _Hyperstack(shape=shape, recording=Recording(count=count, times_ns=times), offsets=np.array(offsets))
+    order = stack.page_order if stack and len(offsets) == stack.count else [0]
+    if stack and (stack.count != count or sorted(order) != list(range(len(offsets)))):
+        what = f"its text announces {stack.count} images, it holds {count}: the text is not used"
+        stack, order, remarks = None, list(range(len(offsets))), [] if ends_early else [what]
+    recording = Recording(count=count, count_is_certain=not ends_early, remarks=tuple(remarks))
+    if stack:
+        times, planes = stack.times_ns, stack.planes
+        recording = replace(recording, times_ns=times, planes=planes, planes_in_words=stack.planes_in_words)
+        offsets = [offsets[page] for page in order]
+    return _Pages(shape=shape, recording=recording, offsets=np.array(offsets))
 
 
-def _imagej_times(text: str, count: int) -> Integers | None:
-    """Derive times from ImageJ's frame interval, where all images are frames in time."""
-    entries = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
-    others = {"channels", "slices"} & entries.keys()
-    if entries.get("frames", "" if others else str(count)) != str(count):
-        return None
-    interval = _seconds(entries.get("finterval", ""), entries.get("tunit", "s"))
-    return even_times(range(count), interval) if interval else None
+def _goes_on_behind(path: Path, offset: int) -> bool:
+    """Return whether other samples follow those of the only page, which begins before them, as ImageJ stores them."""
+    with _page_at(path, offset) as page:
+        begin = min(page.dataoffsets, default=0)
+        return offset < begin and path.stat().st_size > begin + page.nbytes
 
 
-def _ome_times(text: str, count: int) -> Integers | None:
-    """Derive times from OME's time increment or the time of every plane."""
-    if "<OME" not in text[:1000] or "<!ENTITY" in text:
-        return None
-    try:
-        pixels = ElementTree.fromstring(text.encode()).find(".//{*}Pixels")
-    except ElementTree.ParseError:
-        return None
-    if pixels is None or pixels.get("SizeT") != str(count):
-        return None
-    if increment := pixels.get("TimeIncrement"):
-        interval = _seconds(increment, pixels.get("TimeIncrementUnit", "s"))
-        return even_times(range(count), interval) if interval else None
-    planes = {plane.get("TheT"): plane for plane in pixels.iterfind("{*}Plane")}
-    each = [planes.get(str(index), pixels) for index in range(count)]
-    times = [_seconds(plane.get("DeltaT", ""), plane.get("DeltaTUnit", "s")) for plane in each]
-    known = [round(time * SECOND) for time in times if time is not None]
-    return np.array(known, dtype=np.int64) if len(known) == count else None
+@contextmanager
+def _page_at(path: Path, offset: int) -> Iterator[tifffile.TiffPage]:
+    import tifffile
 
-
-def _seconds(text: str, unit: str) -> Fraction | None:
-    number = fraction(text)
-    return None if number is None or unit not in _UNITS else number / _UNITS[unit]
+    with opened_tiff(path) as tiff:
+        tiff.filehandle.seek(offset)
+        yield tifffile.TiffPage(tiff, index=0)

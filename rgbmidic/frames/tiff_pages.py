@@ -25,7 +25,8 @@ from rgbmidic.settings import regular
 if TYPE_CHECKING:
     import tifffile
 
-# A file's faults come back as one FrameError; without a handler Python would print tifffile's log as well.
+# A file's faults come back as one FrameError, and tifffile's log of them would reach the terminal as well.
+logging.getLogger("tifffile").propagate = False
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 _HEADERS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -42,6 +43,7 @@ class Tag(IntEnum):
     ROWS = 257
     DESCRIPTION = 270
     ORIENTATION = 274
+    SAMPLES_PER_PIXEL = 277
     COLOUR_MAP = 320
     CFA_REPEAT = 33421
     CFA_PATTERN = 33422

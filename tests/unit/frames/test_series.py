@@ -160,9 +160,7 @@ def test_a_frame_in_two_formats_is_not_measured_twice(tmp_path: Path) -> None:
     _write(tmp_path, ["f1.tif", "f2.tif"])
     for index in (1, 2):
         write_dng(tmp_path / f"f{index}.dng", noisy_mosaic((24, 30), seed=index))
-    with pytest.raises(
-        FrameError, match=r"f1\.dng and f1\.tif: is that one frame in two files\? .*\*\.dng"
-    ):
+    with pytest.raises(FrameError, match=r"f1\.dng and f1\.tif: is that one frame in two files\? .*\*\.dng"):
         open_series(FrameSettings(path=(str(tmp_path),), cfa="RGGB"))
     assert len(open_series(FrameSettings(path=("*.dng",)), tmp_path)) == 2
     assert len(open_series(FrameSettings(path=("*.dng", "*.tif"), kind="monochrome"), tmp_path)) == 2
