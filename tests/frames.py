@@ -54,14 +54,20 @@ def colour_mosaic(shape: tuple[int, int], cfa: str) -> npt.NDArray[np.uint16]:
     return (1000 * (channels + 1) + 2 * rows + columns).astype(np.uint16)
 
 
-def write_cropped_dng(path: Path, active: npt.NDArray[np.uint16], *, top: int, left: int, cfa: str, black: Any) -> None:
-    """A DNG whose `active` area, with the pattern `cfa`, lies inside masked margins."""
+def write_cropped_dng(
+    path: Path, active: npt.NDArray[np.uint16], *, top: int, left: int, cfa: str, black: Any, extra: Any = ()
+) -> None:
+    """A DNG whose `active` area, with the pattern `cfa`, lies inside masked margins; `extra` tags replace others."""
     rows, columns = active.shape
     full = np.full((rows + top + 2, columns + left + 3), 50, dtype=np.uint16)
     full[top : top + rows, left : left + columns] = active
     mosaic = Mosaic(values=full, cfa=cfa, black_level=black, white_level=4095)
     area = (_ACTIVE_AREA, "I", 4, (top, left, top + rows, left + columns), True)
-    tags = [*_dng_tags(mosaic, (1, 1, 1), path), area]
+    tags = [
+        *(one for one in _dng_tags(mosaic, (1, 1, 1), path) if one[0] not in {new[0] for new in extra}),
+        area,
+        *extra,
+    ]
     tifffile.imwrite(path, full, photometric=32803, extratags=tags, metadata=None, rowsperstrip=len(full))
 
 

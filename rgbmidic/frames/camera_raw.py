@@ -63,7 +63,7 @@ class CameraRaw(FrameSource):
             return int(raw.sizes.height), int(raw.sizes.width)
 
     def _stored(self, index: int) -> StoredFrame:
-        stored_as_is, black_by_tags = _tags(self.path)
+        stored_as_is, black_by_tags, _ = _tags(self.path)
         values, black, white, cfa, margin = self._decoded(_MARKS[0])
         if _MALLOPT is None or (values == 257 * _MARKS[0]).any():
             # LibRaw returns from some damage without an error: what it did not write is what memory held
@@ -76,6 +76,16 @@ class CameraRaw(FrameSource):
         _check_filled(values, black, white, stored_as_is=stored_as_is, path=self.path)
         kind: FrameKind = "bayer" if cfa else "monochrome"
         return StoredFrame(values=values, kind=kind, cfa=cfa, black_level=black, white_level=white)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a user should know of the black levels."""
+        try:
+            _, _, spread = _tags(self.path)
+        except FrameError:  # reported when it is read
+            return ()
+        what = "its black level varies from row to row, column to column or over more than 2x2 pixels by {:.3g} DN"
+        return (f"{what.format(spread)}: the mean of each position is taken",) if spread > 1 else ()
 
     def _decoded(self, mark: int) -> tuple[AnyArray, FloatArray, float, str | None, tuple[int, int]]:
         """Decode the samples into memory filled with the byte `mark`: samples, levels, pattern, minus the margins."""
@@ -106,7 +116,7 @@ def _filled_memory(byte: int) -> Iterator[None]:
         _MALLOPT(_PERTURB, 0)
 
 
-def _tags(path: Path) -> tuple[bool, FloatArray | None]:
+def _tags(path: Path) -> tuple[bool, FloatArray | None, float]:
     """Read what the TIFF tags of a raw state beyond what LibRaw gives, and check that its image data are all there.
 
     Returns
@@ -114,8 +124,10 @@ def _tags(path: Path) -> tuple[bool, FloatArray | None]:
     stored_as_is : bool
         Whether the samples are uncompressed and all there, so that zeros in them are real.
     black : ndarray, shape (2, 2), or None
-        DNG black level by position from the sensor's first pixel on; None where no tag states it or states more than a
-        2x2 cell can hold, in files that are not TIFF inside, or that only LibRaw can follow.
+        DNG black level by position from the sensor's first pixel on, the mean where it varies further; None where no
+        tag states it, in files that are not TIFF inside, or that only LibRaw can follow.
+    spread : float
+        By how many DN the black level of a position varies over the sensor.
 
     Raises
     ------
@@ -127,27 +139,44 @@ def _tags(path: Path) -> tuple[bool, FloatArray | None]:
             raw = [page for page in pages if page.photometric in (32803, 34892)] or pages  # CFA, linear raw
             page = max(raw, key=lambda page: page.imagewidth * page.imagelength)
             top, left, *_ = tag(page, Tag.ACTIVE_AREA) or (0, 0)
-            stored_as_is, black = is_stored_as_is(page), _black_cell(page)
+            stored_as_is, (black, spread) = is_stored_as_is(page), _black_cell(page)
             missing = [reason for page in raw if (reason := missing_data(page, path.stat().st_size))]
             black = None if black is None else np.roll(black, (top, left), axis=(0, 1))
     except FrameError:
-        return False, None
+        return False, None, 0.0
     if missing:
         raise damaged(path, missing[0])
-    return stored_as_is, black
+    return stored_as_is, black, spread
 
 
-def _black_cell(page: tifffile.TiffPage) -> FloatArray | None:
-    levels, repeat = tag(page, Tag.BLACK), tag(page, Tag.BLACK_REPEAT) or (1, 1)
-    varies = Tag.BLACK_DELTA_H in page.tags or Tag.BLACK_DELTA_V in page.tags
-    if levels is None or varies or not set(repeat) <= {1, 2}:
+def _black_cell(page: tifffile.TiffPage) -> tuple[FloatArray | None, float]:
+    """Return the mean black level (2, 2) of each position of a page's active area, and by how much it varies there.
+
+    The levels of a cell of any size, and what is added by column and by row (DNG 1.4, BlackLevelDeltaH and -V).
+    """
+    rows, columns = tag(page, Tag.BLACK_REPEAT) or (1, 1)
+    levels = _reals(page, Tag.BLACK)
+    if levels is None or levels.size != rows * columns:
+        return None, 0.0
+    cell = np.tile(levels.reshape(rows, columns), (math.lcm(rows, 2) // rows, math.lcm(columns, 2) // columns))
+    parts = [[cell[row::2, column::2] for column in (0, 1)] for row in (0, 1)]
+    black = np.array([[part.mean() for part in line] for line in parts])
+    spread = max(float(np.ptp(part)) for line in parts for part in line)
+    for code, shape in ((Tag.BLACK_DELTA_H, (1, 2)), (Tag.BLACK_DELTA_V, (2, 1))):
+        if (added := _reals(page, code)) is not None and added.size > 1:
+            black = black + np.array([added[0::2].mean(), added[1::2].mean()]).reshape(shape)
+            spread += max(float(np.ptp(added[0::2])), float(np.ptp(added[1::2])))
+    return black, spread
+
+
+def _reals(page: tifffile.TiffPage, code: int) -> FloatArray | None:
+    """Return the numbers of a tag; rationals come as numerator, denominator."""
+    values = tag(page, code)
+    if values is None:
         return None
-    numbers = np.array(levels, dtype=np.float64)
-    if len(numbers) == 2 * math.prod(repeat):  # rationals come as numerator, denominator
-        numbers = numbers[::2] / numbers[1::2]
-    if len(numbers) != math.prod(repeat):
-        return None
-    return np.tile(numbers.reshape(repeat), (2 // repeat[0], 2 // repeat[1]))
+    numbers = np.array(values, dtype=np.float64)
+    with np.errstate(all="ignore"):  # levels that are not finite are refused where the frame is checked
+        return numbers[::2] / numbers[1::2] if page.tags[code].dtype in (5, 10) else numbers
 
 
 @contextmanager

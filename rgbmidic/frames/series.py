@@ -93,10 +93,13 @@ class FrameSeries:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What the headers state that a user should know, each once, with the file or files."""
+        """What the headers state that a user should know, each once, with the file or files.
+
+        Of files of one frame each the first is looked at: one camera wrote them all.
+        """
         found: dict[str, list[str]] = {}
-        for source in (source for sources in self.lights for source in sources):
-            for remark in source.recording.remarks:
+        for source in (one for sources in self.lights for one in sources if len(one) > 1 or one is sources[0]):
+            for remark in source.remarks:
                 found.setdefault(remark, []).append(legible(source.path.name))
         more = {remark: f" and {len(names) - 1} more" if len(names) > 1 else "" for remark, names in found.items()}
         return tuple(f"{names[0]}{more[remark]}: {remark}" for remark, names in found.items())
