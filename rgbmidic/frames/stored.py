@@ -113,8 +113,8 @@ def unpack_bits(packed: bytes | AnyArray, bits: int) -> AnyArray:
     Returns
     -------
     ndarray, shape (..., N), uint16
-        Groups of samples that end with a byte: 5 bytes hold 4 samples of 10 bits, 3 two of 12. A line that ends within
-        a group is filled up with zeros.
+        Groups of samples that end with a byte: 5 bytes hold 4 samples of 10 bits, 3 two of 12, 7 four of 14. A line
+        that ends within a group is filled up with zeros.
     """
     lines = np.frombuffer(packed, dtype=np.uint8) if isinstance(packed, bytes) else packed
     group = math.lcm(bits, 8)
@@ -124,8 +124,11 @@ def unpack_bits(packed: bytes | AnyArray, bits: int) -> AnyArray:
     values = np.empty((*groups.shape[:-1], group // bits), dtype=np.uint16)
     for sample in range(group // bits):
         byte, begin = divmod(sample * bits, 8)
-        both = groups[..., byte].astype(np.uint16) << 8 | groups[..., byte + 1]
-        values[..., sample] = both >> (16 - bits - begin) & (2**bits - 1)
+        over = -(begin + bits) % 8
+        joined: AnyArray = groups[..., byte].astype(np.uint16 if begin + bits <= 16 else np.uint32)
+        for part in range(byte + 1, byte + (begin + bits + over) // 8):
+            joined = joined << 8 | groups[..., part]
+        values[..., sample] = joined >> over & (2**bits - 1)
     return values.reshape(*lines.shape[:-1], -1)
 
 

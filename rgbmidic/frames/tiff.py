@@ -29,6 +29,7 @@ from rgbmidic.frames.stored import (
     check_count,
     check_size,
     damaged,
+    unpack_bits,
 )
 from rgbmidic.frames.tiff_pages import (
     UNCOMPRESSED,
@@ -51,6 +52,8 @@ TIFF_ENDINGS = (".tif", ".tiff")
 _BY_TIFFFILE: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
 """Compressions (deflate, LZMA) that tifffile undoes, without a limit, and what undoes them up to one."""
 _MIN_IS_WHITE, _PALETTE = 0, 3
+_PACKED = (10, 12, 14)
+"""Bits of samples that are stored without a gap; they have a white level of their own."""
 _MISSING = -1
 """In place of the offset of a page that is announced, and that the list of pages does not lead to."""
 
@@ -96,10 +99,11 @@ def _as_shown(values: AnyArray, page: tifffile.TiffPage, path: Path) -> StoredFr
         if values.dtype != np.uint8 or not (table // 256 == np.arange(table.shape[1])).all():
             raise FrameError(f"{path} shows its grey levels through a colour table; save it as a plain grey image")
     elif page.photometric == _MIN_IS_WHITE:
-        values = np.iinfo(values.dtype).max - values
+        values = values.dtype.type(2**page.bitspersample - 1) - values
     pattern = tag(page, Tag.CFA_PATTERN) or ()
     is_bayer = tag(page, Tag.CFA_REPEAT) == (2, 2) and set(pattern) <= {0, 1, 2}
-    return StoredFrame.plain(values, path, "".join("RGB"[channel] for channel in pattern if is_bayer) or None)
+    frame = StoredFrame.plain(values, path, "".join("RGB"[channel] for channel in pattern if is_bayer) or None)
+    return replace(frame, bits=page.bitspersample) if page.bitspersample in _PACKED else frame
 
 
 @contextmanager
@@ -115,9 +119,11 @@ def _only_page(path: Path) -> Iterator[tifffile.TiffPage]:
 
 def _check_page(page: tifffile.TiffPage, path: Path) -> None:
     """Refuse a page whose samples are no raw frame's or not all there, before anything is unpacked."""
-    if page.dtype is None or page.dtype.name not in ("uint8", "uint16"):
-        kind = page.dtype or f"{page.bitspersample}-bit"
-        raise FrameError(f"{path} has {kind} samples; allowed are unsigned 8 or 16 bit")
+    bits, integer = page.bitspersample, page.dtype is not None and page.dtype.kind == "u"
+    if not integer or bits not in ((8, 16, *_PACKED) if page.compression == UNCOMPRESSED else (8, 16)):
+        kind = page.dtype if bits in (8, 16, 32, 64) else f"{bits}-bit"
+        allowed = "unsigned 8 or 16 bit, and uncompressed 10, 12 or 14 bit"
+        raise FrameError(f"{path} has {kind or 'unknown'} samples; allowed are {allowed}")
     if not (page.imagelength and page.imagewidth and page.samplesperpixel):  # an entry that is damaged counts as 0
         told = f"{page.imagelength} rows of {page.imagewidth} pixels with {page.samplesperpixel} samples"
         raise damaged(path, f"its header announces {told}")
@@ -135,11 +141,32 @@ def _unpacked(page: tifffile.TiffPage, path: Path) -> AnyArray:
     if page.compression not in (UNCOMPRESSED, *_BY_TIFFFILE):
         name = getattr(page.compression, "name", page.compression)
         raise FrameError(f"{path} is stored in a way that is not read ({name}); save it as a plain uncompressed TIFF")
+    if page.bitspersample in _PACKED:
+        return _unpacked_bits(page, path)
     if page.compression in _BY_TIFFFILE:
         _check_unpacked(page, path)
     values = np.asarray(page.asarray())
     # where one plane lies after the other
     return np.moveaxis(values, 0, -1) if values.ndim == 3 and page.planarconfig == 2 else values
+
+
+def _unpacked_bits(page: tifffile.TiffPage, path: Path) -> AnyArray:
+    """Unpack samples (H, W, C) of 10, 12 or 14 bit, the highest bit first; every row begins with a byte (TIFF 6.0)."""
+    columns = page.imagewidth * page.samplesperpixel
+    line = -(-columns * page.bitspersample // 8)
+    if page.is_tiled or page.fillorder != 1 or (page.planarconfig == 2 and page.samplesperpixel > 1):
+        what = "in tiles, in planes or from the lowest bit on"
+        raise FrameError(f"{path} has packed samples of {page.bitspersample} bit {what}, which is not read")
+    needed, parts = page.imagelength * line, b""
+    with path.open("rb") as file:
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            file.seek(offset)
+            parts += file.read(min(count, page.rowsperstrip * line, needed - len(parts)))
+    if len(parts) < needed:
+        raise damaged(path, f"its image data have {len(parts)} bytes, too few for its size")
+    lines = np.frombuffer(parts, dtype=np.uint8).reshape(page.imagelength, line)
+    values = unpack_bits(lines, page.bitspersample)[:, :columns]
+    return values.reshape(page.imagelength, page.imagewidth, page.samplesperpixel)
 
 
 def _by_opencv(page: tifffile.TiffPage, path: Path) -> AnyArray:
