@@ -5,8 +5,8 @@ XML inside a binary file) wrote; samples of 12 bit are packed as in a file of a 
 to be so, too.
 
 The layout of .seq is that of NorPix, "The NorPix Sequence File Format (.seq)", 2015. Before version 5 of the header the
-frames begin behind its 1024 bytes, and time stamps have no microseconds. No file of a camera was at hand: the reader is
-tested with files that the tests write.
+frames begin behind its 1024 bytes, and time stamps have no microseconds. The 118 frames of a camera's file that pims
+tests with are read as by pims.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _mraw_header(path: Path) -> EvenFrames:
     whole = partial(_whole, path, entries)
     rows, columns, stored_bits = map(whole, ("Image Height", "Image Width", "Color Bit"))
     kind = entries.get("Color Type", "")
-    if kind.lower() not in ("mono", "raw") or stored_bits in (24, 30, 36, 48):
+    if kind.lower() not in ("mono", "raw", "bayer") or stored_bits in (24, 30, 36, 48):
         raise FrameError(
             f'{path} states {stored_bits} bit of colour type "{kind}": its samples are no longer the sensor\'s; save '
             "the movie as raw (Bayer) or monochrome"
@@ -106,7 +106,7 @@ def _mraw_header(path: Path) -> EvenFrames:
         recording=Recording(count=count),
         stored_bits=stored_bits,
         shift=0 if side == "lower" else max(stored_bits - depth, 0),
-        stated=StoredFrame(bits=min(stored_bits, depth)),
+        stated=StoredFrame(kind="bayer" if kind.lower() == "bayer" else None, bits=min(stored_bits, depth)),
     ).checked(path)
     return replace(header, recording=_recording(path, entries, count, depth))
 

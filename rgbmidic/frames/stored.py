@@ -389,6 +389,8 @@ def raw_frame(
         first = stored.values[..., :1]
         if (stored.values == first).all():  # one channel that was saved as three
             stored = StoredFrame(values=first[..., 0], bits=stored.bits)
+        elif stated.kind == "monochrome":  # a colour picture under one white light
+            stored = StoredFrame(values=stored.values[..., 1], bits=stored.bits)
     kind = _agreed("kind", [(None, stated.kind), (path, stored.kind)])
     if camera and kind and kind not in known:
         raise _differ("kind", (path if stated.kind is None else None, kind), (camera.name, " or ".join(known)))

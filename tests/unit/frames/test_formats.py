@@ -132,12 +132,14 @@ def test_what_is_no_raw_frame_is_refused(tmp_path: Path) -> None:
         read_frame(tmp_path / "f.png")
 
 
-def test_three_equal_channels_count_as_grey_only_where_that_is_stated(tmp_path: Path) -> None:
+def test_colour_pictures_are_grey_only_where_that_is_stated(tmp_path: Path) -> None:
     file = _png(tmp_path / "f.png", np.repeat(GREY[..., None], 3, axis=2))
     assert len(read_frame(file).values) == 3
     np.testing.assert_array_equal(read_frame(file, kind="monochrome").values[0], GREY)
-    with pytest.raises(FrameError, match=r"kind is stated as monochrome, but .*rgb"):
-        read_frame(_png(tmp_path / "g.png", RGB), kind="monochrome")
+    other = _png(tmp_path / "g.png", RGB)
+    np.testing.assert_array_equal(read_frame(other, kind="monochrome").values[0], RGB[..., 1])
+    with pytest.raises(FrameError, match=r"kind is stated as bayer, but .*rgb"):
+        read_frame(other, kind="bayer", cfa="RGGB")
 
 
 def test_a_mosaic_needs_its_pattern(tmp_path: Path) -> None:
