@@ -293,16 +293,15 @@ class Recording:
         times = None if self.times_ns is None else np.asarray(self.times_ns)[:: self.planes]
         if times is None or len(times) < 2:
             return
-        # lost frames change the mean of the steps, uneven ones their median; stamps may be whole microseconds
-        rate, steps = self.frame_rate, np.diff(times)
-        periods = np.array([np.median(steps), np.mean(steps)])
         if (falls := (times[1:] <= times[:-1]) | (times[:-1] == np.iinfo(np.int64).min)).any():
-            remark = (
-                f"its time stamps do not rise (at frame {self.planes * (int(np.argmax(falls)) + 1)}): they are not used"
-            )
+            where = self.planes * (int(np.argmax(falls)) + 1)
+            remark = f"its time stamps do not rise (at frame {where}): they are not used"
             object.__setattr__(self, "times_ns", None)
-        elif rate and (np.abs(periods * rate / SECOND - 1) > max(0.01, rate * 1e-6)).all():
-            stamped = SECOND / periods[0]
+        elif rate := self.frame_rate:
+            periods = int(self.numbered[-1]) if self.planes == 1 else len(times) - 1
+            stamped = periods * SECOND / float(times[-1] - times[0])
+            if abs(rate / stamped - 1) <= max(0.01, rate * 1e-6):  # stamps may be whole microseconds
+                return
             remark = f"it states {rate:g} frames per second, its time stamps {stamped:.6g}: these are taken"
         else:
             return
