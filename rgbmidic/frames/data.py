@@ -265,6 +265,8 @@ class Recording:
         they would be off by a quarter of a frame at a million frames a second.
     numbers : ndarray, shape (count,), int64, or None
         The camera's own numbers, with gaps where frames are lost.
+    saved_every
+        Of how many frames that the camera took one is in the file, as the file states.
     planes
         Number of frames that belong to one time, such as the channels of a hyperstack, each an image of one light.
     planes_in_words
@@ -283,6 +285,7 @@ class Recording:
     trigger: int | None = None
     times_ns: Integers | None = None
     numbers: Integers | None = None
+    saved_every: int = 1
     planes: int = 1
     planes_in_words: str = ""
     count_is_certain: bool = True
@@ -299,7 +302,7 @@ class Recording:
             object.__setattr__(self, "times_ns", None)
         elif rate := self.frame_rate:
             periods = int(self.numbered[-1]) if self.planes == 1 else len(times) - 1
-            stamped = periods * SECOND / float(times[-1] - times[0])
+            stamped = self.saved_every * periods * SECOND / float(times[-1] - times[0])
             if abs(rate / stamped - 1) <= max(0.01, rate * 1e-6):  # stamps may be whole microseconds
                 return
             remark = f"it states {rate:g} frames per second, its time stamps {stamped:.6g}: these are taken"

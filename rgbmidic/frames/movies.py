@@ -69,7 +69,7 @@ class MrawFile(Movie):
         found = _beside(self.path, *MRAW_ENDINGS[1:])
         if found is None:
             raise FrameError(f"{self.path} needs its header {self.path.stem}.cihx or {self.path.stem}.cih beside it")
-        return _mraw_header(found)
+        return _mraw_header(found).noting_rest(self.path.stat().st_size)
 
 
 def _beside(path: Path, *endings: str) -> Path | None:
@@ -162,6 +162,7 @@ def _recording(path: Path, entries: Mapping[str, str], count: int, depth: int) -
         frame_rate=float(rate) if rate else None,
         exposure_ns=round(exposure) if exposure else None,
         trigger=-first // step,
+        saved_every=step,
         times_ns=times,
     )
 

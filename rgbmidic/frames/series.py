@@ -98,7 +98,8 @@ class FrameSeries:
         Of files of one frame each the first is looked at: one camera wrote them all.
         """
         found: dict[str, list[str]] = {}
-        for source in (one for sources in self.lights for one in sources if len(one) > 1 or one is sources[0]):
+        stacks = any(len(source) > 1 for sources in self.lights for source in sources)
+        for source in (one for sources in self.lights for one in (sources if stacks else sources[:1])):
             for remark in source.remarks:
                 found.setdefault(remark, []).append(legible(source.path.name))
         more = {remark: f" and {len(names) - 1} more" if len(names) > 1 else "" for remark, names in found.items()}

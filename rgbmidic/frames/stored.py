@@ -291,6 +291,13 @@ class EvenFrames(MovieHeader):
         check_size(path, needed=self.size, stored=self.size)
         return self
 
+    def noting_rest(self, size: int) -> Self:
+        """Return the header with a remark where a file of `size` bytes goes on behind its frames."""
+        if (rest := size - self.start - self.recording.count * (self.size + self.gap)) <= 0:
+            return self
+        remark = f"it has {rest} bytes more than the {self.recording.count} frames that its header announces"
+        return replace(self, recording=replace(self.recording, remarks=(*self.recording.remarks, remark)))
+
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame."""
         with path.open("rb") as file:

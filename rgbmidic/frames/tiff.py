@@ -63,6 +63,14 @@ class TiffFile(FrameSource):
 
     packages = ("tifffile",)
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What else the header states that a user should know."""
+        try:
+            return _stack(self.path).recording.remarks
+        except FrameError:  # reported when it is read
+            return ()
+
     def _shape(self) -> tuple[int, int]:
         with _only_page(self.path) as page:
             return int(page.imagelength), int(page.imagewidth)
@@ -248,8 +256,12 @@ def _stack(path: Path) -> _Pages:
         shape = (pages.value(entries, Tag.ROWS), pages.value(entries, Tag.COLUMNS))
         samples = math.prod(shape) * (pages.value(entries, Tag.SAMPLES_PER_PIXEL) or 1)
     stack, count, remarks = Hyperstack.parse(text, samples), len(offsets) + ends_early, list[str]()
-    if stack and stack.by_imagej and len(offsets) == 1 < stack.count and _goes_on_behind(path, offsets[0]):
+    if stack is None and "<OME" in text[:1000]:
+        remarks.append("its OME description cannot be read")
+    if stack and stack.by_imagej and len(offsets) == 1 < stack.count and (room := _room_behind(path, offsets[0])):
         count = stack.count
+        if room > count:
+            remarks.append(f"its text announces {count} images, and it has room for {room}")
     elif stack and ends_early and stack.count > len(offsets):
         count, ends_early = stack.count, False
         offsets += [_MISSING] * (count - len(offsets))
@@ -257,7 +269,7 @@ def _stack(path: Path) -> _Pages:
     order = stack.page_order if stack and len(offsets) == stack.count else [0]
     if stack and (stack.count != count or sorted(order) != list(range(len(offsets)))):
         what = f"its text announces {stack.count} images, it holds {count}: the text is not used"
-        stack, order, remarks = None, list(range(len(offsets))), [] if ends_early else [what]
+        stack, order, remarks = None, list(range(len(offsets))), remarks if ends_early else [*remarks, what]
     recording = Recording(count=count, count_is_certain=not ends_early, remarks=tuple(remarks))
     if stack:
         times, planes = stack.times_ns, stack.planes
@@ -266,11 +278,14 @@ def _stack(path: Path) -> _Pages:
     return _Pages(shape=shape, recording=recording, offsets=np.array(offsets))
 
 
-def _goes_on_behind(path: Path, offset: int) -> bool:
-    """Return whether other samples follow those of the only page, which begins before them, as ImageJ stores them."""
+def _room_behind(path: Path, offset: int) -> int:
+    """Return for how many frames there is room from the samples of the only page on, as ImageJ stores more than 4 GB.
+
+    0 where none follows: ImageJ writes a page before its samples, and they end with the file.
+    """
     with _page_at(path, offset) as page:
-        begin = min(page.dataoffsets, default=0)
-        return offset < begin and path.stat().st_size > begin + page.nbytes
+        begin, size = min(page.dataoffsets, default=0), path.stat().st_size
+        return -(-(size - begin) // page.nbytes) if offset < begin and size > begin + page.nbytes > begin else 0
 
 
 @contextmanager

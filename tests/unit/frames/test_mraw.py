@@ -160,6 +160,19 @@ def test_a_bayer_movie_is_no_monochrome_one(tmp_path: Path, ending: str) -> None
             open_source(path, FrameSettings(path=("m",), **stated)).read(0)
 
 
+def test_a_movie_that_goes_on_behind_its_frames_says_so(tmp_path: Path) -> None:
+    path = write_mraw(tmp_path, _frames(8), bits=8)
+    path.write_bytes(path.read_bytes() + bytes(7))
+    told = "bytes more than the 5 frames that its header announces"
+    assert _series(path).remarks == (f"movie.mraw: it has 7 {told}",)
+    np.save(tmp_path / "m.npy", _frames(8))
+    assert _series(tmp_path / "m.npy").remarks == ()
+    (tmp_path / "m.npy").write_bytes((tmp_path / "m.npy").read_bytes() + bytes(3))
+    assert _series(tmp_path / "m.npy").remarks == (
+        "m.npy: it has 3 bytes more than the 5 frames that its header announces",
+    )
+
+
 def test_a_folder_with_movies_only_names_one(tmp_path: Path) -> None:
     write_mraw(tmp_path, _frames(12), bits=12)
     with pytest.raises(FrameError, match=r"folder without frames.*movie\.cihx is a movie .*name the movie itself"):

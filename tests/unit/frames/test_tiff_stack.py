@@ -24,6 +24,7 @@ STATED = FrameSettings(path=("frame",), kind="monochrome")
 
 
 def _write(path: Path, frames: Any = FRAMES, **options: Any) -> Path:
+    path.parent.mkdir(exist_ok=True)
     tifffile.imwrite(path, frames, **{"photometric": "minisblack", **options})
     return path
 
@@ -325,6 +326,22 @@ def test_one_page_with_the_text_of_a_stack_is_one_frame(tmp_path: Path) -> None:
     source = _open(tmp_path / "m.tif")
     assert (len(source), source.recording.times_ns) == (3, None)
     assert source.recording.remarks == ("its text announces 5 images, it holds 3: the text is not used",)
+    assert series.remarks == ("one_0.tif: its text announces 5 images, it holds 1: the text is not used",)
+
+
+def test_what_is_lost_of_a_description_is_reported(tmp_path: Path) -> None:
+    path = _description(_behind_one_page(tmp_path / "m.tif"), "ImageJ=1.54\nimages=4\nframes=4\n")
+    assert _series(path).remarks == ("m.tif: its text announces 4 images, and it has room for 6",)
+    path = _description(_write(tmp_path / "o.tif"), '<OME><Image><Pixels SizeT="6"')
+    assert _series(path).remarks == ("o.tif: its OME description cannot be read",)
+    for number, frames in enumerate((FRAMES, FRAMES, FRAMES)):
+        _write(tmp_path / "several" / f"{number}.tif", frames)
+    with tifffile.TiffFile(tmp_path / "several" / "1.tif") as tiff:
+        following = tiff.pages[1].offset
+    content = (tmp_path / "several" / "1.tif").read_bytes()
+    (tmp_path / "several" / "1.tif").write_bytes(content.replace(struct.pack("<I", following), bytes(4), 1))
+    remark = "1.tif: its text announces 6 images, it holds 1: the text is not used"
+    assert _series(tmp_path / "several").remarks == (remark,)
 
 
 @pytest.mark.parametrize("options", [{}, {"metadata": None}, {"imagej": True, "metadata": {"axes": "TYX"}}], ids=str)
