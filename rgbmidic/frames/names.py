@@ -99,9 +99,10 @@ class NamedFiles:
     @classmethod
     def ordered(cls, files: Collection[Path]) -> Self:
         """Return files in the order of their names."""
-        common = os.path.commonpath([file.parent for file in files]) if files else ""
-        names = [str(file.relative_to(common).with_suffix("")).casefold() for file in files]
-        splits, doubt = _split(names)
+        one_folder = len({file.parent for file in files}) == 1
+        common = "" if one_folder or not files else os.path.commonpath([file.parent for file in files])
+        names = [file.stem if one_folder else str(file.relative_to(common).with_suffix("")) for file in files]
+        splits, doubt = _split([name.casefold() for name in names])
         keys = {
             file: [(_number(part), "") if place % 2 else (Fraction(), part) for place, part in enumerate(split)]
             for file, split in zip(files, splits, strict=True)
@@ -131,7 +132,7 @@ class NamedFiles:
 
 
 def _number(text: str) -> Fraction:
-    return Fraction(text.replace(",", "."))
+    return Fraction(int(text) if text.isdecimal() else text.replace(",", "."))
 
 
 def _split(names: Sequence[str]) -> tuple[list[list[str]], str]:

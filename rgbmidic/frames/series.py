@@ -24,7 +24,6 @@ from rgbmidic.frames.formats import known_formats, open_source
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.frames.names import NamedFiles, list_frames
 from rgbmidic.frames.source import FrameSource, file_fingerprint
-from rgbmidic.frames.stacks import split_dataset
 from rgbmidic.frames.stored import Camera
 from rgbmidic.frames.tiff import TIFF_ENDINGS
 from rgbmidic.settings import FrameSettings
@@ -289,8 +288,7 @@ def open_series(
             "frames.path must name the frame files; it is empty, which is for a frame source that a script gives "
             "(rgbmidic.measure(settings, out, source=...))"
         )
-    files = [list_frames(text, base) for text in settings.path]
-    opened = [[open_source(path, settings, camera) for path in paths] for paths in files]
+    opened = [[open_source(path, settings, camera) for path in list_frames(text, base)] for text in settings.path]
     # a movie in two files, samples and header, is one source where a pattern matches both
     lights = tuple(tuple({source.path: source for source in sources}.values()) for sources in opened)
     for text, sources in zip(settings.path, lights, strict=True):
@@ -299,10 +297,6 @@ def open_series(
     if len(set(counts)) > 1:
         numbers_given = ", ".join(f"{text}: {count}" for text, count in zip(settings.path, counts, strict=True))
         raise FrameError(f"lights fired in succession need equal numbers of frames; given are {numbers_given}")
-    for text, paths in zip(settings.path, files, strict=True):
-        named = NamedFiles.ordered([Path(split_dataset(path)[0]) for path in paths])
-        if in_order and named.doubt:
-            logger.warning("the order of %s is uncertain (%s): taken as %s", text, named.doubt, named.listed)
     begins: Sequence[int] = ()
     numbers = _numbers(settings, lights) if in_order else ()
     if settings.lights > 1:
@@ -379,7 +373,7 @@ def _numbers(settings: FrameSettings, lights: Sequence[Sequence[FrameSource]]) -
     """Return the frame numbers that the names or the headers of all lights hold; empty where they hold none."""
     found: dict[str, tuple[int, ...]] = {}
     for text, sources in zip(settings.path, lights, strict=True):
-        if counts := _counts(sources):
+        if counts := _counts(text, sources):
             scale = math.lcm(*(count.denominator for count in counts))
             step = Fraction(math.gcd(*(int(scale * (count - counts[0])) for count in counts)) or 1, scale)
             numbers = found[text] = tuple(int((count - counts[0]) / step) for count in counts)
@@ -394,13 +388,14 @@ def _numbers(settings: FrameSettings, lights: Sequence[Sequence[FrameSource]]) -
     return next(iter(found.values()), ())
 
 
-def _counts(sources: Sequence[FrameSource]) -> tuple[Fraction, ...]:
+def _counts(text: str, sources: Sequence[FrameSource]) -> tuple[Fraction, ...]:
     """Return the camera's numbers in a movie's header, else those in the names; empty where there are none."""
     if len(sources) == 1 and len(sources[0]) > 1:
         return tuple(map(Fraction, sources[0].recording.numbered.tolist()))
-    if any(len(source) > 1 for source in sources):
-        return ()
-    return NamedFiles.ordered([source.path for source in sources]).counts
+    named = NamedFiles.ordered([source.path for source in sources])
+    if named.doubt:
+        logger.warning("the order of %s is uncertain (%s): taken as %s", text, named.doubt, named.listed)
+    return () if any(len(source) > 1 for source in sources) else named.counts
 
 
 def _listed(numbers: Sequence[int | Fraction], most: int = 10) -> str:
