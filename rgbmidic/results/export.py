@@ -26,7 +26,7 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.fields.units import column
 from rgbmidic.results.files import check_file, write_complete, write_table, writing
 from rgbmidic.results.physical import Physical
-from rgbmidic.results.quantities import FAILED, FINITE_ELEMENTS, QUANTITIES, SHARED, UNKNOWN_TIME, Quantity
+from rgbmidic.results.quantities import FAILED, FINITE_ELEMENTS, QUANTITIES, SHARED, Quantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray
@@ -243,9 +243,8 @@ def _write_npz(physical: Physical, file: BinaryIO) -> None:
         for name in ("nodes", "elements", "names", "lights", *stated):
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(getattr(result, name)), allow_pickle=False)
-        timed = not (result.time_ns == UNKNOWN_TIME).any()
         for quantity in QUANTITIES.values():
-            if not quantity.stackable or (quantity.name == "time_ns" and not timed):
+            if not quantity.stackable:
                 continue
             blank = quantity.unmeasured(result.table.sizes)
             head = {"descr": blank.dtype.str, "fortran_order": False, "shape": (len(result), *blank.shape)}

@@ -248,8 +248,6 @@ class SetupControls(Controls):
             bk.Spinner(title=title, name=title.lower(), value=at, low=0, high=last, step=1, **wide)
             for title, at in chosen.items()
         )
-        if len(frames.reference) > 1:
-            self.reference.title = f"Reference (the first of {len(frames.reference)}, to {frames.reference[-1]})"
         calibration = str(draft.section("calibration").get("file", ""))
         texts = {"Calibration file": calibration, "Write to": str(draft.file), "Result folder": str(out)}
         self.calibration, self.file, self.out = (

@@ -8,13 +8,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from results import LIGHTS, NODES, make_origin, make_result, random_record
+from results import LIGHTS, NODES, make_origin, make_result
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results import (
     EXPORT_FORMATS,
     QUANTITIES,
-    UNKNOWN_TIME,
     FrameRecord,
     Origin,
     Quantity,
@@ -51,16 +50,6 @@ def test_npz_holds_every_array(result: Result, tmp_path: Path) -> None:
         assert set(archive.files) == {"nodes", "elements", "names", "lights"} | stackable
         for name in archive.files:
             np.testing.assert_array_equal(archive[name], getattr(result, name), err_msg=name)
-
-
-def test_npz_has_no_times_where_a_frame_has_none(tmp_path: Path) -> None:
-    times = (0, UNKNOWN_TIME)
-    records = [FrameRecord.of(nodes=NODES, lights=3, **{**random_record(1).values, "time_ns": one}) for one in times]
-    result = make_result(tmp_path / "untimed", record=lambda index: records[index])
-    export_result(result, "npz", tmp_path / "fields.npz")
-    with np.load(tmp_path / "fields.npz") as archive:
-        assert "time_ns" not in archive.files
-        assert "number" in archive.files
 
 
 def test_csv_has_one_row_per_node_and_frame(result: Result, tmp_path: Path) -> None:
