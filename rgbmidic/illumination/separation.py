@@ -245,7 +245,10 @@ class Separation:
             raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
         elif known.crosstalk is None:
             what = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
-            raise ConfigurationError(f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk")
+            raise ConfigurationError(
+                f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk; of one white light, "
+                'state frames.kind = "monochrome"'
+            )
         else:
             images = _separated(linear[0], known, self.demosaic, self.texture, self.tables)
         return replace(images, registration=known.registration)

@@ -195,7 +195,6 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         logger.warning("%s: %s gives %.0f %% of its light in the reference", name, light, 100 * gain)
     match, best, reference_updates = _compared(plan, index, start, reference_update, deformed, solution)
     reflection = images.reflection_index(step, here)
-    samples = (there,) if isinstance(there, IlluminationImages) else there
     return {
         "solution": kept,
         "number": plan.series.numbers[index],
@@ -208,8 +207,14 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         "reflection_thumbnail": None if reflection is None else _in_bytes(reflection),
         "inputs": inputs,
         "machine": machine(),
-        "checksum": zlib.crc32(b"".join(one.values.tobytes() for one in samples)),
+        "checksum": checksum(there),
     }
+
+
+def checksum(state: RawState) -> int:
+    """Return the CRC-32 of the samples of a state."""
+    samples = (state,) if isinstance(state, IlluminationImages) else state
+    return zlib.crc32(b"".join(one.values.tobytes() for one in samples))
 
 
 def _causes(

@@ -307,6 +307,7 @@ class _Live:
 
     def __init__(self, plan: Plan) -> None:
         self._plan, self._starts, self._checksum = plan, dict[int, Start](), NO_CHECKSUM
+        self._of_reference = set[int]()
         self._updates: dict[tuple[int, ...], ReferenceUpdate] = {(): ReferenceUpdate.none(plan.reference)}
         self.solution: Solution
 
@@ -330,6 +331,10 @@ class _Live:
         checksum = record.values["checksum"]
         if checksum == self._checksum != NO_CHECKSUM:
             logger.warning("state %d repeats the one before, bit for bit", place)
+        elif plan.series.chosen[place] in plan.settings.frames.reference:
+            self._of_reference.add(checksum)
+        elif checksum in self._of_reference - {NO_CHECKSUM}:
+            logger.warning("state %d is the reference, bit for bit: its displacement of 0 is not measured", place)
         self._checksum = checksum
         self._starts[place] = after
         if (frames := after.reference_updates)[-2:] not in self._updates:

@@ -23,6 +23,7 @@ from scipy.sparse.linalg import splu
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
 from rgbmidic.fields.nodal import Places
+from rgbmidic.frames.names import NamedFiles
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh, read_mesh
 from rgbmidic.results.physical import placement_of, rectification_of
 from rgbmidic.results.result import Result
@@ -154,14 +155,16 @@ def _listed(path: Path, interval: float | None) -> list[tuple[float | None, Path
 
 def _numbered(path: Path, interval: float | None) -> list[tuple[float | None, Path]]:
     """Return the files of a folder by the last number in their names, times the `interval`."""
-    files = {file: re.findall(r"\d+", file.stem) for file in path.iterdir() if file.suffix.lower() in (".vtu", ".vtk")}
-    if not files or not all(files.values()):
+    files = NamedFiles.ordered([file for file in path.iterdir() if file.suffix.lower() in (".vtu", ".vtk")])
+    if not files.paths or not all(files.numbers):
         raise InputError(f"{path} must hold one .pvd file, or .vtu or .vtk files with a number in their names")
     if interval is None or not interval > 0:
         raise InputError(
             f"the times of the files in {path} are not known: state --interval, the time between two numbers (above 0)"
         )
-    return sorted((interval * int(numbers[-1]), file) for file, numbers in files.items())
+    return sorted(
+        (interval * float(numbers[-1]), file) for numbers, file in zip(files.numbers, files.paths, strict=True)
+    )
 
 
 def _displacement(mesh: FiniteElementMesh, field: str | None) -> FloatArray:

@@ -217,6 +217,15 @@ def test_a_simulation_is_read_with_its_times_and_interpolated(states, name):
     assert read.mesh.node_numbers.tolist() == finite_elements().node_numbers.tolist()
 
 
+@pytest.mark.parametrize("numbers", [(0.25, 0.5, 0.75), (-0.5, 0, 0.25, 1), (9, 10, 11)])
+def test_signs_and_fractions_in_the_names_of_states_count(tmp_path, numbers):
+    for number in numbers:
+        write_state(tmp_path / f"plate_{number}.vtu", number * stretch())
+    read = Simulation.read(tmp_path, interval=2.0)
+    assert read.times.tolist() == [2.0 * number for number in numbers]
+    assert read.at(2.0 * numbers[1]) == pytest.approx(numbers[1] * stretch(), abs=1e-9)
+
+
 def test_what_may_be_meant_otherwise_is_stated(tmp_path, states, caplog):
     table = states.parent / "table.csv"
     mesh = finite_elements()
