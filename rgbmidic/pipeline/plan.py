@@ -27,7 +27,7 @@ from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError
 from rgbmidic.fields import CameraCalibration
-from rgbmidic.frames import Window, read_frame
+from rgbmidic.frames import Window, read_mask
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import DARK, IlluminationImages, correlated
@@ -436,6 +436,8 @@ def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
     ------
     RegionError
         The region is empty, outside the image, or the mask image has another size.
+    FrameError
+        The mask image cannot be read.
     """
     if settings.rectangle is not None:
         outlined = Region.from_rectangle(settings.rectangle, shape)
@@ -444,8 +446,16 @@ def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
     elif settings.mask is None:
         outlined = Region.from_mask(np.ones(shape, dtype=bool))
     else:
+        mask = read_mask(settings.mask)
+        inside = mask >= 0.5
+        if (excluded := np.count_nonzero(~inside & (mask > 0))) > 0.25 * np.count_nonzero(inside):
+            # soft edges and JPEG files have 7 to 15 %
+            logger.warning(
+                f"region.mask {settings.mask}: {excluded} pixels under half of the largest value are not measured, "
+                f"{np.count_nonzero(inside)} are: draw in one colour what is to be measured"
+            )
         try:
-            outlined = Region.from_mask(read_frame(settings.mask, kind="monochrome").values[0], shape)
+            outlined = Region.from_mask(inside, shape)
         except RegionError as error:
             raise RegionError(f"region.mask {settings.mask}: {error}") from None
     return outlined.without(settings.holes)
