@@ -39,6 +39,8 @@ def read_mask(path: Path) -> FloatImage:
         values = stored(path)
     except UnidentifiedImageError:
         raise FrameError(f"{path} is no mask: allowed are pictures (PNG, TIFF, BMP, JPEG) and .npy arrays") from None
+    except FileNotFoundError:
+        raise FrameError(f"the mask is not found: {path}") from None
     except OSError as error:
         raise FrameError(f"the mask {path} cannot be read: {disk_reason(error) if error.errno else error}") from None
     except (SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:  # Pillow's for damaged files

@@ -13,6 +13,7 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames import open_series, open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.contrast import CONTRAST, LocalContrast
 from rgbmidic.illumination.crosstalk import align
 from rgbmidic.illumination.demosaicing import SMALLEST_FRAME
 from rgbmidic.illumination.frame_check import Frame, check_state
@@ -20,14 +21,13 @@ from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_m
 from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection.channels import (
-    CONSTANTS,
     Channel,
     channels_of,
     noise_estimate,
     speckle_texture,
     surroundings,
 )
-from rgbmidic.lab.inspection.prediction import LocalContrast, Prediction, predict, separated
+from rgbmidic.lab.inspection.prediction import Prediction, predict, separated
 from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import finite_elements_of, read_region
@@ -307,7 +307,7 @@ def _light_summaries(
     summaries = []
     for j, light in enumerate(images.names):
         values, valid = images.values[j][inside], images.valid[j][inside]
-        mean = local_mean(images.values[j], CONSTANTS.contrast_widths[0])[inside]
+        mean = local_mean(images.values[j], CONTRAST.contrast_widths[0])[inside]
         summaries.append(
             LightSummary(
                 name=light,

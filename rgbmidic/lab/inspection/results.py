@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic.illumination.checks import Check, reported
+from rgbmidic.illumination.contrast import CONTRAST
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.channels import CONSTANTS
 from rgbmidic.lab.inspection.prediction import Prediction
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.suitability import SPECKLES
+from rgbmidic.pipeline.suitability import SPECKLES, SUITABILITY
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
@@ -210,7 +211,7 @@ def _of_exposure(inspection: Inspection) -> Iterator[Check]:
             f"channel {channel.name}: {channel.saturated:.1%} of the samples are saturated and will not be measured"
         )
         text = f"{bright}; less exposure, or another place of the lamp"
-        yield Check("saturated", text, channel.saturated, CONSTANTS.saturated)
+        yield Check("saturated", text, channel.saturated, SUITABILITY.clipped)
         dark = f"channel {channel.name} is dark: 95 % of its samples are below {channel.high:.1%} of the full scale"
         yield Check("dark", f"{dark}; more light or exposure", max(CONSTANTS.dark - channel.high, 0.0))
 
@@ -247,11 +248,11 @@ def _of_region(inspection: Inspection) -> Iterator[Check]:
     if len(inspection.lights) > 1:
         what, why = "no light shows", "all lights reflect or saturate there"
     reasons = []
-    if dark > CONSTANTS.hidden:
+    if dark > CONTRAST.hidden:
         reasons.append(f"it holds dark background ({dark:.1%}), draw it inside the specimen")
-    if hidden - dark > CONSTANTS.hidden or not reasons:
+    if hidden - dark > CONTRAST.hidden or not reasons:
         reasons.append(f"{why}, or there is no paint")
     text = f"{what} the texture on {hidden:.1%} of the region: {'; '.join(reasons)}"
-    yield Check("hidden", text, hidden, CONSTANTS.hidden)
+    yield Check("hidden", text, hidden, CONTRAST.hidden)
     lost = f"{inspection.unmeasured:.1%} of the nodes will not be measured"
     yield Check("not measured", lost, inspection.unmeasured)

@@ -96,7 +96,7 @@ def test_what_is_no_mask_is_one_line(tmp_path):
         "wrong.png": "damaged|cannot be read",
         "text.png": "is no mask: allowed are pictures",
         "short.npy": "damaged",
-        "missing.png": "No such file",
+        "missing.png": "not found: .*missing.png",
     }
     for name, message in messages.items():
         with pytest.raises(FrameError, match=message):
