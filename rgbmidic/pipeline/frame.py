@@ -196,8 +196,10 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         del ready, weights  # a tenth of what a frame needs
     solution = reference_update.track(deformed, start, plan.solver, plan.method)
     if solution.status is not Status.CONVERGED:
-        causes = _causes(plan, there, images, reference.offset(deformed), solution)
-        solution = replace(solution, reason="; ".join([solution.reason, *causes]))
+        causes = [solution.reason, *_causes(plan, there, images, reference.offset(deformed), solution)]
+        if plan.reference_motion > SUITABILITY.blur:  # of the reference, whatever else a frame shows
+            causes = [unsteady(plan.reference_motion)]
+        solution = replace(solution, reason="; ".join(causes))
     key = place % STRIDE == 0 or place == len(plan.series.chosen) - 1
     if (settings.mesh.error is True or (settings.mesh.error == "key" and key)) and solution.measured.any():
         with stage("conclusion"):
@@ -237,8 +239,6 @@ def _causes(
 
     `state` is cut to the reference's window, which begins at `offset` (x, y) in the `images`' own.
     """
-    if plan.reference_motion > SUITABILITY.blur:
-        return [unsteady(plan.reference_motion)]
     causes = [fault] if (fault := exposure_fault(state, plan.region.mask)) else []
     there = np.where(np.isfinite(solution.displacement), solution.displacement, 0) - offset
     brightness = brightness_change(plan.images.values, images.values, plan.reference, there)

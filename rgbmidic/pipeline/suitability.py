@@ -52,9 +52,9 @@ class SuitabilityConstants:
         Fraction of the samples in the region that are saturated, beyond that of the reference, from which a frame is
         over-exposed. Chosen: reflections saturate a few per cent; three times the exposure saturates a fifth and more.
     repeated
-        Correlation of the texture with itself, displaced by more than a speckle, from which it repeats itself. Random
-        speckle reaches .35 where `enough_speckles` overlap, dots on a grid with a jitter of a tenth of their pitch .8
-        (tests/unit/pipeline/test_suitability.py).
+        Correlation of the texture with itself, displaced by more than a speckle, from which it repeats itself. Of 360
+        random speckles of 2 to 10 px in regions of 70 to 300 px none exceeds .35; dots on a grid reach 1, with a jitter
+        of a tenth of their pitch .7 (tests/unit/pipeline/test_suitability.py).
     enough_speckles
         Number of speckles in the overlap of the texture with itself from which their correlation counts: it then
         scatters by .1.
@@ -235,21 +235,20 @@ def unsteady(motion: float) -> str:
 
 
 def _shift(first: FloatArray, second: FloatArray) -> float:
-    """Length of the shift between two pictures in their pixels: by phase correlation, below a pixel by gradients."""
-    height, width = first.shape
-    if min(height, width) < 16:
-        return 0.0
-    window = cv2.createHanningWindow((width, height), cv2.CV_64F)
-    x, y = cv2.phaseCorrelate(first, second, window)[0]
-    column, row = (round(np.clip(part, -side / 2, side / 2)) for part, side in ((x, width), (y, height)))
-    kept = [slice(max(-part, 0), side - max(part, 0)) for part, side in ((row, height), (column, width))]
-    moved = [slice(max(part, 0), side + min(part, 0)) for part, side in ((row, height), (column, width))]
-    at_rest = np.corrcoef(first.ravel(), second.ravel())[0, 1]
-    if max(abs(row), abs(column)) > 1 and np.corrcoef(first[*kept].ravel(), second[*moved].ravel())[0, 1] > at_rest:
-        return float(np.hypot(x, y))
-    along_y, along_x = np.gradient((first + second) / 2)
-    system = np.stack([part.ravel() for part in (along_x, along_y, second, np.ones_like(first))])
-    return float(np.hypot(*(np.linalg.pinv(system @ system.T) @ (system @ first.ravel()))[:2]))
+    """Length of the shift between two pictures in their pixels: of the best correlation, below a pixel by gradients."""
+    # of Gaussians of 2 px the differences are gradients, and little of them is noise
+    before, after = (
+        cv2.GaussianBlur(one, (0, 0), 2.0) - cv2.GaussianBlur(one, (0, 0), 20.0) for one in (first, second)
+    )
+    size = [next_fast_len(2 * side, real=True) for side in first.shape]
+    correlation = irfft2(rfft2(after, s=size) * np.conj(rfft2(before, s=size)), s=size)
+    best = np.unravel_index(int(correlation.argmax()), correlation.shape)
+    whole = np.linalg.norm([(int(at) + side // 2) % side - side // 2 for at, side in zip(best, size, strict=True)])
+    if whole > 1.5:
+        return float(whole)
+    along_y, along_x = np.gradient((before + after) / 2)
+    system = np.stack([part.ravel() for part in (along_x, along_y, after, np.ones_like(after))])
+    return float(np.hypot(*(np.linalg.pinv(system @ system.T) @ (system @ before.ravel()))[:2]))
 
 
 def check_texture(state: RawState, inside: BoolArray, name: str) -> None:

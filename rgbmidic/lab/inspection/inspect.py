@@ -31,6 +31,7 @@ from rgbmidic.lab.inspection.prediction import Prediction, predict, separated
 from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import finite_elements_of, read_region
+from rgbmidic.pipeline.suitability import clipping, repetition
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatImage, Progress
 
@@ -168,6 +169,8 @@ def inspect_frame(
     part = window.part_of(Window.whole(shape))
     region, known = region.part(*part), known.cropped(window.origin, window.shape)
     cut = [replace(shot, values=np.ascontiguousarray(shot.values[..., *part])) for shot in frames]
+    if clipped := clipping(frames):
+        cut = [replace(shot, white_level=clipped[0]) for shot in cut]
     linear = [linearise(shot, known.noise) for shot in cut]
     report(0, 3, "exposure, speckle and noise")
     channels = channels_of(linear)
@@ -212,6 +215,8 @@ def inspect_frame(
         mesh=mesh,
         prediction=prediction,
         greens=greens,
+        clipping="" if clipped is None else clipped[1],
+        repetition=repetition(images, region, None if speckle is None else speckle.diameter) or "",
     )
 
 

@@ -145,6 +145,10 @@ class Inspection:
         Standard uncertainty to expect at its nodes, px.
     greens : float
         Difference of the means of the two greens of a mosaic over their mean; 0 for other cameras.
+    clipping : str
+        Where samples pile up below the stated white level, which then counts as the white level; empty: nowhere.
+    repetition : str
+        How the texture repeats itself; empty: it does not.
     """
 
     name: str
@@ -168,6 +172,8 @@ class Inspection:
     mesh: Tri3Mesh
     prediction: Prediction
     greens: float
+    clipping: str
+    repetition: str
 
     @property
     def unmeasured(self) -> float:
@@ -206,6 +212,8 @@ def _of_set_up(inspection: Inspection) -> Iterator[Check]:
 
 
 def _of_exposure(inspection: Inspection) -> Iterator[Check]:
+    if inspection.clipping:
+        yield Check("white level", f"{inspection.clipping}, as the figures here assume")
     for channel in inspection.channels:
         bright = (
             f"channel {channel.name}: {channel.saturated:.1%} of the samples are saturated and will not be measured"
@@ -234,6 +242,8 @@ def _of_speckle(inspection: Inspection) -> Iterator[Check]:
             "pulled towards whole pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer lens",
             max(CONSTANTS.too_fine - texture.correlation, 0.0),
         )
+    if inspection.repetition:
+        yield Check("repetition", inspection.repetition)
     if np.isnan(size):
         yield Check("no texture", "no speckle is seen: its autocorrelation has no width")
     elif inspection.element_size < SPECKLES * size:
