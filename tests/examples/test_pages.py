@@ -45,7 +45,7 @@ PAGES = OUTSIDE + sorted(
 )
 NOT_RUN = 16
 """Blocks that do not run, at most: installation, servers, clusters, MATLAB, others' packages, minutes of work."""
-BLOCK = re.compile(r"(?:^<!-- (.*?) -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"(?:^<!-- ([^\n]*?) -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 def blocks(page: str) -> list[tuple[str, str, str]]:
