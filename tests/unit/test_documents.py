@@ -120,7 +120,7 @@ PROSE += [page for page in DOCS.rglob("*.md") if not GENERATED & set(page.parent
 
 def test_links_between_the_documents_lead_somewhere():
     for page in PROSE:
-        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"
 
 
