@@ -6,7 +6,6 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
 from rgbmidic.errors import FrameError, disk_reason
 from rgbmidic.settings import regular
@@ -34,6 +33,8 @@ def read_mask(path: Path) -> FloatImage:
     FrameError
         The file is missing, damaged or no picture, or has values that are negative or not finite.
     """
+    from PIL import Image, UnidentifiedImageError
+
     try:
         stored = np.load if regular(path).suffix.lower() == ".npy" else _grey
         values = stored(path)
@@ -55,6 +56,8 @@ def read_mask(path: Path) -> FloatImage:
 
 def _grey(path: Path) -> AnyArray:
     """Strongest channel of each pixel of a picture, times its opacity."""
+    from PIL import Image
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # frames of 100 Mpx are none
         with Image.open(path) as picture:
