@@ -7,13 +7,14 @@ import logging
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift
+from small_tests import colour_test
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.frame_check import saturation_pile
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.inspection import inspect_frame
 from rgbmidic.mesh import Region
-from rgbmidic.pipeline import measure
+from rgbmidic.pipeline import Plan, measure
 from rgbmidic.pipeline.suitability import ReferenceMotion, background_fraction, clipping, repetition, speckle_size
 from rgbmidic.report import write_report
 from rgbmidic.settings import TestSettings
@@ -143,6 +144,15 @@ def test_motion_of_the_reference_frames_is_found(kind, motion):
     watch = ReferenceMotion(region.mask)
     assert [id(state) for state in watch.watch(states)] == [id(state) for state in states]
     assert watch.largest == pytest.approx(np.hypot(*motion), rel=0.1, abs=0.005)
+
+
+@pytest.mark.parametrize(("motion", "said"), [((0.03, 0.02), 0), ((0.3, 0.1), 1)])
+def test_a_camera_that_shakes_is_not_another_camera(motion, said, tmp_path, told):
+    """The difference of two reference frames that moved is no noise."""
+    test = colour_test(tmp_path, ((0.0, 0.0), motion))
+    Plan.from_settings(test.settings(frames={"reference": [0, 1]}))
+    assert len(told()) == said
+    assert all(line.startswith("the reference frames move against each other by up to 0.3") for line in told())
 
 
 def test_a_reference_of_moving_frames_is_one_line(tmp_path, told):
