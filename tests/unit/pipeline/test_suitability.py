@@ -16,7 +16,6 @@ from rgbmidic.lab.inspection import inspect_frame
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan, measure
 from rgbmidic.pipeline.suitability import ReferenceMotion, background_fraction, clipping, repetition, speckle_size
-from rgbmidic.report import write_report
 from rgbmidic.settings import TestSettings
 
 SHAPE = (120, 140)
@@ -156,24 +155,21 @@ def test_a_camera_that_shakes_is_not_another_camera(motion, said, tmp_path, told
 
 
 def test_a_reference_of_moving_frames_is_one_line(tmp_path, told):
-    frames = [noisy(np.roll(speckle(), 3 * index, axis=1), index).astype(np.uint16) for index in range(8)]
-    result = run(tmp_path, frames, reference="0:7")
-    assert told()[0].startswith("the reference frames move against each other by up to 18 px")
+    frames = [noisy(np.roll(speckle(), 5 * index, axis=1), index).astype(np.uint16) for index in range(5)]
+    result = run(tmp_path, frames, reference="0:4")
+    assert told()[0].startswith("the reference frames move against each other by up to 15 px")
     assert len(told()) == 2  # of the test, and which frames could not be measured for it
     assert told()[1].endswith(f"cannot be measured: {told()[0]}")
     assert len(set(result.reasons)) == 1
 
 
-def test_a_lamp_that_goes_out_is_one_line_of_the_run_and_stands_in_the_report(tmp_path, told):
+def test_a_lamp_that_goes_out_is_one_line_of_the_run_and_is_kept_with_it(tmp_path, told):
     frames = []
-    for index in range(6):
+    for index in range(4):
         moved = shift(speckle(), (0, 0.2 * index), mode="nearest")
-        frames.append(np.stack([moved, (0.1 if index > 2 else 1.0) * moved]).astype(np.float32))
+        frames.append(np.stack([moved, (0.1 if index > 1 else 1.0) * moved]).astype(np.float32))
         frames[-1] += np.random.default_rng(index).normal(size=frames[-1].shape).astype(np.float32)
     result = run(tmp_path, frames, kind=None)
     (line,) = told()
-    assert line == "frames 3 to 5 (frame 3, ...): light 2 gives less than 30% of its light in the reference"
+    assert line == "frames 2 to 3 (frame 2, ...): light 2 gives less than 30% of its light in the reference"
     assert result.warnings == (line,)
-    write_report(result, tmp_path / "report.html")
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert page.count(line) == 1
