@@ -9,12 +9,13 @@ import pytest
 from scipy.ndimage import gaussian_filter, shift
 from small_tests import colour_test
 
-from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording
 from rgbmidic.illumination.frame_check import saturation_pile
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.inspection import inspect_frame
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan, measure
+from rgbmidic.pipeline.source import SourceSeries
 from rgbmidic.pipeline.suitability import ReferenceMotion, background_fraction, clipping, repetition, speckle_size
 from rgbmidic.settings import TestSettings
 
@@ -143,6 +144,34 @@ def test_motion_of_the_reference_frames_is_found(kind, motion):
     watch = ReferenceMotion(region.mask)
     assert [id(state) for state in watch.watch(states)] == [id(state) for state in states]
     assert watch.largest == pytest.approx(np.hypot(*motion), rel=0.1, abs=0.005)
+
+
+class Exposed(SourceSeries):
+    """Frames of 1 kHz that were exposed for so many µs."""
+
+    @property
+    def recording(self) -> Recording:
+        times = np.arange(len(self), dtype=np.int64) * 1_000_000
+        return Recording(count=len(self), times_ns=times, exposure_ns=1000 * self.source.exposed_us)
+
+
+class Frames(list):
+    exposed_us = 0
+
+
+@pytest.mark.parametrize(("exposed_us", "said"), [(400, 0), (600, 1)])
+def test_motion_of_more_than_a_pixel_during_the_exposure_is_told(exposed_us, said, tmp_path, told):
+    frames = Frames(noisy(np.roll(speckle(), 2 * index, axis=1), index).astype(np.uint16) for index in range(3))
+    frames.exposed_us = exposed_us
+    stated = TestSettings.from_mapping(
+        {"frames": {"path": [], "kind": "monochrome", "white_level": 4095}, "region": {"rectangle": [20, 20, 109, 99]}}
+    )
+    source = Exposed(source=frames, stated=stated.frames, chosen=range(3), shape=SHAPE)
+    measure(stated, tmp_path / "out", source=source)
+    assert len(told()) == said
+    assert all(
+        "frames 1 to 2 (frame 1, ...): motion blur: the specimen moves by more than 1 px" in one for one in told()
+    )
 
 
 @pytest.mark.parametrize(("motion", "said"), [((0.03, 0.02), 0), ((0.3, 0.1), 1)])
