@@ -211,8 +211,7 @@ class Plan:
         if not given and isinstance(separate, WindowedSeparation):
             window = window_of_reference(region, settings, frame)
             region = region.part(*window.part_of(Window.whole(frame)))
-        motion = suitability.ReferenceMotion(region.mask)
-        state, images, separate = _read_reference(settings, series, separate, window, region, calibration, motion)
+        state, images, separate, motion = _read_reference(settings, series, separate, window, region, calibration)
         if separation is not None and isinstance(state, IlluminationImages):
             raise ConfigurationError("the source gives images of the lights, which need no separation: give only one")
         if mesh is not None:
@@ -243,7 +242,7 @@ class Plan:
             speckle=suitability.speckle_size(images, region),
             saturated=suitability.saturated_fraction(state, region.mask),
             clipped_at=None if (clipping := suitability.clipping(state)) is None else clipping[0],
-            reference_motion=motion.largest,
+            reference_motion=motion,
             exposure=1e-9 * (series.recording.exposure_ns or 0),
             window=window,
             element_size=size,
@@ -336,13 +335,14 @@ def _read_reference(
     window: Window,
     region: Region,
     calibration: Calibration | None,
-    motion: suitability.ReferenceMotion,
-) -> tuple[RawState, IlluminationImages, LightSeparation]:
-    """First state of the reference, mean images of all its frames, and the separation that has learnt from them.
+) -> tuple[RawState, IlluminationImages, LightSeparation, float]:
+    """First state of the reference, mean images of all its frames, the separation that has learnt from them, and their
+    largest motion against the first, px.
 
     Raw frames that contradict the stated levels or their calibration are refused; doubts are warned of.
     """
     indices, name = settings.frames.reference, ", ".join(map(series.name, settings.frames.reference))
+    motion = suitability.ReferenceMotion(region.mask)
     states = list(motion.watch(series.read(index, window) for index in indices[:2]))
     raw = [state for state in states if not isinstance(state, IlluminationImages)]
     for frame in raw[0] if raw else ():
@@ -371,7 +371,7 @@ def _read_reference(
                 logger.warning("%s may not be what %s calibrates: %s", name, settings.calibration.file, found.text)
     others = motion.watch(series.read(index, window) for index in indices[2:])
     images, learnt = reference_images(separation, chain(states, others), window)
-    return states[0], images, learnt
+    return states[0], images, learnt, motion.largest
 
 
 def _check_reference(plan: Plan, state: RawState, noise: NoiseModel | None) -> None:
