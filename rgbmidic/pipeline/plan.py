@@ -336,8 +336,7 @@ def _read_reference(
     region: Region,
     calibration: Calibration | None,
 ) -> tuple[RawState, IlluminationImages, LightSeparation, float]:
-    """First state of the reference, mean images of all its frames, the separation that has learnt from them, and their
-    largest motion against the first, px.
+    """First state of the reference, mean images of its frames, the separation learnt from them, their motion (px).
 
     Raw frames that contradict the stated levels or their calibration are refused; doubts are warned of.
     """
