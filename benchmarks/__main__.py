@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import importlib
 import importlib.metadata
 import os
 import platform
@@ -73,13 +74,17 @@ def main() -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help="tables to measure; all if none is named")
     parser.add_argument("--quick", action="store_true", help="a few rows of each; written only where --out is given")
     parser.add_argument("--scatter", action="store_true", help="how draws of the noise scatter the figures of --quick")
-    parser.add_argument("--pages", action="store_true", help="measure nothing: write the tables into the pages")
+    parser.add_argument(
+        "--pages", action="store_true", help="measure nothing: write tables and descriptions into the pages"
+    )
     parser.add_argument("--list", action="store_true", help="names, pages and CPU seconds of the tables")
     parser.add_argument("--processes", type=int, default=1, metavar="N", help="tables measured at once (default 1)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help=f"default: {FOLDER.relative_to(ROOT)}")
     options = parser.parse_args()
     if options.pages:
+        sys.path.append(str(ROOT / "docs" / "_ext"))
         fill_pages()
+        fill_pages(importlib.import_module("reference").filled)
         return 0
     broken = load()
     if unknown := [name for name in options.names if name not in TABLES]:

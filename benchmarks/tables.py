@@ -327,10 +327,10 @@ def filled(text: str, folder: Path = FOLDER) -> str:
     return _FIGURE.sub(figure_of, _BLOCK.sub(table_of, text))
 
 
-def fill_pages() -> None:
-    """Write tables and figures into the pages that show them."""
+def fill_pages(fill: Callable[[str], str] = filled) -> None:
+    """Write tables and figures into the pages that show them, or what else `fill` gives."""
     for page in PAGES:
-        if (text := page.read_text(encoding="utf-8")) != (new := filled(text)):
+        if (text := page.read_text(encoding="utf-8")) != (new := fill(text)):
             page.write_text(new, encoding="utf-8")
 
 

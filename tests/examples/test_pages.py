@@ -49,9 +49,9 @@ BLOCK = re.compile(r"(?:^<!-- ([^\n]*?) -->\n)?^```(\w*)\n(.*?)^```$", re.MULTIL
 
 
 def blocks(page: str) -> list[tuple[str, str, str]]:
-    """Mark, language and text of each block; directives of the site are none."""
+    """Mark, language and text of each block; directives of the site and what the code states are none."""
     text = (ROOT / page).read_text(encoding="utf-8")
-    text = re.sub(r"^```\{.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"^```\{.*?^```$|^<!-- generated: .*?^<!-- end -->$", "", text, flags=re.MULTILINE | re.DOTALL)
     return [(mark or "", language, code) for mark, language, code in BLOCK.findall(text)]
 
 
