@@ -215,6 +215,8 @@ def saturation_pile(samples: npt.NDArray[np.integer[Any]], white: float) -> floa
     top = int(samples.max(initial=0))
     if top >= white or top < 8 or (count := np.count_nonzero(samples == top)) <= 20:
         return None
+    if count == samples.size:  # a constant
+        return None
     bits = int(np.bitwise_or.reduce(samples, axis=None))
     step = bits & -bits  # all samples are multiples of it
     below = np.count_nonzero(samples >= top - 4 * step) - count
