@@ -289,7 +289,7 @@ def test_troubles_are_told(lights, code):
 @pytest.mark.parametrize(("size", "code"), [(2.0, "fine speckle"), (26.0, "coloured")])
 def test_coarse_speckle_whose_colours_hardly_agree_is_not_called_too_fine(size, code):
     texture = SimpleNamespace(specific=0.2, correlation=0.74)
-    seen = SimpleNamespace(texture=texture, speckle_px=size, element_size=100.0)
+    seen = SimpleNamespace(texture=texture, speckle_px=size, element_size=100.0, repetition="")
     assert [check.name for check in _of_speckle(seen) if not check.passed] == [code]
 
 
