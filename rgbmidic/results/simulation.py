@@ -33,7 +33,9 @@ logger = logging.getLogger(__name__)
 
 _FIELDS = ("displacement", "displacements", "u", "disp")
 """Names, in small letters, under which a displacement is written: by ParaView and CalculiX, by Abaqus, by others."""
-_COMPONENTS = tuple(re.compile(rf"(?:{name})(?:_(mm|m|um|inch))?", re.IGNORECASE) for name in ("u|u_?[x1]", "v|u_?[y2]"))
+_COMPONENTS = tuple(
+    re.compile(rf"(?:{name})(?:_(mm|m|um|inch))?", re.IGNORECASE) for name in ("u|u_?[x1]", "v|u_?[y2]")
+)
 """Names of the columns of a table: the displacement along the first and the second axis, and its unit."""
 _TIMES = {"time": 1.0, "time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6}
 
