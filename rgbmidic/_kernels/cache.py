@@ -14,7 +14,7 @@ from rgbmidic.errors import disk_reason
 logger = logging.getLogger(__name__)
 
 
-class KernelCache(FunctionCache):  # type: ignore[misc]  # numba has no types
+class KernelCache(FunctionCache):
     """Cache of a kernel's compiled forms; a power cut may have left its files empty or cut off."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
