@@ -161,4 +161,4 @@ class Alignment:
         least = np.arctanh(scores[max(best - 1, 0) : best + 2].min()) - 2 * math.sqrt(2 / (len(self.history) - 3))
         first, end = np.searchsorted(below, [best, best])
         scores[(below[first - 1] if first else 0) : (below[end] if end < len(below) else None)] = 0
-        return offsets[np.arctanh(scores) > least]
+        return np.asarray(offsets[np.arctanh(scores) > least])

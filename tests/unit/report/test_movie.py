@@ -18,7 +18,7 @@ from results import NODES, make_result, smooth_record
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import FrameError, InputError, ResultError
-from rgbmidic.report import movie
+from rgbmidic.report import movie, video
 from rgbmidic.report.curves import Curve
 from rgbmidic.report.movie import Movie, MovieConstants, _Canvas, write_movie
 from rgbmidic.results import FrameRecord, Maps
@@ -192,6 +192,27 @@ def test_nothing_is_left_of_a_movie_whose_command_is_terminated(
     out = tmp_path / "m.gif"
     assert execute(cli.app, ["movie", str(maps.result.path), "--out", str(out), "--width", "320"]) == 130
     assert signal.getsignal(signal.SIGTERM) is before
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interruption_while_its_timer_starts_ends_a_movie_and_the_timer(
+    maps: Maps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    timers: list[video.Timer] = []
+
+    class Interrupted(video.Timer):
+        def start(self) -> None:
+            super().start()
+            timers.append(self)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(video, "Timer", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_movie(Movie(maps=maps, fields=["u"], width=320), tmp_path / "m.mp4")
+    for timer in timers:
+        timer.join(10)
+    assert timers
+    assert not any(timer.is_alive() for timer in timers)
     assert not list(tmp_path.iterdir())
 
 
