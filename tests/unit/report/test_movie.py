@@ -195,9 +195,7 @@ def test_nothing_is_left_of_a_movie_whose_command_is_terminated(
     assert not list(tmp_path.iterdir())
 
 
-def test_an_interruption_while_its_timer_starts_ends_a_movie_and_the_timer(
-    maps: Maps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interruption_while_its_timer_starts_ends_the_timer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     timers: list[video.Timer] = []
 
     class Interrupted(video.Timer):
@@ -207,13 +205,13 @@ def test_an_interruption_while_its_timer_starts_ends_a_movie_and_the_timer(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(video, "Timer", Interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        write_movie(Movie(maps=maps, fields=["u"], width=320), tmp_path / "m.mp4")
+    pages = iter([np.zeros((2, 2, 4), dtype=np.uint8)] * 2)
+    with (tmp_path / "m.mp4").open("wb") as file, pytest.raises(KeyboardInterrupt):
+        video.video(file, pages, 25.0, ["cat"], 300.0)
     for timer in timers:
         timer.join(10)
     assert timers
     assert not any(timer.is_alive() for timer in timers)
-    assert not list(tmp_path.iterdir())
 
 
 def test_wrong_input_is_refused_and_nothing_is_overwritten(maps: Maps, tmp_path: Path) -> None:
