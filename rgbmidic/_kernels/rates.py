@@ -168,7 +168,7 @@ def _add_window(t, y, w, first, last, chance, times, low, high, begin, end, base
     top = _NONE
     for d in range(LOWEST, HIGHEST + 1):
         if chance[d - LOWEST] > _LEAST and last - first >= d:
-            top = d
+            top = np.int64(d)
     if top < 0:
         return
     _orthonormal(t, w, first, last, top, norms, shifts, values)
