@@ -65,6 +65,11 @@ class Alignment:
         return len(self.history) / max(1, self.intervals[0] / self.intervals[1])
 
     @cached_property
+    def constant(self) -> float:
+        """Variance up to which a part of the channel counts as constant."""
+        return _CONSTANT * float(np.nanvar(self.values))
+
+    @cached_property
     def needed(self) -> int:
         """Number of frames that must lie within the times of the channel: half of them."""
         return max(len(self.history) // 2, MIN_FRAMES)
@@ -109,7 +114,7 @@ class Alignment:
         moved = self._values(offset)
         used = np.isfinite(moved)
         values, history = moved[used], self.history[used]
-        if len(values) < self.needed or not np.var(values) > _CONSTANT * np.nanvar(self.values) or not np.ptp(history):
+        if len(values) < self.needed or not np.var(values) > self.constant or not np.ptp(history):
             return 0.0
         return float(np.corrcoef(values, history)[0, 1])
 
@@ -140,7 +145,7 @@ class Alignment:
 
     def _values(self, offset: float) -> FloatArray:
         """Interpolate the channel at the frames, its times shifted by an offset; NaN where it has no value."""
-        return np.interp(self.frame_times, self.times + offset, self.values, np.nan, np.nan)
+        return np.interp(self.frame_times - offset, self.times, self.values, np.nan, np.nan)
 
     def refined(self, offset: float, reach: float) -> float:
         """Return the offset of the best correlation (absolute) within some reach of one, both in s."""
