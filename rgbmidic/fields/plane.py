@@ -26,7 +26,7 @@ from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.text import uncertain
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, as_numbers
 
 logger = logging.getLogger(__name__)
 
@@ -110,9 +110,8 @@ class CameraCalibration:
             given = getattr(self, key)
             if given is None:
                 continue
-            values = np.asarray(given, dtype=np.float64)
-            if values.shape != shape or not np.isfinite(values).all():
-                raise CalibrationError(f"{self.name}: {key} must be finite with shape {shape}, not {values.shape}")
+            needed = f"{self.name}: {key} must be finite with shape {shape}"
+            values = as_numbers(given, needed, shape, error=CalibrationError)
             object.__setattr__(self, key, values)
         if self.lens is not None and self.lens[0] <= 0:
             raise CalibrationError(f"{self.name}: the focal length must be positive, not {self.lens[0]:g} px")

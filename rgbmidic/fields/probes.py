@@ -426,4 +426,9 @@ def make_probe(
     if kind == "tip":
         stated: dict[str, Any] = {name: getattr(settings, name) for name in _OF_TIPS}
         more["williams"] = Williams(units=Units() if rectified is None else rectified.units, **stated)
-    return make(covariance, name, *(place if rectified is None else rectified.place(place, points)), **more)
+    placed = np.asarray(place if rectified is None else rectified.place(place, points), dtype=np.float64)
+    nodes = covariance.mesh.nodes
+    if not (np.abs(placed) <= np.abs(nodes).max() + 2 * np.ptp(nodes, axis=0).max()).all():  # too far to be sampled
+        where = Places.of(covariance.mesh, nodes[:1]).where
+        raise InputError(f"half or more of {name} is outside {where}; given is {list(place)}")
+    return make(covariance, name, *placed.tolist(), **more)

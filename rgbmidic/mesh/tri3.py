@@ -109,7 +109,7 @@ class Tri3Mesh:
         """
         given: Any = element_size
         if not (isinstance(given, int | float | np.number) and math.isfinite(given) and given >= 4):
-            chosen = ': "auto" is for rgbmidic.measure' if given == "auto" else ""
+            chosen = ': "auto" is for rgbmidic.measure' if isinstance(given, str) and given == "auto" else ""
             raise InputError(f"element_size must be a number of at least 4 px; given is {given!r}{chosen}")
         # speckles are 3 to 5 px wide, and a pixel or two at each border serve the filters only
         if (width := region.width) < 10:

@@ -183,7 +183,7 @@ class SourceSeries:
                 f"{where} has masked samples, which a raw frame cannot have: give it saturated there, or images of the "
                 "lights as floats"
             )
-        if kind not in "uif" or values.ndim not in (2, 3):
+        if kind not in "uif" or values.ndim not in (2, 3) or not values.size:
             raise FrameError(
                 f"{where} is {values.dtype} of shape {values.shape}; allowed are whole numbers (H, W) or (C, H, W), "
                 "floats (H, W) or (k, H, W), Mosaic, ChannelFrame and IlluminationImages"

@@ -80,7 +80,7 @@ def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset
     plane = "" if physical.rectified.camera is None else "on the plane of the specimen"
     for name, entry in QUANTITIES.items():
         dimension = _PARTS[name][0] if name in _PARTS else ""
-        if not entry.stackable or name.removesuffix("_std") in _COMPONENTS or name == "number":
+        if not entry.stackable or name.removesuffix("_std") in _COMPONENTS or name in ("number", "time_ns"):
             continue
         axes = ("frame", *(axis if isinstance(axis, str) else dimension for axis in entry.axes))
         moved = name.removesuffix("_std") in ("u", "v")

@@ -34,7 +34,10 @@ logger = logging.getLogger(__name__)
 
 _FIELDS = ("displacement", "displacements", "u", "disp")
 """Names, in small letters, under which a displacement is written: by ParaView and CalculiX, by Abaqus, by others."""
-_COMPONENT = re.compile(r"(?:u|v|u[xy12]|u_[xy12])(?:_(mm|m|um|inch))?", re.IGNORECASE)
+_COMPONENTS = tuple(
+    re.compile(rf"(?:{name})(?:_(mm|m|um|inch))?", re.IGNORECASE) for name in ("u|u_?[x1]", "v|u_?[y2]")
+)
+"""Names of the columns of a table: the displacement along the first and the second axis, and its unit."""
 _TIMES = {"time": 1.0, "time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6}
 
 
@@ -186,11 +189,13 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read: {error}") from None
     names = [name.strip() for name in next(csv.reader(lines[:1]), [])]
-    moved = [name for name in names if _COMPONENT.fullmatch(name)]
-    clock = next((name for name in names if name.lower() in _TIMES), None)
-    if "node" not in names or len(moved) != 2:
-        raise InputError(f'{path} needs a header line with "node", "u_mm" and "v_mm" (and "time_s"), not {names}')
-    wanted = [names.index(name) for name in ("node", *moved, *([clock] if clock else []))]
+    components = [[match for name in names if (match := pattern.fullmatch(name))] for pattern in _COMPONENTS]
+    clocks = [name for name in names if name.lower() in _TIMES]
+    if names.count("node") != 1 or [len(found) for found in components] != [1, 1] or len(clocks) > 1:
+        raise InputError(
+            f'{path} needs a header line with one column each "node", "u_mm" and "v_mm" (and "time_s"), not {names}'
+        )
+    wanted = [names.index(name) for name in ("node", *(match.string for (match,) in components), *clocks)]
     rows = []
     for number, row in enumerate(csv.reader(lines[1:]), 2):
         try:
@@ -207,16 +212,15 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
     if not known.all():
         logger.warning("%s: %d rows name nodes that %s does not have", path, int((~known).sum()), mesh.name)
         table, places = table[known], places[known]
-    times = table[:, 3] * _TIMES[clock.lower()] if clock else np.zeros(len(table))
+    times = table[:, 3] * _TIMES[clocks[0].lower()] if clocks else np.zeros(len(table))
     steps, state = np.unique(times, return_inverse=True)
     cells, count = np.unique(state * len(mesh.points) + places, return_counts=True)
     if (count > 1).any():
         node = mesh.node_numbers[cells[count.argmax()] % len(mesh.points)]
         raise InputError(f"{path} has two rows or more for node {node} at one time: several states need a time_s")
     values = np.full((len(steps), len(mesh.points), 2), np.nan)
-    factors = [LENGTH_UNITS[(found[1] or unit).lower()] for name in moved if (found := _COMPONENT.fullmatch(name))]
-    values[state, places] = table[:, 1:3] * factors
-    return values, steps if clock else None
+    values[state, places] = table[:, 1:3] * [LENGTH_UNITS[(match[1] or unit).lower()] for (match,) in components]
+    return values, steps if clocks else None
 
 
 def places_among(numbers: IntArray, wanted: npt.NDArray[Any]) -> IntArray:

@@ -58,6 +58,8 @@ class ViewerConstants:
     progress_ms, idle_ms, run_ms
         Time between two parts of the time line; between two checks whether a result has grown, and pictures of that;
         between two reports of a run.
+    ahead_ms
+        Time between two frames that are read beside the one in view: less than between two that are played.
     slice_s
         Time for which frames are read along a line before they are drawn, or before another line has its turn.
     settled_ns
@@ -94,6 +96,7 @@ class ViewerConstants:
     progress_ms: int = 200
     idle_ms: int = 1000
     run_ms: int = 500
+    ahead_ms: int = 100
     slice_s: float = 0.25
     settled_ns: int = 2_000_000_000
     forgotten_ms: int = 15_000

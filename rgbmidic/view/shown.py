@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
@@ -28,6 +29,8 @@ from rgbmidic.view.picture import Overlay, Picture, RawPictures, element_at, pal
 
 _REASONS = ("measured", "no light sees enough texture here", "the images around it do not match", "carried over")
 """What a node's status means, under the pointer."""
+_UNREADABLE = (RgbmidicError, OSError, IndexError, KeyError)
+"""What a field or a raw frame that cannot be read raises."""
 
 
 def palette_name(field: Quantity, *, symmetric: bool) -> str:
@@ -72,7 +75,8 @@ class ShownFields:
 
     def _take(self, maps: Maps) -> None:
         self.maps = maps
-        self._read, self._moved = lru_cache(4)(maps.read), lru_cache(2)(maps.displacement)
+        self._read, self._moved = lru_cache(3 * (1 + len(BESIDE)))(maps.read), lru_cache(2)(maps.displacement)
+        self._ahead: tuple[tuple[Any, ...], ...] = ()
         self._test_range = lru_cache(8)(partial(range_of_test, maps))
 
     @property
@@ -129,6 +133,21 @@ class ShownFields:
         named = [f"{self.view.field}_std" if name == UNCERTAINTY else name for name in asked]
         return [self.view.field, *(name for name in named if name in self.maps.all)]
 
+    def read_ahead(self) -> None:
+        """Read the next frame or the one before, whichever is not read yet, so that a step there does not wait."""
+        view, result = self.view, self.result
+        for frame in (view.frame + 1, view.frame - 1):
+            wanted = (frame, view.over, *self.names)
+            if not 0 <= frame < len(result) or not result.finished[frame] or wanted in self._ahead:
+                continue
+            self._ahead = (wanted, *self._ahead[:1])  # also where it cannot be read, which a step there reports
+            with suppress(*_UNREADABLE):
+                for name in self.names:
+                    self._read(name, frame)
+                if view.over == "deformed":
+                    self._raw(frame)
+            return
+
     @property
     def gauge(self) -> float:
         """Length of the virtual strain gauges, px."""
@@ -179,7 +198,7 @@ class ShownFields:
             return self._reference, ""
         try:
             return self._raw(self.view.frame), ""
-        except (RgbmidicError, OSError, IndexError, KeyError) as error:
+        except _UNREADABLE as error:
             return self._reference, f"the raw frame cannot be shown ({error}): this is the reference image"
 
     @property

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import os
 import subprocess
 import sys
 from itertools import pairwise
@@ -13,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
 from matplotlib.text import Text
 from results import LIGHTS, MESH, NODES, make_origin, make_result
 
@@ -450,3 +453,21 @@ def test_matplotlib_is_imported_only_for_a_figure() -> None:
     code = "import sys, rgbmidic.report, rgbmidic.results; print({'matplotlib', 'numba'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_a_picture_appears_when_all_of_it_is_written_and_only_in_a_format_that_there_is(tmp_path: Path) -> None:
+    path, figure = tmp_path / "a.png", Figure()
+    save_figure(figure, path)
+    before = path.read_bytes()
+    assert before[:4] == b"\x89PNG"
+
+    def draw(renderer: object) -> None:
+        assert [file.name for file in tmp_path.glob("a.png.*.part")]
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    figure.draw = draw  # type: ignore[method-assign]
+    with pytest.raises(ResultError, match=r"a\.png cannot be written: No space"):
+        save_figure(figure, path)
+    assert [file.read_bytes() for file in tmp_path.iterdir()] == [before]
+    with pytest.raises(InputError, match=r"a\.xyz cannot be written: a figure is one of .*\.png, "):
+        save_figure(figure, tmp_path / "a.xyz")

@@ -303,6 +303,31 @@ def test_a_result_of_mesh_file_is_compared_by_number_where_the_simulation_has_an
         Simulation.read(tmp_path / "t.csv", mesh=measured_mesh(result))
 
 
+@pytest.mark.parametrize(
+    ("header", "row"),
+    [
+        ("node,u_mm,v_mm", "100,1,2"),
+        ("v_mm,node,u_mm", "2,100,1"),
+        ("node,UY_um,time_ms,ux", "100,2000,7,1"),
+        ("u2,w_mm,u_1,node", "2,3,1,100"),
+    ],
+)
+def test_the_columns_of_a_table_are_taken_by_their_names(tmp_path, header, row):
+    (tmp_path / "t.csv").write_text(f"{header}\n{row}")
+    read = Simulation.read(tmp_path / "t.csv", mesh=finite_elements())
+    assert read.displacement[0, 0].tolist() == [1, 2]
+    assert read.times is None or read.times.tolist() == [0.007]
+
+
+@pytest.mark.parametrize(
+    "header", ["node,u_mm,u_mm", "node,v_mm,uy", "node,u_mm,v_mm,ux", "node,u,v,node", "node,u,v,time_s,time_ms", "u,v"]
+)
+def test_each_column_of_a_table_must_be_there_once(tmp_path, header):
+    (tmp_path / "t.csv").write_text(f"{header}\n1,1,1,1,1")
+    with pytest.raises(InputError, match='one column each "node", "u_mm" and "v_mm"'):
+        Simulation.read(tmp_path / "t.csv", mesh=finite_elements())
+
+
 def test_nodes_on_two_sides_of_a_crack_are_told_apart_by_their_numbers(tmp_path):
     cracked = Tri3Mesh.from_region(Region.from_rectangle((10, 10, 210, 170), (200, 240)), 20, [[(0, 95), (110, 95)]])
     assert len(cracked.copies) > 2
