@@ -14,13 +14,15 @@ reference. With equal noise in all frames the variance stated for t is ``(1 + 1/
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
+from numpy.polynomial import Chebyshev, Polynomial
 
+from rgbmidic.correlation.constants import USUAL
 from rgbmidic.correlation.recovery import Recovery, blended, quadratic_fit
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -200,27 +202,37 @@ def field_rms(mesh: Tri3Mesh, values: FloatArray, truth: FloatArray, *, border: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodalCovariance:
-    """Correlation of the errors of one displacement component between the nodes of a mesh; u and v are not correlated.
+    """Covariance of the errors of one displacement component between nodes; u and v are not correlated.
+
+    A nodal error is that of the fit, correlated by the mesh, and what the bias of the lights leaves, which is alike
+    over the window in which the lights are compared. Either correlation is kept as a factor ``F F^T``: an error is
+    ``F z`` with independent z of unit variance, and no combination of nodes has a negative variance.
 
     Attributes
     ----------
     mesh
         The mesh.
-    correlation : csr_matrix, shape (N, N)
-        1 on the diagonal.
+    fit : csr_matrix, shape (n, R)
+        Factor of the correlation of the fit's errors between the n nodes.
+    bias : csr_matrix, shape (n, S)
+        Factor of the correlation ``exp(-d^2 / (4 r^2))`` of the lights' bias at a distance d, with r its range: windows
+        ``exp(-d^2 / (2 r^2))`` at places r apart have it to 1e-4.
     """
 
     mesh: Tri3Mesh
-    correlation: sp.csr_matrix
+    fit: sp.csr_matrix
+    bias: sp.csr_matrix
 
     @classmethod
-    def from_mesh(cls, mesh: Tri3Mesh) -> Self:
+    def from_mesh(cls, mesh: Tri3Mesh, image_nodes: FloatArray | None = None) -> Self:
         """Propagate the covariance of the linear fit (inverse mass matrix) through the recovery of the nodal values.
 
         Parameters
         ----------
         mesh
             N nodes, E elements.
+        image_nodes : ndarray, shape (N, 2)
+            The nodes in px of the image, in which the lights' bias has its range; None: those of the mesh.
 
         Returns
         -------
@@ -228,64 +240,96 @@ class NodalCovariance:
         """
         mass = mesh.mass_matrix
         scale = sp.diags(1 / np.sqrt(mass.diagonal()))
-        inverse = scale @ _chebyshev_inverse(sp.csr_matrix(scale @ mass @ scale)) @ scale
         everywhere = np.ones(len(mesh.elements), dtype=bool)
         recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes))).value
-        whole = sp.csr_matrix(recovery @ inverse @ recovery.T)
-        unit = sp.diags(1 / np.sqrt(whole.diagonal()))
-        return cls(mesh=mesh, correlation=sp.csr_matrix(unit @ whole @ unit))
+        fit = recovery @ scale @ _inverse_root(sp.csr_matrix(scale @ mass @ scale))
+        return cls(mesh=mesh, fit=_unit_rows(fit), bias=_windows(mesh.nodes if image_nodes is None else image_nodes))
 
-    def variance(self, weights: FloatArray, std: FloatArray) -> FloatArray:
-        """Compute the variance of a weighted sum of nodal values.
+    @property
+    def correlation(self) -> sp.csr_matrix:
+        """Correlation (n, n) of the fit's errors."""
+        return sp.csr_matrix(self.fit @ self.fit.T)
+
+    def factor(self, std: FloatArray, bias: FloatArray | float = 0.0) -> sp.csr_matrix:
+        """Return the factor F (n, R + S) of the covariance ``F F^T`` of nodal values.
 
         Parameters
         ----------
-        weights : ndarray, shape (..., N)
+        std : ndarray, shape (n,)
+            Their standard uncertainty.
+        bias : ndarray, shape (n,)
+            The part of it that the lights' bias leaves.
+
+        Returns
+        -------
+        csr_matrix, shape (n, R + S)
+        """
+        shared = np.minimum(bias, std)
+        parts = sp.diags(np.sqrt(std**2 - shared**2)) @ self.fit, sp.diags(shared) @ self.bias
+        return sp.csr_matrix(sp.hstack(parts))
+
+    def errors(self, weights: FloatArray, std: FloatArray, bias: FloatArray | float = 0.0) -> FloatArray:
+        """Resolve the errors of weighted sums of nodal values into independent errors of unit variance.
+
+        The covariance of two sums is the product of their coefficients, the variance of one the sum of their squares.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (..., n)
             Of the nodes. Nodes of the weight 0 take no part, their uncertainty may be NaN.
-        std : ndarray, shape (..., N)
+        std : ndarray, shape (..., n)
             Standard uncertainty of the nodal values.
+        bias : ndarray, shape (..., n)
+            The part of it that the lights' bias leaves.
 
         Returns
         -------
-        ndarray, shape (...)
+        ndarray, shape (..., R + S)
         """
-        parts = np.where(weights != 0, np.asarray(weights) * np.asarray(std), 0.0)
-        flat = np.atleast_2d(parts.reshape(-1, parts.shape[-1]))
-        total = np.einsum("fn,fn->f", flat @ self.correlation, flat)
-        return np.asarray(np.maximum(total, 0)).reshape(parts.shape[:-1])
+        weights, std = np.asarray(weights), np.asarray(std)
+        shared = np.minimum(bias, std)
+        stds = np.sqrt(std**2 - shared**2), shared
+        parts = [np.where(weights != 0, weights * part, 0.0) for part in stds]
+        shape = parts[0].shape[:-1]
+        flat = [part.reshape(-1, part.shape[-1]) @ factor for part, factor in zip(parts, (self.fit, self.bias), strict=True)]
+        return np.concatenate(flat, axis=1).reshape(*shape, -1)
 
-    def part(self, nodes: IntArray) -> FloatArray:
-        """Extract the correlation (m, m) of some nodes, given by their indices (m,).
+    def variance(self, weights: FloatArray, std: FloatArray, bias: FloatArray | float = 0.0) -> FloatArray:
+        """Compute the variance (...) of weighted sums of nodal values; parameters as of `errors`."""
+        return np.asarray((self.errors(weights, std, bias) ** 2).sum(axis=-1))
 
-        Parameters
-        ----------
-        nodes : ndarray, shape (m,)
-            Indices of the nodes.
-
-        Returns
-        -------
-        ndarray, shape (m, m)
-        """
-        return np.asarray(self.correlation[nodes][:, nodes].toarray())
+    def part(self, nodes: IntArray) -> Self:
+        """Return the covariance of some nodes alone, given by their indices (m,)."""
+        fit, bias = (factor[nodes] for factor in (self.fit, self.bias))
+        return replace(self, fit=fit[:, np.unique(fit.indices)], bias=bias[:, np.unique(bias.indices)])
 
 
-def _chebyshev_inverse(matrix: sp.csr_matrix, degree: int = 4) -> sp.csr_matrix:
-    """Approximate the inverse of a matrix with eigenvalues in the bounds above by the best polynomial of a `degree`.
+def _inverse_root(matrix: sp.csr_matrix, degree: int = 4) -> sp.csr_matrix:
+    """Approximate the inverse root of a matrix with eigenvalues in the bounds above by a polynomial of a `degree`.
 
-    Saad, Iterative methods for sparse linear systems, algorithm 12.1, on the unit matrix. Every such polynomial is
-    positive within the bounds, so that no combination of nodes gets a negative variance. The degree is the number of
-    edges from a node up to which the inverse is kept: what lies beyond 4 is .8 % or less.
+    That through the root's values at Chebyshev's points: within .3 % of it. The degree is the number of edges from a
+    node up to which its row is kept.
     """
-    middle, half = (_HIGH + _LOW) / 2, (_HIGH - _LOW) / 2
-    residual: Any = sp.eye(matrix.shape[0], format="csr")
-    step = residual / middle
-    total, rho = step, half / middle
-    for _ in range(degree):
-        residual = residual - matrix @ step
-        before, rho = rho, 1 / (2 * middle / half - rho)
-        step = rho * before * step + (2 * rho / half) * residual
-        total = total + step
+    root = Chebyshev.interpolate(lambda x: x**-0.5, degree, domain=[_LOW, _HIGH]).convert(kind=Polynomial)
+    unit: Any = sp.eye(matrix.shape[0], format="csr")
+    total = 0 * unit
+    for coefficient in root.coef[::-1]:
+        total = total @ matrix + coefficient * unit
     return sp.csr_matrix(total)
+
+
+def _windows(nodes: FloatArray) -> sp.csr_matrix:
+    """Gaussian windows around places a range of the lights' bias apart, at nodes (N, 2) in px of the image, (N, S)."""
+    at = nodes / USUAL.bias_range
+    near = np.round(at - at.min(axis=0)).astype(np.int64)[:, :, None] + np.arange(7)  # three on either side
+    x, y = np.exp(-((at[:, :, None] - at.min(axis=0)[:, None] + 3 - near) ** 2) / 2).swapaxes(0, 1)
+    places = near[:, 1, :, None] * (near[:, 0].max() + 1) + near[:, 0, None]
+    starts = 49 * np.arange(len(nodes) + 1)
+    return _unit_rows(sp.csr_matrix(((y[:, :, None] * x[:, None]).ravel(), places.ravel(), starts)))
+
+
+def _unit_rows(matrix: sp.csr_matrix) -> sp.csr_matrix:
+    return sp.csr_matrix(sp.diags(1 / np.sqrt(matrix.multiply(matrix).sum(axis=1).A1)) @ matrix)
 
 
 def reference_fraction(count: int) -> float:
@@ -375,7 +419,7 @@ class RigidMotion:
 
     @classmethod
     def of(
-        cls, covariance: NodalCovariance, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray
+        cls, covariance: NodalCovariance, u: FloatArray, v: FloatArray, *std: FloatArray
     ) -> Self:
         """Fit shift and rotation of any size (Kabsch, Acta Cryst A32, 1976).
 
@@ -383,8 +427,10 @@ class RigidMotion:
         ----------
         covariance
             Of the mesh.
-        u, v, u_std, v_std : ndarray, shape (N,)
+        u, v : ndarray, shape (N,)
             In px; NaN where not measured.
+        *std : ndarray, shape (N,)
+            Their standard uncertainties u_std and v_std; u_bias and v_bias, the part that the lights' bias leaves.
 
         Returns
         -------
@@ -395,7 +441,7 @@ class RigidMotion:
         InputError
             Fewer than two nodes are measured.
         """
-        nodes, known = covariance.mesh.nodes, np.isfinite(u + v + u_std + v_std)
+        nodes, known = covariance.mesh.nodes, np.isfinite(u + v + sum(std))
         if known.sum() < 2:
             raise InputError("a rigid motion needs two measured nodes or more")
         centre = nodes[known].mean(axis=0)
@@ -409,11 +455,12 @@ class RigidMotion:
         c, s = np.cos(angle), np.sin(angle)
         lever[:, known] = np.stack([-(s * arm[:, 0] + c * arm[:, 1]), c * arm[:, 0] - s * arm[:, 1]])
         lever /= np.hypot(along, turned)
-        turning = covariance.variance(lever[0], u_std) + covariance.variance(lever[1], v_std)
+        u_std, v_std = std[::2], std[1::2]
+        turning = covariance.variance(lever[0], *u_std) + covariance.variance(lever[1], *v_std)
         return cls(
             centre=centre,
             shift=shift,
-            shift_std=np.sqrt(np.array([covariance.variance(even, part) for part in (u_std, v_std)])),
+            shift_std=np.sqrt(np.array([covariance.variance(even, *part) for part in (u_std, v_std)])),
             rotation=angle,
             rotation_std=float(np.sqrt(turning)),
         )
@@ -427,20 +474,20 @@ class RigidMotion:
         ----------
         nodes : ndarray, shape (N, 2)
             In px on the reference.
-        field : ndarray, shape (4, N)
-            u, v and their standard uncertainty, px. That of the rigid motion itself is not added: it is the less, the
-            more nodes there are.
+        field : ndarray, shape (4, N) or (6, N)
+            u, v, their standard uncertainty, and the part that the lights' bias leaves, px. The uncertainty of the
+            rigid motion itself is not added: it is the less, the more nodes there are.
 
         Returns
         -------
-        ndarray, shape (4, N)
+        ndarray, shape (4, N) or (6, N)
             As `field`.
         """
         c, s = np.cos(self.rotation), np.sin(self.rotation)
         back = np.array([[c, s], [-s, c]])
         arm = nodes - self.centre
         left = (arm + field[:2].T - self.shift) @ back.T - arm
-        return np.concatenate([left.T, np.sqrt(back**2 @ field[2:] ** 2)])
+        return np.concatenate([left.T, *np.sqrt(back**2 @ field[2:].reshape(-1, 2, len(nodes)) ** 2)])
 
     def at(self, points: FloatArray) -> FloatArray:
         """Compute the displacement (P, 2) in px of points (P, 2) by the rigid motion alone.

@@ -62,8 +62,8 @@ class Mean:
         See `Probe`.
     weights : ndarray, shape (m,)
         Of the nodes; their sum is 1.
-    correlation : ndarray, shape (m, m)
-        Of the nodes' errors.
+    covariance
+        Of these nodes.
     least
         Part of the weights that must be measured; the mean is that of the measured part.
     inside
@@ -73,7 +73,7 @@ class Mean:
     name: str
     nodes: IntArray
     weights: FloatArray
-    correlation: FloatArray
+    covariance: NodalCovariance
     least: float = 1.0
     inside: float = 1.0
 
@@ -105,8 +105,7 @@ class Mean:
         places.check(name)
         weights, least = places.mean(), least - _CONSTANTS.rounding
         nodes = np.flatnonzero(weights).astype(np.int64)
-        correlation = covariance.part(nodes)
-        return cls(name=name, nodes=nodes, weights=weights[nodes], correlation=correlation, least=least)
+        return cls(name=name, nodes=nodes, weights=weights[nodes], covariance=covariance.part(nodes), least=least)
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px.
@@ -121,17 +120,17 @@ class Mean:
         list of History
         """
         known = _known(nodal)
-        u, v = self.average(nodal.u, nodal.u_std, known), self.average(nodal.v, nodal.v_std, known)
+        u, v = (self.average(value, std, known, bias) for value, std, bias in nodal.components)
         note = _cut(self.name, "mean", self.inside * np.where(np.isfinite(u[0]), known @ self.weights, 1.0))
         return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], note)
 
     def average(
-        self, values: FloatArray, std: FloatArray, known: BoolArray, *, alike: bool = False
+        self, values: FloatArray, std: FloatArray, known: BoolArray, bias: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Average a quantity (T, m) of the nodes where it is known, with its standard uncertainty, each (T,).
 
-        The errors are correlated between nodes as those of a displacement, or where they are `alike` the same at all
-        nodes, which is the most that they can add up to.
+        The errors are correlated between nodes as those of a displacement; without a `bias` they are taken as the same
+        at all nodes, which is the most that they can add up to.
 
         Parameters
         ----------
@@ -139,8 +138,8 @@ class Mean:
             The quantity and its standard uncertainty.
         known : ndarray, shape (T, m), bool
             Where it is known.
-        alike
-            Whether the errors are the same at all nodes.
+        bias : ndarray, shape (T, m)
+            The part of a displacement's uncertainty that the lights' bias leaves; None of another quantity.
 
         Returns
         -------
@@ -150,9 +149,10 @@ class Mean:
         enough = measured >= self.least
         weights = np.where(known, self.weights, 0) / np.where(enough, measured, 1)[:, None]
         mean = (weights * np.where(known, values, 0)).sum(axis=1)
-        parts = weights * np.where(known, std, 0)
-        square = parts.sum(axis=1) ** 2 if alike else np.einsum("tm,tm->t", parts @ self.correlation, parts)
-        spread = np.sqrt(np.maximum(square, 0))
+        if bias is None:
+            spread = (weights * np.where(known, std, 0)).sum(axis=1)
+        else:
+            spread = np.sqrt(self.covariance.variance(weights, std, bias))
         return np.where(enough, mean, np.nan), np.where(enough, spread, np.nan)
 
 
@@ -215,7 +215,7 @@ class Gauge:
         Places.of(covariance.mesh, ends).check(name)
         first, second = (Places.of(covariance.mesh, end).mean() for end in ends)
         self.nodes = np.flatnonzero(second - first).astype(np.int64)
-        self.weights, self.correlation = (second - first)[self.nodes], covariance.part(self.nodes)
+        self.weights, self.covariance = (second - first)[self.nodes], covariance.part(self.nodes)
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute the extension in px and the strain from the displacements of its `nodes` in every frame."""
@@ -224,9 +224,8 @@ class Gauge:
         now = self.arm + apart if self.moving else np.broadcast_to(self.arm, apart.shape)
         towards = now / np.hypot(*now.T)[:, None]
         extension = np.hypot(*now.T) - length if self.moving else (towards * apart).sum(axis=1)
-        errors = [self.weights * std for std in (nodal.u_std, nodal.v_std)]
-        spread = np.stack([np.einsum("tm,tm->t", part @ self.correlation, part) for part in errors], axis=1)
-        std = np.sqrt(np.maximum((towards**2 * spread).sum(axis=1), 0))
+        spread = [self.covariance.variance(self.weights, std, bias) for _, std, bias in nodal.components]
+        std = np.sqrt((towards**2 * np.stack(spread, axis=1)).sum(axis=1))
         parts = [("extension", "px", extension, std), ("strain", "", extension / length, std / length)]
         return histories_of(self.name, parts)
 
@@ -263,8 +262,7 @@ class StrainGauge:
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute strain, principal strains and equivalent from the displacements of its `nodes` in every frame."""
-        rows = zip(nodal.u, nodal.v, nodal.u_std, nodal.v_std, strict=True)
-        gradients, covariances = zip(*(self.gauges.gradient(*row) for row in rows), strict=True)
+        gradients, covariances = zip(*(self.gauges.gradient(*row) for row in nodal.fields.swapaxes(0, 1)), strict=True)
         strain = strain_of_gradient(np.concatenate(gradients), np.concatenate(covariances), self.measure)
         weights = self.gauges.fractions / self.gauges.fractions.sum()
         measured = np.isfinite(strain.components[:, 0])
@@ -319,9 +317,9 @@ class Area(Mean):
             raise InputError(f"half or more of {name} is outside {places.where}")
         elements, count = np.unique(places.element[places.inside], return_counts=True)
         nodes = np.unique(mesh.elements[elements]).astype(np.int64)
-        weights, correlation = places.mean()[nodes], covariance.part(nodes)
-        least = _CONSTANTS.least - _CONSTANTS.rounding
-        super().__init__(name=name, nodes=nodes, weights=weights, correlation=correlation, least=least, inside=inside)
+        weights, least = places.mean()[nodes], _CONSTANTS.least - _CONSTANTS.rounding
+        part = covariance.part(nodes)
+        super().__init__(name=name, nodes=nodes, weights=weights, covariance=part, least=least, inside=inside)
         self.elements, self.parts = np.searchsorted(nodes, mesh.elements[elements]), count / count.sum()
         self.slopes, self.measure = mesh.shape_gradients()[elements], measure
 
@@ -346,11 +344,11 @@ class Area(Mean):
             weights, frames = np.zeros((len(self.nodes), 2)), np.flatnonzero(of_frame.ravel() == place)
             np.add.at(weights, self.elements[there], (self.parts[there] / measured)[:, None, None] * self.slopes[there])
             covariance[frames] = 0
-            for row, (value, std) in enumerate(((nodal.u, nodal.u_std), (nodal.v, nodal.v_std))):
+            for row, (value, *stds) in enumerate(nodal.components):
                 gradient[frames, row] = np.where(known, value, 0)[frames] @ weights
-                errors = np.where(known, std, 0)[frames, None] * weights.T
+                errors = self.covariance.errors(weights.T, *(std[frames, None] for std in stds))
                 own = slice(2 * row, 2 * row + 2)
-                covariance[frames, own, own] = errors @ self.correlation @ errors.swapaxes(1, 2)
+                covariance[frames, own, own] = errors @ errors.swapaxes(1, 2)
         strain = strain_of_gradient(gradient, covariance, self.measure)
         return [*moved, *_strain_histories(self.name, strain, moved[0].note)]
 
