@@ -83,8 +83,8 @@ class JumpAlong:
             raise InputError(f"no pair of nodes lies on the crack between the points {listed(place)} px of {name}")
         self.name, self.points = name, mesh.nodes[path]
         self.nodes, index = np.unique(arrives, return_inverse=True)
-        sides, before, after = index.reshape(-1, 2), *self._beside
-        self.used = sides[np.stack([self.pairs, before, after], axis=1)].reshape(-1, 6)
+        sides = index.reshape(-1, 2)
+        self.used = sides[np.stack([self.pairs, *self._beside], axis=1)].reshape(-1, 6)
         self.covariances = [covariance.part(self.nodes[row]) for row in self.used]
 
     @property
@@ -102,11 +102,12 @@ class JumpAlong:
         tangent = arm / length
         normal = np.stack([tangent[1], -tangent[0]])
         opening, sliding = (jump * normal).sum(axis=0), (jump * tangent).sum(axis=0)
+
         def error(axis: FloatArray, turn: FloatArray) -> FloatArray:
             parts = axis[..., None] * across + turn[..., None] * along
             pairs = enumerate(self.covariances)
             square = [one.variance(parts[:, :, p], *(std[:, :, p] for std in stds)).sum(axis=0) for p, one in pairs]
-            return np.sqrt(np.stack(square, axis=1))
+            return np.asarray(np.sqrt(np.stack(square, axis=1)))
 
         # the axes turn with the crack: d(normal) = tangent d(angle), d(angle) = -normal . d(arm) / length
         steps = np.hypot(*np.diff(self.points, axis=0, prepend=self.points[:1]).T)

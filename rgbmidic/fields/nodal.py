@@ -243,7 +243,7 @@ class NodalCovariance:
         everywhere = np.ones(len(mesh.elements), dtype=bool)
         recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes))).value
         fit = recovery @ scale @ _inverse_root(sp.csr_matrix(scale @ mass @ scale))
-        return cls(mesh=mesh, fit=_unit_rows(fit), bias=_windows(mesh.nodes if image_nodes is None else image_nodes))
+        return cls(mesh=mesh, fit=unit_rows(fit), bias=_windows(mesh.nodes if image_nodes is None else image_nodes))
 
     @property
     def correlation(self) -> sp.csr_matrix:
@@ -291,12 +291,29 @@ class NodalCovariance:
         stds = np.sqrt(std**2 - shared**2), shared
         parts = [np.where(weights != 0, weights * part, 0.0) for part in stds]
         shape = parts[0].shape[:-1]
-        flat = [part.reshape(-1, part.shape[-1]) @ factor for part, factor in zip(parts, (self.fit, self.bias), strict=True)]
+        flat = [
+            part.reshape(-1, part.shape[-1]) @ factor for part, factor in zip(parts, (self.fit, self.bias), strict=True)
+        ]
         return np.concatenate(flat, axis=1).reshape(*shape, -1)
 
     def variance(self, weights: FloatArray, std: FloatArray, bias: FloatArray | float = 0.0) -> FloatArray:
         """Compute the variance (...) of weighted sums of nodal values; parameters as of `errors`."""
         return np.asarray((self.errors(weights, std, bias) ** 2).sum(axis=-1))
+
+    def relative(self, matrices: Sequence[sp.csr_matrix]) -> Self:
+        """Return the covariance of quantities (n,), each over its standard uncertainty.
+
+        Parameters
+        ----------
+        matrices : length c, of csr_matrix, shape (n, N)
+            A quantity is the sum of so many displacement components, each weighted over the nodes by one of them.
+
+        Returns
+        -------
+        NodalCovariance
+        """
+        fit, bias = (unit_rows(sp.hstack([one @ root for one in matrices])) for root in (self.fit, self.bias))
+        return replace(self, fit=fit, bias=bias)
 
     def part(self, nodes: IntArray) -> Self:
         """Return the covariance of some nodes alone, given by their indices (m,)."""
@@ -324,12 +341,14 @@ def _windows(nodes: FloatArray) -> sp.csr_matrix:
     near = np.round(at - at.min(axis=0)).astype(np.int64)[:, :, None] + np.arange(7)  # three on either side
     x, y = np.exp(-((at[:, :, None] - at.min(axis=0)[:, None] + 3 - near) ** 2) / 2).swapaxes(0, 1)
     places = near[:, 1, :, None] * (near[:, 0].max() + 1) + near[:, 0, None]
-    starts = 49 * np.arange(len(nodes) + 1)
-    return _unit_rows(sp.csr_matrix(((y[:, :, None] * x[:, None]).ravel(), places.ravel(), starts)))
+    node, row, column = np.nonzero((heights := y[:, :, None] * x[:, None]) > 0.01)  # the correlation is right to .01
+    return unit_rows(sp.csr_matrix((heights[node, row, column], (node, places[node, row, column]))))
 
 
-def _unit_rows(matrix: sp.csr_matrix) -> sp.csr_matrix:
-    return sp.csr_matrix(sp.diags(1 / np.sqrt(matrix.multiply(matrix).sum(axis=1).A1)) @ matrix)
+def unit_rows(matrix: sp.csr_matrix) -> sp.csr_matrix:
+    """Scale rows to unit length; those of zeros stay."""
+    length = np.sqrt(np.asarray(matrix.multiply(matrix).sum(axis=1)).ravel())
+    return sp.csr_matrix(sp.diags(np.divide(1, length, out=np.zeros_like(length), where=length > 0)) @ matrix)
 
 
 def reference_fraction(count: int) -> float:
@@ -418,9 +437,7 @@ class RigidMotion:
     rotation_std: float
 
     @classmethod
-    def of(
-        cls, covariance: NodalCovariance, u: FloatArray, v: FloatArray, *std: FloatArray
-    ) -> Self:
+    def of(cls, covariance: NodalCovariance, u: FloatArray, v: FloatArray, *std: FloatArray) -> Self:
         """Fit shift and rotation of any size (Kabsch, Acta Cryst A32, 1976).
 
         Parameters

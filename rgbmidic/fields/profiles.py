@@ -14,7 +14,6 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -133,9 +132,9 @@ class ProfileLine:
     even : ndarray, shape (P,), bool
         Where the strain gauges around extend to both sides along the line: at an edge their strain is that of a place
         further inside.
-    correlations
-        Correlation (n, n) of the errors at these nodes of a displacement (``""``), of the strains ``"exx"`` and
-        ``"eyy"``, which are slopes along x and y, and of all other strains (``"strain"``), taken as the mean of both.
+    covariances
+        Of the errors at these nodes of a displacement (``""``), of the strains ``"exx"`` and ``"eyy"``, which are
+        slopes along x and y, and of all other strains (``"strain"``), taken as sums of both.
 
     Raises
     ------
@@ -163,16 +162,18 @@ class ProfileLine:
         part = Tri3Mesh(nodes=mesh.nodes[nodes], elements=np.searchsorted(nodes, elements).astype(np.int32))
         self.points, self.positions = points, np.linspace(0, length, len(points))
         self.places = Places.of(part, points)
-        slopes = [slope[nodes] for slope in gauges.slopes]
-        exx, eyy = (_unit(slope @ covariance.correlation @ slope.T) for slope in slopes)
-        self.correlations = {"": covariance.part(nodes), "exx": exx, "eyy": eyy, "strain": (exx + eyy) / 2}
+        exx, eyy = (covariance.relative([slope[nodes]]) for slope in gauges.slopes)
+        both = covariance.relative([slope[nodes] for slope in gauges.slopes])
+        self.covariances = {"": covariance.part(nodes), "exx": exx, "eyy": eyy, "strain": both}
         count = np.bincount(gauges.rows, weights=gauges.fractions, minlength=len(mesh.nodes))
         arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ way / length
         lopsided = np.abs(np.bincount(gauges.rows, weights=gauges.fractions * arm, minlength=len(mesh.nodes)) / count)
         at_corners = lopsided[nodes][part.elements[self.places.element]]
         self.even = (at_corners < _CONSTANTS.lopsided * mesh.size).all(axis=1)
 
-    def read(self, values: FloatArray, std: FloatArray, kind: str = "") -> tuple[FloatArray, FloatArray]:
+    def read(
+        self, values: FloatArray, std: FloatArray, kind: str = "", bias: FloatArray | float = 0.0
+    ) -> tuple[FloatArray, FloatArray]:
         """Interpolate a nodal field (N,) and its standard uncertainty at the points, each (P,).
 
         Parameters
@@ -180,34 +181,38 @@ class ProfileLine:
         values, std : ndarray, shape (N,)
             Of the mesh; NaN where not measured.
         kind
-            Key of `correlations`.
+            Key of `covariances`.
+        bias : ndarray, shape (N,)
+            The part of the uncertainty that the lights' bias leaves.
 
         Returns
         -------
         values, std : ndarray, shape (P,)
             NaN where a node around is not measured.
         """
-        values, std = values[self.nodes], std[self.nodes]
+        values, std, bias = (part[self.nodes] for part in np.broadcast_arrays(values, std, bias))
         weights = _weights(self, np.isfinite(values).tobytes())
-        parts = np.nan_to_num(weights) * std
-        spread = np.einsum("pn,nm,pm->p", parts, self.correlations[kind], parts, optimize=True)
         found = weights @ np.nan_to_num(values)
-        return found, np.where(np.isfinite(found), np.sqrt(np.maximum(spread, 0)), np.nan)
+        variance = self.covariances[kind].variance(np.nan_to_num(weights), std, bias)
+        return found, np.where(np.isfinite(found), np.sqrt(variance), np.nan)
 
-    def correlation(self, kind: str = "") -> FloatArray:
+    def correlation(self, kind: str = "", bias_fraction: float = 0.0) -> FloatArray:
         """Compute the correlation (P, P) of the noise of a field between the points; 0 outside the mesh.
 
         Parameters
         ----------
         kind
-            Key of `correlations`.
+            Key of `covariances`.
+        bias_fraction
+            Part of the variance that the lights' bias leaves.
 
         Returns
         -------
         ndarray, shape (P, P)
         """
         weights = np.nan_to_num(_weights(self, np.ones(len(self.nodes), dtype=bool).tobytes()))
-        return _unit(weights @ self.correlations[kind] @ weights.T)
+        errors = self.covariances[kind].errors(weights, np.ones(len(self.nodes)), bias_fraction**0.5)
+        return _unit(errors @ errors.T)
 
 
 @lru_cache(maxsize=4)
@@ -225,12 +230,11 @@ def _weights(line: ProfileLine, measured: bytes) -> FloatArray:
     return total
 
 
-def _unit(covariance: Any) -> FloatArray:
-    """Return the correlation of a covariance matrix, sparse or not; 0 where a variance is."""
-    whole = np.asarray(covariance.toarray() if hasattr(covariance, "toarray") else covariance)
-    scale = np.sqrt(np.maximum(np.nan_to_num(np.diag(whole)), 0))
+def _unit(covariance: FloatArray) -> FloatArray:
+    """Return the correlation of a covariance matrix; 0 where a variance is."""
+    scale = np.sqrt(np.diag(covariance))
     scale = np.divide(1, scale, out=np.zeros_like(scale), where=scale > 0)
-    return np.asarray(np.nan_to_num(whole) * scale * scale[:, None])
+    return np.asarray(covariance * scale * scale[:, None])
 
 
 def rate_correlation(times: FloatArray, window: float) -> FloatArray:

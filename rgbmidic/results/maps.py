@@ -20,7 +20,7 @@ from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.results.physical import MOVED, Physical, displacements, frame_times, named, reference_frames, shared_part
+from rgbmidic.results.physical import Physical, displacements, frame_times, named, reference_frames, shared_part
 from rgbmidic.results.quantities import DERIVED, UNKNOWN_TIME, UV, WITH_ERROR, Quantity, map_quantities
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import MeshSettings, ProbeSettings, ScaleSettings
@@ -238,7 +238,7 @@ class Maps(Portable):
         base = name.removesuffix("_std")
         derived = base in DERIVED or name in WITH_ERROR
         stored = ("light_fraction",) if kind == "fraction" else () if derived else (base,)
-        read = next(self.result.table.each([*MOVED, "node_status", *stored], [frame]))
+        read = next(self.result.table.each(["u", "v", "node_status", *stored], [frame]))
         nothing = np.full(len(self.result.nodes), np.nan)
         if name in WITH_ERROR:
             values, std = self._with_error(WITH_ERROR[name], frame), nothing
@@ -284,7 +284,7 @@ class Maps(Portable):
             parts = [self._rates(part, frame, entry.order) for part in entry.parts]
         else:
             moved = self.displacement(frame)
-            parts = [moved[UV.index(part) :: 2] for part in entry.parts]
+            parts = [moved[UV.index(part) : 4 : 2] for part in entry.parts]
         values, std = parts[0]
         if len(parts) > 1:
             vector, error = (np.stack(each, axis=1) for each in zip(*parts, strict=True))
@@ -292,7 +292,9 @@ class Maps(Portable):
         return self._units.lengths(values, std) if entry.unit else (values, std)
 
     def displacement(self, frame: int) -> FloatArray:
-        """Return u, v and their standard uncertainties (4, N) in rectified px, since `since`, rigid motion removed.
+        """Return u, v, their standard uncertainties and what the lights' bias leaves of these, (6, N) in rectified px.
+
+        They are those since `since`, the rigid motion removed.
 
         Parameters
         ----------
@@ -301,7 +303,7 @@ class Maps(Portable):
 
         Returns
         -------
-        ndarray, shape (4, N)
+        ndarray, shape (6, N)
         """
         moved = self._since(frame)
         motion = self._rigid(moved)
@@ -341,7 +343,7 @@ class Maps(Portable):
         return displacements(self.result, self.physical.rectified, frames)  # `physical` may be of an earlier state
 
     def _since(self, frame: int) -> FloatArray:
-        """Return u, v and their uncertainties (4, N) since the frame that is the reference here."""
+        """Return u, v and their uncertainties (6, N) since the frame that is the reference here."""
         moved = next(self._displacements([frame]))
         if self.since is None:
             return moved
@@ -440,7 +442,7 @@ class Maps(Portable):
         frames, clock = self._there[outer], self._clock[outer]
         plain = replace(self, since=None, rigid_removed=False)
         if name in UV:
-            each = (moved[UV.index(name) :: 2] for moved in self._displacements(frames.tolist()))
+            each = (moved[UV.index(name) : 4 : 2] for moved in self._displacements(frames.tolist()))
         else:
             each = (np.stack(plain._derived(name, frame)) for frame in frames.tolist())
         series = np.stack([*each], axis=1)

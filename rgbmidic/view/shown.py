@@ -232,8 +232,8 @@ class ShownFields:
         if found is None:
             return f"{place}: &nbsp; outside the mesh"
         nodes, told = found[0].astype(np.int64), []
-        correlation, least = physical.covariance.part(nodes), VIEWER.least_weight
-        mean = Mean(name="", nodes=nodes, weights=found[1], correlation=correlation, least=least)
+        covariance, least = physical.covariance.part(nodes), VIEWER.least_weight
+        mean = Mean(name="", nodes=nodes, weights=found[1], covariance=covariance, least=least)
         for name in self.names:
             field, blank = self.maps.all[name], self.values(name).status[nodes].max()
             value, std = self._mean(field, mean)
@@ -270,7 +270,7 @@ class ShownFields:
         wanted = of_gauge or (name if isinstance(probe, Area) and group == "Strain" else None)
         if wanted and maps.since is None and not maps.rigid_removed:
             moved = self.displacement[:, None, probe.nodes]
-            part = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), moved, strict=True)))
+            part = Nodal.of(moved)
             whole = (one for one in probe.histories(part) if one.name == f"{probe.name}_{wanted}")
             for one in (read for history in whole for read in in_units(history, maps.physical.units, None)):
                 if one.std is not None:
@@ -292,9 +292,9 @@ class ShownFields:
             return float(values.values[mean.nodes[mean.weights.argmax()]]), math.nan
         exact = name in ("u", "v")
         read = self.displacement["uv".index(name) :: 2] if exact else np.stack([values.values, values.std])
-        of_nodes, stds = read[:, None, mean.nodes]
+        of_nodes, stds, *bias = read[:, None, mean.nodes]
         stated = bool(np.isfinite(stds).any())
-        pair = mean.average(of_nodes, stds, np.isfinite(of_nodes + (stds if stated else 0)), alike=not exact)
+        pair = mean.average(of_nodes, stds, np.isfinite(of_nodes + (stds if stated else 0)), *bias)
         (value,), (std,) = self.maps.physical.units.lengths(*pair) if exact else pair
         if exact and name != field.name:
             return float(std), math.nan
