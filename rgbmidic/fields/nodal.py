@@ -341,7 +341,7 @@ def _windows(nodes: FloatArray) -> sp.csr_matrix:
     near = np.round(at - at.min(axis=0)).astype(np.int64)[:, :, None] + np.arange(7)  # three on either side
     x, y = np.exp(-((at[:, :, None] - at.min(axis=0)[:, None] + 3 - near) ** 2) / 2).swapaxes(0, 1)
     places = near[:, 1, :, None] * (near[:, 0].max() + 1) + near[:, 0, None]
-    node, row, column = np.nonzero((heights := y[:, :, None] * x[:, None]) > 0.01)  # the correlation is right to .01
+    node, row, column = np.nonzero((heights := y[:, :, None] * x[:, None]) > 0.007)  # of 1; the correlation is right to .01
     return unit_rows(sp.csr_matrix((heights[node, row, column], (node, places[node, row, column]))))
 
 

@@ -28,6 +28,9 @@ from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
 SHORTEST = 3.0
 """Length of the shortest gauge in elements: a node and those around it."""
+_BEYOND = SHORTEST - 2 * np.sqrt(2)
+"""Elements by which a gauge is longer than to the farthest node of the elements around its centre: nothing on a regular
+mesh, where that is at the root of 2. At an edge, a gauge that did not hold these would hold the nodes of a line."""
 _Function = Callable[[FloatArray], FloatArray]
 _OF_STRETCH: dict[str, tuple[_Function, _Function]] = {
     "green-lagrange": (lambda c: (c - 1) / 2, lambda c: np.full_like(c, 0.5)),
@@ -234,9 +237,7 @@ def strain_of(
     elements: npt.NDArray[np.int32],
     u: FloatArray,
     v: FloatArray,
-    u_std: FloatArray,
-    v_std: FloatArray,
-    *,
+    *std: FloatArray,
     gauge: float | None = None,
     measure: str = MEASURES[0],
 ) -> Strain:
@@ -250,8 +251,8 @@ def strain_of(
         In px on the reference.
     elements : ndarray, shape (E, 3)
         Node indices.
-    u, v, u_std, v_std : ndarray, shape (N,)
-        In px; NaN where not measured.
+    u, v, *std : ndarray, shape (N,)
+        As of `StrainGauges.gradient`.
     gauge
         Length of the virtual strain gauge in px; None: the shortest, three elements.
     measure
@@ -268,7 +269,7 @@ def strain_of(
         The gauge is too short, or the measure unknown.
     """
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
-    return StrainGauges.at_nodes(covariance, gauge).strain(u, v, u_std, v_std, measure=measure)
+    return StrainGauges.at_nodes(covariance, gauge).strain(u, v, *std, measure=measure)
 
 
 class StrainGauges:
@@ -283,7 +284,7 @@ class StrainGauges:
     length
         In px; None: the shortest, three elements. On a graded mesh each gauge has three elements as they are around it,
         and this length where that is more and the length is stated; if it is not, `length` is that of elements of the
-        mesh's size.
+        mesh's size. A gauge that would not hold the elements around its centre, which are stretched, is as much longer.
     needed : csr_matrix, shape (G, N)
         Nodes that must have data, else the gauge has none: the centre and those beside it.
 
@@ -326,6 +327,10 @@ class StrainGauges:
         if mesh.is_graded:
             around = (needed @ mesh.sizes) / np.asarray(needed.sum(axis=1)).ravel()
             lengths = np.maximum(SHORTEST * around, length or 0)
+        far = np.zeros(len(centres))
+        row, node = needed.nonzero()
+        np.maximum.at(far, row, np.hypot(*(mesh.nodes[node] - centres[row]).T) + _BEYOND / 2 * mesh.sizes[node])
+        lengths = np.maximum(lengths, 2 * far)
         pattern = _reach(mesh, centres, lengths / 2, needed)
         self.starts, self.bias = pattern.indptr, covariance.bias
         self.rows = np.repeat(np.arange(len(centres)), np.diff(self.starts))
