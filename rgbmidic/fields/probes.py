@@ -19,7 +19,8 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.crack_tip import CrackTip, Williams
 from rgbmidic.fields.cracks import JumpAlong
 from rgbmidic.fields.history import History, Nodal, Probe, histories_of
-from rgbmidic.fields.nodal import NodalCovariance, Places
+from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
 from rgbmidic.fields.units import Units

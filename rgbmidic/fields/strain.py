@@ -22,7 +22,8 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields.nodal import NodalCovariance, Places
+from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 

@@ -22,7 +22,7 @@ from scipy.sparse.linalg import splu
 
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
-from rgbmidic.fields.nodal import Places
+from rgbmidic.fields.interpolation import Places
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh, read_mesh
 from rgbmidic.results.physical import placement_of, rectification_of
 from rgbmidic.results.result import Result
