@@ -61,25 +61,32 @@ class Mean:
     ----------
     name, nodes
         See `Probe`.
-    weights : ndarray, shape (m,)
-        Of the nodes; their sum is 1.
+    places
+        Points that stand for the place, in the mesh of the `nodes`.
+    factors : ndarray, shape (P,)
+        Of the points in the mean.
     correlation : ndarray, shape (m, m)
         Of the nodes' errors.
     least
-        Part of the weights that must be measured; the mean is that of the measured part.
-    inside
-        Part of the place that lies in the region.
+        Part of the points in the region that must be measured; the mean is that of the measured part.
     """
 
     name: str
     nodes: IntArray
-    weights: FloatArray
+    places: Places
+    factors: FloatArray
     correlation: FloatArray
     least: float = 1.0
-    inside: float = 1.0
 
     @classmethod
-    def over(cls, covariance: NodalCovariance, name: str, points: npt.ArrayLike, least: float = 1.0) -> Mean:
+    def over(
+        cls,
+        covariance: NodalCovariance,
+        name: str,
+        points: npt.ArrayLike,
+        least: float = 1.0,
+        factors: npt.ArrayLike | None = None,
+    ) -> Mean:
         """Average over points (P, 2) that stand for a place, px.
 
         Parameters
@@ -91,7 +98,9 @@ class Mean:
         points : array_like, shape (P, 2)
             Points (x, y) on the reference, px.
         least
-            Fraction of the weight that nodes with data must have in a frame.
+            Fraction of the points that must have data in a frame.
+        factors : array_like, shape (P,), optional
+            Of the points; None: equal ones, whose sum is 1.
 
         Returns
         -------
@@ -104,10 +113,11 @@ class Mean:
         """
         places = Places.of(covariance.mesh, points)
         places.check(name)
-        weights, least = places.mean(), least - _CONSTANTS.rounding
-        nodes = np.flatnonzero(weights).astype(np.int64)
+        equal = np.full(len(places.points), 1 / len(places.points))
+        amounts = equal if factors is None else np.asarray(factors, dtype=np.float64)
+        nodes, places = places.nearby()
         correlation = covariance.part(nodes)
-        return cls(name=name, nodes=nodes, weights=weights[nodes], correlation=correlation, least=least)
+        return cls(name=name, nodes=nodes, places=places, factors=amounts, correlation=correlation, least=least)
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px.
@@ -121,15 +131,41 @@ class Mean:
         -------
         list of History
         """
-        known = _known(nodal)
-        u, v = self.average(nodal.u, nodal.u_std, known), self.average(nodal.v, nodal.v_std, known)
-        note = _cut(self.name, "mean", self.inside * np.where(np.isfinite(u[0]), known @ self.weights, 1.0))
-        return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], note)
+        weights, used = self.weights(_known(nodal))
+        u, v = self.average(nodal.u, nodal.u_std, weights), self.average(nodal.v, nodal.v_std, weights)
+        return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], _cut(self.name, "mean", used))
+
+    def weights(self, has_data: BoolArray, axis: int | None = None) -> tuple[FloatArray, FloatArray]:
+        """Compute the weight of every node in the mean, or in that of the slope along an axis, in every frame.
+
+        Parameters
+        ----------
+        has_data : ndarray, shape (T, m), bool
+            Nodes that have data.
+        axis
+            0 or 1: the slope along x or y; None: the field.
+
+        Returns
+        -------
+        weights : ndarray, shape (T, m)
+            NaN where too few points are measured.
+        used : ndarray, shape (T,)
+            Fraction of the place that is measured; 1 where it is too little.
+        """
+        patterns, frame = np.unique(has_data, axis=0, return_inverse=True)
+        weights, used = np.full(patterns.shape, np.nan), np.ones(len(patterns))
+        for row, pattern in enumerate(patterns):
+            measured = self.places.measured(pattern)
+            fraction = measured.sum() / self.places.inside.sum()
+            if fraction >= self.least - _CONSTANTS.rounding:
+                sums = (self.factors * measured / fraction)[None]
+                weights[row], used[row] = self.places.weights(pattern, sums, axis).toarray()[0], measured.mean()
+        return weights[frame.ravel()], used[frame.ravel()]
 
     def average(
-        self, values: FloatArray, std: FloatArray, known: BoolArray, *, alike: bool = False
+        self, values: FloatArray, std: FloatArray, weights: FloatArray, *, alike: bool = False
     ) -> tuple[FloatArray, FloatArray]:
-        """Average a quantity (T, m) of the nodes where it is known, with its standard uncertainty, each (T,).
+        """Average a quantity (T, m) of the nodes, with its standard uncertainty, each (T,).
 
         The errors are correlated between nodes as those of a displacement, or where they are `alike` the same at all
         nodes, which is the most that they can add up to.
@@ -138,8 +174,8 @@ class Mean:
         ----------
         values, std : ndarray, shape (T, m)
             The quantity and its standard uncertainty.
-        known : ndarray, shape (T, m), bool
-            Where it is known.
+        weights : ndarray, shape (T, m)
+            Of the nodes, see `weights`.
         alike
             Whether the errors are the same at all nodes.
 
@@ -147,14 +183,14 @@ class Mean:
         -------
         values, std : ndarray, shape (T,)
         """
-        measured = known @ self.weights
-        enough = measured >= self.least
-        weights = np.where(known, self.weights, 0) / np.where(enough, measured, 1)[:, None]
-        mean = (weights * np.where(known, values, 0)).sum(axis=1)
-        parts = weights * np.where(known, std, 0)
+        parts = _products(weights, std)
         square = parts.sum(axis=1) ** 2 if alike else np.einsum("tm,tm->t", parts @ self.correlation, parts)
-        spread = np.sqrt(np.maximum(square, 0))
-        return np.where(enough, mean, np.nan), np.where(enough, spread, np.nan)
+        return _products(weights, values).sum(axis=1), np.sqrt(np.maximum(square, 0))
+
+
+def _products(weights: FloatArray, values: FloatArray) -> FloatArray:
+    """Multiply values (T, m) by weights; those of the weight 0, which may be NaN, give 0."""
+    return np.multiply(weights, values, out=np.zeros(weights.shape), where=weights != 0)
 
 
 def _known(nodal: Nodal) -> BoolArray:
@@ -213,21 +249,18 @@ class Gauge:
         self.name, self.moving, self.arm = name, moving, ends[1] - ends[0]
         if not np.hypot(*self.arm) > 0:
             raise InputError(f"{name} needs two different points, not ({place[0]:g}, {place[1]:g}) twice")
-        Places.of(covariance.mesh, ends).check(name)
-        first, second = (Places.of(covariance.mesh, end).mean() for end in ends)
-        self.nodes = np.flatnonzero(second - first).astype(np.int64)
-        self.weights, self.correlation = (second - first)[self.nodes], covariance.part(self.nodes)
+        self._apart = Mean.over(covariance, name, ends, factors=(-1, 1))
+        self.nodes = self._apart.nodes
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute the extension in px and the strain from the displacements of its `nodes` in every frame."""
-        length = float(np.hypot(*self.arm))
-        apart = np.stack([nodal.u @ self.weights, nodal.v @ self.weights], axis=1)
+        length, (weights, _) = float(np.hypot(*self.arm)), self._apart.weights(_known(nodal))
+        pairs = (nodal.u, nodal.u_std), (nodal.v, nodal.v_std)
+        apart, spread = np.stack([self._apart.average(*pair, weights) for pair in pairs], axis=2)
         now = self.arm + apart if self.moving else np.broadcast_to(self.arm, apart.shape)
         towards = now / np.hypot(*now.T)[:, None]
         extension = np.hypot(*now.T) - length if self.moving else (towards * apart).sum(axis=1)
-        errors = [self.weights * std for std in (nodal.u_std, nodal.v_std)]
-        spread = np.stack([np.einsum("tm,tm->t", part @ self.correlation, part) for part in errors], axis=1)
-        std = np.sqrt(np.maximum((towards**2 * spread).sum(axis=1), 0))
+        std = np.hypot(*(towards * spread).T)
         parts = [("extension", "px", extension, std), ("strain", "", extension / length, std / length)]
         return histories_of(self.name, parts)
 
@@ -285,8 +318,7 @@ def _strain_histories(name: str, strain: Strain, note: str) -> list[History]:
 class Area(Mean):
     """Mean displacement over an area, and the strain of the mean displacement gradient over it.
 
-    The gradient of a linear displacement is constant in an element, so that its mean over the area is one of the
-    elements, each by the part of the area that it holds. It is that of the nodes around the area alone (Gauss).
+    The mean gradient is that of the displacement around the area alone (Gauss).
 
     Parameters
     ----------
@@ -299,15 +331,6 @@ class Area(Mean):
     measure
         Strain measure, as of `strain_of`.
 
-    Attributes
-    ----------
-    elements : ndarray, shape (E, 3), int
-        Indices in `nodes` of the corners of the elements that the area touches.
-    parts : ndarray, shape (E,)
-        Fraction of the area within each; their sum is 1.
-    slopes : ndarray, shape (E, 3, 2)
-        Gradient of the shape functions, per px.
-
     Raises
     ------
     InputError
@@ -315,16 +338,14 @@ class Area(Mean):
     """
 
     def __init__(self, covariance: NodalCovariance, name: str, points: FloatArray, measure: str = MEASURES[0]) -> None:
-        mesh, places = covariance.mesh, Places.of(covariance.mesh, points)
-        if (inside := float(places.inside.mean())) < _CONSTANTS.least:
+        places = Places.of(covariance.mesh, points)
+        if places.inside.mean() < _CONSTANTS.least:
             raise InputError(f"half or more of {name} is outside {places.where}")
-        elements, count = np.unique(places.element[places.inside], return_counts=True)
-        nodes = np.unique(mesh.elements[elements]).astype(np.int64)
-        weights, correlation = places.mean()[nodes], covariance.part(nodes)
-        least = _CONSTANTS.least - _CONSTANTS.rounding
-        super().__init__(name=name, nodes=nodes, weights=weights, correlation=correlation, least=least, inside=inside)
-        self.elements, self.parts = np.searchsorted(nodes, mesh.elements[elements]), count / count.sum()
-        self.slopes, self.measure = mesh.shape_gradients()[elements], measure
+        nodes, places = places.nearby()
+        equal = places.inside / places.inside.sum()
+        correlation, least = covariance.part(nodes), _CONSTANTS.least
+        super().__init__(name=name, nodes=nodes, places=places, factors=equal, correlation=correlation, least=least)
+        self.measure = measure
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px, then strain, principal strains and equivalent strain.
@@ -339,19 +360,12 @@ class Area(Mean):
         list of History
         """
         moved, known = super().histories(nodal), _known(nodal)
-        gradient, covariance = np.full((len(known), 2, 2), np.nan), np.full((len(known), 4, 4), np.nan)
-        patterns, of_frame = np.unique(known[:, self.elements].all(axis=2), axis=0, return_inverse=True)
-        for place, there in enumerate(patterns):
-            if (measured := self.parts[there].sum()) < self.least:
-                continue
-            weights, frames = np.zeros((len(self.nodes), 2)), np.flatnonzero(of_frame.ravel() == place)
-            np.add.at(weights, self.elements[there], (self.parts[there] / measured)[:, None, None] * self.slopes[there])
-            covariance[frames] = 0
-            for row, (value, std) in enumerate(((nodal.u, nodal.u_std), (nodal.v, nodal.v_std))):
-                gradient[frames, row] = np.where(known, value, 0)[frames] @ weights
-                errors = np.where(known, std, 0)[frames, None] * weights.T
-                own = slice(2 * row, 2 * row + 2)
-                covariance[frames, own, own] = errors @ self.correlation @ errors.swapaxes(1, 2)
+        slopes = np.stack([self.weights(known, axis)[0] for axis in (0, 1)], axis=1)
+        gradient, covariance = np.zeros((len(known), 2, 2)), np.zeros((len(known), 4, 4))
+        for row, (value, std) in enumerate(((nodal.u, nodal.u_std), (nodal.v, nodal.v_std))):
+            gradient[:, row] = _products(slopes, value[:, None]).sum(axis=2)
+            errors, own = _products(slopes, std[:, None]), slice(2 * row, 2 * row + 2)
+            covariance[:, own, own] = errors @ self.correlation @ errors.swapaxes(1, 2)
         strain = strain_of_gradient(gradient, covariance, self.measure)
         return [*moved, *_strain_histories(self.name, strain, moved[0].note)]
 
