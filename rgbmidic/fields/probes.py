@@ -119,6 +119,12 @@ class Mean:
         correlation = covariance.part(nodes)
         return cls(name=name, nodes=nodes, places=places, factors=amounts, correlation=correlation, least=least)
 
+    @property
+    def nearest(self) -> int:
+        """Node of the mesh that is nearest to the first of the points."""
+        nodes = self.places.mesh.nodes - self.places.points[0]
+        return int(self.nodes[np.hypot(*nodes.T).argmin()])
+
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px.
 
