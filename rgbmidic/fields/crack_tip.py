@@ -22,7 +22,8 @@ from scipy.linalg import cholesky, solve_triangular
 from rgbmidic.errors import InputError
 from rgbmidic.fields.cracks import at_some, crack_faces, listed, nearest_node
 from rgbmidic.fields.history import History, Nodal, Part, histories_of
-from rgbmidic.fields.nodal import NodalCovariance, Places
+from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray

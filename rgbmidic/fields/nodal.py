@@ -1,4 +1,4 @@
-"""Nodal fields: points in a mesh, nodes and pixels, the covariance of nodes and of frames, rigid motion.
+"""Nodal fields: the covariance of nodes and of frames, rigid motion.
 
 The solve is a least-squares fit of linear elements, whose covariance is the inverse of a Hessian: for a texture that is
 alike everywhere the inverse of the mesh's mass matrix. The displacement at a node is then that of a quadratic through
@@ -18,186 +18,17 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
 from numpy.polynomial import Chebyshev, Polynomial
 
 from rgbmidic.correlation.constants import USUAL
-from rgbmidic.correlation.recovery import Recovery, blended, quadratic_fit
+from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
-from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage, IntArray
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 _LOW, _HIGH = 0.5, 2.0
 """Bounds of the eigenvalues of a TRI3 mass matrix over its diagonal, on any mesh (Wathen, IMA J Numer Anal 7, 1987)."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Places:
-    """Points in a mesh: their elements and barycentric coordinates.
-
-    Attributes
-    ----------
-    mesh
-        The mesh.
-    points : ndarray, shape (P, 2)
-        In px on the reference.
-    inside : ndarray, shape (P,), bool
-    element : ndarray, shape (P,), int
-        The element that holds the point, the nearest one for a point outside.
-    barycentric : ndarray, shape (P, 3)
-        Value of the shape functions of that element's nodes at the point.
-    """
-
-    mesh: Tri3Mesh
-    points: FloatArray
-    inside: BoolArray
-    element: IntArray
-    barycentric: FloatArray
-
-    @classmethod
-    def of(cls, mesh: Tri3Mesh, points: npt.ArrayLike) -> Self:
-        """Find the elements of points (P, 2) in a mesh.
-
-        Parameters
-        ----------
-        mesh
-            N nodes, E elements.
-        points : array_like, shape (P, 2)
-            Points (x, y) on the reference, px.
-
-        Returns
-        -------
-        Places
-        """
-        from scipy.spatial import cKDTree
-
-        points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
-        corners, slopes = mesh.nodes[mesh.elements], mesh.shape_gradients()
-        middle = corners.mean(axis=1)
-        count = min(24, len(middle))  # the nearest elements: their sizes in one mesh differ by a factor of 2
-        near = np.asarray(cKDTree(middle).query(points, k=count)[1]).reshape(len(points), count)
-        shape = 1 / 3 + np.einsum("pced,pcd->pce", slopes[near], points[:, None] - middle[near])
-        best = shape.min(axis=2).argmax(axis=1)
-        row = np.arange(len(points))
-        barycentric = shape[row, best]
-        inside = barycentric.min(axis=1) >= -1e-6  # rounding, 1e-5 px
-        return cls(mesh=mesh, points=points, inside=inside, element=near[row, best], barycentric=barycentric)
-
-    def check(self, what: str) -> None:
-        """Refuse points outside the mesh.
-
-        Parameters
-        ----------
-        what
-            What the points are, for the message.
-
-        Raises
-        ------
-        InputError
-            One is; the message names it after `what`.
-        """
-        if not self.inside.all():
-            x, y = self.points[~self.inside][0]
-            raise InputError(f"{what} at ({x:g}, {y:g}) px is outside {self.where}")
-
-    @property
-    def where(self) -> str:
-        """Text for messages with the bounds of the region."""
-        (left, top), (right, bottom) = self.mesh.nodes.min(axis=0), self.mesh.nodes.max(axis=0)
-        return f"the region that was measured, which lies within x {left:g} to {right:g}, y {top:g} to {bottom:g}"
-
-    def mean(self) -> FloatArray:
-        """Compute the weight (N,) of every node in the mean over the points that are inside.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Of unit sum.
-        """
-        nodes, weights = self.mesh.elements[self.element[self.inside]], self.barycentric[self.inside]
-        sums = np.bincount(nodes.ravel(), weights=weights.ravel(), minlength=len(self.mesh.nodes))
-        return np.asarray(sums / max(self.inside.sum(), 1))
-
-
-def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> FloatImage:
-    """Interpolate a nodal field at the pixels of an image, by quadratics through the nodes around each node.
-
-    Each node's quadratic is weighted by its shape function. Linear interpolation of exact nodal values would lose a
-    tenth of the height of a wave of 6 elements; this one keeps .99 of it, .95 at 4 and .83 at 3 elements.
-
-    Parameters
-    ----------
-    mesh
-        The mesh.
-    values : ndarray, shape (N, 2)
-        At the nodes; NaN where a node has no data.
-    shape
-        Rows and columns (H, W) of the image.
-
-    Returns
-    -------
-    ndarray, shape (2, H, W), float32
-        NaN outside the mesh and in elements with a NaN node.
-    """
-    pixels = PixelMap.from_mesh(mesh, Region.from_mask(np.ones(shape, dtype=bool)))
-    used = np.asarray(np.isfinite(values)[mesh.elements].all(axis=(1, 2)))
-    known = np.nan_to_num(values)
-    out = blended(mesh, pixels, [values, *(operator @ known for operator in quadratic_fit(mesh, used)[1:])])
-    return np.stack([pixels.scatter(part, fill=np.nan) for part in out])
-
-
-def at_nodes(field: FloatArray, nodes: FloatArray) -> FloatArray:
-    """Interpolate a pixel field at nodes, bilinearly.
-
-    Parameters
-    ----------
-    field : ndarray, shape (C, H, W)
-        At the pixels.
-    nodes : ndarray, shape (N, 2)
-        Positions (x, y) in px; a node outside the image takes the value at its edge.
-
-    Returns
-    -------
-    ndarray, shape (N, C)
-        NaN where one of the four pixels around is NaN.
-    """
-    height, width = field.shape[1:]
-    x = np.clip(nodes[:, 0], 0, width - 1)
-    y = np.clip(nodes[:, 1], 0, height - 1)
-    column = np.minimum(x.astype(int), width - 2)
-    row = np.minimum(y.astype(int), height - 2)
-    tx, ty = x - column, y - row
-    above = (1 - tx) * field[:, row, column] + tx * field[:, row, column + 1]
-    below = (1 - tx) * field[:, row + 1, column] + tx * field[:, row + 1, column + 1]
-    return np.asarray(((1 - ty) * above + ty * below).T)
-
-
-def field_rms(mesh: Tri3Mesh, values: FloatArray, truth: FloatArray, *, border: float = 0.0) -> float:
-    """Compute the root mean square difference, over pixels and components, of a nodal field and a pixel field.
-
-    Parameters
-    ----------
-    mesh
-        The mesh.
-    values : ndarray, shape (N, 2)
-        At its nodes; the elements of NaN nodes are left out.
-    truth : ndarray, shape (2, H, W)
-        At the pixels; NaN pixels are left out.
-    border
-        Width in px of the rim of the mesh's bounding box that is left out.
-
-    Returns
-    -------
-    float
-    """
-    difference = at_pixels(mesh, values, truth.shape[1:]) - truth
-    low, high = mesh.nodes.min(axis=0) + border, mesh.nodes.max(axis=0) - border
-    rows = slice(int(np.ceil(low[1])), int(high[1]) + 1)
-    columns = slice(int(np.ceil(low[0])), int(high[0]) + 1)
-    inner = difference[:, rows, columns]
-    inner = inner[np.isfinite(inner)]
-    return float(np.sqrt(np.mean(inner**2))) if inner.size else float("nan")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -341,7 +172,9 @@ def _windows(nodes: FloatArray) -> sp.csr_matrix:
     near = np.round(at - at.min(axis=0)).astype(np.int64)[:, :, None] + np.arange(7)  # three on either side
     x, y = np.exp(-((at[:, :, None] - at.min(axis=0)[:, None] + 3 - near) ** 2) / 2).swapaxes(0, 1)
     places = near[:, 1, :, None] * (near[:, 0].max() + 1) + near[:, 0, None]
-    node, row, column = np.nonzero((heights := y[:, :, None] * x[:, None]) > 0.007)  # of 1; the correlation is right to .01
+    node, row, column = np.nonzero(
+        (heights := y[:, :, None] * x[:, None]) > 0.007
+    )  # of 1; the correlation is right to .01
     return unit_rows(sp.csr_matrix((heights[node, row, column], (node, places[node, row, column]))))
 
 

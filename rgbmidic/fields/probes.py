@@ -19,7 +19,8 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.crack_tip import CrackTip, Williams
 from rgbmidic.fields.cracks import JumpAlong
 from rgbmidic.fields.history import History, Nodal, Probe, histories_of
-from rgbmidic.fields.nodal import NodalCovariance, Places
+from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
 from rgbmidic.fields.units import Units
@@ -60,25 +61,32 @@ class Mean:
     ----------
     name, nodes
         See `Probe`.
-    weights : ndarray, shape (m,)
-        Of the nodes; their sum is 1.
+    places
+        Points that stand for the place, in the mesh of the `nodes`.
+    factors : ndarray, shape (P,)
+        Of the points in the mean.
     covariance
-        Of these nodes.
+        Of the nodes' errors.
     least
-        Part of the weights that must be measured; the mean is that of the measured part.
-    inside
-        Part of the place that lies in the region.
+        Part of the points in the region that must be measured; the mean is that of the measured part.
     """
 
     name: str
     nodes: IntArray
-    weights: FloatArray
+    places: Places
+    factors: FloatArray
     covariance: NodalCovariance
     least: float = 1.0
-    inside: float = 1.0
 
     @classmethod
-    def over(cls, covariance: NodalCovariance, name: str, points: npt.ArrayLike, least: float = 1.0) -> Mean:
+    def over(
+        cls,
+        covariance: NodalCovariance,
+        name: str,
+        points: npt.ArrayLike,
+        least: float = 1.0,
+        factors: npt.ArrayLike | None = None,
+    ) -> Mean:
         """Average over points (P, 2) that stand for a place, px.
 
         Parameters
@@ -90,7 +98,9 @@ class Mean:
         points : array_like, shape (P, 2)
             Points (x, y) on the reference, px.
         least
-            Fraction of the weight that nodes with data must have in a frame.
+            Fraction of the points that must have data in a frame.
+        factors : array_like, shape (P,), optional
+            Of the points; None: equal ones, whose sum is 1.
 
         Returns
         -------
@@ -103,9 +113,17 @@ class Mean:
         """
         places = Places.of(covariance.mesh, points)
         places.check(name)
-        weights, least = places.mean(), least - _CONSTANTS.rounding
-        nodes = np.flatnonzero(weights).astype(np.int64)
-        return cls(name=name, nodes=nodes, weights=weights[nodes], covariance=covariance.part(nodes), least=least)
+        equal = np.full(len(places.points), 1 / len(places.points))
+        amounts = equal if factors is None else np.asarray(factors, dtype=np.float64)
+        nodes, places = places.nearby()
+        part = covariance.part(nodes)
+        return cls(name=name, nodes=nodes, places=places, factors=amounts, covariance=part, least=least)
+
+    @property
+    def nearest(self) -> int:
+        """Node of the mesh that is nearest to the first of the points."""
+        nodes = self.places.mesh.nodes - self.places.points[0]
+        return int(self.nodes[np.hypot(*nodes.T).argmin()])
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px.
@@ -119,41 +137,67 @@ class Mean:
         -------
         list of History
         """
-        known = _known(nodal)
-        u, v = (self.average(value, std, known, bias) for value, std, bias in nodal.components)
-        note = _cut(self.name, "mean", self.inside * np.where(np.isfinite(u[0]), known @ self.weights, 1.0))
-        return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], note)
+        weights, used = self.weights(_known(nodal))
+        u, v = (self.average(weights, *component) for component in nodal.components)
+        return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], _cut(self.name, "mean", used))
 
-    def average(
-        self, values: FloatArray, std: FloatArray, known: BoolArray, bias: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Average a quantity (T, m) of the nodes where it is known, with its standard uncertainty, each (T,).
-
-        The errors are correlated between nodes as those of a displacement; without a `bias` they are taken as the same
-        at all nodes, which is the most that they can add up to.
+    def weights(self, has_data: BoolArray, axis: int | None = None) -> tuple[FloatArray, FloatArray]:
+        """Compute the weight of every node in the mean, or in that of the slope along an axis, in every frame.
 
         Parameters
         ----------
+        has_data : ndarray, shape (T, m), bool
+            Nodes that have data.
+        axis
+            0 or 1: the slope along x or y; None: the field.
+
+        Returns
+        -------
+        weights : ndarray, shape (T, m)
+            NaN where too few points are measured.
+        used : ndarray, shape (T,)
+            Fraction of the place that is measured; 1 where it is too little.
+        """
+        patterns, frame = np.unique(has_data, axis=0, return_inverse=True)
+        weights, used = np.full(patterns.shape, np.nan), np.ones(len(patterns))
+        for row, pattern in enumerate(patterns):
+            measured = self.places.measured(pattern)
+            fraction = measured.sum() / self.places.inside.sum()
+            if fraction >= self.least - _CONSTANTS.rounding:
+                sums = (self.factors * measured / fraction)[None]
+                weights[row], used[row] = self.places.weights(pattern, sums, axis).toarray()[0], measured.mean()
+        return weights[frame.ravel()], used[frame.ravel()]
+
+    def average(
+        self, weights: FloatArray, values: FloatArray, std: FloatArray, bias: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Average a quantity (T, m) of the nodes, with its standard uncertainty, each (T,).
+
+        The errors are correlated between nodes as those of a displacement; of another quantity, without a `bias`, they
+        are taken as the same at all nodes, which is the most that they can add up to.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (T, m)
+            Of the nodes, see `weights`.
         values, std : ndarray, shape (T, m)
             The quantity and its standard uncertainty.
-        known : ndarray, shape (T, m), bool
-            Where it is known.
         bias : ndarray, shape (T, m)
-            The part of a displacement's uncertainty that the lights' bias leaves; None of another quantity.
+            The part of a displacement's uncertainty that the lights' bias leaves.
 
         Returns
         -------
         values, std : ndarray, shape (T,)
         """
-        measured = known @ self.weights
-        enough = measured >= self.least
-        weights = np.where(known, self.weights, 0) / np.where(enough, measured, 1)[:, None]
-        mean = (weights * np.where(known, values, 0)).sum(axis=1)
+        mean = _products(weights, values).sum(axis=1)
         if bias is None:
-            spread = (weights * np.where(known, std, 0)).sum(axis=1)
-        else:
-            spread = np.sqrt(self.covariance.variance(weights, std, bias))
-        return np.where(enough, mean, np.nan), np.where(enough, spread, np.nan)
+            return mean, _products(weights, std).sum(axis=1)
+        return mean, np.sqrt(self.covariance.variance(weights, std, bias))
+
+
+def _products(weights: FloatArray, values: FloatArray) -> FloatArray:
+    """Multiply values (T, m) by weights; those of the weight 0, which may be NaN, give 0."""
+    return np.multiply(weights, values, out=np.zeros(weights.shape), where=weights != 0)
 
 
 def _known(nodal: Nodal) -> BoolArray:
@@ -212,20 +256,17 @@ class Gauge:
         self.name, self.moving, self.arm = name, moving, ends[1] - ends[0]
         if not np.hypot(*self.arm) > 0:
             raise InputError(f"{name} needs two different points, not ({place[0]:g}, {place[1]:g}) twice")
-        Places.of(covariance.mesh, ends).check(name)
-        first, second = (Places.of(covariance.mesh, end).mean() for end in ends)
-        self.nodes = np.flatnonzero(second - first).astype(np.int64)
-        self.weights, self.covariance = (second - first)[self.nodes], covariance.part(self.nodes)
+        self._apart = Mean.over(covariance, name, ends, factors=(-1, 1))
+        self.nodes = self._apart.nodes
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute the extension in px and the strain from the displacements of its `nodes` in every frame."""
-        length = float(np.hypot(*self.arm))
-        apart = np.stack([nodal.u @ self.weights, nodal.v @ self.weights], axis=1)
+        length, (weights, _) = float(np.hypot(*self.arm)), self._apart.weights(_known(nodal))
+        apart, spread = np.stack([self._apart.average(weights, *one) for one in nodal.components], axis=2)
         now = self.arm + apart if self.moving else np.broadcast_to(self.arm, apart.shape)
         towards = now / np.hypot(*now.T)[:, None]
         extension = np.hypot(*now.T) - length if self.moving else (towards * apart).sum(axis=1)
-        spread = [self.covariance.variance(self.weights, std, bias) for _, std, bias in nodal.components]
-        std = np.sqrt((towards**2 * np.stack(spread, axis=1)).sum(axis=1))
+        std = np.hypot(*(towards * spread).T)
         parts = [("extension", "px", extension, std), ("strain", "", extension / length, std / length)]
         return histories_of(self.name, parts)
 
@@ -257,17 +298,28 @@ class StrainGauge:
     ) -> None:
         gauges = StrainGauges.at_points(covariance, np.array([[x, y]]), length)
         self.name, self.measure, self.nodes = name, measure, np.unique(gauges.nodes)
-        self.gauges = gauges.of_nodes(self.nodes)
+        self.gauges, self.covariance = gauges.of_nodes(self.nodes), covariance.part(self.nodes)
         self.inside = float(Places.of(covariance.mesh, _circle(x, y, gauges.length / 2)).inside.mean())
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute strain, principal strains and equivalent from the displacements of its `nodes` in every frame."""
-        gradients, covariances = zip(*(self.gauges.gradient(*row) for row in nodal.fields.swapaxes(0, 1)), strict=True)
-        strain = strain_of_gradient(np.concatenate(gradients), np.concatenate(covariances), self.measure)
+        patterns, frame = np.unique(known := _known(nodal), axis=0, return_inverse=True)
+        slopes = np.stack([self.gauges.weights(pattern) for pattern in patterns])
+        strain = _strain(slopes[frame.ravel()], nodal, self.covariance, self.measure)
         weights = self.gauges.fractions / self.gauges.fractions.sum()
         measured = np.isfinite(strain.components[:, 0])
-        used = np.where(measured, _known(nodal)[:, self.gauges.nodes] @ weights, 1.0)
+        used = np.where(measured, known[:, self.gauges.nodes] @ weights, 1.0)
         return _strain_histories(self.name, strain, _cut(self.name, "strain", self.inside * used))
+
+
+def _strain(slopes: FloatArray, nodal: Nodal, covariance: NodalCovariance, measure: str) -> Strain:
+    """Compute the strain (T,) of the displacement gradient that weights (T, 2, m) of the nodes give."""
+    gradient, spread = np.zeros((len(slopes), 2, 2)), np.zeros((len(slopes), 4, 4))
+    for row, (value, std, bias) in enumerate(nodal.components[:, :, :, None]):
+        gradient[:, row] = _products(slopes, value).sum(axis=2)
+        errors, own = covariance.errors(slopes, std, bias), slice(2 * row, 2 * row + 2)
+        spread[:, own, own] = errors @ errors.swapaxes(1, 2)
+    return strain_of_gradient(gradient, spread, measure)
 
 
 def _strain_histories(name: str, strain: Strain, note: str) -> list[History]:
@@ -282,8 +334,7 @@ def _strain_histories(name: str, strain: Strain, note: str) -> list[History]:
 class Area(Mean):
     """Mean displacement over an area, and the strain of the mean displacement gradient over it.
 
-    The gradient of a linear displacement is constant in an element, so that its mean over the area is one of the
-    elements, each by the part of the area that it holds. It is that of the nodes around the area alone (Gauss).
+    The mean gradient is that of the displacement around the area alone (Gauss).
 
     Parameters
     ----------
@@ -296,15 +347,6 @@ class Area(Mean):
     measure
         Strain measure, as of `strain_of`.
 
-    Attributes
-    ----------
-    elements : ndarray, shape (E, 3), int
-        Indices in `nodes` of the corners of the elements that the area touches.
-    parts : ndarray, shape (E,)
-        Fraction of the area within each; their sum is 1.
-    slopes : ndarray, shape (E, 3, 2)
-        Gradient of the shape functions, per px.
-
     Raises
     ------
     InputError
@@ -312,16 +354,14 @@ class Area(Mean):
     """
 
     def __init__(self, covariance: NodalCovariance, name: str, points: FloatArray, measure: str = MEASURES[0]) -> None:
-        mesh, places = covariance.mesh, Places.of(covariance.mesh, points)
-        if (inside := float(places.inside.mean())) < _CONSTANTS.least:
+        places = Places.of(covariance.mesh, points)
+        if places.inside.mean() < _CONSTANTS.least:
             raise InputError(f"half or more of {name} is outside {places.where}")
-        elements, count = np.unique(places.element[places.inside], return_counts=True)
-        nodes = np.unique(mesh.elements[elements]).astype(np.int64)
-        weights, least = places.mean()[nodes], _CONSTANTS.least - _CONSTANTS.rounding
-        part = covariance.part(nodes)
-        super().__init__(name=name, nodes=nodes, weights=weights, covariance=part, least=least, inside=inside)
-        self.elements, self.parts = np.searchsorted(nodes, mesh.elements[elements]), count / count.sum()
-        self.slopes, self.measure = mesh.shape_gradients()[elements], measure
+        nodes, places = places.nearby()
+        equal = places.inside / places.inside.sum()
+        part, least = covariance.part(nodes), _CONSTANTS.least
+        super().__init__(name=name, nodes=nodes, places=places, factors=equal, covariance=part, least=least)
+        self.measure = measure
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px, then strain, principal strains and equivalent strain.
@@ -336,20 +376,8 @@ class Area(Mean):
         list of History
         """
         moved, known = super().histories(nodal), _known(nodal)
-        gradient, covariance = np.full((len(known), 2, 2), np.nan), np.full((len(known), 4, 4), np.nan)
-        patterns, of_frame = np.unique(known[:, self.elements].all(axis=2), axis=0, return_inverse=True)
-        for place, there in enumerate(patterns):
-            if (measured := self.parts[there].sum()) < self.least:
-                continue
-            weights, frames = np.zeros((len(self.nodes), 2)), np.flatnonzero(of_frame.ravel() == place)
-            np.add.at(weights, self.elements[there], (self.parts[there] / measured)[:, None, None] * self.slopes[there])
-            covariance[frames] = 0
-            for row, (value, *stds) in enumerate(nodal.components):
-                gradient[frames, row] = np.where(known, value, 0)[frames] @ weights
-                errors = self.covariance.errors(weights.T, *(std[frames, None] for std in stds))
-                own = slice(2 * row, 2 * row + 2)
-                covariance[frames, own, own] = errors @ errors.swapaxes(1, 2)
-        strain = strain_of_gradient(gradient, covariance, self.measure)
+        slopes = np.stack([self.weights(known, axis)[0] for axis in (0, 1)], axis=1)
+        strain = _strain(slopes, nodal, self.covariance, self.measure)
         return [*moved, *_strain_histories(self.name, strain, moved[0].note)]
 
 

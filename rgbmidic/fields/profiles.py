@@ -20,11 +20,10 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.special import chdtrc
 
-from rgbmidic.correlation.recovery import quadratic_fit
 from rgbmidic.errors import InputError
-from rgbmidic.fields.nodal import NodalCovariance, Places
+from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.strain import StrainGauges
-from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.text import uncertain
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -45,9 +44,6 @@ class ProfileConstants:
         Distance of the points along a line in elements, the golden section: the positions of a fit then lie
         anywhere between the nodes, and what interpolation leaves out shows in its chi-square. With half an
         element it was 3.4 times that.
-    around
-        Elements around a line whose nodes are read: the quadratic at a node is fitted to those within two edges
-        of it.
     lopsided
         Elements by which the middle of a gauge's nodes may lie off its own along a line: a tenth of what an
         edge does.
@@ -82,7 +78,6 @@ class ProfileConstants:
 
     least: float = 0.5
     step: float = 0.382
-    around: float = 4.0
     lopsided: float = 0.1
     clear: float = 5.0
     smoothest: float = 3.5
@@ -107,8 +102,8 @@ maximum."""
 class ProfileLine:
     """Points .38 elements apart along a line in a mesh, at which nodal fields are read.
 
-    A value is that of the quadratics through the nodes around each node, weighted by its shape function, as in
-    `at_pixels`; its uncertainty follows from the correlation of the nodes' errors.
+    A value is that of the field between the nodes (`Places`); its uncertainty follows from the correlation of the nodes'
+    errors.
 
     Parameters
     ----------
@@ -153,22 +148,16 @@ class ProfileLine:
             raise InputError(
                 f"half or more of the line from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) px is outside {places.where}"
             )
-        way = points[-1] - points[0]
-        along = np.clip((mesh.nodes - points[0]) @ way / length**2, 0, 1)
-        away = mesh.nodes - points[0] - along[:, None] * way
-        near = np.hypot(*away.T) <= _CONSTANTS.around * mesh.size
-        elements = mesh.elements[near[mesh.elements].all(axis=1)]
-        self.nodes = nodes = np.unique(elements)
-        part = Tri3Mesh(nodes=mesh.nodes[nodes], elements=np.searchsorted(nodes, elements).astype(np.int32))
         self.points, self.positions = points, np.linspace(0, length, len(points))
-        self.places = Places.of(part, points)
+        self.nodes, self.places = places.nearby()
+        nodes = self.nodes
         exx, eyy = (covariance.relative([slope[nodes]]) for slope in gauges.slopes)
         both = covariance.relative([slope[nodes] for slope in gauges.slopes])
         self.covariances = {"": covariance.part(nodes), "exx": exx, "eyy": eyy, "strain": both}
         count = np.bincount(gauges.rows, weights=gauges.fractions, minlength=len(mesh.nodes))
-        arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ way / length
+        arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ (points[-1] - points[0]) / length
         lopsided = np.abs(np.bincount(gauges.rows, weights=gauges.fractions * arm, minlength=len(mesh.nodes)) / count)
-        at_corners = lopsided[nodes][part.elements[self.places.element]]
+        at_corners = lopsided[mesh.elements[places.element]]
         self.even = (at_corners < _CONSTANTS.lopsided * mesh.size).all(axis=1)
 
     def read(
@@ -218,16 +207,10 @@ class ProfileLine:
 @lru_cache(maxsize=4)
 def _weights(line: ProfileLine, measured: bytes) -> FloatArray:
     """Return the weight (P, n) of every node at each point; NaN outside the mesh and beside missing nodes."""
-    mesh, places = line.places.mesh, line.places
-    used = np.asarray(np.frombuffer(measured, dtype=bool)[mesh.elements].all(axis=1))
-    _, *slopes = (operator.toarray() for operator in quadratic_fit(mesh, used))
-    value, total = np.eye(len(mesh.nodes)), np.zeros((len(line.points), len(mesh.nodes)))
-    for node, shape in zip(mesh.elements[places.element].T, places.barycentric.T, strict=True):
-        x, y = (line.points - mesh.nodes[node]).T
-        terms = zip((np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2), (value, *slopes), strict=True)
-        total += shape[:, None] * sum(factor[:, None] * operator[node] for factor, operator in terms)
-    total[~(places.inside & used[places.element])] = np.nan
-    return total
+    has_data = np.frombuffer(measured, dtype=bool)
+    weights = line.places.weights(has_data).toarray()
+    weights[~line.places.measured(has_data)] = np.nan
+    return np.asarray(weights)
 
 
 def _unit(covariance: FloatArray) -> FloatArray:

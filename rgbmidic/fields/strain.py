@@ -22,7 +22,8 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields.nodal import NodalCovariance, Places
+from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
@@ -337,7 +338,7 @@ class StrainGauges:
         self.nodes = pattern.indices.astype(np.int64)
         away = np.hypot(*(mesh.nodes[self.nodes] - centres[self.rows]).T)
         self.fractions = np.clip((lengths[self.rows] / 2 - away) / mesh.sizes[self.nodes], 0, 1)
-        self.whole = self._weights(np.ones(len(mesh.nodes), dtype=bool))
+        self.whole = self.weights(np.ones(len(mesh.nodes), dtype=bool))
         self.slopes = self._matrices(self.whole)
         alone = [_products(slope, slope) for slope in self.slopes]
         together = [_products(part, part) for part in (slope @ covariance.fit for slope in self.slopes)]
@@ -425,9 +426,8 @@ class StrainGauges:
             Of the gradient row by row.
         """
         measured = np.isfinite(u + v + sum(std))
-        known = self.needed @ (~measured * 1.0) == 0
-        weights = self.whole if measured.all() else self._weights(measured)
-        values, spread = np.zeros((len(known), 2, 2)), np.zeros((len(known), 4, 4))
+        weights = self.whole if measured.all() else self.weights(measured)
+        values, spread = np.zeros((len(self.centres), 2, 2)), np.zeros((len(self.centres), 4, 4))
         matrices = self.slopes if measured.all() else self._matrices(weights)
         for component, value in enumerate((u, v)):
             whole, shared = (np.where(measured, part, 0.0) for part in (*std[component::2], np.zeros_like(u))[:2])
@@ -439,7 +439,6 @@ class StrainGauges:
                 x, y = (slope @ (sp.diags(shared) @ self.bias) for slope in matrices)
                 sums += np.stack([_products(x, x), _products(y, y), _products(x, y)], axis=1)
             spread[:, own, own] = sums[:, [[0, 2], [2, 1]]]
-        values[~known], spread[~known] = np.nan, np.nan
         return values, spread
 
     def strain(self, u: FloatArray, v: FloatArray, *std: FloatArray, measure: str = MEASURES[0]) -> Strain:
@@ -461,8 +460,19 @@ class StrainGauges:
     def _matrices(self, weights: FloatArray) -> list[sp.csr_matrix]:
         return [sp.csr_matrix((w, self.nodes, self.starts), shape=self.needed.shape) for w in weights]
 
-    def _weights(self, measured: BoolArray) -> FloatArray:
-        """Compute the weight (2, M) of every node in the slopes of each gauge; NaN where its nodes lie on a line."""
+    def weights(self, measured: BoolArray) -> FloatArray:
+        """Compute the weight of every node of each gauge in its slopes.
+
+        Parameters
+        ----------
+        measured : ndarray, shape (N,), bool
+            Nodes that have data.
+
+        Returns
+        -------
+        ndarray, shape (2, M)
+            NaN where a node that it needs has no data, or its nodes lie on a line.
+        """
         use = measured[self.nodes] * self.fractions
         arm = (self.points[self.nodes] - self.centres[self.rows]).T
         count = np.maximum(self._sum(use), np.finfo(float).tiny)
@@ -471,6 +481,7 @@ class StrainGauges:
         determinant = xx * yy - xy * xy
         # a hundredth of the second moment across as along: the nodes lie on a line
         determinant = np.where(determinant > 1e-2 * ((xx + yy) / 2) ** 2, determinant, np.nan)
+        determinant[self.needed @ (~measured * 1.0) > 0] = np.nan
         xx, xy, yy = (part[self.rows] / determinant[self.rows] for part in (xx, xy, yy))
         return np.stack([use * (yy * x - xy * y), use * (xx * y - xy * x)])
 

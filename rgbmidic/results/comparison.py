@@ -25,12 +25,12 @@ import scipy.sparse as sp
 
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.errors import InputError
-from rgbmidic.fields import NodalCovariance, StrainGauges, strain_of_gradient
+from rgbmidic.fields import NodalCovariance, Places, StrainGauges, strain_of_gradient
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh
 from rgbmidic.results.physical import frame_times, rectification_of, shared_part
 from rgbmidic.results.quantities import FAILED
 from rgbmidic.results.result import Result
-from rgbmidic.results.simulation import Levelling, Simulation, places_among, reading
+from rgbmidic.results.simulation import Levelling, Simulation, places_among
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
@@ -326,21 +326,25 @@ class Comparison:
         return own if len(np.unique(own[own >= 0])) == len(self.mesh.nodes) else np.full(len(points), -1)
 
     @cached_property
-    def _read(self) -> tuple[sp.csr_matrix, BoolArray]:
-        """Matrix (M, N) that reads the measurement at the simulation's nodes, and which of them lie in it (M,)."""
-        if (inside := self._own >= 0).any():
-            entries = np.ones(inside.sum()), (np.flatnonzero(inside), self._own[inside])
-            return sp.csr_matrix(entries, shape=(len(inside), len(self.mesh.nodes))), inside
-        matrix, depth = reading(self.mesh, self.simulation.mesh.points)
-        inside = depth > -_SAME
-        if not inside.any():
+    def _places(self) -> Places:
+        """The simulation's nodes in the measurement's mesh."""
+        places = Places.of(self.mesh, self.simulation.mesh.points)
+        if not places.inside.any():
             raise InputError(f"no node of {self.simulation.name} lies in the region that was measured")
-        return sp.csr_matrix(sp.diags(1.0 * inside) @ matrix), inside
+        return places
+
+    def _read(self, has_data: BoolArray | None = None) -> tuple[sp.csr_matrix, BoolArray]:
+        """Matrix (M, N) that reads the measurement at the simulation's nodes, and where its nodes (N,) have data (M,)."""
+        valid = np.ones(len(self.mesh.nodes), dtype=bool) if has_data is None else has_data
+        if (same := self._own >= 0).any():
+            entries = np.ones(same.sum()), (np.flatnonzero(same), self._own[same])
+            return sp.csr_matrix(entries, shape=(len(same), len(valid))), same & valid[self._own]
+        return self._places.weights(valid), self._places.measured(valid)
 
     @cached_property
     def _gauges(self) -> tuple[StrainGauges, sp.csr_matrix]:
         """The shortest strain gauges, and the matrix (M, G) that gives each node of the simulation its own."""
-        read, inside = self._read
+        read, inside = self._read()
         if (self._own >= 0).any():
             return StrainGauges.at_nodes(self.covariance), read
         gauges = StrainGauges.at_points(self.covariance, self.simulation.mesh.points[inside])
@@ -349,7 +353,7 @@ class Comparison:
     @cached_property
     def _correlations(self) -> list[list[sp.csr_matrix]]:
         """Correlations (M, M) of each of the `QUANTITIES` between nodes: of the fit's errors, of the lights' bias."""
-        read, (gauges, given) = self._read[0], self._gauges
+        read, (gauges, given) = self._read()[0], self._gauges
         x, y = (given @ slope for slope in gauges.slopes)
         parts = [self.covariance.relative(matrices) for matrices in ([read], [x], [y], [x, y])]
         moved, *strains = ([sp.csr_matrix(root @ root.T) for root in (one.fit, one.bias)] for one in parts)
@@ -357,18 +361,17 @@ class Comparison:
 
     def _at_nodes(self, displacement: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Displacement (2, N) and its strain at the simulation's nodes, (5, M), and their noise, (2, 5, M)."""
-        read, inside = self._read
-        (values,), own = np.split(np.full((3, len(QUANTITIES), len(inside)), np.nan), [1])
+        has_data = np.isfinite(displacement + noise[0]).all(axis=0)
+        read, measured = self._read(has_data)
+        (values,), own = np.split(np.full((3, len(QUANTITIES), len(measured)), np.nan), [1])
         (gauges, given), bias = self._gauges, noise[1]
         node, gauge = given.nonzero()
         for std, stds in zip(own, (noise, np.stack([bias, bias])), strict=True):
-            for row, (part, whole, shared) in enumerate(zip(displacement, *stds, strict=True)):
-                known = np.isfinite(part + whole)
-                there = inside & (abs(read) @ ~known == 0)
-                factor = read @ self.covariance.factor(np.where(known, whole, 0), np.where(known, shared, 0))
-                values[row] = np.where(there, read @ np.where(known, part, 0), np.nan)
+            for row, (part, *errors) in enumerate(zip(displacement, *stds, strict=True)):
+                factor = read @ self.covariance.factor(*np.where(has_data, errors, 0))
+                values[row] = np.where(measured, read @ np.where(has_data, part, 0), np.nan)
                 variance = np.asarray(factor.multiply(factor).sum(axis=1)).ravel()
-                std[row] = np.where(there, np.sqrt(variance), np.nan)
+                std[row] = np.where(measured, np.sqrt(variance), np.nan)
             strain = gauges.strain(*displacement, *stds[0], *stds[1])
             values[2:, node], std[2:, node] = strain.components[gauge].T, strain.components_std[gauge].T
         return values, own

@@ -231,9 +231,8 @@ class ShownFields:
         found = element_at(self.nodes, self.result.elements, x, y)
         if found is None:
             return f"{place}: &nbsp; outside the mesh"
-        nodes, told = found[0].astype(np.int64), []
-        covariance, least = physical.covariance.part(nodes), VIEWER.least_weight
-        mean = Mean(name="", nodes=nodes, weights=found[1], covariance=covariance, least=least)
+        nodes, told = found[0], []
+        mean = Mean.over(physical.covariance, "the pointer", [found[1] @ physical.mesh.nodes[nodes]])
         for name in self.names:
             field, blank = self.maps.all[name], self.values(name).status[nodes].max()
             value, std = self._mean(field, mean)
@@ -289,12 +288,13 @@ class ShownFields:
         """
         name, values = _measured(field), self.values(field.name)
         if field.stepped:
-            return float(values.values[mean.nodes[mean.weights.argmax()]]), math.nan
+            return float(values.values[mean.nearest]), math.nan
         exact = name in ("u", "v")
         read = self.displacement["uv".index(name) :: 2] if exact else np.stack([values.values, values.std])
         of_nodes, stds, *bias = read[:, None, mean.nodes]
         stated = bool(np.isfinite(stds).any())
-        pair = mean.average(of_nodes, stds, np.isfinite(of_nodes + (stds if stated else 0)), *bias)
+        weights, _ = mean.weights(np.isfinite(of_nodes + (stds if stated else 0)))
+        pair = mean.average(weights, of_nodes, stds, *bias)
         (value,), (std,) = self.maps.physical.units.lengths(*pair) if exact else pair
         if exact and name != field.name:
             return float(std), math.nan

@@ -1,0 +1,265 @@
+"""The field between the nodes of a mesh: points, pixels and the weights of the nodes there.
+
+Each node has a quadratic with its value, fitted to the nodes around it (`quadratic_fit`). In an element the quadratics
+of its corners are weighted by their shape functions: a continuous field, linear in the nodal values. Linear
+interpolation of exact nodal values would lose a tenth of the height of a wave of 6 elements; this field keeps .99 of
+it, .95 at 4 and .83 at 3 elements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from rgbmidic.correlation.recovery import quadratic_fit
+from rgbmidic.errors import InputError
+from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage, IntArray
+
+_ROUNDING = 1e-6
+"""Rounding of barycentric coordinates, 1e-5 px."""
+_AT_ONCE = 20_000
+"""Points whose elements are searched at once: some 60 MB (derived)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Places:
+    """Points in a mesh: their elements and barycentric coordinates.
+
+    Attributes
+    ----------
+    mesh
+        The mesh.
+    points : ndarray, shape (P, 2)
+        In px on the reference.
+    inside : ndarray, shape (P,), bool
+    element : ndarray, shape (P,), int
+        The element that holds the point, the nearest one for a point outside.
+    barycentric : ndarray, shape (P, 3)
+        Value of the shape functions of that element's nodes at the point.
+    """
+
+    mesh: Tri3Mesh
+    points: FloatArray
+    inside: BoolArray
+    element: IntArray
+    barycentric: FloatArray
+
+    @classmethod
+    def of(cls, mesh: Tri3Mesh, points: npt.ArrayLike) -> Self:
+        """Find the elements of points (P, 2) in a mesh.
+
+        Parameters
+        ----------
+        mesh
+            N nodes, E elements.
+        points : array_like, shape (P, 2)
+            Points (x, y) on the reference, px.
+
+        Returns
+        -------
+        Places
+        """
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+        middle, slopes, element = mesh.centres, mesh.shape_gradients(), np.empty(len(points), dtype=np.int64)
+        count = min(24, len(middle))  # the nearest elements: their sizes in one mesh differ by a factor of 2
+        for start in range(0, len(points), _AT_ONCE):
+            part = points[start : start + _AT_ONCE]
+            near = np.asarray(mesh.centre_tree.query(part, k=count)[1]).reshape(-1, count)
+            shape = np.einsum("pced,pcd->pce", slopes[near], part[:, None] - middle[near])
+            element[start : start + _AT_ONCE] = near[np.arange(len(near)), shape.min(axis=2).argmax(axis=1)]
+        return cls.within(mesh, points, element)
+
+    @classmethod
+    def within(cls, mesh: Tri3Mesh, points: FloatArray, element: IntArray) -> Self:
+        """Take points (P, 2) whose elements (P,) are known."""
+        away = points - mesh.centres[element]
+        barycentric = 1 / 3 + np.einsum("pcd,pd->pc", mesh.shape_gradients()[element], away)
+        inside = barycentric.min(axis=1) >= -_ROUNDING
+        return cls(mesh=mesh, points=points, inside=inside, element=element, barycentric=barycentric)
+
+    def check(self, what: str) -> None:
+        """Refuse points outside the mesh.
+
+        Parameters
+        ----------
+        what
+            What the points are, for the message.
+
+        Raises
+        ------
+        InputError
+            One is; the message names it after `what`.
+        """
+        if not self.inside.all():
+            x, y = self.points[~self.inside][0]
+            raise InputError(f"{what} at ({x:g}, {y:g}) px is outside {self.where}")
+
+    @property
+    def where(self) -> str:
+        """Text for messages with the bounds of the region."""
+        (left, top), (right, bottom) = self.mesh.nodes.min(axis=0), self.mesh.nodes.max(axis=0)
+        return f"the region that was measured, which lies within x {left:g} to {right:g}, y {top:g} to {bottom:g}"
+
+    def nearby(self) -> tuple[IntArray, Self]:
+        """Return the nodes (m,) on which the field at the points depends, and the points in the mesh of these alone."""
+        mesh, near = self.mesh, np.zeros(len(self.mesh.nodes), dtype=bool)
+        near[mesh.elements[self.element[self.inside]]] = True
+        near = mesh.beside(mesh.beside(near))  # a quadratic is fitted to the nodes within two edges
+        number = np.cumsum(near[mesh.elements].all(axis=1)) - 1
+        element = np.where(self.inside, number[self.element], 0)
+        return np.flatnonzero(near), replace(self, mesh=mesh.part(near), element=element)
+
+    def measured(self, has_data: BoolArray) -> BoolArray:
+        """Report which points (P,) are inside, and have data at the corners around them.
+
+        Parameters
+        ----------
+        has_data : ndarray, shape (N,), bool
+            Nodes that have data.
+
+        Returns
+        -------
+        ndarray, shape (P,), bool
+        """
+        missing = (np.abs(self.barycentric) * ~has_data[self.mesh.elements[self.element]]).sum(axis=1)
+        return np.asarray(self.inside & (missing <= _ROUNDING))
+
+    def weights(self, has_data: BoolArray, sums: FloatArray | None = None, axis: int | None = None) -> sp.csr_matrix:
+        """Compute the weight of every node in the field at the points, or in its slope, or in sums of either.
+
+        Parameters
+        ----------
+        has_data : ndarray, shape (N,), bool
+            Nodes that have data; the weights of the others are 0, and mean nothing where `measured` is false.
+        sums : ndarray, shape (S, P), optional
+            Factors of the points in each sum; None: the points themselves.
+        axis
+            0 or 1: the slope along x or y, per px; None: the field.
+
+        Returns
+        -------
+        csr_matrix, shape (P, N) or (S, N)
+        """
+        factors = (one if sums is None else sp.csr_matrix(sums) @ one for one in self._factors(axis))
+        fits = _fits(self.mesh, has_data.tobytes())
+        return sp.csr_matrix(sum(one @ fit for one, fit in zip(factors, fits, strict=True)))
+
+    def read(self, values: FloatArray) -> FloatArray:
+        """Evaluate nodal fields at the points.
+
+        Parameters
+        ----------
+        values : ndarray, shape (N,) or (N, C)
+            At the nodes; NaN where a node has no data.
+
+        Returns
+        -------
+        ndarray, shape (P,) or (P, C)
+            NaN outside the mesh and beside nodes without data.
+        """
+        valid = np.isfinite(values)
+        has_data = valid.reshape(len(values), -1).all(axis=1)
+        terms = (fit @ np.where(valid, values, 0) for fit in _fits(self.mesh, has_data.tobytes()))
+        field = np.asarray(sum(one @ term for one, term in zip(self._factors(), terms, strict=True)))
+        field[~self.measured(has_data)] = np.nan
+        return field
+
+    def _factors(self, axis: int | None = None) -> Iterator[sp.csr_matrix]:
+        """Matrices (P, N) that weight each of the `TERMS` of the nodes' quadratics, or their slopes along an axis."""
+        node, first = self.mesh.elements[self.element], np.arange(0, self.barycentric.size + 1, 3)
+        x, y = np.moveaxis(self.points[:, None] - self.mesh.nodes[node], 2, 0)
+        slope = 0 if axis is None else self.mesh.shape_gradients()[self.element, :, axis]
+        for power, *slopes in ((1, 0, 0), (x, 1, 0), (y, 0, 1), (x * x / 2, x, 0), (x * y, y, x), (y * y / 2, 0, y)):
+            factor = self.barycentric * power if axis is None else slope * power + self.barycentric * slopes[axis]
+            yield sp.csr_matrix((factor.ravel(), node.ravel(), first), shape=(len(first) - 1, len(self.mesh.nodes)))
+
+
+@lru_cache(maxsize=4)  # a few meshes, as a rule with data at all nodes: 8 MB each for 8,000 of them
+def _fits(mesh: Tri3Mesh, has_data: bytes) -> tuple[sp.csr_matrix, ...]:
+    """Matrices (N, N) from nodal values to each of the `TERMS`, the value being the node's own."""
+    used = np.asarray(np.frombuffer(has_data, dtype=bool)[mesh.elements].all(axis=1))
+    return sp.eye(len(mesh.nodes), format="csr"), *quadratic_fit(mesh, used)[1:]
+
+
+def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> FloatImage:
+    """Evaluate nodal fields at the pixels of an image.
+
+    Parameters
+    ----------
+    mesh
+        The mesh.
+    values : ndarray, shape (N, C)
+        At the nodes; NaN where a node has no data.
+    shape
+        Rows and columns (H, W) of the image.
+
+    Returns
+    -------
+    ndarray, shape (C, H, W), float32
+        NaN outside the mesh and in elements with a NaN node.
+    """
+    pixels = PixelMap.from_mesh(mesh, Region.from_mask(np.ones(shape, dtype=bool)))
+    element = np.repeat(np.arange(len(mesh.elements)), np.diff(pixels.offsets))
+    places = Places.within(mesh, np.stack([pixels.columns, pixels.rows], axis=1).astype(np.float64), element)
+    field = replace(places, inside=np.ones(len(element), dtype=bool)).read(values)
+    return np.stack([pixels.scatter(part, fill=np.nan) for part in field.T])
+
+
+def at_nodes(field: FloatArray, nodes: FloatArray) -> FloatArray:
+    """Interpolate a pixel field at nodes, bilinearly.
+
+    Parameters
+    ----------
+    field : ndarray, shape (C, H, W)
+        At the pixels.
+    nodes : ndarray, shape (N, 2)
+        Positions (x, y) in px; a node outside the image takes the value at its edge.
+
+    Returns
+    -------
+    ndarray, shape (N, C)
+        NaN where one of the four pixels around is NaN.
+    """
+    height, width = field.shape[1:]
+    x = np.clip(nodes[:, 0], 0, width - 1)
+    y = np.clip(nodes[:, 1], 0, height - 1)
+    column = np.minimum(x.astype(int), width - 2)
+    row = np.minimum(y.astype(int), height - 2)
+    tx, ty = x - column, y - row
+    above = (1 - tx) * field[:, row, column] + tx * field[:, row, column + 1]
+    below = (1 - tx) * field[:, row + 1, column] + tx * field[:, row + 1, column + 1]
+    return np.asarray(((1 - ty) * above + ty * below).T)
+
+
+def field_rms(mesh: Tri3Mesh, values: FloatArray, truth: FloatArray, *, border: float = 0.0) -> float:
+    """Compute the root mean square difference, over pixels and components, of a nodal field and a pixel field.
+
+    Parameters
+    ----------
+    mesh
+        The mesh.
+    values : ndarray, shape (N, 2)
+        At its nodes; the elements of NaN nodes are left out.
+    truth : ndarray, shape (2, H, W)
+        At the pixels; NaN pixels are left out.
+    border
+        Width in px of the rim of the mesh's bounding box that is left out.
+
+    Returns
+    -------
+    float
+    """
+    difference = at_pixels(mesh, values, truth.shape[1:]) - truth
+    low, high = mesh.nodes.min(axis=0) + border, mesh.nodes.max(axis=0) - border
+    rows = slice(int(np.ceil(low[1])), int(high[1]) + 1)
+    columns = slice(int(np.ceil(low[0])), int(high[0]) + 1)
+    inner = difference[:, rows, columns]
+    inner = inner[np.isfinite(inner)]
+    return float(np.sqrt(np.mean(inner**2))) if inner.size else float("nan")
