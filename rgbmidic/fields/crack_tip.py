@@ -254,7 +254,8 @@ class CrackTip:
         away = np.hypot(*(mesh.nodes - tip).T)
         self.nodes = np.flatnonzero((away >= inner) & (away <= outer))
         self.points, self.face = (mesh.nodes[self.nodes] - tip) @ self.axes.T, side[self.nodes]
-        self.covariance, per = covariance.part(self.nodes), _CONSTANTS.per_coefficient
+        part, per = covariance.part(self.nodes), _CONSTANTS.per_coefficient
+        self.correlations = np.stack([(root @ root.T).toarray() for root in (part.fit, part.bias)])
         self.least = per * ((williams.terms or 2) + 1)
         self.most_terms = williams.terms or min(_CONSTANTS.most_terms, len(self.nodes) // per - 1)
         self._check_annulus(mesh)
@@ -386,11 +387,12 @@ class _Weighted:
     def __init__(self, probe: CrackTip, field: FloatArray, known: BoolArray) -> None:
         std, bias = field[2:4, known], field[4:, known]
         level = float(np.median(std))
-        self.probe, self.certain = probe, not level > 0
+        self.probe, self.certain, self._factors = probe, not level > 0, list[FloatArray]()
         std = np.ones_like(std) if self.certain else np.maximum(std, _CONSTANTS.least_std * level)
-        covariance = probe.covariance.part(np.flatnonzero(known))
-        factors = [covariance.factor(*parts) for parts in zip(std, bias, strict=True)]
-        self._factors = [cholesky((factor @ factor.T).toarray(), lower=True) for factor in factors]
+        correlations, shared = probe.correlations[:, known][..., known], np.minimum(bias, std)
+        for parts in np.stack([np.sqrt(std**2 - shared**2), shared], axis=1)[..., None]:
+            covariance = (parts * correlations * parts.swapaxes(1, 2)).sum(axis=0)
+            self._factors.append(cholesky(covariance, lower=True))
         self.points, self.face = probe.points[known], probe.face[known]
         arm = self.points @ probe.axes
         arm -= arm.mean(axis=0)

@@ -20,7 +20,7 @@ from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.results.physical import Physical, displacements, frame_times, named, reference_frames, shared_part
+from rgbmidic.results.physical import MOVED, Physical, displacements, frame_times, named, reference_frames, shared_part
 from rgbmidic.results.quantities import DERIVED, UNKNOWN_TIME, UV, WITH_ERROR, Quantity, map_quantities
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import MeshSettings, ProbeSettings, ScaleSettings
@@ -237,7 +237,7 @@ class Maps(Portable):
             raise InputError(f"there is no frame {frame} in a result of {len(self.result)} frames")
         base = name.removesuffix("_std")
         derived = base in DERIVED or name in WITH_ERROR
-        stored = ("light_fraction",) if kind == "fraction" else () if derived else (base,)
+        stored = ("light_fraction",) if kind == "fraction" else () if derived or name in MOVED else (name,)
         read = next(self.result.table.each(["u", "v", "node_status", *stored], [frame]))
         nothing = np.full(len(self.result.nodes), np.nan)
         if name in WITH_ERROR:
@@ -248,6 +248,8 @@ class Maps(Portable):
         elif kind == "fraction":
             light = self.result.lights.index(name.removeprefix("fraction of "))
             values, std = np.where(read["node_status"] == 0, read["light_fraction"][:, light], np.nan), nothing
+        elif name in MOVED:
+            values, std = self.physical.length * next(self._displacements([frame]))[MOVED.index(name)], nothing
         else:
             values, std = np.asarray(read[name], dtype=np.float64), nothing
         return MapValues(

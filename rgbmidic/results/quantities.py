@@ -285,8 +285,8 @@ _TABLE = (
     Quantity("v", _NODE, "px", "displacement.1", f"displacement in y {_AT_NODE}", **_EXACT),
     Quantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
     Quantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
-    Quantity("u_bias_std", _NODE, "px", "bias_std.0", _BIAS.format("u")),
-    Quantity("v_bias_std", _NODE, "px", "bias_std.1", _BIAS.format("v")),
+    Quantity("u_bias_std", _NODE, "px", "bias_std.0", _BIAS.format("u"), kind="positive"),
+    Quantity("v_bias_std", _NODE, "px", "bias_std.1", _BIAS.format("v"), kind="positive"),
     *with_uncertainty(
         Quantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
         Quantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
