@@ -19,7 +19,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.crack_tip import CrackTip, Williams
 from rgbmidic.fields.cracks import JumpAlong
 from rgbmidic.fields.history import History, Nodal, Probe, histories_of
-from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.interpolation import Places, PointSum
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
@@ -59,12 +59,10 @@ class Mean:
 
     Attributes
     ----------
-    name, nodes
+    name
         See `Probe`.
-    places
-        Points that stand for the place, in the mesh of the `nodes`.
-    factors : ndarray, shape (P,)
-        Of the points in the mean.
+    sum
+        Over points that stand for the place.
     correlation : ndarray, shape (m, m)
         Of the nodes' errors.
     least
@@ -72,9 +70,7 @@ class Mean:
     """
 
     name: str
-    nodes: IntArray
-    places: Places
-    factors: FloatArray
+    sum: PointSum
     correlation: FloatArray
     least: float = 1.0
 
@@ -114,16 +110,13 @@ class Mean:
         places = Places.of(covariance.mesh, points)
         places.check(name)
         equal = np.full(len(places.points), 1 / len(places.points))
-        amounts = equal if factors is None else np.asarray(factors, dtype=np.float64)
-        nodes, places = places.nearby()
-        correlation = covariance.part(nodes)
-        return cls(name=name, nodes=nodes, places=places, factors=amounts, correlation=correlation, least=least)
+        points_sum = PointSum.over(places, equal if factors is None else np.asarray(factors, dtype=np.float64))
+        return cls(name=name, sum=points_sum, correlation=covariance.part(points_sum.nodes), least=least)
 
     @property
-    def nearest(self) -> int:
-        """Node of the mesh that is nearest to the first of the points."""
-        nodes = self.places.mesh.nodes - self.places.points[0]
-        return int(self.nodes[np.hypot(*nodes.T).argmin()])
+    def nodes(self) -> IntArray:
+        """See `Probe`."""
+        return self.sum.nodes
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px.
@@ -137,36 +130,36 @@ class Mean:
         -------
         list of History
         """
-        weights, used = self.weights(_known(nodal))
-        u, v = self.average(nodal.u, nodal.u_std, weights), self.average(nodal.v, nodal.v_std, weights)
-        return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], _cut(self.name, "mean", used))
+        weights, measured = self.weights(_known(nodal))
+        return self._moved(nodal, weights[:, 0], measured)
 
-    def weights(self, has_data: BoolArray, axis: int | None = None) -> tuple[FloatArray, FloatArray]:
-        """Compute the weight of every node in the mean, or in that of the slope along an axis, in every frame.
+    def _moved(self, nodal: Nodal, weights: FloatArray, measured: FloatArray) -> list[History]:
+        u, v = self.average(nodal.u, nodal.u_std, weights), self.average(nodal.v, nodal.v_std, weights)
+        note = _cut(self.name, "mean", self.sum.inside * measured)
+        return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], note)
+
+    def weights(self, has_data: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Compute the weights of the nodes in the mean and in those of the slopes along x and y, in every frame.
 
         Parameters
         ----------
         has_data : ndarray, shape (T, m), bool
             Nodes that have data.
-        axis
-            0 or 1: the slope along x or y; None: the field.
 
         Returns
         -------
-        weights : ndarray, shape (T, m)
+        weights : ndarray, shape (T, 3, m)
             NaN where too few points are measured.
-        used : ndarray, shape (T,)
-            Fraction of the place that is measured; 1 where it is too little.
+        measured : ndarray, shape (T,)
+            Fraction of the points in the region that are measured; 1 where they are too few.
         """
         patterns, frame = np.unique(has_data, axis=0, return_inverse=True)
-        weights, used = np.full(patterns.shape, np.nan), np.ones(len(patterns))
+        weights, measured = np.full((len(patterns), 3, has_data.shape[1]), np.nan), np.ones(len(patterns))
         for row, pattern in enumerate(patterns):
-            measured = self.places.measured(pattern)
-            fraction = measured.sum() / self.places.inside.sum()
+            sums, fraction = self.sum.weights(pattern)
             if fraction >= self.least - _CONSTANTS.rounding:
-                sums = (self.factors * measured / fraction)[None]
-                weights[row], used[row] = self.places.weights(pattern, sums, axis).toarray()[0], measured.mean()
-        return weights[frame.ravel()], used[frame.ravel()]
+                weights[row], measured[row] = sums / fraction, fraction
+        return weights[frame.ravel()], measured[frame.ravel()]
 
     def average(
         self, values: FloatArray, std: FloatArray, weights: FloatArray, *, alike: bool = False
@@ -260,7 +253,7 @@ class Gauge:
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute the extension in px and the strain from the displacements of its `nodes` in every frame."""
-        length, (weights, _) = float(np.hypot(*self.arm)), self._apart.weights(_known(nodal))
+        length, weights = float(np.hypot(*self.arm)), self._apart.weights(_known(nodal))[0][:, 0]
         pairs = (nodal.u, nodal.u_std), (nodal.v, nodal.v_std)
         apart, spread = np.stack([self._apart.average(*pair, weights) for pair in pairs], axis=2)
         now = self.arm + apart if self.moving else np.broadcast_to(self.arm, apart.shape)
@@ -347,10 +340,8 @@ class Area(Mean):
         places = Places.of(covariance.mesh, points)
         if places.inside.mean() < _CONSTANTS.least:
             raise InputError(f"half or more of {name} is outside {places.where}")
-        nodes, places = places.nearby()
-        equal = places.inside / places.inside.sum()
-        correlation, least = covariance.part(nodes), _CONSTANTS.least
-        super().__init__(name=name, nodes=nodes, places=places, factors=equal, correlation=correlation, least=least)
+        area = PointSum.over(places, places.inside / places.inside.sum())
+        super().__init__(name=name, sum=area, correlation=covariance.part(area.nodes), least=_CONSTANTS.least)
         self.measure = measure
 
     def histories(self, nodal: Nodal) -> list[History]:
@@ -365,9 +356,9 @@ class Area(Mean):
         -------
         list of History
         """
-        moved, known = super().histories(nodal), _known(nodal)
-        slopes = np.stack([self.weights(known, axis)[0] for axis in (0, 1)], axis=1)
-        gradient, covariance = np.zeros((len(known), 2, 2)), np.zeros((len(known), 4, 4))
+        weights, measured = self.weights(_known(nodal))
+        moved, slopes = self._moved(nodal, weights[:, 0], measured), weights[:, 1:]
+        gradient, covariance = np.zeros((len(weights), 2, 2)), np.zeros((len(weights), 4, 4))
         for row, (value, std) in enumerate(((nodal.u, nodal.u_std), (nodal.v, nodal.v_std))):
             gradient[:, row] = _products(slopes, value[:, None]).sum(axis=2)
             errors, own = _products(slopes, std[:, None]), slice(2 * row, 2 * row + 2)
