@@ -160,7 +160,7 @@ class Places:
             NaN outside the mesh and beside nodes without data.
         """
         valid = np.isfinite(values)
-        has_data = valid.reshape(len(values), -1).all(axis=1)
+        has_data = np.asarray(valid.reshape(len(values), -1).all(axis=1))
         terms = (fit @ np.where(valid, values, 0) for fit in _fits(self.mesh, has_data.tobytes()))
         field = np.asarray(sum(one @ term for one, term in zip(self._matrices(), terms, strict=True)))
         field[~self.measured(has_data)] = np.nan
@@ -173,7 +173,7 @@ class Places:
             yield sp.csr_matrix((factor.ravel(), node, first), shape=(len(self.points), len(self.mesh.nodes)))
 
     def factors(self, axis: int | None = None) -> Iterator[FloatArray]:
-        """Yield the factors (P, 3) of each of the `TERMS` at an element's corners in the field, or in its slope along an axis."""
+        """Yield the factors (P, 3) of each of the `TERMS` at the corners, in the field or its slope along an axis."""
         x, y = np.moveaxis(self.points[:, None] - self.mesh.nodes[self.mesh.elements[self.element]], 2, 0)
         slope = 0 if axis is None else self.mesh.shape_gradients()[self.element, :, axis]
         for power, *slopes in ((1, 0, 0), (x, 1, 0), (y, 0, 1), (x * x / 2, x, 0), (x * y, y, x), (y * y / 2, 0, y)):
@@ -182,7 +182,7 @@ class Places:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointSum:
-    """A weighted sum of the field over points of a mesh, and the same of its slopes along x and y.
+    """A weighted sum of the field over points of a mesh, and where asked the same of its slopes along x and y.
 
     Attributes
     ----------
@@ -197,9 +197,9 @@ class PointSum:
     corners : ndarray, shape (G, 3), int
         These, in `part`.
     needed : ndarray, shape (G, 3), bool
-        Those on which the group depends: a point on a node depends on this one.
-    moments : ndarray, shape (3, 6, G, 3)
-        Factors of the `TERMS` at the corners in the sums of field, slope along x and slope along y.
+        Those on which the group depends: the field at a node depends on this one, slopes depend on all.
+    moments : ndarray, shape (S, 6, G, 3)
+        Factors of the `TERMS` at the corners in the sums of the field, its slope along x and its slope along y.
     """
 
     nodes: IntArray
@@ -211,30 +211,35 @@ class PointSum:
     moments: FloatArray
 
     @classmethod
-    def over(cls, places: Places, factors: FloatArray) -> Self:
+    def over(cls, places: Places, factors: FloatArray, *, slopes: bool = False) -> Self:
         """Sum over places, one at least inside, with factors (P,)."""
         nodes, near = places.nearby()
-        inside, needed = near.inside, np.abs(near.barycentric) > _ROUNDING
+        inside, needed = near.inside, slopes | (np.abs(near.barycentric) > _ROUNDING)
         _, first, group, count = np.unique(
             8 * near.element[inside] + needed[inside] @ (1, 2, 4),
             return_index=True,
             return_inverse=True,
             return_counts=True,
         )
-        sums = sp.csr_matrix((factors[inside], (group.ravel(), np.flatnonzero(inside))), shape=(len(first), len(inside)))
+        sums = sp.csr_matrix(
+            (factors[inside], (group.ravel(), np.flatnonzero(inside))), shape=(len(first), len(inside))
+        )
         chosen = np.flatnonzero(inside)[first]
         return cls(
             nodes=nodes,
             part=near.mesh,
             inside=float(inside.mean()),
             count=count / count.sum(),
-            corners=near.mesh.elements[near.element[chosen]],
+            corners=near.mesh.elements[near.element[chosen]].astype(np.int64),
             needed=needed[chosen],
-            moments=np.array([[sums @ factor for factor in near.factors(axis)] for axis in (None, 0, 1)]),
+            moments=np.array(
+                [[sums @ one for one in near.factors(axis)] for axis in ((None, 0, 1) if slopes else (None,))]
+            )
+            * needed[chosen],
         )
 
     def weights(self, has_data: BoolArray) -> tuple[FloatArray, float]:
-        """Compute the weights of the nodes in field, slope along x and slope along y, over the points that are measured.
+        """Compute the weights of the nodes in the S sums, over the points that are measured.
 
         Parameters
         ----------
@@ -243,12 +248,12 @@ class PointSum:
 
         Returns
         -------
-        weights : ndarray, shape (3, m)
+        weights : ndarray, shape (S, m)
         measured
             Fraction of the points inside that have data.
         """
         measured = (has_data[self.corners] | ~self.needed).all(axis=1)
-        node, weights = self.corners[measured].ravel(), np.zeros((3, len(has_data)))
+        node, weights = self.corners[measured].ravel(), np.zeros((len(self.moments), len(has_data)))
         fits = _fits(self.part, has_data.tobytes())
         for fit, sums in zip(fits, self.moments[:, :, measured].swapaxes(0, 1), strict=True):
             each = [np.bincount(node, weights=one.ravel(), minlength=len(has_data)) for one in sums]

@@ -139,7 +139,7 @@ class Mean:
         return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], note)
 
     def weights(self, has_data: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Compute the weights of the nodes in the mean and in those of the slopes along x and y, in every frame.
+        """Compute the weights of the nodes in the mean, and for an area in those of the slopes, in every frame.
 
         Parameters
         ----------
@@ -148,13 +148,14 @@ class Mean:
 
         Returns
         -------
-        weights : ndarray, shape (T, 3, m)
-            NaN where too few points are measured.
+        weights : ndarray, shape (T, S, m)
+            Of the S sums of `PointSum`; NaN where too few points are measured.
         measured : ndarray, shape (T,)
             Fraction of the points in the region that are measured; 1 where they are too few.
         """
         patterns, frame = np.unique(has_data, axis=0, return_inverse=True)
-        weights, measured = np.full((len(patterns), 3, has_data.shape[1]), np.nan), np.ones(len(patterns))
+        shape = len(patterns), len(self.sum.moments), has_data.shape[1]
+        weights, measured = np.full(shape, np.nan), np.ones(len(patterns))
         for row, pattern in enumerate(patterns):
             sums, fraction = self.sum.weights(pattern)
             if fraction >= self.least - _CONSTANTS.rounding:
@@ -340,7 +341,7 @@ class Area(Mean):
         places = Places.of(covariance.mesh, points)
         if places.inside.mean() < _CONSTANTS.least:
             raise InputError(f"half or more of {name} is outside {places.where}")
-        area = PointSum.over(places, places.inside / places.inside.sum())
+        area = PointSum.over(places, places.inside / places.inside.sum(), slopes=True)
         super().__init__(name=name, sum=area, correlation=covariance.part(area.nodes), least=_CONSTANTS.least)
         self.measure = measure
 

@@ -103,7 +103,7 @@ maximum."""
 class ProfileLine:
     """Points .38 elements apart along a line in a mesh, at which nodal fields are read.
 
-    A value is that of the field between the nodes (`Places`); its uncertainty follows from the correlation of the nodes'
+    A value is that of the field between the nodes (`Places`); its uncertainty follows from the correlation of their
     errors.
 
     Parameters
@@ -159,7 +159,7 @@ class ProfileLine:
         arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ (points[-1] - points[0]) / length
         lopsided = np.abs(np.bincount(gauges.rows, weights=gauges.fractions * arm, minlength=len(mesh.nodes)) / count)
         at_corners = lopsided[mesh.elements[places.element]]
-        self.even = (at_corners < _CONSTANTS.lopsided * mesh.size).all(axis=1)
+        self.even = np.asarray((at_corners < _CONSTANTS.lopsided * mesh.size).all(axis=1))
 
     def read(self, values: FloatArray, std: FloatArray, kind: str = "") -> tuple[FloatArray, FloatArray]:
         """Interpolate a nodal field (N,) and its standard uncertainty at the points, each (P,).
@@ -178,7 +178,7 @@ class ProfileLine:
         """
         values, std = values[self.nodes], std[self.nodes]
         weights = _weights(self, np.isfinite(values).tobytes())
-        parts = np.nan_to_num(weights) * std
+        parts = np.nan_to_num(weights) * np.where(np.isfinite(values), std, 0)
         spread = np.einsum("pn,nm,pm->p", parts, self.correlations[kind], parts, optimize=True)
         found = weights @ np.nan_to_num(values)
         return found, np.where(np.isfinite(found), np.sqrt(np.maximum(spread, 0)), np.nan)

@@ -288,7 +288,9 @@ class ShownFields:
         """
         name, values = _measured(field), self.values(field.name)
         if field.stepped:
-            return float(values.values[mean.nodes[mean.sum.weights(np.ones(len(mean.nodes), dtype=bool))[0][0].argmax()]]), math.nan
+            return float(
+                values.values[mean.nodes[mean.sum.weights(np.ones(len(mean.nodes), dtype=bool))[0][0].argmax()]]
+            ), math.nan
         exact = name in ("u", "v")
         read = self.displacement["uv".index(name) :: 2] if exact else np.stack([values.values, values.std])
         of_nodes, stds = read[:, None, mean.nodes]
