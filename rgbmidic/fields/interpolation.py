@@ -131,25 +131,20 @@ class Places:
         missing = (np.abs(self.barycentric) * ~has_data[self.mesh.elements[self.element]]).sum(axis=1)
         return np.asarray(self.inside & (missing <= _ROUNDING))
 
-    def weights(self, has_data: BoolArray, sums: FloatArray | None = None, axis: int | None = None) -> sp.csr_matrix:
-        """Compute the weight of every node in the field at the points, or in its slope, or in sums of either.
+    def weights(self, has_data: BoolArray) -> sp.csr_matrix:
+        """Compute the weight (P, N) of every node in the field at the points.
 
         Parameters
         ----------
         has_data : ndarray, shape (N,), bool
-            Nodes that have data; the weights of the others are 0, and mean nothing where `measured` is false.
-        sums : ndarray, shape (S, P), optional
-            Factors of the points in each sum; None: the points themselves.
-        axis
-            0 or 1: the slope along x or y, per px; None: the field.
+            Nodes that have data; the weights of the others are 0. A point that is not `measured` has no meaning.
 
         Returns
         -------
-        csr_matrix, shape (P, N) or (S, N)
+        csr_matrix, shape (P, N)
         """
-        factors = (one if sums is None else sp.csr_matrix(sums) @ one for one in self._factors(axis))
         fits = _fits(self.mesh, has_data.tobytes())
-        return sp.csr_matrix(sum(one @ fit for one, fit in zip(factors, fits, strict=True)))
+        return sp.csr_matrix(sum(one @ fit for one, fit in zip(self._matrices(), fits, strict=True)))
 
     def read(self, values: FloatArray) -> FloatArray:
         """Evaluate nodal fields at the points.
@@ -165,20 +160,105 @@ class Places:
             NaN outside the mesh and beside nodes without data.
         """
         valid = np.isfinite(values)
-        has_data = valid.reshape(len(values), -1).all(axis=1)
+        has_data = np.asarray(valid.reshape(len(values), -1).all(axis=1))
         terms = (fit @ np.where(valid, values, 0) for fit in _fits(self.mesh, has_data.tobytes()))
-        field = np.asarray(sum(one @ term for one, term in zip(self._factors(), terms, strict=True)))
+        field = np.asarray(sum(one @ term for one, term in zip(self._matrices(), terms, strict=True)))
         field[~self.measured(has_data)] = np.nan
         return field
 
-    def _factors(self, axis: int | None = None) -> Iterator[sp.csr_matrix]:
-        """Matrices (P, N) that weight each of the `TERMS` of the nodes' quadratics, or their slopes along an axis."""
-        node, first = self.mesh.elements[self.element], np.arange(0, self.barycentric.size + 1, 3)
-        x, y = np.moveaxis(self.points[:, None] - self.mesh.nodes[node], 2, 0)
+    def _matrices(self) -> Iterator[sp.csr_matrix]:
+        """Weigh each of the `TERMS` of the nodes' quadratics (N,) at the points: (P, N)."""
+        node, first = self.mesh.elements[self.element].ravel(), np.arange(0, self.barycentric.size + 1, 3)
+        for factor in self.factors():
+            yield sp.csr_matrix((factor.ravel(), node, first), shape=(len(self.points), len(self.mesh.nodes)))
+
+    def factors(self, axis: int | None = None) -> Iterator[FloatArray]:
+        """Yield the factors (P, 3) of each of the `TERMS` at the corners, in the field or its slope along an axis."""
+        x, y = np.moveaxis(self.points[:, None] - self.mesh.nodes[self.mesh.elements[self.element]], 2, 0)
         slope = 0 if axis is None else self.mesh.shape_gradients()[self.element, :, axis]
         for power, *slopes in ((1, 0, 0), (x, 1, 0), (y, 0, 1), (x * x / 2, x, 0), (x * y, y, x), (y * y / 2, 0, y)):
-            factor = self.barycentric * power if axis is None else slope * power + self.barycentric * slopes[axis]
-            yield sp.csr_matrix((factor.ravel(), node.ravel(), first), shape=(len(first) - 1, len(self.mesh.nodes)))
+            yield self.barycentric * power if axis is None else slope * power + self.barycentric * slopes[axis]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PointSum:
+    """A weighted sum of the field over points of a mesh, and where asked the same of its slopes along x and y.
+
+    Attributes
+    ----------
+    nodes : ndarray, shape (m,), int
+        Nodes of the mesh on which it depends.
+    part
+        The mesh of these alone.
+    inside
+        Fraction of the points that lie in the mesh: the others take no part.
+    count : ndarray, shape (G,)
+        Fraction of the latter in each group: those of an element that depend on the same of its corners.
+    corners : ndarray, shape (G, 3), int
+        These, in `part`.
+    needed : ndarray, shape (G, 3), bool
+        Those on which the group depends: the field at a node depends on this one, slopes depend on all.
+    moments : ndarray, shape (S, 6, G, 3)
+        Factors of the `TERMS` at the corners in the sums of the field, its slope along x and its slope along y.
+    """
+
+    nodes: IntArray
+    part: Tri3Mesh
+    inside: float
+    count: FloatArray
+    corners: IntArray
+    needed: BoolArray
+    moments: FloatArray
+
+    @classmethod
+    def over(cls, places: Places, factors: FloatArray, *, slopes: bool = False) -> Self:
+        """Sum over places, one at least inside, with factors (P,)."""
+        nodes, near = places.nearby()
+        inside, needed = near.inside, slopes | (np.abs(near.barycentric) > _ROUNDING)
+        _, first, group, count = np.unique(
+            8 * near.element[inside] + needed[inside] @ (1, 2, 4),
+            return_index=True,
+            return_inverse=True,
+            return_counts=True,
+        )
+        sums = sp.csr_matrix(
+            (factors[inside], (group.ravel(), np.flatnonzero(inside))), shape=(len(first), len(inside))
+        )
+        chosen = np.flatnonzero(inside)[first]
+        return cls(
+            nodes=nodes,
+            part=near.mesh,
+            inside=float(inside.mean()),
+            count=count / count.sum(),
+            corners=near.mesh.elements[near.element[chosen]].astype(np.int64),
+            needed=needed[chosen],
+            moments=np.array(
+                [[sums @ one for one in near.factors(axis)] for axis in ((None, 0, 1) if slopes else (None,))]
+            )
+            * needed[chosen],
+        )
+
+    def weights(self, has_data: BoolArray) -> tuple[FloatArray, float]:
+        """Compute the weights of the nodes in the S sums, over the points that are measured.
+
+        Parameters
+        ----------
+        has_data : ndarray, shape (m,), bool
+            Nodes that have data.
+
+        Returns
+        -------
+        weights : ndarray, shape (S, m)
+        measured
+            Fraction of the points inside that have data.
+        """
+        measured = (has_data[self.corners] | ~self.needed).all(axis=1)
+        node, weights = self.corners[measured].ravel(), np.zeros((len(self.moments), len(has_data)))
+        fits = _fits(self.part, has_data.tobytes())
+        for fit, sums in zip(fits, self.moments[:, :, measured].swapaxes(0, 1), strict=True):
+            each = [np.bincount(node, weights=one.ravel(), minlength=len(has_data)) for one in sums]
+            weights += np.asarray(each) @ fit
+        return weights, float(self.count[measured].sum())
 
 
 @lru_cache(maxsize=4)  # a few meshes, as a rule with data at all nodes: 8 MB each for 8,000 of them

@@ -19,7 +19,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.crack_tip import CrackTip, Williams
 from rgbmidic.fields.cracks import JumpAlong
 from rgbmidic.fields.history import History, Nodal, Probe, histories_of
-from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.interpolation import Places, PointSum
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
@@ -59,12 +59,10 @@ class Mean:
 
     Attributes
     ----------
-    name, nodes
+    name
         See `Probe`.
-    places
-        Points that stand for the place, in the mesh of the `nodes`.
-    factors : ndarray, shape (P,)
-        Of the points in the mean.
+    sum
+        Over points that stand for the place.
     covariance
         Of the nodes' errors.
     least
@@ -72,9 +70,7 @@ class Mean:
     """
 
     name: str
-    nodes: IntArray
-    places: Places
-    factors: FloatArray
+    sum: PointSum
     covariance: NodalCovariance
     least: float = 1.0
 
@@ -114,16 +110,13 @@ class Mean:
         places = Places.of(covariance.mesh, points)
         places.check(name)
         equal = np.full(len(places.points), 1 / len(places.points))
-        amounts = equal if factors is None else np.asarray(factors, dtype=np.float64)
-        nodes, places = places.nearby()
-        part = covariance.part(nodes)
-        return cls(name=name, nodes=nodes, places=places, factors=amounts, covariance=part, least=least)
+        points_sum = PointSum.over(places, equal if factors is None else np.asarray(factors, dtype=np.float64))
+        return cls(name=name, sum=points_sum, covariance=covariance.part(points_sum.nodes), least=least)
 
     @property
-    def nearest(self) -> int:
-        """Node of the mesh that is nearest to the first of the points."""
-        nodes = self.places.mesh.nodes - self.places.points[0]
-        return int(self.nodes[np.hypot(*nodes.T).argmin()])
+    def nodes(self) -> IntArray:
+        """See `Probe`."""
+        return self.sum.nodes
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px.
@@ -137,36 +130,37 @@ class Mean:
         -------
         list of History
         """
-        weights, used = self.weights(_known(nodal))
-        u, v = (self.average(weights, *component) for component in nodal.components)
-        return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], _cut(self.name, "mean", used))
+        weights, measured = self.weights(_known(nodal))
+        return self._moved(nodal, weights[:, 0], measured)
 
-    def weights(self, has_data: BoolArray, axis: int | None = None) -> tuple[FloatArray, FloatArray]:
-        """Compute the weight of every node in the mean, or in that of the slope along an axis, in every frame.
+    def _moved(self, nodal: Nodal, weights: FloatArray, measured: FloatArray) -> list[History]:
+        u, v = (self.average(weights, *component) for component in nodal.components)
+        note = _cut(self.name, "mean", self.sum.inside * measured)
+        return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], note)
+
+    def weights(self, has_data: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Compute the weights of the nodes in the mean, and for an area in those of the slopes, in every frame.
 
         Parameters
         ----------
         has_data : ndarray, shape (T, m), bool
             Nodes that have data.
-        axis
-            0 or 1: the slope along x or y; None: the field.
 
         Returns
         -------
-        weights : ndarray, shape (T, m)
-            NaN where too few points are measured.
-        used : ndarray, shape (T,)
-            Fraction of the place that is measured; 1 where it is too little.
+        weights : ndarray, shape (T, S, m)
+            Of the S sums of `PointSum`; NaN where too few points are measured.
+        measured : ndarray, shape (T,)
+            Fraction of the points in the region that are measured; 1 where they are too few.
         """
         patterns, frame = np.unique(has_data, axis=0, return_inverse=True)
-        weights, used = np.full(patterns.shape, np.nan), np.ones(len(patterns))
+        shape = len(patterns), len(self.sum.moments), has_data.shape[1]
+        weights, measured = np.full(shape, np.nan), np.ones(len(patterns))
         for row, pattern in enumerate(patterns):
-            measured = self.places.measured(pattern)
-            fraction = measured.sum() / self.places.inside.sum()
+            sums, fraction = self.sum.weights(pattern)
             if fraction >= self.least - _CONSTANTS.rounding:
-                sums = (self.factors * measured / fraction)[None]
-                weights[row], used[row] = self.places.weights(pattern, sums, axis).toarray()[0], measured.mean()
-        return weights[frame.ravel()], used[frame.ravel()]
+                weights[row], measured[row] = sums / fraction, fraction
+        return weights[frame.ravel()], measured[frame.ravel()]
 
     def average(
         self, weights: FloatArray, values: FloatArray, std: FloatArray, bias: FloatArray | None = None
@@ -261,7 +255,7 @@ class Gauge:
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute the extension in px and the strain from the displacements of its `nodes` in every frame."""
-        length, (weights, _) = float(np.hypot(*self.arm)), self._apart.weights(_known(nodal))
+        length, weights = float(np.hypot(*self.arm)), self._apart.weights(_known(nodal))[0][:, 0]
         apart, spread = np.stack([self._apart.average(weights, *one) for one in nodal.components], axis=2)
         now = self.arm + apart if self.moving else np.broadcast_to(self.arm, apart.shape)
         towards = now / np.hypot(*now.T)[:, None]
@@ -357,10 +351,8 @@ class Area(Mean):
         places = Places.of(covariance.mesh, points)
         if places.inside.mean() < _CONSTANTS.least:
             raise InputError(f"half or more of {name} is outside {places.where}")
-        nodes, places = places.nearby()
-        equal = places.inside / places.inside.sum()
-        part, least = covariance.part(nodes), _CONSTANTS.least
-        super().__init__(name=name, nodes=nodes, places=places, factors=equal, covariance=part, least=least)
+        area = PointSum.over(places, places.inside / places.inside.sum(), slopes=True)
+        super().__init__(name=name, sum=area, covariance=covariance.part(area.nodes), least=_CONSTANTS.least)
         self.measure = measure
 
     def histories(self, nodal: Nodal) -> list[History]:
@@ -375,9 +367,9 @@ class Area(Mean):
         -------
         list of History
         """
-        moved, known = super().histories(nodal), _known(nodal)
-        slopes = np.stack([self.weights(known, axis)[0] for axis in (0, 1)], axis=1)
-        strain = _strain(slopes, nodal, self.covariance, self.measure)
+        weights, measured = self.weights(_known(nodal))
+        moved = self._moved(nodal, weights[:, 0], measured)
+        strain = _strain(weights[:, 1:], nodal, self.covariance, self.measure)
         return [*moved, *_strain_histories(self.name, strain, moved[0].note)]
 
 

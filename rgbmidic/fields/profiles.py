@@ -102,7 +102,7 @@ maximum."""
 class ProfileLine:
     """Points .38 elements apart along a line in a mesh, at which nodal fields are read.
 
-    A value is that of the field between the nodes (`Places`); its uncertainty follows from the correlation of the nodes'
+    A value is that of the field between the nodes (`Places`); its uncertainty follows from the correlation of their
     errors.
 
     Parameters
@@ -158,7 +158,7 @@ class ProfileLine:
         arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ (points[-1] - points[0]) / length
         lopsided = np.abs(np.bincount(gauges.rows, weights=gauges.fractions * arm, minlength=len(mesh.nodes)) / count)
         at_corners = lopsided[mesh.elements[places.element]]
-        self.even = (at_corners < _CONSTANTS.lopsided * mesh.size).all(axis=1)
+        self.even = np.asarray((at_corners < _CONSTANTS.lopsided * mesh.size).all(axis=1))
 
     def read(
         self, values: FloatArray, std: FloatArray, kind: str = "", bias: FloatArray | float = 0.0

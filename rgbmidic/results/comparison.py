@@ -334,7 +334,7 @@ class Comparison:
         return places
 
     def _read(self, has_data: BoolArray | None = None) -> tuple[sp.csr_matrix, BoolArray]:
-        """Matrix (M, N) that reads the measurement at the simulation's nodes, and where its nodes (N,) have data (M,)."""
+        """Matrix (M, N) that reads nodes (N,) with data at the simulation's, and which of these it reaches (M,)."""
         valid = np.ones(len(self.mesh.nodes), dtype=bool) if has_data is None else has_data
         if (same := self._own >= 0).any():
             entries = np.ones(same.sum()), (np.flatnonzero(same), self._own[same])
@@ -361,7 +361,7 @@ class Comparison:
 
     def _at_nodes(self, displacement: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Displacement (2, N) and its strain at the simulation's nodes, (5, M), and their noise, (2, 5, M)."""
-        has_data = np.isfinite(displacement + noise[0]).all(axis=0)
+        has_data = np.asarray(np.isfinite(displacement + noise[0]).all(axis=0))
         read, measured = self._read(has_data)
         (values,), own = np.split(np.full((3, len(QUANTITIES), len(measured)), np.nan), [1])
         (gauges, given), bias = self._gauges, noise[1]

@@ -281,7 +281,7 @@ class Levelling:
         points = np.einsum("qc,ecd->eqd", inner, mesh.nodes[mesh.elements])
         places = Places.of(simulated, points.reshape(-1, 2))
         # it is continued linearly by half an element: the outline of a region drawn by hand differs by some px (chosen)
-        depth = places.barycentric.min(axis=1).reshape(points.shape[:2])
+        depth: FloatArray = np.asarray(places.barycentric.min(axis=1)).reshape(points.shape[:2])
         used: BoolArray = np.asarray((depth > -0.5).all(axis=1))
         if not used.any():
             raise InputError("the simulation's mesh covers no element of the measurement's: check where it is placed")
@@ -301,7 +301,7 @@ class Levelling:
         """Displacement (2, N) at the measurement's nodes of a simulated one (M, 2); NaN where that does not reach."""
         moments = self._moments @ np.nan_to_num(displacement)
         unknown: FloatArray = np.asarray(np.isnan(displacement).any(axis=1), dtype=np.float64)
-        lost = (abs(self._moments) @ unknown) > 0
+        lost = np.asarray(abs(self._moments) @ unknown) > 0
         recovered = (self._recovery.value @ self._factors.solve(moments)).T
         return np.where(self._covered & ~lost, recovered, np.nan)
 

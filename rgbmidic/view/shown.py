@@ -288,13 +288,15 @@ class ShownFields:
         """
         name, values = _measured(field), self.values(field.name)
         if field.stepped:
-            return float(values.values[mean.nearest]), math.nan
+            return float(
+                values.values[mean.nodes[mean.sum.weights(np.ones(len(mean.nodes), dtype=bool))[0][0].argmax()]]
+            ), math.nan
         exact = name in ("u", "v")
         read = self.displacement["uv".index(name) :: 2] if exact else np.stack([values.values, values.std])
         of_nodes, stds, *bias = read[:, None, mean.nodes]
         stated = bool(np.isfinite(stds).any())
         weights, _ = mean.weights(np.isfinite(of_nodes + (stds if stated else 0)))
-        pair = mean.average(weights, of_nodes, stds, *bias)
+        pair = mean.average(weights[:, 0], of_nodes, stds, *bias)
         (value,), (std,) = self.maps.physical.units.lengths(*pair) if exact else pair
         if exact and name != field.name:
             return float(std), math.nan
