@@ -164,7 +164,7 @@ def displacements(result: Result, rectified: Rectification, frames: Iterable[int
 
 def _moved(rectified: Rectification, read: Mapping[str, AnyArray]) -> FloatArray:
     moved = np.stack([np.asarray(read[name], np.float64) for name in MOVED])
-    moved[4:] = np.nan_to_num(moved[4:])  # of records that were made without it
+    moved[4:][np.isnan(moved[4:]) & np.isfinite(moved[2:4])] = 0.0  # of records that were made without it
     return np.stack(rectified.displacement(*moved))
 
 

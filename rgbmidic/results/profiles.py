@@ -34,7 +34,7 @@ class Wave:
     """
 
     what: str
-    level: float
+    level: float | str
     arrivals: Arrivals
     front: Front
 
@@ -137,7 +137,7 @@ class Profile:
             return self.field.name[:3]
         return "strain" if self.field.unit in ("", "deg") or "_rate" in self.field.name else ""
 
-    def wave(self, what: str = "front", level: float = 0.5) -> Wave:
+    def wave(self, what: str = "front", level: float | str = "50%") -> Wave:
         """Fit the speed of a front or peak.
 
         Parameters
