@@ -159,8 +159,8 @@ def profile(
         print(f"{wave_text(read, wave)}; arrival times: {arrivals_file(out)}")
         if wave.arrivals.cut.any():
             command.note(
-                f"note: at {wave.arrivals.cut.sum()} of {len(wave.arrivals.cut)} positions the field still rises in the "
-                "last frames: its peak is not known, and they are left out; --level takes a value, too, such as -0.005"
+                f"note: at {wave.arrivals.cut.sum()} of {len(wave.arrivals.cut)} positions the field still rises in "
+                "the last frames: its peak is not known, they are left out; --level takes a value, too, such as -0.005"
             )
         if not wave.front.straight:
             command.note(

@@ -544,8 +544,8 @@ def fit_front(
         raise InputError(
             f"no front: something arrives at {len(there)} of {len(positions)} positions, {len(used)} of them far "
             f"enough apart to be independent; a speed needs {_CONSTANTS.fewest}. A peak counts that exceeds "
-            f"{_CONSTANTS.clear:g} standard uncertainties and lies within the frames; at {arrivals.cut.sum()} positions "
-            "the field still rises in the last of them: take a front at a value in place of a part of the peak"
+            f"{_CONSTANTS.clear:g} standard uncertainties and lies within the frames; at {arrivals.cut.sum()} "
+            "positions the field still rises in the last of them: take a front at a value, not at a part of the peak"
         )
     parts = arrivals.weights[used] * np.nan_to_num(std.T[used])
     own = parts @ parts.T if between_frames is None else parts @ between_frames @ parts.T

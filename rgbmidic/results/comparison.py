@@ -232,7 +232,10 @@ class Comparison:
         gradient = self.simulated_mesh.nodal_gradient(simulated)
         strain = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4))).components
         values, own = self._at_nodes(measured, noise)
-        ways = {"nodes": np.concatenate([simulated.T, strain.T]), "levelled": self._at_nodes(levelled, noise)[0]}
+        ways = {
+            "nodes": np.concatenate([simulated.T, strain.T]),
+            "levelled": self._at_nodes(levelled, noise * [[[1]], [[0]]])[0],
+        }
         common = self.relative_std * values * np.array([1, 1, 0, 0, 0])[:, None]
         std = np.hypot(own[0], common)
         agreement = {}
@@ -351,22 +354,31 @@ class Comparison:
         return gauges, sp.eye(len(inside), format="csr")[:, inside]
 
     @cached_property
-    def _correlations(self) -> list[list[sp.csr_matrix]]:
-        """Correlations (M, M) of each of the `QUANTITIES` between nodes: of the fit's errors, of the lights' bias."""
+    def _correlations(self) -> list[tuple[list[sp.csr_matrix], list[sp.csr_matrix]]]:
+        """Correlations C and K (M, M) between nodes of each of the `QUANTITIES`: of fit and lights' bias.
+
+        With them their products C C, 2 C K and K K, entry by entry.
+        """
         read, (gauges, given) = self._read()[0], self._gauges
         x, y = (given @ slope for slope in gauges.slopes)
-        parts = [self.covariance.relative(matrices) for matrices in ([read], [x], [y], [x, y])]
-        moved, *strains = ([sp.csr_matrix(root @ root.T) for root in (one.fit, one.bias)] for one in parts)
-        return [moved, moved, *strains]
+        found = []
+        for matrices in ([read], [x], [y], [x, y]):
+            relative = self.covariance.relative(matrices)
+            fit, bias = (sp.csr_matrix(root @ root.T) for root in (relative.fit, relative.bias))
+            products = [sp.csr_matrix(one) for one in (fit.multiply(fit), 2 * fit.multiply(bias), bias.multiply(bias))]
+            found.append(([fit, bias], products))
+        return [found[0], *found]
 
     def _at_nodes(self, displacement: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Displacement (2, N) and its strain at the simulation's nodes, (5, M), and their noise, (2, 5, M)."""
         has_data = np.asarray(np.isfinite(displacement + noise[0]).all(axis=0))
         read, measured = self._read(has_data)
-        (values,), own = np.split(np.full((3, len(QUANTITIES), len(measured)), np.nan), [1])
+        values, *own = np.full((3, len(QUANTITIES), len(measured)), np.nan)
         (gauges, given), bias = self._gauges, noise[1]
         node, gauge = given.nonzero()
-        for std, stds in zip(own, (noise, np.stack([bias, bias])), strict=True):
+        cases = [(own[0], noise), (own[1], np.stack([bias, bias]))]
+        own[1][:] = 0.0
+        for std, stds in cases if (bias > 0).any() else cases[:1]:
             for row, (part, *errors) in enumerate(zip(displacement, *stds, strict=True)):
                 factor = read @ self.covariance.factor(*np.where(has_data, errors, 0))
                 values[row] = np.where(measured, read @ np.where(has_data, part, 0), np.nan)
@@ -374,7 +386,7 @@ class Comparison:
                 std[row] = np.where(measured, np.sqrt(variance), np.nan)
             strain = gauges.strain(*displacement, *stds[0], *stds[1])
             values[2:, node], std[2:, node] = strain.components[gauge].T, strain.components_std[gauge].T
-        return values, own
+        return values, np.stack(own)
 
     def _agreement(
         self, rows: list[int], difference: FloatArray, own: FloatArray, common: FloatArray, taken: float
@@ -392,10 +404,12 @@ class Comparison:
             return Agreement(values=0)
         ratio, noise, bias, shared = (np.where(known, part / scale, 0) for part in (difference, *own, common))
         square = float((shared**2).sum()) ** 2
-        for row, *stds, b in zip(rows, np.sqrt(np.maximum(noise**2 - bias**2, 0)), bias, shared, strict=True):
-            parts = zip(map(sp.diags, stds), self._correlations[row], strict=True)
-            whole = sp.csr_matrix(sum(scaled @ correlation @ scaled for scaled, correlation in parts))
-            square += float(whole.multiply(whole).sum() + 2 * b @ whole @ b)
+        fit = np.sqrt(np.maximum(noise**2 - bias**2, 0))
+        for row, n, m, s in zip(rows, fit, bias, shared, strict=True):
+            correlations, products = self._correlations[row]
+            pairs = [(n * n, products[0]), (n * m, products[1]), (m * m, products[2])]
+            pairs += [(2**0.5 * s * std, one) for std, one in zip((n, m), correlations, strict=True)]
+            square += sum(float(std @ one @ std) for std, one in pairs)
         chi_square, freedom = float((ratio**2).sum() / (count - taken)), count**2 / square
         return Agreement(
             values=count,
