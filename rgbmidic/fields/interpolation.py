@@ -84,6 +84,36 @@ class Places:
         inside = barycentric.min(axis=1) >= -_ROUNDING
         return cls(mesh=mesh, points=points, inside=inside, element=element, barycentric=barycentric)
 
+    @classmethod
+    def parts(cls, mesh: Tri3Mesh, along: int) -> tuple[Self, npt.NDArray[np.int32]]:
+        """Divide each element, for pictures of the field that are linear in the parts.
+
+        Parameters
+        ----------
+        mesh
+            E elements.
+        along
+            Parts of a side.
+
+        Returns
+        -------
+        places : Places
+            Corners of the parts, those of each element apart.
+        parts : ndarray, shape (E along^2, 3), int32
+            Indices of the corners of each part.
+        """
+        steps = [(i, j) for i in range(along + 1) for j in range(along + 1 - i)]
+        index = {step: number for number, step in enumerate(steps)}
+        up = [((i, j), (i + 1, j), (i, j + 1)) for i, j in steps if i + j < along]
+        down = [((i + 1, j), (i + 1, j + 1), (i, j + 1)) for i, j in steps if i + j < along - 1]
+        parts = np.array([[index[corner] for corner in part] for part in up + down])
+        second, third = np.array(steps).T / along
+        shape = np.stack([1 - second - third, second, third], axis=1)
+        points = np.einsum("sc,ecd->esd", shape, mesh.nodes[mesh.elements]).reshape(-1, 2)
+        element = np.arange(len(mesh.elements))
+        corners = (len(steps) * element[:, None, None] + parts).reshape(-1, 3)
+        return cls.within(mesh, points, np.repeat(element, len(steps))), corners.astype(np.int32)
+
     def check(self, what: str) -> None:
         """Refuse points outside the mesh.
 

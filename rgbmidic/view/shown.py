@@ -152,15 +152,17 @@ class ShownFields:
         """Return a field as it is painted; palette, range by hand and number of colours are those of the first."""
         view, field, values, first = self.view, self.maps.all[name], self.values(name), name == self.view.field
         suits = palette_name(field, symmetric=view.symmetric)
+        painted, elements = self.maps.drawn(field, np.column_stack([self.nodes, values.values]))
+        beyond = (np.abs(values.values) - 2 * values.std)[:, None]
         return Overlay(
-            nodes=self.nodes,
-            elements=self.result.elements,
-            values=values.values,
+            nodes=painted[:, :2],
+            elements=elements,
+            values=np.ascontiguousarray(painted[:, 2]),
             ends=self.ends(name, by_hand=first),
             colours=palette((first and not field.codes and view.palette) or suits, view.levels),
             opacity=view.opacity,
             stepped=field.stepped,
-            beyond=np.abs(values.values) - 2 * values.std if view.hatched else None,
+            beyond=self.maps.drawn(field, beyond)[0][:, 0] if view.hatched else None,
         )
 
     @property
