@@ -197,6 +197,11 @@ class Places:
         field[~self.measured(has_data)] = np.nan
         return field
 
+    def linear(self, values: FloatArray) -> FloatArray:
+        """Interpolate nodal values (N,) linearly, within those of each element's nodes; as `read`, (P,)."""
+        field = np.einsum("pc,pc->p", self.barycentric, values[self.mesh.elements[self.element]])
+        return np.where(self.inside, field, np.nan)
+
     def _matrices(self) -> Iterator[sp.csr_matrix]:
         """Weigh values and slopes at the nodes (N,) in the field at the points: (P, N) each."""
         node, first = self.mesh.elements[self.element].ravel(), np.arange(0, self.barycentric.size + 1, 3)
@@ -273,13 +278,15 @@ class PointSum:
             * needed[chosen],
         )
 
-    def weights(self, has_data: BoolArray) -> tuple[FloatArray, float]:
+    def weights(self, has_data: BoolArray, *, linear: bool = False) -> tuple[FloatArray, float]:
         """Compute the weights of the nodes in the S sums, over the points that are measured.
 
         Parameters
         ----------
         has_data : ndarray, shape (m,), bool
             Nodes that have data.
+        linear
+            Whether the field is linear in each element, within the values of its nodes.
 
         Returns
         -------
@@ -289,8 +296,8 @@ class PointSum:
         """
         measured = (has_data[self.corners] | ~self.needed).all(axis=1)
         node, weights = self.corners[measured].ravel(), np.zeros((len(self.moments), len(has_data)))
-        fits = _fits(self.part, has_data.tobytes())
-        for fit, sums in zip(fits, self.moments[:, :, measured].swapaxes(0, 1), strict=True):
+        fits = _fits(self.part, has_data.tobytes())[: 1 if linear else None]
+        for fit, sums in zip(fits, self.moments[:, :, measured].swapaxes(0, 1), strict=False):
             each = [np.bincount(node, weights=one.ravel(), minlength=len(has_data)) for one in sums]
             weights += np.asarray(each) @ fit
         return weights, float(self.count[measured].sum())

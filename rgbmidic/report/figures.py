@@ -243,9 +243,15 @@ class MapDrawer:
                 self._show(axis, values, norm, field)
                 axis.set_title(style.literal(field.label))
                 if hatched and np.isfinite(uncertainty).any():
-                    doubtful = self._raster(np.abs(values) - 2 * uncertainty)
+                    doubtful = self._places.linear(np.abs(values) - 2 * uncertainty)
                     with np.errstate(invalid="ignore"):
-                        axis.contourf(*self._grid, doubtful, levels=[-np.inf, 0], hatches=["////"], colors="none")
+                        axis.contourf(
+                            *self._grid,
+                            doubtful.reshape(self._grid[0].shape),
+                            levels=[-np.inf, 0],
+                            hatches=["////"],
+                            colors="none",
+                        )
         return figure
 
     def fractions(self, frame: int) -> Figure:
@@ -388,15 +394,16 @@ class MapDrawer:
             style.freeze_axes(figure, self._dpi)
         return figure
 
-    def _raster(self, values: FloatArray, *, stepped: bool = False) -> FloatArray:
+    def _raster(self, values: FloatArray, field: Quantity) -> FloatArray:
         """Evaluate a nodal field between the nodes; NaN where one of those around has no data.
 
         Where values between nodes mean nothing it is that of the nearest one.
         """
         from scipy.spatial import cKDTree
 
-        picture = self._places.read(values).reshape(self._grid[0].shape)
-        if stepped:
+        read = self._places.read if field.signed else self._places.linear
+        picture = read(values).reshape(self._grid[0].shape)
+        if field.stepped:
             picture = np.where(np.isfinite(picture), values[cKDTree(self.result.nodes).query(self._points)[1]], np.nan)
         return np.asarray(picture)
 
@@ -413,7 +420,7 @@ class MapDrawer:
             return
         codes = len(field.codes)
         colours = ListedColormap(style.STATUS_COLOURS[:codes]) if codes else field_colours(field)
-        picture = self._raster(values, stepped=field.stepped)
+        picture = self._raster(values, field)
         axis.imshow(picture, extent=self._extent, cmap=colours, norm=norm, interpolation="nearest")
         if bar:
             style.add_colour_bar(axis, norm, colours, shown=known, names=field.codes)

@@ -314,9 +314,9 @@ class Maps(Portable):
     def drawn(self, field: Quantity, values: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
         """Return nodal values (N, C) of a field as pictures draw them, linear in triangles, and the triangles (F, 3).
 
-        They are parts of the elements, or the elements where values between the nodes mean nothing.
+        They are parts of the elements, or the elements of what has no sign: it stays within the values of its nodes.
         """
-        if field.stepped:
+        if not field.signed:
             return values, self.result.elements
         places, parts = self._parts
         return places.read(values), parts

@@ -290,14 +290,14 @@ class ShownFields:
         """
         name, values = _measured(field), self.values(field.name)
         if field.stepped:
-            return float(
-                values.values[mean.nodes[mean.sum.weights(np.ones(len(mean.nodes), dtype=bool))[0][0].argmax()]]
-            ), math.nan
+            nearest = mean.sum.weights(np.ones(len(mean.nodes), dtype=bool), linear=True)[0][0].argmax()
+            return float(values.values[mean.nodes[nearest]]), math.nan
         exact = name in ("u", "v")
         read = self.displacement["uv".index(name) :: 2] if exact else np.stack([values.values, values.std])
         of_nodes, stds = read[:, None, mean.nodes]
         stated = bool(np.isfinite(stds).any())
-        weights, _ = mean.weights(np.isfinite(of_nodes + (stds if stated else 0)))
+        has_data = np.isfinite(of_nodes + (stds if stated else 0))
+        weights, _ = mean.weights(has_data, linear=not (exact or field.signed))
         pair = mean.average(of_nodes, stds, weights[:, 0], alike=not exact)
         (value,), (std,) = self.maps.physical.units.lengths(*pair) if exact else pair
         if exact and name != field.name:
