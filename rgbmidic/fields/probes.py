@@ -138,13 +138,15 @@ class Mean:
         note = _cut(self.name, "mean", self.sum.inside * measured)
         return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], note)
 
-    def weights(self, has_data: BoolArray) -> tuple[FloatArray, FloatArray]:
+    def weights(self, has_data: BoolArray, *, linear: bool = False) -> tuple[FloatArray, FloatArray]:
         """Compute the weights of the nodes in the mean, and for an area in those of the slopes, in every frame.
 
         Parameters
         ----------
         has_data : ndarray, shape (T, m), bool
             Nodes that have data.
+        linear
+            As of `PointSum.weights`.
 
         Returns
         -------
@@ -157,7 +159,7 @@ class Mean:
         shape = len(patterns), len(self.sum.moments), has_data.shape[1]
         weights, measured = np.full(shape, np.nan), np.ones(len(patterns))
         for row, pattern in enumerate(patterns):
-            sums, fraction = self.sum.weights(pattern)
+            sums, fraction = self.sum.weights(pattern, linear=linear)
             if fraction >= self.least - _CONSTANTS.rounding:
                 weights[row], measured[row] = sums / fraction, fraction
         return weights[frame.ravel()], measured[frame.ravel()]

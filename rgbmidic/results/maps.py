@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields.history import FEWEST, rate_frames, rate_words, rates
+from rgbmidic.fields.interpolation import Places
 from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
 from rgbmidic.fields.units import Units
@@ -31,6 +32,9 @@ WINDOW = 9
 of a displacement per frame, and a change within 4 frames is still seen."""
 _AROUND = 2
 """Windows of frames that are read at once, and on either side of these: the widest fit takes in 5/3 of a window."""
+_PARTS = 80_000
+"""Parts of the elements in a picture, each side in 4 at most: what a picture leaves out that is linear in the elements
+is then a sixteenth."""
 _AT_ONCE = 4096
 """Nodes whose rates are computed at once: 25 MB of results at the default window."""
 
@@ -310,6 +314,25 @@ class Maps(Portable):
         moved = self._since(frame)
         motion = self._rigid(moved)
         return moved if motion is None else motion.removed(self._covariance.mesh.nodes, moved)
+
+    def drawn(self, field: Quantity, values: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
+        """Return nodal values (N, C) of a field as pictures draw them, linear in triangles, and the triangles (F, 3).
+
+        They are parts of the elements, or the elements of what has no sign: it stays within the values of its nodes.
+        """
+        if not field.signed:
+            return values, self.result.elements
+        places, parts = self._parts
+        return places.read(values), parts
+
+    @cached_property
+    def _parts(self) -> tuple[Places, npt.NDArray[np.int32]]:
+        mesh = self.physical.mesh
+        return Places.parts(mesh, int(np.clip((_PARTS / len(mesh.elements)) ** 0.5, 1, 4)))
+
+    def places(self, points: FloatArray, element: IntArray) -> Places:
+        """Return points (P, 2) of the image, px, of which the elements (P,) are known, to read nodal values there."""
+        return Places.within(Tri3Mesh(nodes=self.result.nodes, elements=self.result.elements), points, element)
 
     def strain_at(self, frame: int, x: float, y: float, length: float) -> dict[str, FloatArray]:
         """Compute the strain of one virtual gauge at a place of the image, px; each quantity, (1,), by its name.

@@ -152,15 +152,17 @@ class ShownFields:
         """Return a field as it is painted; palette, range by hand and number of colours are those of the first."""
         view, field, values, first = self.view, self.maps.all[name], self.values(name), name == self.view.field
         suits = palette_name(field, symmetric=view.symmetric)
+        painted, elements = self.maps.drawn(field, np.column_stack([self.nodes, values.values]))
+        beyond = (np.abs(values.values) - 2 * values.std)[:, None]
         return Overlay(
-            nodes=self.nodes,
-            elements=self.result.elements,
-            values=values.values,
+            nodes=painted[:, :2],
+            elements=elements,
+            values=np.ascontiguousarray(painted[:, 2]),
             ends=self.ends(name, by_hand=first),
             colours=palette((first and not field.codes and view.palette) or suits, view.levels),
             opacity=view.opacity,
             stepped=field.stepped,
-            beyond=np.abs(values.values) - 2 * values.std if view.hatched else None,
+            beyond=self.maps.drawn(field, beyond)[0][:, 0] if view.hatched else None,
         )
 
     @property
@@ -288,14 +290,14 @@ class ShownFields:
         """
         name, values = _measured(field), self.values(field.name)
         if field.stepped:
-            return float(
-                values.values[mean.nodes[mean.sum.weights(np.ones(len(mean.nodes), dtype=bool))[0][0].argmax()]]
-            ), math.nan
+            nearest = mean.sum.weights(np.ones(len(mean.nodes), dtype=bool), linear=True)[0][0].argmax()
+            return float(values.values[mean.nodes[nearest]]), math.nan
         exact = name in ("u", "v")
         read = self.displacement["uv".index(name) :: 2] if exact else np.stack([values.values, values.std])
         of_nodes, stds, *bias = read[:, None, mean.nodes]
         stated = bool(np.isfinite(stds).any())
-        weights, _ = mean.weights(np.isfinite(of_nodes + (stds if stated else 0)))
+        has_data = np.isfinite(of_nodes + (stds if stated else 0))
+        weights, _ = mean.weights(has_data, linear=not (exact or field.signed))
         pair = mean.average(weights[:, 0], of_nodes, stds, *bias)
         (value,), (std,) = self.maps.physical.units.lengths(*pair) if exact else pair
         if exact and name != field.name:
