@@ -3,7 +3,8 @@
 The solve is a least-squares fit of linear elements, whose covariance is the inverse of a Hessian: for a texture that is
 alike everywhere the inverse of the mesh's mass matrix. The displacement at a node is then that of a quadratic through
 the nodes around it, a linear function of theirs. Where the texture, the weights or the noise vary, the stated
-uncertainty of each node reports by how much; its correlation with the others is taken as the mesh's alone.
+uncertainty of each node reports by how much; its correlation with the others is taken as the mesh's alone, but for the
+part that the lights' bias leaves.
 
 The frames of a test have the noise of the reference in common, which cancels in differences and rates. The displacement
 of frame t has the error ``b_t - r``: that of the frame's own noise, less the mean of the same for the n frames of the
@@ -122,9 +123,8 @@ class NodalCovariance:
         stds = np.sqrt(std**2 - shared**2), shared
         parts = [np.where(weights != 0, weights * part, 0.0) for part in stds]
         shape = parts[0].shape[:-1]
-        flat = [
-            part.reshape(-1, part.shape[-1]) @ factor for part, factor in zip(parts, (self.fit, self.bias), strict=True)
-        ]
+        factors = zip(parts, (self.fit, self.bias), strict=True)
+        flat = [part.reshape(-1, part.shape[-1]) @ factor for part, factor in factors]
         return np.concatenate(flat, axis=1).reshape(*shape, -1)
 
     def variance(self, weights: FloatArray, std: FloatArray, bias: FloatArray | float = 0.0) -> FloatArray:
@@ -172,16 +172,17 @@ def _windows(nodes: FloatArray) -> sp.csr_matrix:
     near = np.round(at - at.min(axis=0)).astype(np.int64)[:, :, None] + np.arange(7)  # three on either side
     x, y = np.exp(-((at[:, :, None] - at.min(axis=0)[:, None] + 3 - near) ** 2) / 2).swapaxes(0, 1)
     places = near[:, 1, :, None] * (near[:, 0].max() + 1) + near[:, 0, None]
-    node, row, column = np.nonzero(
-        (heights := y[:, :, None] * x[:, None]) > 0.007
-    )  # of 1; the correlation is right to .01
+    heights = y[:, :, None] * x[:, None]
+    node, row, column = np.nonzero(heights > 0.007)  # of 1: the correlation is right to .01
     return unit_rows(sp.csr_matrix((heights[node, row, column], (node, places[node, row, column]))))
 
 
 def unit_rows(matrix: sp.csr_matrix) -> sp.csr_matrix:
-    """Scale rows to unit length; those of zeros stay."""
+    """Scale rows to unit length; those of zeros or NaN become zeros."""
     length = np.sqrt(np.asarray(matrix.multiply(matrix).sum(axis=1)).ravel())
-    return sp.csr_matrix(sp.diags(np.divide(1, length, out=np.zeros_like(length), where=length > 0)) @ matrix)
+    unit = sp.csr_matrix(sp.diags(np.divide(1, length, out=np.zeros_like(length), where=length > 0)) @ matrix)
+    unit.data = np.nan_to_num(unit.data)
+    return unit
 
 
 def reference_fraction(count: int) -> float:
