@@ -51,7 +51,17 @@ class Nodal:
 
     @classmethod
     def of(cls, fields: FloatArray) -> Self:
-        """Take all of them in their order, (6, T, m), or the first four."""
+        """Take all fields in one array.
+
+        Parameters
+        ----------
+        fields : ndarray, shape (6, T, m) or (4, T, m)
+            The fields in the order of the attributes; without the last two, nothing is left by the bias of lights.
+
+        Returns
+        -------
+        Nodal
+        """
         return cls(**dict(zip(cls.__dataclass_fields__, fields, strict=False)))
 
     @property

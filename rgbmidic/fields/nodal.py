@@ -128,7 +128,17 @@ class NodalCovariance:
         return np.concatenate(flat, axis=1).reshape(*shape, -1)
 
     def variance(self, weights: FloatArray, std: FloatArray, bias: FloatArray | float = 0.0) -> FloatArray:
-        """Compute the variance (...) of weighted sums of nodal values; parameters as of `errors`."""
+        """Compute the variance of weighted sums of nodal values.
+
+        Parameters
+        ----------
+        weights, std, bias : ndarray, shape (..., n)
+            As of `errors`.
+
+        Returns
+        -------
+        ndarray, shape (...)
+        """
         return np.asarray((self.errors(weights, std, bias) ** 2).sum(axis=-1))
 
     def relative(self, matrices: Sequence[sp.csr_matrix]) -> Self:
@@ -147,7 +157,17 @@ class NodalCovariance:
         return replace(self, fit=fit, bias=bias)
 
     def part(self, nodes: IntArray) -> Self:
-        """Return the covariance of some nodes alone, given by their indices (m,)."""
+        """Return the covariance of some nodes alone.
+
+        Parameters
+        ----------
+        nodes : ndarray, shape (m,)
+            Their indices.
+
+        Returns
+        -------
+        NodalCovariance
+        """
         fit, bias = (factor[nodes] for factor in (self.fit, self.bias))
         return replace(self, fit=fit[:, np.unique(fit.indices)], bias=bias[:, np.unique(bias.indices)])
 
