@@ -541,11 +541,12 @@ def fit_front(
         if not used or abs(correlation[p, used[-1]]) <= _CONSTANTS.independent:
             used.append(int(p))
     if len(used) < _CONSTANTS.fewest:
+        cut = int(arrivals.cut.sum())
+        rising = f"; at {cut} positions the field still rises in the last of them: take a value, not a part of the peak"
         raise InputError(
             f"no front: something arrives at {len(there)} of {len(positions)} positions, {len(used)} of them far "
             f"enough apart to be independent; a speed needs {_CONSTANTS.fewest}. A peak counts that exceeds "
-            f"{_CONSTANTS.clear:g} standard uncertainties and lies within the frames; at {arrivals.cut.sum()} "
-            "positions the field still rises in the last of them: take a front at a value, not at a part of the peak"
+            f"{_CONSTANTS.clear:g} standard uncertainties and lies within the frames{rising if cut else ''}"
         )
     parts = arrivals.weights[used] * np.nan_to_num(std.T[used])
     own = parts @ parts.T if between_frames is None else parts @ between_frames @ parts.T
