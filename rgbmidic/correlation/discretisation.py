@@ -125,6 +125,7 @@ def discretisation_error(
     return replace(
         solution,
         displacement_std=std[:, :2],
+        bias_std=np.minimum(solution.bias_std, std[:, :2]),
         strain_std=std[:, 2:],
         displacement_error=np.where(np.isfinite(solution.displacement), error[:, :2], np.nan),
         strain_error=np.where(np.isfinite(solution.strain), error[:, 2:], np.nan),

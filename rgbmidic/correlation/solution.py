@@ -57,6 +57,9 @@ class Solution(Described):
     displacement_std : ndarray, shape (N, 2), float64
         Standard uncertainty of the nodal values in px, from the residual (noise, demosaicing, irregular reflections,
         deviations from a quadratic); NaN where not measured.
+    bias_std : ndarray, shape (N, 2), float64
+        Part of it in px that the bias of the lights leaves (`light_bias`), alike over some 24 px: the variance beside
+        it, ``displacement_std**2 - bias_std**2``, follows the mesh. 0 with a single light; NaN where not measured.
     strain, strain_std : ndarray, shape (N, 3), float64
         Small strain (exx, eyy, exy), tensor shear, and its standard uncertainty: slopes of the quadratic through the
         neighbouring nodes; NaN where the node or a neighbour is not measured.
@@ -89,6 +92,7 @@ class Solution(Described):
     elements: npt.NDArray[np.int32]
     displacement: FloatArray
     displacement_std: FloatArray
+    bias_std: FloatArray
     strain: FloatArray
     strain_std: FloatArray
     displacement_error: FloatArray
@@ -145,6 +149,7 @@ class Solution(Described):
             elements=mesh.elements,
             displacement=np.full((count, 2), np.nan),
             displacement_std=np.full((count, 2), np.nan),
+            bias_std=np.full((count, 2), np.nan),
             strain=np.full((count, 3), np.nan),
             strain_std=np.full((count, 3), np.nan),
             displacement_error=np.full((count, 2), np.nan),

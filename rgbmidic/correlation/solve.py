@@ -298,9 +298,10 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     fitted = estimate.displacement
     residual = weighting.residual.without(*recovery.bend(fitted))
     std = standard_uncertainty(residual, equations, weighting.precision, recovery)
+    bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
     if weighting.precision is not None:
         bias, bias_std = light_bias(weighting.residual, equations.weights)
-        fitted, std = fitted + bias, np.hypot(std, bias_std)
+    fitted, std = fitted + bias, np.hypot(std, bias_std)
     node_status = judge(equations, weighting.residual, weighting.matched, std[:, :2])
     measured = np.asarray(node_status == NodeStatus.MEASURED)
     if not measured.any():
@@ -326,6 +327,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         Solution.failed(mesh, len(reference.images), "", history),
         displacement=np.where(measured[:, None], field[:, :2], np.nan),
         displacement_std=np.where(measured[:, None], std[:, :2], np.nan),
+        bias_std=np.where(measured[:, None], bias_std[:, :2], np.nan),
         strain=np.where(inner[:, None], field[:, 2:], np.nan),
         strain_std=np.where(inner[:, None], std[:, 2:], np.nan),
         node_status=node_status,

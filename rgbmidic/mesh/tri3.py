@@ -130,6 +130,28 @@ class Tri3Mesh:
         return np.asarray(self.nodes[self.elements].mean(axis=1))
 
     @cached_property
+    def centre_tree(self) -> cKDTree:
+        """Search tree of the `centres`."""
+        return cKDTree(self.centres)
+
+    def part(self, nodes: BoolArray) -> Tri3Mesh:
+        """Return the mesh of some nodes (N,) and of the elements between them, with their `sizes` in the whole.
+
+        Parameters
+        ----------
+        nodes : ndarray, shape (N,), bool
+            The nodes of the part.
+
+        Returns
+        -------
+        Tri3Mesh
+        """
+        number, kept = np.cumsum(nodes, dtype=np.int32) - 1, nodes[self.elements].all(axis=1)
+        part = Tri3Mesh(nodes=self.nodes[nodes], elements=number[self.elements[kept]])
+        vars(part).update(size=self.size, sizes=self.sizes[nodes], is_graded=self.is_graded)
+        return part
+
+    @cached_property
     def copies(self) -> npt.NDArray[np.int32]:
         """Pairs of nodes at one place, on two sides of a crack, shape (C, 2)."""
         pairs = cKDTree(self.nodes).query_pairs(1e-9, output_type="ndarray").astype(np.int32)

@@ -365,7 +365,8 @@ def wave_text(profile: Profile, wave: Wave) -> str:
     if unit == "mm/s":
         speed, std, unit = speed / 1000, std / 1000, "m/s"
     fit = f"chi-square {front.chi_square:.3g} of {front.freedom}"
-    return f"{wave.what} of {profile.field.symbol}: {uncertain(speed, std, unit)} ({fit})"
+    level = f" at {wave.level}" if wave.what == "front" else ""
+    return f"{wave.what} of {profile.field.symbol}{level}: {uncertain(speed, std, unit)} ({fit})"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

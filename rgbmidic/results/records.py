@@ -94,6 +94,8 @@ class Quantities:
     v = _Attribute()
     u_std = _Attribute()
     v_std = _Attribute()
+    u_bias_std = _Attribute()
+    v_bias_std = _Attribute()
     exx = _Attribute()
     eyy = _Attribute()
     exy = _Attribute()

@@ -22,7 +22,7 @@ from scipy.sparse.linalg import splu
 
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
-from rgbmidic.fields.nodal import Places
+from rgbmidic.fields.interpolation import Places
 from rgbmidic.frames.names import NamedFiles
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh, read_mesh
 from rgbmidic.results.physical import placement_of, rectification_of
@@ -286,12 +286,16 @@ class Levelling:
         # of their number, and is 1 % of what levelling changes at 3 (derived)
         inner = _middles(int(np.clip(math.ceil(2 * mesh.size / simulated.size), 3, 12)))
         points = np.einsum("qc,ecd->eqd", inner, mesh.nodes[mesh.elements])
-        read, depth = reading(simulated, points.reshape(-1, 2))
+        places = Places.of(simulated, points.reshape(-1, 2))
         # it is continued linearly by half an element: the outline of a region drawn by hand differs by some px (chosen)
-        used: BoolArray = np.asarray((depth.reshape(points.shape[:2]) > -0.5).all(axis=1))
+        depth: FloatArray = np.asarray(places.barycentric.min(axis=1)).reshape(points.shape[:2])
+        used: BoolArray = np.asarray((depth > -0.5).all(axis=1))
         if not used.any():
             raise InputError("the simulation's mesh covers no element of the measurement's: check where it is placed")
-        row = np.arange(len(depth))
+        row = np.arange(depth.size)
+        # the simulation is linear in its elements
+        entries = places.barycentric.ravel(), (np.repeat(row, 3), simulated.elements[places.element].ravel())
+        read = sp.csr_matrix(entries, shape=(len(row), len(simulated.nodes)))
         columns, values = np.repeat(mesh.elements, len(inner), axis=0), np.tile(inner, (len(mesh.elements), 1))
         shape = sp.csr_matrix((values.ravel(), (np.repeat(row, 3), columns.ravel())), shape=(len(row), len(mesh.nodes)))
         weighted = sp.csr_matrix(sp.diags(np.repeat(used * mesh.areas / len(inner), len(inner))) @ shape).T
@@ -304,7 +308,7 @@ class Levelling:
         """Displacement (2, N) at the measurement's nodes of a simulated one (M, 2); NaN where that does not reach."""
         moments = self._moments @ np.nan_to_num(displacement)
         unknown: FloatArray = np.asarray(np.isnan(displacement).any(axis=1), dtype=np.float64)
-        lost = (abs(self._moments) @ unknown) > 0
+        lost = np.asarray(abs(self._moments) @ unknown) > 0
         recovered = (self._recovery.value @ self._factors.solve(moments)).T
         return np.where(self._covered & ~lost, recovered, np.nan)
 
@@ -315,14 +319,3 @@ def _middles(parts: int) -> FloatArray:
     down = [(i + 2 / 3, j + 2 / 3) for i in range(parts - 1) for j in range(parts - 1 - i)]
     first, second = np.array(up + down).T / parts
     return np.stack([first, second, 1 - first - second], axis=1)
-
-
-def reading(mesh: Tri3Mesh, points: FloatArray) -> tuple[sp.csr_matrix, FloatArray]:
-    """Matrix (P, N) that reads a nodal field at points (P, 2), and the least barycentric coordinate there (P,)."""
-    at_once = 20_000  # points: some 60 MB (derived)
-    parts = [Places.of(mesh, points[start : start + at_once]) for start in range(0, len(points), at_once)]
-    values = np.concatenate([part.barycentric for part in parts])
-    nodes = mesh.elements[np.concatenate([part.element for part in parts])]
-    row = np.repeat(np.arange(len(points)), 3)
-    matrix = sp.csr_matrix((values.ravel(), (row, nodes.ravel())), shape=(len(points), len(mesh.nodes)))
-    return matrix, values.min(axis=1)

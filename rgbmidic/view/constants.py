@@ -48,8 +48,6 @@ class ViewerConstants:
         Raw frames that are kept as pictures: those around the one in view.
     frames_at_once
         Frames whose status is read before the page is served again. Measured: 10 ms.
-    least_weight
-        Part of the weights of a point's nodes that must be measured: all but what rounding leaves of a node beside it.
     play_ms
         Least time between two frames that are played: 6 to 7 a second, which the eye can follow.
     view_ms, mark_ms
@@ -89,7 +87,6 @@ class ViewerConstants:
     range_frames: int = 24
     raw_frames: int = 8
     frames_at_once: int = 100
-    least_weight: float = 1 - 1e-9
     play_ms: int = 150
     view_ms: int = 40
     mark_ms: int = 60

@@ -81,8 +81,9 @@ def test_a_map_of_a_mesh_with_a_crack_has_the_values_of_both_sides(tmp_path: Pat
     shown = picture.get_array()
     assert not np.ma.getmaskarray(np.ma.masked_invalid(shown)).any()
     column = np.argmin(np.abs(x - 20))
-    assert shown[y < 40][:, column].max() == pytest.approx(-1)
-    assert shown[y > 40][:, column].min() == pytest.approx(1)
+    # two elements from the step to 0 the field swings by 1 %
+    assert shown[y < 40][:, column].max() == pytest.approx(-1, abs=0.02)
+    assert shown[y > 40][:, column].min() == pytest.approx(1, abs=0.02)
 
 
 def test_a_reference_that_shows_a_part_of_the_frame_lies_where_it_belongs(tmp_path: Path) -> None:
@@ -135,7 +136,8 @@ def test_every_map_shows_its_quantities_around_the_mesh(tmp_path: Path, kind: st
     for axis, name in zip(figure.axes, figures.MAPS[kind], strict=False):
         assert axis.get_title() == maps.field(name).label
         picture, values = axis.images[-1].get_array(), maps.read(name, 0).values
-        assert np.nanmin(values) <= np.nanmin(picture) <= np.nanmax(picture) <= np.nanmax(values)
+        beyond = 0.1 * np.ptp(values[np.isfinite(values)]) + 1e-9  # the field may be curved between the nodes
+        assert np.nanmin(values) - beyond <= np.nanmin(picture) <= np.nanmax(picture) <= np.nanmax(values) + beyond
         (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
         assert left < 10 < 110 < right < 150
         assert top < 5 < 75 < bottom < 100
