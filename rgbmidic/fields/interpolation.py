@@ -79,7 +79,21 @@ class Places:
 
     @classmethod
     def within(cls, mesh: Tri3Mesh, points: FloatArray, element: IntArray) -> Self:
-        """Take points (P, 2) whose elements (P,) are known."""
+        """Take points whose elements are known.
+
+        Parameters
+        ----------
+        mesh
+            N nodes, E elements.
+        points : ndarray, shape (P, 2)
+            Points (x, y) on the reference, px.
+        element : ndarray, shape (P,), int
+            Their elements.
+
+        Returns
+        -------
+        Places
+        """
         away = points - mesh.centres[element]
         barycentric = 1 / 3 + np.einsum("pcd,pd->pc", mesh.shape_gradients()[element], away)
         inside = barycentric.min(axis=1) >= -_ROUNDING
@@ -139,7 +153,15 @@ class Places:
         return f"the region that was measured, which lies within x {left:g} to {right:g}, y {top:g} to {bottom:g}"
 
     def nearby(self) -> tuple[IntArray, Self]:
-        """Return the nodes (m,) on which the field at the points depends, and the points in the mesh of these alone."""
+        """Take the part of the mesh on which the field at the points depends.
+
+        Returns
+        -------
+        nodes : ndarray, shape (m,), int
+            Its nodes.
+        places : Places
+            The points in it.
+        """
         mesh, near = self.mesh, np.zeros(len(self.mesh.nodes), dtype=bool)
         near[mesh.elements[self.element[self.inside]]] = True
         near = mesh.beside(mesh.beside(mesh.beside(near)))  # two edges from those beside an element's nodes
@@ -198,7 +220,18 @@ class Places:
         return field
 
     def linear(self, values: FloatArray) -> FloatArray:
-        """Interpolate nodal values (N,) linearly, within those of each element's nodes; as `read`, (P,)."""
+        """Interpolate nodal values linearly, within those of each element's nodes.
+
+        Parameters
+        ----------
+        values : ndarray, shape (N,)
+            At the nodes; NaN where a node has no data.
+
+        Returns
+        -------
+        ndarray, shape (P,)
+            As of `read`.
+        """
         field = np.einsum("pc,pc->p", self.barycentric, values[self.mesh.elements[self.element]])
         return np.where(self.inside, field, np.nan)
 
@@ -209,7 +242,18 @@ class Places:
             yield sp.csr_matrix((factor.ravel(), node, first), shape=(len(self.points), len(self.mesh.nodes)))
 
     def factors(self, axis: int | None = None) -> Iterator[FloatArray]:
-        """Yield the factors (P, 3) of value and slopes at the corners, in the field or in its slope along an axis."""
+        """Compute the factors of value and slopes at an element's corners in the field at the points.
+
+        Parameters
+        ----------
+        axis
+            0 or 1: in its slope along x or y; None: in the field.
+
+        Returns
+        -------
+        iterator of ndarray, shape (P, 3)
+            Of the value, the slope along x and that along y.
+        """
         arms = np.moveaxis(self.points[:, None] - self.mesh.nodes[self.mesh.elements[self.element]], 2, 0)
         if axis is None:
             shape, inner = self.barycentric, np.zeros(2)

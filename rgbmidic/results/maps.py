@@ -316,9 +316,22 @@ class Maps(Portable):
         return moved if motion is None else motion.removed(self._covariance.mesh.nodes, moved)
 
     def drawn(self, field: Quantity, values: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
-        """Return nodal values (N, C) of a field as pictures draw them, linear in triangles, and the triangles (F, 3).
+        """Return nodal values as pictures draw them, linear in triangles, and the triangles.
 
         They are parts of the elements, or the elements of what has no sign: it stays within the values of its nodes.
+
+        Parameters
+        ----------
+        field
+            Whether it has a sign.
+        values : ndarray, shape (N, C)
+            At the nodes; NaN where a node has no data.
+
+        Returns
+        -------
+        values : ndarray, shape (M, C)
+            At the corners of the triangles.
+        triangles : ndarray, shape (F, 3), int32
         """
         if not field.signed:
             return values, self.result.elements
@@ -331,7 +344,19 @@ class Maps(Portable):
         return Places.parts(mesh, int(np.clip((_PARTS / len(mesh.elements)) ** 0.5, 1, 4)))
 
     def places(self, points: FloatArray, element: IntArray) -> Places:
-        """Return points (P, 2) of the image, px, of which the elements (P,) are known, to read nodal values there."""
+        """Take points of the image whose elements are known, to read nodal values there.
+
+        Parameters
+        ----------
+        points : ndarray, shape (P, 2)
+            Points (x, y) of the image, px.
+        element : ndarray, shape (P,), int
+            Their elements.
+
+        Returns
+        -------
+        Places
+        """
         return Places.within(Tri3Mesh(nodes=self.result.nodes, elements=self.result.elements), points, element)
 
     def strain_at(self, frame: int, x: float, y: float, length: float) -> dict[str, FloatArray]:
