@@ -87,10 +87,12 @@ class SolverConstants:
         Stretch (norm of C) beyond that of the elements around from which an element is torn, not strained: a strain of
         20 % in both directions more than theirs gives .6.
     shared
-        Correlation of a light's gradient with the mean of the others', median over the region, from which theirs takes
-        its place. Lights of one paint reach .95 to 1. At .85 the error of two lights with noise grows by an eighth so
-        (derived), that of three whose paint is their own by 18 % of the variance by a tenth (measured); below it they
-        would lose more.
+        Correlation of a light's gradient with that of the others, in a window, up to which it is matched with the mean
+        of all, and from which with that of the others. Lights of smooth paint reach .95 to 1. At .85 the others' mean
+        would cost three lights whose paint is their own by 18 % of the variance a tenth (measured).
+    follows
+        Displacement (px) of what a light alone shows against the solution at which it counts half in its gradient.
+        With half or twice of it the error on coarse paint differs by 1 % (measured).
     shown
         Fraction of its Schur complement that the images have of a rigid motion that is measured. The rest is the
         hold's, which holds no data. Lights that see within one element of one another leave .998 or more to the images,
@@ -165,7 +167,8 @@ class SolverConstants:
     worse: float = 8.0
     around: int = 61
     torn: float = 0.5
-    shared: float = 0.85
+    shared: tuple[float, float] = (0.85, 0.95)
+    follows: float = 0.1
     shown: float = 0.5
     named: float = 0.1
     lit: float = 0.3

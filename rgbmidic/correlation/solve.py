@@ -20,7 +20,7 @@ import numpy as np
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, UnsolvableError, compare, iterate
-from rgbmidic.correlation.light_bias import light_bias
+from rgbmidic.correlation.light_bias import light_bias, settled_gradient
 from rgbmidic.correlation.nodes import judge, matching_elements, misfit, one_sided_texture
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
@@ -207,13 +207,15 @@ def solve(
     rigid = np.zeros((len(reference.images), problem.functions.shape[1]))
     try:
         with one_blas_thread():
-            return _conclude(problem, *_passes(problem, Estimate(displacement=initial, rigid=rigid), residual))
+            return _conclude(*_passes(problem, Estimate(displacement=initial, rigid=rigid), residual))
     except UnsolvableError as error:
         return Solution.failed(reference.mesh, len(reference.images), str(error), error.history)
 
 
-def _passes(problem: Problem, estimate: Estimate, residual: Residual | None) -> tuple[Estimate, Equations, Weighting]:
-    """Run passes until the weights have settled."""
+def _passes(
+    problem: Problem, estimate: Estimate, residual: Residual | None
+) -> tuple[Problem, Estimate, Equations, Weighting]:
+    """Run passes until the weights have settled; the problem is returned with the lights' gradients decided."""
     tolerance = problem.options.tolerance
     estimate, weighting = _begin(problem, estimate, residual)
     equations: Equations | None = None
@@ -224,6 +226,12 @@ def _passes(problem: Problem, estimate: Estimate, residual: Residual | None) -> 
         reached = max(tolerance, problem.constants.first_pass) if number == 0 else tolerance
         estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, reached)
         weighting = next_weighting(problem, weighting, equations, estimate, number)
+        if (
+            number == 0
+            and (found := settled_gradient(weighting.residual, weighting.weights())) is not problem.reference
+        ):
+            problem, equations = replace(problem, reference=found), None
+            weighting = replace(weighting, residual=replace(weighting.residual, reference=found))
     assert equations is not None
     if estimate.longest > tolerance:
         estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance)
@@ -235,7 +243,7 @@ def _passes(problem: Problem, estimate: Estimate, residual: Residual | None) -> 
             equations = _equations(problem, weighting, estimate)
             estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance)
         weighting = replace(weighting, residual=compare(problem, weighting.values, estimate))
-    return estimate, equations, weighting
+    return problem, estimate, equations, weighting
 
 
 @stage("search")

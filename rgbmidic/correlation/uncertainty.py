@@ -37,7 +37,7 @@ def displacing_fraction(reference: Reference, difference: FloatImage, weight: Fl
         Its inverse variance.
     """
     block = reference.constants.block
-    xx, _, yy = BlockScores.of(reference, block, difference, weight, *reference.texture).products()
+    xx, _, yy = BlockScores.of(reference, block, difference, weight, *reference.texture.texture).products()
     # at least 0.01: of images without noise it is not 0 (up to twice of it nothing changes)
     fraction = np.maximum(xx + yy, 0.01)
     return np.asarray(reference.pixels.from_blocks(fraction[None], block)[0])
@@ -261,11 +261,11 @@ def standard_uncertainty(
         std = np.sqrt(np.maximum(std**2 + rigid, 0))
     if precision is not None:
         std = std * precision.robust_loss(reference, equations.weights)[:, None]
-    if recovery is None:
+    if recovery is None or len(equations.weights) == 1:
         return std
-    lights = zip(equations.weights, residual.difference, reference.channel_specific.swapaxes(0, 1), strict=False)
+    specific = map(reference.channel_specific, range(len(equations.weights)))
+    lights = zip(equations.weights, residual.difference, specific, strict=True)
     pulls = np.array([reference.assembly.vector(reference.projected(*light)) for light in lights])
-    pulls = pulls.reshape(-1, reference.assembly.size)  # none where there is but one light
     pull, rigid_pull = pulls.sum(axis=0), (pulls[1:] @ equations.functions).ravel()
     step, _ = equations.increment(pull, np.zeros_like(pull), rigid_pull)
     return np.hypot(std, recovery.field(*step.T))
