@@ -19,7 +19,9 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
-def judge(equations: Equations, residual: Residual, matched: BoolArray, std: FloatArray) -> npt.NDArray[np.uint8]:
+def judge(
+    equations: Equations, residual: Residual, matched: BoolArray, std: FloatArray, sensitivity: FloatArray
+) -> npt.NDArray[np.uint8]:
     """`NodeStatus` of every node (N,) at the end of a solve: of the rules, the first that applies decides.
 
     Parameters
@@ -30,8 +32,13 @@ def judge(equations: Equations, residual: Residual, matched: BoolArray, std: Flo
         Elements whose images match.
     std : ndarray, shape (N, 2)
         Standard uncertainty of u and v, px.
+    sensitivity : ndarray, shape (N,)
+        As observed, over that of the equations.
     """
-    textured, one_sided = equations.textured, one_sided_texture(equations, residual)
+    textured, one_sided = (
+        equations.observability * np.minimum(sensitivity, 1) > 1,
+        one_sided_texture(equations, residual),
+    )
     mismatched = residual.reference.mesh.to_nodes((~matched).astype(np.float64)) > 0
     rules = (
         # the elements around it do not match, and the others have too little texture

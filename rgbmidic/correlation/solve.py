@@ -19,7 +19,15 @@ import numpy as np
 
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import rigid_functions
-from rgbmidic.correlation.equations import Equations, Estimate, Problem, UnsolvableError, compare, iterate
+from rgbmidic.correlation.equations import (
+    Equations,
+    Estimate,
+    Problem,
+    UnsolvableError,
+    compare,
+    iterate,
+    observed_sensitivity,
+)
 from rgbmidic.correlation.light_bias import light_bias, settled_gradient
 from rgbmidic.correlation.nodes import judge, matching_elements, misfit, one_sided_texture
 from rgbmidic.correlation.recovery import Recovery
@@ -309,8 +317,10 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
     if weighting.precision is not None:
         bias, bias_std = light_bias(weighting.residual, equations.weights)
-    fitted, std = fitted + bias, np.hypot(std, bias_std)
-    node_status = judge(equations, weighting.residual, weighting.matched, std[:, :2])
+    sensitivity = observed_sensitivity(problem, equations, weighting.values, weighting.residual, estimate)
+    scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
+    fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale
+    node_status = judge(equations, weighting.residual, weighting.matched, std[:, :2], sensitivity)
     measured = np.asarray(node_status == NodeStatus.MEASURED)
     if not measured.any():
         along = one_sided_texture(equations, weighting.residual) & (node_status == NodeStatus.NOT_SEEN)

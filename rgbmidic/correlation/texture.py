@@ -98,9 +98,12 @@ class TextureGradient:
             blocks = (np.indices(together.shape[1:]) + 0.5) * (WINDOW.step / side) - 0.5
             together = together * [map_coordinates(one, blocks, order=1, mode="nearest") for one in consistency]
         others, both = (1 - together) * self.in_others, together * self.in_all
-        # others * (texture - own) + both * texture
-        of_texture, of_own = (pixels.from_blocks(grid, WINDOW.step) for grid in (others + both, -others))
-        return of_texture * self.texture[:, None] + of_own * self.images
+        out = np.empty_like(self.images)
+        for light, grids in enumerate(zip(others + both, others, strict=True)):
+            of_texture, of_own = pixels.from_blocks(np.stack(grids), WINDOW.step)
+            np.multiply(self.texture, of_texture, out=out[:, light])
+            out[:, light] -= of_own * self.images[:, light]
+        return out
 
 
 def _quotient(along: FloatImage, square: FloatImage) -> FloatImage:
