@@ -70,7 +70,7 @@ class SolverConstants:
     lost
         Uncertainty (px) from which a node is decorrelated: a position uncertain by half a pixel is no match.
     probe
-        Motion (px) by which the sensitivity is observed: 20 times the noise of a node, a fortieth of a speckle (derived).
+        Motion (px) by which the sensitivity is observed: 20 times a node's noise, a fortieth of a speckle (derived).
     one_sided
         Texture in the worse direction over that in the better one under which the former may be noise... Chosen; half
         or twice of it matters in a deep shadow only.

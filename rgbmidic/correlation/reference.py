@@ -57,6 +57,11 @@ class Deformed:
         """Count the blocks with a weight other than 1."""
         object.__setattr__(self, "partial", np.stack([_partial_blocks(weight) for weight in self.weights]))
 
+    def contains(self, points: FloatArray) -> BoolArray:
+        """Whether points (N, 2), counted from the first pixel, lie on the images' pixels, (N,)."""
+        limits = np.array(self.weights.shape[:0:-1]) - 0.5
+        return np.asarray(((points >= -0.5) & (points <= limits)).all(axis=1))
+
     def pictures(self, registration: Registration | None = None) -> tuple[FloatImage, FloatImage]:
         """Return the images, holes filled and prefiltered, and the weights, both (k, H, W) on the first light's pixels.
 

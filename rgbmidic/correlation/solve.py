@@ -320,8 +320,14 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     sensitivity = observed_sensitivity(problem, equations, weighting.values, weighting.residual, estimate)
     scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
     fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale
-    node_status = judge(equations, weighting.residual, weighting.matched, std[:, :2], sensitivity)
+    field = recovery.field(*fitted.T)
+    inside = problem.deformed.contains(mesh.nodes + field[:, :2] - reference.offset(problem.deformed))
+    node_status = judge(equations, weighting.residual, weighting.matched, std[:, :2], sensitivity, inside)
     measured = np.asarray(node_status == NodeStatus.MEASURED)
+    if not measured.any() and np.isnan(std[equations.textured]).all():
+        raise UnsolvableError(
+            "the region is too small for its elements: nothing is left of the noise to state an uncertainty", estimate
+        )
     if not measured.any():
         along = one_sided_texture(equations, weighting.residual) & (node_status == NodeStatus.NOT_SEEN)
         one_sided = "the texture runs in one direction only: what lies along it cannot be measured"
@@ -336,7 +342,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
             estimate,
         )
     inner = measured & ~mesh.beside(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
-    squares, field = weighting.residual.squares(equations.weights), recovery.field(*fitted.T)
+    squares = weighting.residual.squares(equations.weights)
     square, total, _ = squares.sum(axis=1).T
     some = equations.weights[:, :: max(1, equations.weights.shape[1] // 100_000)]
     seen, history = some.sum(axis=0), estimate.history(measured)

@@ -224,6 +224,24 @@ def _rigid_variance(
     return np.stack(variance, axis=1)
 
 
+def _probed_std(
+    equations: Equations, covariance: sp.csc_matrix, reference: Reference, asked: list[tuple[Functional, BoolArray]]
+) -> FloatArray:
+    """Evaluate `functional_std` without what nodes that are lost add to those probed together with them.
+
+    Beside nodes that are hardly seen columns of M^-1 are a hundred times as large as others, which they still exceed
+    where they have decayed: the sums of these may vanish, or be negative. What is large is known itself, and left out
+    when the others are evaluated once more.
+    """
+    mesh, lost = reference.material, reference.constants.lost
+    found = functional_std(equations.solve, covariance, mesh, asked)
+    far = found > [lost] * 2 + [lost / mesh.size] * (len(asked) - 2)
+    if not far.any():
+        return found
+    others = [(functional, nodes & ~beyond) for (functional, nodes), beyond in zip(asked, far.T, strict=True)]
+    return np.where(far, found, functional_std(equations.solve, covariance, mesh, others))
+
+
 def standard_uncertainty(
     residual: Residual, equations: Equations, precision: Precision | None, recovery: Recovery | None = None
 ) -> FloatArray:
@@ -255,7 +273,7 @@ def standard_uncertainty(
         inner = textured & ~reference.mesh.beside(~textured)
         asked += [(one, inner) for one in recovery.strain_functionals]
     covariance = reference.assembly.matrix(score_covariance(residual, equations.weights, equations.blocks))
-    std = functional_std(equations.solve, covariance, reference.material, asked)
+    std = _probed_std(equations, covariance, reference, asked)
     if equations.rigid is not None:
         rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in asked])
         std = np.sqrt(np.maximum(std**2 + rigid, 0))
