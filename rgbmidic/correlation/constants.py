@@ -141,6 +141,12 @@ class SolverConstants:
         Standard deviation (px) of the window in which a light's bias is found: it changes over some 50 px, and the mean
         of the lights that agree is known the better the wider it is. Half of it and 16 px give errors up to 5 % larger
         on raised droplets.
+    local_bias_range
+        The same where the bias changes by more than chance within that window: a third of it, 1,000 px. With 12 px
+        lights displaced within a disc of 35 px leave a tenth more.
+    local_bias
+        Variances by chance (of both directions together: 2) that such a change must exceed: four times what noise
+        alone has on average (James and Stein 1961). Scenes with reflections do not change.
     """
 
     first_pass: float = 0.01
@@ -187,6 +193,8 @@ class SolverConstants:
     even: float = 0.6
     prior: float = 0.1
     bias_range: float = 24.0
+    local_bias_range: float = 8.0
+    local_bias: float = 8.0
 
 
 USUAL = SolverConstants()

@@ -184,6 +184,8 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         solution = replace(solution, reason="; ".join([solution.reason, *causes]))
         end = "cannot be measured" if solution.status is Status.FAILED else "did not converge"
         logger.warning("frame %d (%s) %s: %s", index, name, end, solution.reason)
+    if solution.disagreement:
+        logger.warning("frame %d (%s): %s", index, name, solution.disagreement)
     key = place % STRIDE == 0 or place == len(plan.series.chosen) - 1
     if (settings.mesh.error is True or (settings.mesh.error == "key" and key)) and solution.measured.any():
         with stage("conclusion"):
