@@ -24,7 +24,7 @@ NO_MATCH = "the images do not match anywhere in the region"
 
 
 DISPUTED = 0.1
-"""Uncertainty (px) that the bias of the lights leaves from which they are said to disagree, at 1 % of the nodes: chosen."""
+"""Uncertainty (px) by the lights' bias from which, at 1 % of the nodes, they are said to disagree. Chosen."""
 
 
 class Status(IntEnum):

@@ -225,21 +225,30 @@ def _rigid_variance(
 
 
 def _probed_std(
-    equations: Equations, covariance: sp.csc_matrix, reference: Reference, asked: list[tuple[Functional, BoolArray]]
+    equations: Equations, scores: FloatArray, reference: Reference, asked: list[tuple[Functional, BoolArray]]
 ) -> FloatArray:
-    """Evaluate `functional_std` without what nodes that are lost add to those probed together with them.
+    """Evaluate `functional_std` for element blocks of `scores` (E, 3, 3, 3) without what lost nodes do to others.
 
     Beside nodes that are hardly seen columns of M^-1 are a hundred times as large as others, which they still exceed
     where they have decayed: the sums of these may vanish, or be negative. What is large is known itself, and left out
-    when the others are evaluated once more.
+    when the others are evaluated again. Beside them the least is what the information allows (Cramer and Rao): the
+    uncertainty with the scores' variance over their information as small as it is in any element around.
     """
-    mesh, lost = reference.material, reference.constants.lost
+    mesh, assembly, lost = reference.material, reference.assembly, reference.constants.lost
+    limits, covariance = [lost] * 2 + [lost / mesh.size] * (len(asked) - 2), assembly.matrix(scores)
     found = functional_std(equations.solve, covariance, mesh, asked)
-    far = found > [lost] * 2 + [lost / mesh.size] * (len(asked) - 2)
+    far = np.zeros(found.shape, dtype=bool)
+    while ((found > limits) & ~far).any():
+        far |= found > limits
+        others = [(functional, nodes & ~beyond) for (functional, nodes), beyond in zip(asked, far.T, strict=True)]
+        found = np.where(far, found, functional_std(equations.solve, covariance, mesh, others))
     if not far.any():
         return found
-    others = [(functional, nodes & ~beyond) for (functional, nodes), beyond in zip(asked, far.T, strict=True)]
-    return np.where(far, found, functional_std(equations.solve, covariance, mesh, others))
+    score, information = (np.einsum("eaad->ed", blocks)[:, ::2].sum(axis=1) for blocks in (scores, equations.blocks))
+    ratio, least = score / np.maximum(information, 1e-300), np.full(len(found), np.inf)
+    np.minimum.at(least, mesh.elements[information > 0], ratio[information > 0, None])
+    allowed = functional_std(equations.solve, assembly.matrix(equations.blocks), mesh, others)
+    return np.maximum(found, allowed * np.sqrt(np.where(least < np.inf, least, 0))[:, None])
 
 
 def standard_uncertainty(
@@ -272,8 +281,8 @@ def standard_uncertainty(
     if recovery is not None:
         inner = textured & ~reference.mesh.beside(~textured)
         asked += [(one, inner) for one in recovery.strain_functionals]
-    covariance = reference.assembly.matrix(score_covariance(residual, equations.weights, equations.blocks))
-    std = _probed_std(equations, covariance, reference, asked)
+    scores = score_covariance(residual, equations.weights, equations.blocks)
+    std = _probed_std(equations, scores, reference, asked)
     if equations.rigid is not None:
         rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in asked])
         std = np.sqrt(np.maximum(std**2 + rigid, 0))
