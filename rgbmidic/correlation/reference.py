@@ -58,7 +58,17 @@ class Deformed:
         object.__setattr__(self, "partial", np.stack([_partial_blocks(weight) for weight in self.weights]))
 
     def contains(self, points: FloatArray) -> BoolArray:
-        """Whether points (N, 2), counted from the first pixel, lie on the images' pixels, (N,)."""
+        """Find the points that lie on pixels of the images.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 2)
+            x and y in px, counted from the first pixel.
+
+        Returns
+        -------
+        ndarray, shape (N,), bool
+        """
         limits = np.array(self.weights.shape[:0:-1]) - 0.5
         return np.asarray(((points >= -0.5) & (points <= limits)).all(axis=1))
 
