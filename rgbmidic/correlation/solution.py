@@ -131,7 +131,8 @@ class Solution(Described):
     @property
     def disagreement(self) -> str:
         """Where the lights show displacements that their agreement does not settle; empty if they do not."""
-        std, measured = np.nan_to_num(self.bias_std).max(axis=1), int(self.measured.sum())
+        mainly = self.bias_std**2 > 0.8 * self.displacement_std**2  # twice of all else together
+        std, measured = np.where(mainly, self.bias_std, 0).max(axis=1), int(self.measured.sum())
         disputed, (x, y) = int((std > DISPUTED).sum()), self.nodes[std.argmax()]
         if disputed <= 0.01 * measured:
             return ""

@@ -42,6 +42,7 @@ def test_lights_that_agree_are_left_as_they_are(number):
     ratio = (found.displacement - (MOTION, 0)) / found.displacement_std
     assert 0.7 < np.sqrt(np.mean(ratio**2)) < 1.3
     assert np.median(found.displacement_std) < 0.006
+    assert not found.disagreement
 
 
 def test_of_two_lights_that_disagree_nobody_knows_which_is_right():
