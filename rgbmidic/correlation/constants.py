@@ -48,6 +48,9 @@ class SolverConstants:
         Iterations of a pass after which a tenth of the nodes may still move: they wander where nothing matches, or
         faster with the weights of the next pass. Chosen; 1 to 3 give the same, with 5 a fragment that has turned takes
         one more.
+    swing
+        Part of an iteration's motion that the next one takes back, from which steps are shortened: with 1 they diverge,
+        and below .5 each halves the error (derived).
     longest_step
         Longest motion of a node in one iteration, px: a speckle (3 to 5 px), beyond which the gradient is another's.
     smoothness
@@ -162,6 +165,7 @@ class SolverConstants:
     passes: int = 8
     pass_iterations: int = 12
     patience: int = 3
+    swing: float = 0.5
     longest_step: float = 4.0
     smoothness: float = 1e-4
     constant: float = 1e-9

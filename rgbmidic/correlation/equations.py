@@ -279,9 +279,14 @@ def iterate(
     """
     known: FloatImage | None = residual.difference_from(values)
     constants, left = problem.constants, problem.options.max_iterations - len(estimate.increments)
+    relaxation, motion = 1.0, np.zeros_like(estimate.displacement)
     for turn in range(min(constants.pass_iterations, left)):
-        estimate = stepped(problem, equations, values, estimate, known)
-        known = None
+        before, last = estimate.displacement, motion
+        estimate = stepped(problem, equations, values, estimate, known, relaxation)
+        known, motion = None, estimate.displacement - before
+        # where the deformed images have more contrast than the reference, all nodes swing about the solution (Aitken)
+        swing = float((motion * last).sum()) / max(float((last * last).sum()), 1e-30)
+        relaxation /= 1 - swing if swing < -constants.swing else 1
         if not np.isfinite(estimate.displacement).all():
             raise UnsolvableError("the iteration diverged", estimate)
         # a few nodes that wander where nothing matches must not keep the others waiting
@@ -293,10 +298,16 @@ def iterate(
 
 
 def stepped(
-    problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, known: FloatImage | None
+    problem: Problem,
+    equations: Equations,
+    values: FloatImage,
+    estimate: Estimate,
+    known: FloatImage | None,
+    relaxation: float = 1.0,
 ) -> Estimate:
     """One Gauss-Newton iteration; `known` is the difference (k, P) of the states at the estimate, if it is."""
-    motion, shifts = equations.increment(*_right_sides(problem, equations, values, estimate, known))
+    steps = equations.increment(*_right_sides(problem, equations, values, estimate, known))
+    motion, shifts = (relaxation * step for step in steps)
     length = np.hypot(*motion.T)
     longest = float(length[equations.textured].max())
     rigid = estimate.rigid.copy()
