@@ -348,8 +348,9 @@ def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
             place[:] = pixels.gather(old.scatter(row))
         return out
 
-    names = ("values", "gradient", "pixel_weights", "texture", "channel_specific")
-    fields: dict[str, Any] = {name: moved(getattr(reference, name)) for name in names}
+    fields: dict[str, Any] = {name: moved(getattr(reference, name)) for name in ("values", "gradient", "pixel_weights")}
+    texture = reference.texture
+    fields["texture"] = replace(texture, images=moved(texture.images), texture=moved(texture.texture))
     return replace(reference, mesh=mesh, material=mesh, pixels=pixels, assembly=Assembly.from_mesh(mesh), **fields)
 
 

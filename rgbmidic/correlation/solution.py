@@ -23,6 +23,10 @@ NO_MATCH = "the images do not match anywhere in the region"
 """Reason of a frame in which nothing was found."""
 
 
+DISPUTED = 0.1
+"""Uncertainty (px) by the lights' bias from which, at 1 % of the nodes, they are said to disagree. Chosen."""
+
+
 class Status(IntEnum):
     """Status of a frame."""
 
@@ -123,6 +127,19 @@ class Solution(Described):
                 least, most = rounded(known.min(), spread), uncertain(known.max(), spread, "px")
                 lines.append(f"{name}:      {least} to {most} (median)")
         return "\n".join(lines)
+
+    @property
+    def disagreement(self) -> str:
+        """Where the lights show displacements that their agreement does not settle; empty if they do not."""
+        mainly = self.bias_std**2 > 0.8 * self.displacement_std**2  # twice of all else together
+        std, measured = np.where(mainly, self.bias_std, 0).max(axis=1), int(self.measured.sum())
+        disputed, (x, y) = int((std > DISPUTED).sum()), self.nodes[std.argmax()]
+        if disputed <= 0.01 * measured:
+            return ""
+        return (
+            f"the lights show different displacements at {disputed} of {measured} nodes, most at x {x:.0f}, y {y:.0f}, "
+            f"and which is right is not known: their uncertainty holds it ({std.max():.2g} px at most)"
+        )
 
     @classmethod
     def failed(cls, mesh: Tri3Mesh, lights: int, reason: str, history: FloatArray) -> Solution:

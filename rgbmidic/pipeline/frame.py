@@ -200,6 +200,8 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         if plan.reference_motion > SUITABILITY.blur:  # of the reference, whatever else a frame shows
             causes = [unsteady(plan.reference_motion)]
         solution = replace(solution, reason="; ".join(causes))
+    if solution.disagreement:
+        warnings.append(solution.disagreement)
     key = place % STRIDE == 0 or place == len(plan.series.chosen) - 1
     if (settings.mesh.error is True or (settings.mesh.error == "key" and key)) and solution.measured.any():
         with stage("conclusion"):

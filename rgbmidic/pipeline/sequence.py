@@ -129,6 +129,8 @@ def correlate(
         solution = track(first, second.result(), Start(displacement=None), solver, method)
     else:
         solution = solve(first, second.result(), start, solver, method)
+    if solution.disagreement:
+        logger.warning("%s", solution.disagreement)
     if mesh_error:
         solution = discretisation_error(first, second.result(), solution, solver, method)
     return fill(mesh, solution, solver.fill) if solver.fill else solution
