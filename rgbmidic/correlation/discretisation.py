@@ -53,12 +53,17 @@ class DiscretisationConstants:
         more for what is lost with differences taken for noise; chosen on the DIC Challenge star.
     unsmoothed
         Inverse second moment of the rows of TRI3's mass matrix over h^2/3: what `_Halves.unsmooth` overstates.
-    edge
-        Error of one-sided slopes over that of central ones: 2.5 across the edge, 1 along it (DIC Challenge star).
+    one_sided
+        Error at the boundary over `one_sided_difference`, of displacement (2) and strain (3): 0.7 to 1.5 and 1.4 to 3.8
+        at the rim of a hole in elements of 0.15 to 0.3 of its diameter and at straight edges in waves of 3 to 8 (see
+        there). Chosen: two thirds of the largest, for a rim matters more than an edge.
     sure
         Standard deviations of the mean square of noise alone by which the difference, of displacement (2) and of strain
-        (3), and unsmoothed strain (3) must exceed it. Strain's difference has 3 to 4 times the noise of strain, so that
-        what passes by chance would be a multiple of it. Chosen: affine fields come out 15 % larger at most.
+        (3), and what is `_Halves.beyond` (5) must exceed it. Strain's difference has 3 to 4 times the noise of strain,
+        so that what passes by chance would be a multiple of it. Chosen: affine fields come out 15 % larger at most.
+    sure_at_edge
+        The same at the boundary, where the difference has 10 to 16 times the noise of strain, and what one-sided fits
+        miss about as much as strain has.
     uneven
         Variance of the same over that with equal weights: a robust loss weighs pixels unevenly (measured on affine
         fields).
@@ -75,8 +80,9 @@ class DiscretisationConstants:
     spread: int = 4
     of_difference: float = 1.25
     unsmoothed: float = 0.72
-    one_sided: tuple[float, float] = (1.1, 2.2)
+    one_sided: tuple[float, ...] = (1.2, 1.2, 2.5, 2.5, 2.5)
     sure: tuple[float, ...] = (1.2, 1.2, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0, 2.0, 2.0)
+    sure_at_edge: tuple[float, ...] = (3.6, 3.6, 12.0, 12.0, 12.0, 1.0, 1.0, 1.0, 1.0, 1.0)
     uneven: tuple[float, ...] = (1.15, 1.15, 1.4, 1.4, 1.4, 1.15, 1.15, 1.4, 1.4, 1.4)
     chance: float = 0.8
     held: float = 1e-6
@@ -294,11 +300,10 @@ class _Halves:
         """Error (N, 5) from the difference of the two fields and what is `beyond` (N, 10), and noise (N, 5)."""
         constants, edge = _CONSTANTS, self.mesh.on_boundary[:, None]
         noise = np.array(constants.uneven) * draws.variance * np.tile(std, 2) ** 2
-        sure = np.array(constants.sure) * draws.scatter
-        sure[:, :5] *= 1 + 2 * edge
+        sure = np.where(edge, constants.sure_at_edge, constants.sure) * draws.scatter
         square = self._excess(difference, noise, sure)
         square[:, :5] *= constants.of_difference**2
-        lost = np.where(edge, np.repeat(constants.one_sided, [2, 3]), constants.unsmoothed)
+        lost = np.where(edge, constants.one_sided, constants.unsmoothed)
         return np.asarray(np.sqrt(np.fmax(square[:, :5], lost**2 * square[:, 5:])))
 
     def _excess(self, values: FloatArray, variance: FloatArray, sure: FloatArray) -> FloatArray:
@@ -390,7 +395,10 @@ def _drawn(halves: _Halves, reference: Reference) -> _Draws:
     squares = np.concatenate([difference, halves.beyond(everywhere, fields)], axis=2) ** 2
     means = halves.averaged(squares.reshape(count, -1)).reshape(squares.shape)
     typical = means.mean(axis=1)
-    own = halves.averaged((fields**2).mean(axis=1))
+    per_node = (fields**2).mean(axis=1)
+    own = halves.averaged(per_node)
+    # a node that scatters more than its neighbours, by more than draws may, is not averaged with them
+    per_node = np.maximum(own, per_node / (1 + 2 * np.sqrt(2 / _CONSTANTS.draws)))
     scatter = np.sqrt(halves.averaged(means.var(axis=1) / typical**2))
     left, energy = np.zeros((count, 2)), 0.0
     for _ in range(_CONSTANTS.noises):
@@ -403,7 +411,7 @@ def _drawn(halves: _Halves, reference: Reference) -> _Draws:
         energy += float(side @ side) / float((right**2).sum()) * _CONSTANTS.draws / _CONSTANTS.noises
     if not mesh.is_graded:
         left[:] = left.mean(axis=0)
-    own_variance = energy * own / np.column_stack([left, left, left.mean(axis=1)])
+    own_variance = energy * per_node / np.column_stack([left, left, left.mean(axis=1)])
     return _Draws(variance=typical / np.tile(own, 2), scatter=scatter, own_variance=own_variance)
 
 
