@@ -82,7 +82,7 @@ class DiscretisationConstants:
     unsmoothed: float = 0.72
     one_sided: tuple[float, ...] = (1.2, 1.2, 2.5, 2.5, 2.5)
     sure: tuple[float, ...] = (1.2, 1.2, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0, 2.0, 2.0)
-    sure_at_edge: tuple[float, ...] = (3.6, 3.6, 12.0, 12.0, 12.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    sure_at_edge: tuple[float, ...] = (3.6, 3.6, 12.0, 12.0, 12.0, 1.0, 1.0, 2.0, 2.0, 2.0)
     uneven: tuple[float, ...] = (1.15, 1.15, 1.4, 1.4, 1.4, 1.15, 1.15, 1.4, 1.4, 1.4)
     chance: float = 0.8
     held: float = 1e-6
