@@ -24,7 +24,7 @@ from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import Assembly, block_side, rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
 from rgbmidic.correlation.images import apply_prefilter, at_blocks, window_sums
-from rgbmidic.correlation.one_sided_fit import one_sided_difference
+from rgbmidic.correlation.one_sided_fit import at_free_boundary, one_sided_difference
 from rgbmidic.correlation.recovery import Recovery, quadratic_fit
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, corrected_values
@@ -80,7 +80,7 @@ class DiscretisationConstants:
     spread: int = 4
     of_difference: float = 1.25
     unsmoothed: float = 0.72
-    one_sided: tuple[float, ...] = (1.2, 1.2, 2.5, 2.5, 2.5)
+    one_sided: tuple[float, ...] = (1.25, 1.25, 2.6, 2.6, 2.6)
     sure: tuple[float, ...] = (1.2, 1.2, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0, 2.0, 2.0)
     sure_at_edge: tuple[float, ...] = (3.6, 3.6, 12.0, 12.0, 12.0, 1.0, 1.0, 2.0, 2.0, 2.0)
     uneven: tuple[float, ...] = (1.15, 1.15, 1.4, 1.4, 1.4, 1.15, 1.15, 1.4, 1.4, 1.4)
@@ -238,6 +238,8 @@ class _Halves:
     ----------
     mesh
         The reference's own.
+    at_edge : ndarray, shape (N,), bool
+        Its nodes `at_free_boundary`.
     fine
         The reference on the finer mesh: its first nodes are those of `mesh`, each other is between two `neighbours`.
     around : csr_matrix, shape (N, N)
@@ -247,6 +249,7 @@ class _Halves:
     """
 
     mesh: Tri3Mesh
+    at_edge: BoolArray
     fine: Reference
     around: sp.csr_matrix
     unsmooth: Callable[[FloatArray], FloatArray]
@@ -291,14 +294,14 @@ class _Halves:
     def beyond(self, used: BoolArray, field: FloatArray) -> FloatArray:
         """What a field (N, ..., 5) has lost: by unsmoothing its strain inside, by one-sided fits at the boundary."""
         out = one_sided_difference(self.mesh, used, field)
-        inner, strain = ~self.mesh.on_boundary, np.ascontiguousarray(field[..., 2:])
+        inner, strain = ~self.at_edge, np.ascontiguousarray(field[..., 2:])
         unsmoothed = self.unsmooth(np.nan_to_num(strain.reshape(len(strain), -1))).reshape(strain.shape)
         out[inner, ..., 2:] = unsmoothed[inner]
         return out
 
     def error(self, draws: _Draws, difference: FloatArray, std: FloatArray) -> FloatArray:
         """Error (N, 5) from the difference of the two fields and what is `beyond` (N, 10), and noise (N, 5)."""
-        constants, edge = _CONSTANTS, self.mesh.on_boundary[:, None]
+        constants, edge = _CONSTANTS, self.at_edge[:, None]
         noise = np.array(constants.uneven) * draws.variance * np.tile(std, 2) ** 2
         sure = np.where(edge, constants.sure_at_edge, constants.sure) * draws.scatter
         square = self._excess(difference, noise, sure)
@@ -327,13 +330,14 @@ def _halves(reference: Reference) -> tuple[_Halves, _Draws]:
     six = np.concatenate([mesh.elements, count + place.reshape(-1, 3)], axis=1)
     nodes = np.concatenate([mesh.nodes, mesh.nodes[mesh.neighbours].mean(axis=1)])
     fine_mesh = Tri3Mesh(nodes=nodes, elements=six[:, _CHILDREN].reshape(-1, 3))
-    edge = mesh.on_boundary
+    edge = at_free_boundary(mesh)
     i, j = mesh.neighbours[edge[mesh.neighbours[:, 0]] == edge[mesh.neighbours[:, 1]]].T
     itself = np.arange(count)
     row, column = np.concatenate([i, j, itself]), np.concatenate([j, i, itself])
     number = np.bincount(row, minlength=count)
     halves = _Halves(
         mesh=mesh,
+        at_edge=edge,
         fine=_on_mesh(reference, fine_mesh),
         around=sp.csr_matrix((1 / number[row], (row, column)), shape=(count, count)),
         unsmooth=_unsmoothing(mesh),

@@ -13,6 +13,7 @@ import scipy.sparse as sp
 
 from rgbmidic.correlation.recovery import angle_fraction
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.mesh.outline_mesh import EDGES, edge_keys
 from rgbmidic.typing import BoolArray, FloatArray
 
 _POWERS = np.array([(i, n - i) for n in range(4) for i in range(n, -1, -1)])
@@ -24,8 +25,21 @@ elements at straight edges, is then 0.9 to 1.5 and 0.7 to 1.5 times the differen
 2.0 times that of the strain (without noise). Narrower fits follow less of the value, wider ones less of the strain."""
 
 
+def at_free_boundary(mesh: Tri3Mesh) -> BoolArray:
+    """Nodes (N,) on the boundary, and those less than a quarter of an element from an edge of it."""
+    sides = mesh.elements[:, EDGES]
+    keys = edge_keys(sides.reshape(-1, 2), len(mesh.nodes))
+    _, index, count = np.unique(keys, return_inverse=True, return_counts=True)
+    length = np.linalg.norm(np.diff(mesh.nodes[sides], axis=2)[:, :, 0], axis=2)
+    opposite = np.roll(mesh.elements, 1, axis=1)  # edge a joins the corners a and a + 1
+    is_near = 2 * mesh.areas[:, None] / length < mesh.sizes[opposite] / 4
+    found = mesh.on_boundary
+    found[opposite[is_near & (count[index] == 1).reshape(-1, 3)]] = True
+    return found
+
+
 def one_sided_difference(mesh: Tri3Mesh, used: BoolArray, field: FloatArray) -> FloatArray:
-    """Evaluate what third-order polynomials at boundary nodes have beyond a field.
+    """Evaluate what third-order polynomials at the nodes of `at_free_boundary` have beyond a field.
 
     Parameters
     ----------
@@ -39,12 +53,12 @@ def one_sided_difference(mesh: Tri3Mesh, used: BoolArray, field: FloatArray) -> 
     Returns
     -------
     ndarray, shape (N, ..., 5)
-        NaN at inner nodes, and where fewer than ten nodes are reached.
+        NaN at other nodes, and where fewer than ten nodes are reached.
     """
     out, corners = np.full_like(field, np.nan), mesh.elements[used]
     ends = np.repeat(corners, 3, axis=1).ravel(), np.tile(corners, 3).ravel()
     beside = sp.csr_matrix((np.ones(len(ends[0]), dtype=bool), ends), shape=(len(mesh.nodes),) * 2)
-    nodes = np.flatnonzero(mesh.on_boundary)
+    nodes = np.flatnonzero(at_free_boundary(mesh))
     reach = beside[nodes] @ beside @ beside
     number = np.diff(reach.indptr)
     nodes, reach = nodes[number >= len(_POWERS)], reach[number >= len(_POWERS)]
@@ -56,7 +70,7 @@ def one_sided_difference(mesh: Tri3Mesh, used: BoolArray, field: FloatArray) -> 
     size = mesh.sizes[nodes, None]
     x, y = ((axis[other] - axis[nodes, None]) / size for axis in mesh.nodes.T)
     basis = np.stack([x**i * y**j for i, j in _POWERS], axis=1)
-    square = (x**2 + y**2) * angle_fraction(mesh, used)[nodes, None] / 2
+    square = (x**2 + y**2) * np.minimum(angle_fraction(mesh, used), 0.5)[nodes, None] / 2
     weight = np.where(has_node, np.exp(-square / _WIDTHS[:, None, None] ** 2), 0)
     weighted = weight[:, :, None] * basis
     normal = weighted @ basis.transpose(0, 2, 1)
