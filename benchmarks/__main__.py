@@ -1,7 +1,8 @@
-"""Measure the tables of the pages: `python -m benchmarks [NAME ...] [--quick] [--list] [--processes N] [--out FOLDER]`.
+"""Measure the tables of the pages: `python -m benchmarks [NAME ...]`, with `--quick`, `--pages`, `--list` and others.
 
 Each table is measured in a process of its own with one thread and written as a whole to docs/tables/NAME.csv, with
-the commit, date, seed, machine and versions it was measured with, and into README.md where that shows it. `--quick`
+the commit, date, seed, machine and versions it was measured with, and into the pages that show it; `--pages` writes the
+pages alone, from the files. `--quick`
 measures a few rows and writes nothing unless `--out` names a folder. A table that fails does not stop the others; the
 exit status is 1 then. `--scatter` measures how far draws of the cameras' noise scatter the quick rows and writes
 docs/tables/scatter/NAME.csv, by which the tests compare them.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import importlib
 import importlib.metadata
 import os
 import platform
@@ -24,7 +26,7 @@ from pathlib import Path
 from renders import kept_renders
 
 from . import ROOT
-from .tables import FOLDER, README, TABLES, Table, load, measured
+from .tables import FOLDER, TABLES, Table, fill_pages, load, measured
 
 ONE_THREAD = ("NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rgbmidic")
@@ -72,10 +74,18 @@ def main() -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help="tables to measure; all if none is named")
     parser.add_argument("--quick", action="store_true", help="a few rows of each; written only where --out is given")
     parser.add_argument("--scatter", action="store_true", help="how draws of the noise scatter the figures of --quick")
+    parser.add_argument(
+        "--pages", action="store_true", help="measure nothing: write tables and descriptions into the pages"
+    )
     parser.add_argument("--list", action="store_true", help="names, pages and CPU seconds of the tables")
     parser.add_argument("--processes", type=int, default=1, metavar="N", help="tables measured at once (default 1)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help=f"default: {FOLDER.relative_to(ROOT)}")
     options = parser.parse_args()
+    if options.pages:
+        sys.path.append(str(ROOT / "docs" / "_ext"))
+        fill_pages()
+        fill_pages(importlib.import_module("reference").filled)
+        return 0
     broken = load()
     if unknown := [name for name in options.names if name not in TABLES]:
         print(f"tables are: {', '.join(sorted(TABLES))}; given was {', '.join(unknown)}", file=sys.stderr)
@@ -134,7 +144,7 @@ def measure(names: list[str], quick: bool, out: Path | None, processes: int, sca
                 if folder is not None:
                     made.write(folder / f"{name}.csv")
                 if folder == FOLDER:
-                    README.write_text(made.shown_in(README.read_text(encoding="utf-8")), encoding="utf-8")
+                    fill_pages()
             except Exception as error:
                 failed[name] = f"{type(error).__name__}: {error}"
                 print(f"{name}: failed, {failed[name]}", file=sys.stderr, flush=True)

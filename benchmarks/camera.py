@@ -84,7 +84,7 @@ def pictures(folder: Path) -> None:
     for side in ("left", "right"):
         ours, theirs = list[View](), list[View]()
         for path in sorted(folder.glob(f"{side}[0-9]*.jpg")):
-            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            image = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
             frame = ChannelFrame(values=image[None].astype(np.uint16), black_level=0.0, white_level=255.0)
             ours.append(find_view(frame, target, path.name))
             corners = cv2.findChessboardCorners(image, size)[1]

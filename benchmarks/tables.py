@@ -32,8 +32,8 @@ class MissingDataError(Exception):
 
 
 FOLDER = ROOT / "docs" / "tables"
-README = ROOT / "README.md"
-"""Shows tables as markdown, which a repository's page renders: see `Table.shown_in`."""
+PAGES = (ROOT / "README.md", ROOT / "calibration" / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
+"""They show tables and figures as Markdown, so that they can be read in the repository, too: see `filled`."""
 QUICK_FOLDER = FOLDER / "quick"
 """Committed files of the tables whose quick rows are a smaller case instead of some rows of the full table."""
 SCATTER_FOLDER = FOLDER / "scatter"
@@ -149,6 +149,22 @@ def written(value: object, *, key: bool = False) -> str:
     return text
 
 
+_ORIGIN = ("date", "commit", "command")
+
+
+def shown(cell: str) -> str:
+    """A cell as pages show it."""
+    return "–" if cell == "nan" else cell.replace("-", "−") if _is_number(cell) else cell
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
 @dataclass(frozen=True)
 class Table:
     """A table as its file has it."""
@@ -214,12 +230,30 @@ class Table:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
         temporary.replace(path)
 
-    def shown_in(self, text: str) -> str:
-        """A page's text with what lies between `<!-- measured: NAME -->` and `<!-- end -->` replaced by the table."""
-        lines = [self.columns, ["---"] * self.keys + ["---:"] * (len(self.columns) - self.keys), *self.rows]
-        shown = "\n".join(f"| {' | '.join('–' if cell == 'nan' else cell for cell in line)} |" for line in lines)
-        block = re.compile(rf"(<!-- measured: {re.escape(self.name)} -->\n).*?(<!-- end -->)", re.DOTALL)
-        return block.sub(lambda found: f"{found[1]}\n{shown}\n\n{found[2]}", text)
+    def markdown(self, *, columns: str = "", rows: str = "", caption: str = "") -> str:
+        """Return the table as a page shows it: caption with its origin, then the rows.
+
+        Parameters
+        ----------
+        columns
+            Headings with commas between them; empty: all.
+        rows
+            First cells of the rows with commas between them, semicolons between the rows; empty: all.
+        caption
+            Instead of that of the file; ``-``: none.
+        """
+        places = [self.column(name.strip()) for name in columns.split(",")] if columns else range(len(self.columns))
+        chosen = [row for part in rows.split(";") for row in self.matching(part.split(","))] if rows else self.rows
+        ends = ["---:" if all(_is_number(row[place]) for row in chosen) else "---" for place in places]
+        cells = [[self.columns[place] for place in places], ends]
+        cells += [[shown(row[place]) for place in places] for row in chosen]
+        lines = [f"| {' | '.join(line)} |" for line in cells]
+        if caption != "-":
+            origin = "measured {date} at commit {commit} by `{command}`".format_map(
+                {**dict.fromkeys(_ORIGIN, ""), **self.header}
+            )
+            lines = [f"{caption or self.header.get('caption', '')} ({origin})", "", *lines]
+        return "\n".join(lines)
 
     def column(self, name: str) -> int:
         """Number of a column.
@@ -261,6 +295,43 @@ class Table:
         if len(found) > 1:
             raise ValueError(f"table {self.name} has {len(found)} rows {', '.join(values)!r}: name more of its keys")
         return found[0][self.column(column)]
+
+
+_BLOCK = re.compile(r"^( *)(<!-- measured: (\w+)\s(.*?)-->\n).*?(<!-- end -->)", re.DOTALL | re.MULTILINE)
+_FIGURE = re.compile(r'\[[^\[\]]*\](\(\S*tables/(\w+)\.csv "([^";]*); ([^"]*)"\))')
+
+
+def filled(text: str, folder: Path = FOLDER) -> str:
+    """Return a page's text with its tables and figures as the files in a folder have them.
+
+    A table lies between `<!-- measured: NAME -->` and `<!-- end -->`; lines `columns:`, `rows:` and `caption:` in the
+    first comment choose (`Table.markdown`). A figure is a link to its table with the title `KEYS; COLUMN`:
+    `[0.0122](../tables/sphere.csv "Bayer, 8; rms error [px]")`.
+
+    Raises
+    ------
+    ValueError
+        A table, row or column does not exist; the message names those that do.
+    """
+
+    def table_of(found: re.Match[str]) -> str:
+        options = dict(re.findall(r"^ *(\w+): (.*?) *$", found[4], re.MULTILINE))
+        if odd := options.keys() - {"columns", "rows", "caption"}:
+            raise ValueError(f"a table of a page states columns, rows and caption, not {', '.join(odd)}: {found[2]!r}")
+        lines = ["", *Table.read(folder / f"{found[3]}.csv").markdown(**options).splitlines(), "", found[5]]
+        return found[1] + found[2] + "\n".join(found[1] + line if line else "" for line in lines)
+
+    def figure_of(found: re.Match[str]) -> str:
+        return f"[{shown(Table.read(folder / f'{found[2]}.csv').figure(found[3].split(','), found[4]))}]{found[1]}"
+
+    return _FIGURE.sub(figure_of, _BLOCK.sub(table_of, text))
+
+
+def fill_pages(fill: Callable[[str], str] = filled) -> None:
+    """Write tables and figures into the pages that show them, or what else `fill` gives."""
+    for page in PAGES:
+        if (text := page.read_text(encoding="utf-8")) != (new := fill(text)):
+            page.write_text(new, encoding="utf-8")
 
 
 def _same(wanted: str, cell: str) -> bool:

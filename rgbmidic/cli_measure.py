@@ -150,8 +150,10 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
     failed = [index for index in result.deformed if result.status[index] != 0]
     if unread := int(result.unread.sum()):
         note(f"note: frames that could not be read: {unread}; --resume tries them again")
-    if len(failed) > len(result.deformed) / 2 or not result.deformed:
-        first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}" if failed else "there is none"
+    if not result.deformed:
+        raise typer.Exit(command.fail("every frame is one of the reference: there is no deformed one"))
+    if len(failed) > len(result.deformed) / 2:
+        first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}"
         count = f"{len(failed)} of {len(result.deformed)} deformed frames failed or did not converge"
         raise typer.Exit(command.fail(f"{count}; {first}"))
 

@@ -122,6 +122,7 @@ def main(app: typer.Typer) -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # names that are no text, as standard error prints them
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False, markup=False)
+    handler.addFilter(Once())
     loggers = [logging.getLogger(name) for name in ("rgbmidic", "rgbmidic_calibration")]
     for logger in loggers:  # not the root: other libraries talk to programmers
         logger.addHandler(handler)
@@ -129,6 +130,20 @@ def main(app: typer.Typer) -> None:
     for logger in loggers:
         logger.removeHandler(handler)
     sys.exit(status)
+
+
+class Once(logging.Filter):
+    """Lets a text through once: what is repeated for another mesh or file of the same test is one line."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._texts = set[str]()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Report whether the text of a record is new."""
+        is_new = (text := record.getMessage()) not in self._texts
+        self._texts.add(text)
+        return is_new
 
 
 def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> int:

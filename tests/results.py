@@ -55,6 +55,7 @@ def random_record(seed: int) -> FrameRecord:
         "time_ns": seed * 1_000_003,
         "status": seed % 2,
         "reason": "did not converge: é" if seed % 2 else "",
+        "warnings": ["dark: é", "late"][: seed % 3],
         "unread": seed % 2,
         "tries": 1 + seed % 2,
         "iterations": len(history),

@@ -25,7 +25,7 @@ from rgbmidic.errors import CalibrationError, ConfigurationError, FrameError
 from rgbmidic.frames import ChannelFrame, FrameSeries, FrameSource, Mosaic, open_series
 from rgbmidic.frames.data import cfa_channels, planes_of
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.frame_check import unevenness
+from rgbmidic.illumination.frame_check import saturation_pile, unevenness
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
@@ -506,15 +506,6 @@ def _window(side: int, length: int, block: int, step: int, offset: int) -> Float
     edges = np.array([-2, -1, 0, 1, block - 2, block - 1, block, block + 1])
     weights = np.interp(distance, edges, [0, 1, 3, 4, 4, 3, 1, 0], left=0.0, right=0.0)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float64)
-
-
-def saturation_pile(plane: npt.NDArray[np.uint16], white: float) -> float | None:
-    """Largest value of a plane where it occurs far more often than the values just below it."""
-    top = int(plane.max())
-    if top >= white or top < 8:
-        return None
-    count, below = int((plane == top).sum()), int(((plane < top) & (plane >= top - 4)).sum())
-    return float(top) if count > 20 and count > 2 * below else None
 
 
 def unevenness_of(frame: Mosaic | ChannelFrame, lit: float = 0.1) -> float:

@@ -13,7 +13,7 @@ import typer
 from typer import Argument, Option
 
 from rgbmidic import command
-from rgbmidic.errors import ConfigurationError
+from rgbmidic.errors import ConfigurationError, InputError
 
 if TYPE_CHECKING:
     from rgbmidic.settings import FrameSettings
@@ -64,7 +64,7 @@ def _captures(options: dict[str, Any]) -> partial[Captures]:
     """How the captures that options name are found, by a call."""
     from rgbmidic_calibration.captures import Captures
 
-    lights, dark = read_named(options.pop("light"), "--light"), options.pop("dark")
+    lights, dark = read_named(options.pop("light") or (), "--light"), options.pop("dark")
     return partial(Captures.find, lights, dark, _frames(options))
 
 
@@ -127,6 +127,16 @@ def read_limits(options: Sequence[str]) -> Limits:
             )
         limits = replace(limits, **{name: number})
     return limits
+
+
+def _distance(text: str) -> tuple[tuple[float, ...], float]:
+    """Ends (x0, y0, x1, y1) in px and length in mm of ``X0,Y0:X1,Y1=MM``; a `ConfigurationError` for anything else."""
+    ends, _, length = text.partition("=")
+    try:
+        return command.read_place(ends, "--distance", "X0,Y0:X1,Y1"), float(length.removesuffix("mm"))
+    except (InputError, ValueError):
+        form = "X0,Y0:X1,Y1=MM, such as 120,85:840,85=25"
+        raise ConfigurationError(f"--distance is {form}, not {text!r}") from None
 
 
 def _region(text: str | None) -> tuple[float, ...] | None:
@@ -273,27 +283,44 @@ def camera(
 
 
 @app.command()
-@_takes_captures
+@command.gather("captures", CAPTURE_OPTIONS, _captures)
 def check(
-    file: Annotated[Path, Argument(help="Calibration file.")],
+    file: Annotated[Path, Argument(help="Calibration file, or camera file with --distance.")],
     captures: Any,
     together: Annotated[
         list[str] | None, Option(help="NAME+NAME=FILES: the same scene with these lights on together.")
     ] = None,
     limit: Annotated[
         list[str] | None,
-        Option(help="NAME=VALUE: leakage, checkerboard, additivity, strength, noise (in %), registration (in px)."),
+        Option(
+            help="NAME=VALUE: leakage, checkerboard, additivity, strength, noise, distance (in %), registration (in px)."
+        ),
     ] = None,
     region: Region = None,
+    distance: Annotated[
+        list[str] | None,
+        Option(help="X0,Y0:X1,Y1=MM: a known distance on the plane of a camera file, between two places in px."),
+    ] = None,
+    corner_std: Annotated[float, Option(help="Standard uncertainty of such a place, px.")] = 0.5,
 ) -> None:
     """Check a calibration on captures that were not used to make it; exit status 1 if a limit is exceeded."""
+    from rgbmidic.fields.plane import CameraCalibration
     from rgbmidic.illumination.calibration import Calibration
     from rgbmidic_calibration import display
-    from rgbmidic_calibration.verify import check_calibration
+    from rgbmidic_calibration.verify import check_calibration, check_distances
 
-    limits, calibration = read_limits(limit or ()), Calibration.read(file)
-    found = captures(calibration=calibration, together=read_named(together or (), "--together"))
-    checks = check_calibration(calibration, found, limits=limits, region=_region(region))
+    limits = read_limits(limit or ())
+    if CameraCalibration.is_in(file):
+        known = [_distance(text) for text in distance or ()]
+        if not known:
+            raise ConfigurationError(f"{file} is a camera file: state a known distance, --distance X0,Y0:X1,Y1=MM")
+        checks = check_distances(CameraCalibration.read(file), known, corner_std=corner_std, limits=limits)
+    elif distance:
+        raise ConfigurationError(f"--distance is for a camera file (rgbmidic-calibrate camera), and {file} is none")
+    else:
+        calibration = Calibration.read(file)
+        found = captures(calibration=calibration, together=read_named(together or (), "--together"))
+        checks = check_calibration(calibration, found, limits=limits, region=_region(region))
     display.verdict(checks)
     if not all(one.passed for one in checks):
         raise typer.Exit(1)

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import CalibrationError, ConfigurationError
+from rgbmidic.fields.plane import CameraCalibration
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.crosstalk import Crosstalk
@@ -40,6 +41,8 @@ class Limits:
         Misregistration left anywhere in the frame, px.
     noise
         Observed noise against the predicted one, %.
+    distance
+        Known distance on the specimen's plane against the measured one, %.
     """
 
     leakage: float = 0.3
@@ -48,6 +51,7 @@ class Limits:
     strength: float = 5.0
     registration: float = 0.03
     noise: float = 10.0
+    distance: float = 0.5
 
 
 LIMITS = Limits()
@@ -269,6 +273,57 @@ def noise_ratio(stack: TemporalStack, noise: NoiseModel, same_exposure: float = 
     samples = int(clear.sum())
     ratio = float(np.sqrt(observed / max(predicted, 1e-12)))
     return ratio, ratio / np.sqrt(2 * max(samples, 1) * (stack.count - 1))
+
+
+def check_distances(
+    camera: CameraCalibration,
+    distances: Sequence[tuple[Sequence[float], float]],
+    *,
+    corner_std: float = 0.5,
+    limits: Limits = LIMITS,
+) -> list[Check]:
+    """Check plane and scale of a camera on distances that were not used to make it, such as a ruler on the plane.
+
+    Parameters
+    ----------
+    camera
+        The camera under test, with a plane.
+    distances
+        Ends (x0, y0, x1, y1) in px, as they are read in an image, and the true distance in mm.
+    corner_std
+        Standard uncertainty of the ends, px.
+    limits
+        What may be left.
+
+    Returns
+    -------
+    list of Check
+        Relative error of each, and its standard uncertainty from the ends, the lens and the plane.
+
+    Raises
+    ------
+    CalibrationError
+        An end lies outside the frame, or a distance is not positive.
+    """
+    checks = []
+    for number, (ends, true) in enumerate(distances, start=1):
+        points = np.reshape(np.asarray(ends, dtype=np.float64), (2, 2))
+        if not true > 0 or (points < 0).any() or (points > np.array(camera.shape[::-1]) - 1).any():
+            height, width = camera.shape
+            raise CalibrationError(
+                f"a distance has its ends in the frame of {width} x {height} px and a length above 0 mm; given are "
+                f"{points.tolist()} and {true:g} mm"
+            )
+        step = np.diff(camera.to_mm(points), axis=0)[0]
+        length = float(np.hypot(*step))
+        along = step / max(length, 1e-300)
+        by_ends = along @ camera.jacobian(points)
+        slopes = along @ np.diff(camera.sensitivity(points), axis=0)[0]
+        variance = corner_std**2 * float((by_ends**2).sum()) + float(slopes @ camera.correlation @ slopes)
+        text = f"distance {number} is {true:g} mm: measured {length:.6g} mm"
+        error, std = 100 * (length / true - 1), 100 * float(np.sqrt(variance)) / true
+        checks.append(Check(f"distance {number}", text, error, limits.distance, std=std, unit="%"))
+    return checks
 
 
 def check_calibration(

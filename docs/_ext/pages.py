@@ -58,6 +58,7 @@ def rewritten(text: str, folder: Path, page: Path) -> str:
             return f"{label}(/{path.relative_to(DOCS).as_posix()}{anchor})"
         return f"{label}({os.path.relpath(path, page)}{anchor})"
 
+    text = re.sub(r'\[([^\[\]]*)\]\(\S*tables/\w+\.csv "[^"]*"\)', r"\1", text)  # a figure is no link on the site
     parts = re.split(r"(^```.*?^```)", text, flags=re.DOTALL | re.MULTILINE)
     whole = re.compile(r"(!?\[[^\[\]]*\])\(([^)#\s]+)(#[^)\s]*)?\)")
     return "".join(part if n % 2 else whole.sub(link, part) for n, part in enumerate(parts))

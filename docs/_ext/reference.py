@@ -1,7 +1,8 @@
 """The reference pages, generated from the code: commands, keys of the files, fields of a result, public names.
 
-A page asks for one with a fence `{generated}` and a name of `GENERATORS`; in the tables of TEST.toml the columns
-*type* and *default* are the code's. The pages of the public names are written into docs/reference/api.
+A page holds one between `<!-- generated: NAME -->`, a name of `GENERATORS`, and `<!-- end -->`: `python -m benchmarks
+--pages` writes it there. In the tables of TEST.toml the columns *type* and *default* are the code's. The pages of the
+public names are written into docs/reference/api.
 """
 
 from __future__ import annotations
@@ -339,9 +340,12 @@ GENERATORS: dict[str, Callable[[], str]] = {
 }
 
 
-def expanded(text: str) -> str:
-    """A page's text with what its `{generated}` fences ask for in their place."""
-    return re.sub(r"```\{generated\} (.+)\n```", lambda found: GENERATORS[found[1]](), text)
+_BLOCK = re.compile(r"(<!-- generated: ([^\n]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def filled(text: str) -> str:
+    """A page's text with what the code gives between `<!-- generated: NAME -->` and `<!-- end -->`."""
+    return _BLOCK.sub(lambda found: f"{found[1]}\n{GENERATORS[found[2]]().strip()}\n\n{found[3]}", text)
 
 
 # ---- public names
@@ -449,7 +453,6 @@ def _update(path: Path, text: str) -> None:
 def _read(app: Sphinx, docname: str, source: list[str]) -> None:
     if docname == "reference/test-file":
         source[0] = with_types(source[0])
-    source[0] = expanded(source[0])
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -254,11 +254,11 @@ def _unweighted(data: _Data) -> dict[str, Any]:
 def _threshold(data: _Data) -> dict[str, Any]:
     claim = {
         "figure": "Fig. 14",
-        "statement": "at 0.33° the disturbed zone has a radius of 165 px, the grey level on its contour is 69 %",
+        "statement": "at 0.33° the corrupted zone has a radius of 165 px, the grey level on its contour is 69 %",
     }
     used = data.scene.threshold
     if used is None:
-        return claim | {"measured": "no disturbed zone at any angle", "verdict": "not reproduced"}
+        return claim | {"measured": "no corrupted zone at any angle", "verdict": "not reproduced"}
     each = "; ".join(
         f"{angle:g}°: {found.zone.radius:.0f} px, {found.contour:.0%} (P {found.zone.contrast:.1f} times)"
         for angle, found in data.scene.thresholds.items()

@@ -39,6 +39,9 @@ class ProbeConstants:
         Part of a place from which nothing is said of the rest, which is rounding of its points. Chosen.
     rounding
         Of a sum of weights.
+    edge
+        Part of a strain gauge by which one whose middle lies on a straight edge may hold less than half: its points on
+        the edge, a twentieth of a gauge of 25 px.
     step
         Distance in px of the points that stand for a line or an area: an element of 10 px holds some 40.
     """
@@ -46,6 +49,7 @@ class ProbeConstants:
     least: float = 0.5
     whole: float = 0.995
     rounding: float = 1e-9
+    edge: float = 0.05
     step: float = 1.0
 
 
@@ -250,7 +254,7 @@ class StrainGauge:
     Raises
     ------
     InputError
-        It is outside the region, or too short.
+        It is too short, or half of it or more is outside the region.
     """
 
     def __init__(
@@ -259,17 +263,24 @@ class StrainGauge:
         gauges = StrainGauges.at_points(covariance, np.array([[x, y]]), length)
         self.name, self.measure, self.nodes = name, measure, np.unique(gauges.nodes)
         self.gauges = gauges.of_nodes(self.nodes)
-        self.inside = float(Places.of(covariance.mesh, _circle(x, y, gauges.length / 2)).inside.mean())
+        places = Places.of(covariance.mesh, _circle(x, y, gauges.length / 2))
+        self.inside = float(places.inside.mean())
+        if self.inside < _CONSTANTS.least - _CONSTANTS.edge:
+            raise InputError(f"half or more of {name} is outside {places.where}")
 
     def histories(self, nodal: Nodal) -> list[History]:
-        """Compute strain, principal strains and equivalent from the displacements of its `nodes` in every frame."""
+        """Compute strain, principal strains and equivalent from the displacements of its `nodes` in every frame.
+
+        They are NaN where less than half of the nodes, as they count, is measured.
+        """
         rows = zip(nodal.u, nodal.v, nodal.u_std, nodal.v_std, strict=True)
         gradients, covariances = zip(*(self.gauges.gradient(*row) for row in rows), strict=True)
-        strain = strain_of_gradient(np.concatenate(gradients), np.concatenate(covariances), self.measure)
-        weights = self.gauges.fractions / self.gauges.fractions.sum()
-        measured = np.isfinite(strain.components[:, 0])
-        used = np.where(measured, _known(nodal)[:, self.gauges.nodes] @ weights, 1.0)
-        return _strain_histories(self.name, strain, _cut(self.name, "strain", self.inside * used))
+        used = _known(nodal)[:, self.gauges.nodes] @ (self.gauges.fractions / self.gauges.fractions.sum())
+        gradient = np.concatenate(gradients)
+        gradient[used < _CONSTANTS.least - _CONSTANTS.rounding] = np.nan
+        strain = strain_of_gradient(gradient, np.concatenate(covariances), self.measure)
+        kept = np.where(np.isfinite(strain.components[:, 0]), used, 1.0)
+        return _strain_histories(self.name, strain, _cut(self.name, "strain", self.inside * kept))
 
 
 def _strain_histories(name: str, strain: Strain, note: str) -> list[History]:

@@ -196,6 +196,31 @@ def _levels(samples: _Samples, again: _Samples | None, calibrated: float | None,
         yield from _noise(samples, again, step)
 
 
+def saturation_pile(samples: npt.NDArray[np.integer[Any]], white: float) -> float | None:
+    """Find the level below white at which samples pile up as they do at saturation.
+
+    Parameters
+    ----------
+    samples
+        Raw samples.
+    white
+        Their white level.
+
+    Returns
+    -------
+    float or None
+        Their largest value, where it occurs more than twice as often as the four levels below it, which noise would
+        make as frequent; None: it does not.
+    """
+    top = int(samples.max(initial=0))
+    if top >= white or top < 8 or (count := np.count_nonzero(samples == top)) <= 20:
+        return None
+    bits = int(np.bitwise_or.reduce(samples, axis=None))
+    step = bits & -bits  # all samples are multiples of it
+    below = np.count_nonzero(samples >= top - 4 * step) - count
+    return float(top) if count > 2 * below else None
+
+
 def unevenness(
     samples: npt.NDArray[np.uint16], noise: NoiseModel | None = None, black: float = 0.0, step: int = 1
 ) -> float:

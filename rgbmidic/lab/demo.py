@@ -30,6 +30,7 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Plan, Separation, correlate, measure
 from rgbmidic.pipeline.resolution import rms
 from rgbmidic.results import Result
+from rgbmidic.results.files import writing
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ScaleSettings, TestSettings, read_test
 from rgbmidic.typing import FloatArray, FloatImage, Progress
@@ -243,8 +244,9 @@ def write_plate(test: Path) -> CameraCalibration:
         """Values of 0 to 1 as grey levels, with noise of .25 % of the full scale."""
         (test / name).parent.mkdir(exist_ok=True)
         levels = 65535 * (0.05 + 0.8 * values + random.normal(0, 0.0025, values.shape))
-        if not cv2.imwrite(str(test / name), np.round(levels).clip(0, 65535).astype(np.uint16).reshape(_PLATE_SHAPE)):
-            raise ResultError(f"cannot write {test / name}")
+        _, content = cv2.imencode(".png", np.round(levels).clip(0, 65535).astype(np.uint16).reshape(_PLATE_SHAPE))
+        with writing(test / name):  # OpenCV itself opens no non-ASCII names on Windows
+            (test / name).write_bytes(content.tobytes())
 
     def board(name: str, turns: Sequence[float], place: tuple[float, float, float]) -> None:
         places = replace(_posed(turns, place), lens=None).to_mm(straight)

@@ -7,14 +7,12 @@ latest state alone and a few initial guesses.
 from __future__ import annotations
 
 import logging
-import sys
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from heapq import nsmallest
-from logging.handlers import BufferingHandler
 from typing import Any, Protocol
 
 import cv2
@@ -27,6 +25,7 @@ from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError, optio
 from rgbmidic.pipeline.frame import Measured, Updated, attempt, failed_frame
 from rgbmidic.pipeline.plan import STRIDE, Plan, is_key, parent
 from rgbmidic.results import FrameRecord
+from rgbmidic.results.warnings import collected
 
 logger = logging.getLogger(__name__)
 
@@ -123,9 +122,8 @@ class Schedule:
         except CancelledError:
             raise RgbmidicError(LOST_CLUSTER) from None
         except Exception as error:  # a worker of a cluster that died over the frame more often than the cluster allows
-            kind, name = type(error).__name__, self._plan.series.name(index)
-            logger.warning("a worker died while %s was measured (%s)", name, str(error) or kind)
-            return Measured(record=failed_frame(self._plan, index, f"its worker died: {kind}"))
+            reason = f"its worker died: {type(error).__name__}"
+            return Measured(record=failed_frame(self._plan, index, reason))
         for level, text in found.messages:
             logger.log(level, "%s", text)
         return found
@@ -277,11 +275,6 @@ def _measure_elsewhere(plan: Plan, index: int, start: Start, updated: Updated) -
     """Measure a frame in a worker of a cluster, on one thread; nobody reads its log."""
     cv2.setNumThreads(1)
     set_threads(1)
-    logger, thread, handler = logging.getLogger("rgbmidic"), threading.get_ident(), BufferingHandler(sys.maxsize)
-    handler.addFilter(lambda record: record.thread == thread)
-    logger.addHandler(handler)
-    try:
+    with collected() as messages:
         found = attempt(plan, index, start, updated)
-    finally:
-        logger.removeHandler(handler)
-    return Measured(record=found.record, messages=tuple((one.levelno, handler.format(one)) for one in handler.buffer))
+    return Measured(record=found.record, messages=tuple(messages))

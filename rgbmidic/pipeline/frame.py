@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,13 +24,23 @@ from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.data import Window
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState, light_images
-from rgbmidic.pipeline.plan import STRIDE, Plan
-from rgbmidic.pipeline.suitability import SUITABILITY, exposure_fault, saturated_fraction, too_small
+from rgbmidic.pipeline.plan import STRIDE, Plan, parent
+from rgbmidic.pipeline.suitability import (
+    SUITABILITY,
+    clipping,
+    exposure_fault,
+    saturated_fraction,
+    too_small,
+    unsteady,
+)
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import stage, timed
 from rgbmidic.typing import FloatArray, FloatImage
 
 logger = logging.getLogger(__name__)
+
+LEAST_GAIN = 0.3
+"""Light of a lamp over that in the reference, below which the lamp seems to fail; chosen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,7 +100,6 @@ def attempt(plan: Plan, index: int, start: Start, updated: Updated = ()) -> Meas
         return Measured(record=record, solution=values["solution"])
     except RgbmidicError as error:
         reason, unread = str(error), isinstance(error, _UnreadError)
-        logger.warning("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
     except Exception as error:  # whatever it is, the other frames can be measured
         reason, unread = f"unexpected error: {type(error).__name__}: {error}", False
         logger.exception("frame %d (%s) failed: %s", index, plan.series.name(index), reason)
@@ -118,6 +127,15 @@ def failed_frame(plan: Plan, index: int, reason: str, *, unread: bool = False) -
         time_ns = plan.series.time_ns(index)
     nodes, lights, number = len(plan.reference.mesh.nodes), len(plan.images.names), plan.series.numbers[index]
     return FrameRecord.failed(reason, nodes=nodes, lights=lights, number=number, time_ns=time_ns, unread=unread)
+
+
+def messages(kept: Mapping[str, Any]) -> list[str]:
+    """Warnings of a frame of which ``status``, ``reason`` and ``warnings`` are kept, and how it ended if not well."""
+    texts = list[str](map(str, kept["warnings"]))
+    if kept["reason"]:
+        end = "did not converge" if kept["status"] == Status.NOT_CONVERGED else "cannot be measured"
+        texts.append(f"{end}: {kept['reason']}")
+    return texts
 
 
 class _UnreadError(FrameError):
@@ -165,9 +183,7 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     there = state
     if not isinstance(state, IlluminationImages):
         there = tuple(replace(frame, values=frame.values[..., *here]) for frame in state)
-    if (share := saturated_fraction(there, plan.region.mask)) > plan.saturated + SUITABILITY.saturated:
-        words = "%s: %.0f %% of the samples in the region are saturated, %.0f %% in the reference: look at the exposure"
-        logger.warning(words, name, 100 * share, 100 * plan.saturated)
+    warnings = exposure_warnings(plan, there)
     with stage("separation"):
         images = light_images(plan.separation, state, window)
     if (len(images.values), *images.shape) != (len(reference.images), *window.shape):
@@ -180,10 +196,10 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         del ready, weights  # a tenth of what a frame needs
     solution = reference_update.track(deformed, start, plan.solver, plan.method)
     if solution.status is not Status.CONVERGED:
-        causes = _causes(plan, there, images, reference.offset(deformed), solution)
-        solution = replace(solution, reason="; ".join([solution.reason, *causes]))
-        end = "cannot be measured" if solution.status is Status.FAILED else "did not converge"
-        logger.warning("frame %d (%s) %s: %s", index, name, end, solution.reason)
+        causes = [solution.reason, *_causes(plan, there, images, reference.offset(deformed), solution)]
+        if plan.reference_motion > SUITABILITY.blur:  # of the reference, whatever else a frame shows
+            causes = [unsteady(plan.reference_motion)]
+        solution = replace(solution, reason="; ".join(causes))
     key = place % STRIDE == 0 or place == len(plan.series.chosen) - 1
     if (settings.mesh.error is True or (settings.mesh.error == "key" and key)) and solution.measured.any():
         with stage("conclusion"):
@@ -191,13 +207,17 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
     moved = solution.displacement - reference.offset(deformed)
     brightness = brightness_change(plan.images.values, images.values, reference, moved)
-    for light, gain in _dark(images.names, brightness):
-        logger.warning("%s: %s gives %.0f %% of its light in the reference", name, light, 100 * gain)
+    for light, _ in _dark(images.names, brightness):
+        warnings.append(f"{light} gives less than {LEAST_GAIN:.0%} of its light in the reference")
     match, best, reference_updates = _compared(plan, index, start, reference_update, deformed, solution)
+    if len(reference_updates) > len(start.reference_updates):
+        warnings.append("becomes the reference of those after it")
+    warnings += _blur_warning(plan, index, start, solution)
     reflection = images.reflection_index(step, here)
     samples = (there,) if isinstance(there, IlluminationImages) else there
     return {
         "solution": kept,
+        "warnings": warnings,
         "number": plan.series.numbers[index],
         "time_ns": plan.series.time_ns(index),
         "brightness": brightness,
@@ -265,13 +285,47 @@ def _compared(
     best = float(np.fmax(start.best_match, np.float32(median)))
     if index in plan.settings.frames.reference or not reference_update.is_due(match, best):
         return median, best, start.reference_updates
-    logger.warning("frame %d (%s) becomes the reference of those after it", index, plan.series.name(index))
     return median, 0.0, (*start.reference_updates, plan.series.chosen.index(index))
 
 
-def _dark(lights: Sequence[str], brightness: FloatArray, least: float = 0.3) -> list[tuple[str, float]]:
-    """The lights whose lamp seems to fail: they give less than `least` of their light in the reference."""
-    return [(light, gain) for light, gain in zip(lights, brightness[:, 0], strict=True) if gain < least]
+def _dark(lights: Sequence[str], brightness: FloatArray) -> list[tuple[str, float]]:
+    """The lights whose lamp seems to fail: they give less than `LEAST_GAIN` of their light in the reference."""
+    return [(light, gain) for light, gain in zip(lights, brightness[:, 0], strict=True) if gain < LEAST_GAIN]
+
+
+def exposure_warnings(plan: Plan, state: RawState) -> list[str]:
+    """What is doubtful about the exposure of a frame that is cut to the reference's window, a text each.
+
+    They have no figures of the frame, so that one line says it of many frames.
+    """
+    warnings, most = list[str](), plan.saturated + SUITABILITY.saturated
+    if saturated_fraction(state, plan.region.mask) > most:
+        warnings.append(
+            f"more than {most:.0%} of the samples in the region are saturated, {plan.saturated:.0%} in the reference: "
+            "look at the exposure"
+        )
+    if plan.clipped_at is None and (found := clipping(state)):
+        warnings.append(found[1])
+    return warnings
+
+
+def _blur_warning(plan: Plan, index: int, start: Start, solution: Solution) -> list[str]:
+    """Warn of motion blur: of a frame that starts from the one before it, which is known to be exposed for how long."""
+    place = plan.series.chosen.index(index)
+    if parent(place) != place - 1 or start.displacement is None or not solution.measured.any() or not plan.exposure:
+        return []
+    before = plan.series.chosen[place - 1]
+    times = [plan.series.time_ns(number) for number in (before, index)]
+    rate = plan.settings.scale.frame_rate or plan.series.recording.frame_rate
+    if None not in times:
+        seconds = 1e-9 * float(np.diff(np.array(times, dtype=np.int64))[0])
+    else:
+        seconds = (plan.series.numbers[index] - plan.series.numbers[before]) / rate if rate else 0.0
+    moved = np.hypot(*(solution.displacement - start.displacement)[solution.measured].T)
+    if seconds <= 0 or plan.exposure / seconds * float(np.quantile(moved, 0.95)) <= SUITABILITY.blur:
+        return []
+    exposed = f"while it is exposed ({1e6 * plan.exposure:g} µs)"
+    return [f"motion blur: the specimen moves by more than {SUITABILITY.blur:g} px {exposed}"]
 
 
 def _in_bytes(shares: FloatImage) -> npt.NDArray[np.uint8]:

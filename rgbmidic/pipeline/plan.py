@@ -27,10 +27,12 @@ from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.start import search_reach
 from rgbmidic.errors import ConfigurationError, FrameError, RegionError
 from rgbmidic.fields import CameraCalibration
-from rgbmidic.frames import Window, read_frame
+from rgbmidic.frames import Window, read_mask
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.contrast import CONTRAST
 from rgbmidic.illumination.frame_check import check_state
 from rgbmidic.illumination.images import DARK, IlluminationImages, correlated
+from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.separation import (
     LightSeparation,
     RawState,
@@ -110,6 +112,12 @@ class Plan:
         Size of the speckle in the reference's region, px; None where it is not known.
     saturated
         Fraction of the reference's samples in the region that are saturated.
+    clipped_at
+        Level below their white level at which samples of the reference pile up, DN; None: they do not.
+    reference_motion
+        Largest shift of the reference frames against the first of them, px.
+    exposure
+        Exposure time of the frames, s; 0 where it is not known.
     element_size
         Side of the elements, px.
     window
@@ -136,6 +144,9 @@ class Plan:
     reference: Reference
     speckle: float | None
     saturated: float
+    clipped_at: float | None
+    reference_motion: float
+    exposure: float
     window: Window
     element_size: float
     finite_elements: FiniteElementMesh | None = None
@@ -202,7 +213,7 @@ class Plan:
         if not given and isinstance(separate, WindowedSeparation):
             window = window_of_reference(region, settings, frame)
             region = region.part(*window.part_of(Window.whole(frame)))
-        state, images, separate = _read_reference(settings, series, separate, window, region, calibration)
+        state, images, separate, motion = _read_reference(settings, series, separate, window, region, calibration)
         if separation is not None and isinstance(state, IlluminationImages):
             raise ConfigurationError("the source gives images of the lights, which need no separation: give only one")
         if mesh is not None:
@@ -232,13 +243,16 @@ class Plan:
             reference=_reference(images, weights, region, mesh, sigma, solver.prefilter),
             speckle=suitability.speckle_size(images, region),
             saturated=suitability.saturated_fraction(state, region.mask),
+            clipped_at=None if (clipping := suitability.clipping(state)) is None else clipping[0],
+            reference_motion=motion,
+            exposure=1e-9 * (series.recording.exposure_ns or 0),
             window=window,
             element_size=size,
             finite_elements=finite_elements,
             placement=placement,
             notes={"calibration_figures": camera.figures() if camera else {}},
         )
-        _check_reference(plan, state)
+        _check_reference(plan, state, calibration.noise if calibration else None)
         return plan
 
     @property
@@ -323,13 +337,14 @@ def _read_reference(
     window: Window,
     region: Region,
     calibration: Calibration | None,
-) -> tuple[RawState, IlluminationImages, LightSeparation]:
-    """First state of the reference, mean images of all its frames, and the separation that has learnt from them.
+) -> tuple[RawState, IlluminationImages, LightSeparation, float]:
+    """First state of the reference, mean images of its frames, the separation learnt from them, their motion (px).
 
     Raw frames that contradict the stated levels or their calibration are refused; doubts are warned of.
     """
     indices, name = settings.frames.reference, ", ".join(map(series.name, settings.frames.reference))
-    states = [series.read(index, window) for index in indices[:2]]
+    motion = suitability.ReferenceMotion(region.mask)
+    states = list(motion.watch(series.read(index, window) for index in indices[:2]))
     raw = [state for state in states if not isinstance(state, IlluminationImages)]
     for frame in raw[0] if raw else ():
         if shifted := suitability.shifted_levels(samples := frame.values[..., region.mask], frame.white_level):
@@ -345,20 +360,22 @@ def _read_reference(
     if saturated > 0.98:
         fault = suitability.exposure_fault(states[0], region.mask)
         raise FrameError(f"no light sees the region in the reference ({name}): {fault}")
-    if saturated > suitability.SUITABILITY.saturated:
-        logger.warning(f"{100 * saturated:.0f} % of the samples in the region of the reference ({name}) are saturated")
+    if saturated > suitability.SUITABILITY.clipped:
+        text = f"{100 * saturated:.2g} % of the samples in the region of the reference ({name}) are saturated"
+        logger.warning("%s and will not be measured", text)
     if calibration is not None and raw:
         seen = calibration if window.is_whole else calibration.cropped(window.origin, window.shape)
-        repeat = raw[1] if len(raw) > 1 else None
+        # a camera that shakes adds to the difference of two frames: it is not the noise that is calibrated
+        repeat = raw[1] if len(raw) > 1 and motion.largest < suitability.SUITABILITY.shake else None
         for found in check_state(raw[0], seen, region.mask, name, accept=settings.calibration.accept, repeat=repeat):
             if found.passed:
                 logger.warning("%s may not be what %s calibrates: %s", name, settings.calibration.file, found.text)
-    others = (series.read(index, window) for index in indices[2:])
+    others = motion.watch(series.read(index, window) for index in indices[2:])
     images, learnt = reference_images(separation, chain(states, others), window)
-    return states[0], images, learnt
+    return states[0], images, learnt, motion.largest
 
 
-def _check_reference(plan: Plan, state: RawState) -> None:
+def _check_reference(plan: Plan, state: RawState, noise: NoiseModel | None) -> None:
     """Refuse a reference that no light sees or that shows no texture; warn of what will be measured badly."""
     weights, images, region = plan.weights, plan.images, plan.region
     inside, name = region.mask, ", ".join(map(plan.series.name, plan.settings.frames.reference))
@@ -379,6 +396,15 @@ def _check_reference(plan: Plan, state: RawState) -> None:
         fault = suitability.exposure_fault(state, inside) or "it is saturated, dark or excluded by the weights"
         raise FrameError(f"no light sees the region in the reference ({name}): {fault}")
     suitability.check_texture(state, inside, name)
+    if plan.reference_motion > suitability.SUITABILITY.motion:
+        logger.warning("%s", suitability.unsteady(plan.reference_motion))
+    if clipping := suitability.clipping(state):
+        logger.warning("the reference (%s): %s", name, clipping[1])
+    if repeated := suitability.repetition(images, region, plan.speckle):
+        logger.warning("the reference (%s): %s", name, repeated)
+    dark = suitability.background_fraction(images, region, plan.speckle, noise)
+    if dark > CONTRAST.hidden:
+        logger.warning(f"the region holds dark background ({dark:.1%}) in the reference: draw it inside the specimen")
     levels = suitability.light_levels(images, region).items()
     off = [f"{light} ({level:.1%})" for light, level in levels if level < DARK]
     if off and not isinstance(state, IlluminationImages):
@@ -438,6 +464,8 @@ def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
     ------
     RegionError
         The region is empty, outside the image, or the mask image has another size.
+    FrameError
+        The mask image cannot be read.
     """
     if settings.rectangle is not None:
         outlined = Region.from_rectangle(settings.rectangle, shape)
@@ -446,8 +474,16 @@ def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:
     elif settings.mask is None:
         outlined = Region.from_mask(np.ones(shape, dtype=bool))
     else:
+        mask = read_mask(settings.mask)
+        inside = mask >= 0.5
+        if (excluded := np.count_nonzero(~inside & (mask > 0))) > 0.25 * np.count_nonzero(inside):
+            # soft edges and JPEG files have 7 to 15 %
+            logger.warning(
+                f"region.mask {settings.mask}: {excluded} pixels under half of the largest value are not measured, "
+                f"{np.count_nonzero(inside)} are: draw in one colour what is to be measured"
+            )
         try:
-            outlined = Region.from_mask(read_frame(settings.mask, kind="monochrome").values[0], shape)
+            outlined = Region.from_mask(inside, shape)
         except RegionError as error:
             raise RegionError(f"region.mask {settings.mask}: {error}") from None
     return outlined.without(settings.holes)

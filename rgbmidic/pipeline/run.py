@@ -18,7 +18,7 @@ from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, following, open_workers, rank_of
-from rgbmidic.pipeline.frame import Measured, Updated, read_state
+from rgbmidic.pipeline.frame import Measured, Updated, messages, read_state
 from rgbmidic.pipeline.objects import check_object, check_type, describe
 from rgbmidic.pipeline.plan import Plan, dependants
 from rgbmidic.pipeline.resolution import Progress, choose, refine
@@ -28,6 +28,7 @@ from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
 from rgbmidic.results.result import listed, read_shared
+from rgbmidic.results.warnings import collected, of_frames
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.weights import LightWeights
 
@@ -122,21 +123,10 @@ def measure(
     given: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
     begun = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()
     kept = read_provenance(Path(out)) if begun else {}
-    sized, notes = settings.mesh, dict[str, Any]()
-    if sized.element_size == "auto":
-        choice = notes["element_size"] = kept.get("element_size") or asdict(choose(settings, **given))
-        sized = replace(sized, element_size=choice["element_size"])
-    refines = settings.mesh.refine is not False
-    if refines and mesh is not None:
-        raise InputError("mesh.refine is for a mesh made here, and a mesh is given: leave one of them out")
-    plan = Plan.from_settings(replace(settings, mesh=replace(sized, refine=False)), **given)
-    if refines and "refinement" in kept:
-        stored = read_shared(Path(out), kept)
-        finer = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
-        plan, notes["refinement"] = plan.on_mesh(finer), kept["refinement"]
-    elif refines:
-        plan = refine(plan, settings.mesh.refine)
-    plan = replace(plan, settings=settings, notes={**plan.notes, **notes}, timings=timings)
+    with collected() as before:
+        plan = replace(_plan_of(settings, given, kept, Path(out)), timings=timings)
+    warnings = list(dict.fromkeys(text for level, text in before if level >= logging.WARNING))
+    plan = replace(plan, notes={**plan.notes, "warnings": warnings})
     objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
     if settings.weights.method == "images":  # the masks, whatever their files are called
         objects["weights"] = describe(plan.weights)
@@ -162,10 +152,34 @@ def measure(
         if not schedule.done:
             with closing(open_workers(plan, min(workers, len(places)), scheduler)) as others:
                 schedule.run(others)
-        _tell_repeated(store, places, origin.names)
+        table = store.table().each(["status", "reason", "warnings"], places)
+        texts = ((place, messages(kept)) for place, kept in zip(places, table, strict=True))
+        for line in of_frames(texts, origin.names):
+            logger.warning("%s", line)
+        with collected() as together:
+            _tell_repeated(store, places, origin.names)
         if frames is None:
-            store.finish()
+            store.finish([text for _, text in together])
     return Result.open(out, partial=frames is not None, check=False)
+
+
+def _plan_of(settings: TestSettings, given: Mapping[str, Any], kept: Mapping[str, Any], out: Path) -> Plan:
+    """The plan of a test: elements and mesh are those of the provenance `kept` of a result that is gone on with."""
+    sized, notes = settings.mesh, dict[str, Any]()
+    if sized.element_size == "auto":
+        choice = notes["element_size"] = kept.get("element_size") or asdict(choose(settings, **given))
+        sized = replace(sized, element_size=choice["element_size"])
+    refines = settings.mesh.refine is not False
+    if refines and given["mesh"] is not None:
+        raise InputError("mesh.refine is for a mesh made here, and a mesh is given: leave one of them out")
+    plan = Plan.from_settings(replace(settings, mesh=replace(sized, refine=False)), **given)
+    if refines and "refinement" in kept:
+        stored = read_shared(out, kept)
+        finer = Tri3Mesh(nodes=stored["nodes"] - plan.window.origin, elements=stored["elements"])
+        plan, notes["refinement"] = plan.on_mesh(finer), kept["refinement"]
+    elif refines:
+        plan = refine(plan, settings.mesh.refine)
+    return replace(plan, settings=settings, notes={**plan.notes, **notes})
 
 
 class _Folder:

@@ -26,7 +26,7 @@ from rgbmidic.illumination.images import normalise as divide_by_local_mean
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, Threads
-from rgbmidic.pipeline.frame import Measured, next_reference
+from rgbmidic.pipeline.frame import Measured, messages, next_reference
 from rgbmidic.pipeline.objects import check_object, check_type
 from rgbmidic.pipeline.plan import STRIDE, Plan
 from rgbmidic.results.quantities import NO_CHECKSUM
@@ -331,6 +331,8 @@ class _Live:
         if checksum == self._checksum != NO_CHECKSUM:
             logger.warning("state %d repeats the one before, bit for bit", place)
         self._checksum = checksum
+        for text in messages(record.values):
+            logger.warning("state %d: %s", place, text)
         self._starts[place] = after
         if (frames := after.reference_updates)[-2:] not in self._updates:
             before = self._updates[frames[:-1][-2:]]

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from itertools import combinations
 
+import cv2
 import numpy as np
+from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.ndimage import label, maximum, maximum_position
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.illumination.contrast import LocalContrast
+from rgbmidic.illumination.frame_check import saturation_pile
 from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
-from rgbmidic.illumination.linear import QUANTISATION
+from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.mesh import FiniteElementMesh, Region, Tri3Mesh
@@ -40,16 +46,38 @@ class SuitabilityConstants:
         noise of 8, 40 and 80 DN, .4 % strain) 13 of the 46 with fewer than 1.3 did not converge, some with most of
         their nodes lost, 1 of the 36 with 1.3 to 1.85, and none of the 68 with more, which lost 2 % of the nodes at
         most.
+    clipped
+        Fraction of the samples of a reference that are saturated from which a warning is given; chosen.
     saturated
         Fraction of the samples in the region that are saturated, beyond that of the reference, from which a frame is
         over-exposed. Chosen: reflections saturate a few per cent; three times the exposure saturates a fifth and more.
+    repeated
+        Correlation of the texture with itself, displaced by more than a speckle, from which it repeats itself. Of 360
+        random speckles of 2 to 10 px in regions of 70 to 300 px none exceeds .35; dots on a grid reach 1, with a jitter
+        of a tenth of their pitch .7 (tests/unit/pipeline/test_suitability.py).
+    enough_speckles
+        Number of speckles in the overlap of the texture with itself from which their correlation counts: it then
+        scatters by .1.
+    motion
+        Motion (px) of the reference frames against each other from which a warning is given; chosen.
+    shake
+        Motion (px) from which the difference of two reference frames is more than noise: that of speckle of 300 DN/px
+        is 3 DN, a third of usual camera noise.
+    blur
+        Motion (px) during the exposure from which a warning is given: the speckle's gradient is resolved to 1 px.
     """
 
     no_texture: float = 0.05
     faint_texture: float = 0.2
     hardly_enough: float = 1.3
     enough: float = 2.0
+    clipped: float = 0.01
     saturated: float = 0.1
+    repeated: float = 0.5
+    enough_speckles: float = 50.0
+    motion: float = 0.05
+    shake: float = 0.01
+    blur: float = 1.0
 
 
 SUITABILITY = SuitabilityConstants()
@@ -82,20 +110,149 @@ def tell_small(mesh: Tri3Mesh, speckle: float | None, finite_elements: FiniteEle
     logger.warning("%s: %s", finite_elements.name, text)
 
 
-def speckle_size(images: IlluminationImages, region: Region) -> float | None:
-    """Size of the speckle (px), the median over the lights that are on, in the middle of the region; None: unknown."""
-    side = 256  # px: a thousand speckles of 8 px
+def _middle(inside: BoolArray, side: int = 256) -> tuple[slice, slice]:
+    """Rows and columns of the middle of a region (H, W), `side` px at most: a thousand speckles of 8 px."""
     ends = []
     for axis in (1, 0):
-        inside = np.flatnonzero(region.mask.any(axis=axis))
-        first = max(int(np.median(inside)) - side // 2, int(inside[0]))
-        ends.append(slice(first, min(first + side, int(inside[-1]) + 1)))
+        index = np.flatnonzero(inside.any(axis=axis))
+        first = max(int(np.median(index)) - side // 2, int(index[0])) // 2 * 2  # at a whole cell of a mosaic
+        ends.append(slice(first, min(first + side, int(index[-1]) + 1)))
+    return ends[0], ends[1]
+
+
+def _lit_pictures(images: IlluminationImages, region: Region) -> list[FloatArray]:
+    """Images of the lights that are on, in the middle of the region; the mean where a pixel is not valid."""
     levels = light_levels(images, region).values()
     lit = [level >= DARK for level in levels] if max(levels) >= DARK else [True] * len(images.names)
-    pictures = images.values[lit][:, *ends]
-    known = [np.where(np.isfinite(one), one, np.nanmean(one)) for one in pictures if np.isfinite(one).any()]
-    sizes = [size for one in known if (size := speckle_diameter(one.astype(np.float64))) is not None]
+    pictures = images.values[lit][:, *_middle(region.mask)].astype(np.float64)
+    return [np.where(np.isfinite(one), one, np.nanmean(one)) for one in pictures if np.isfinite(one).any()]
+
+
+def speckle_size(images: IlluminationImages, region: Region) -> float | None:
+    """Size of the speckle (px), the median over the lights that are on, in the middle of the region; None: unknown."""
+    sizes = [size for one in _lit_pictures(images, region) if (size := speckle_diameter(one)) is not None]
     return float(np.median(sizes)) if sizes else None
+
+
+def repetition(images: IlluminationImages, region: Region, speckle: float | None) -> str | None:
+    """Find out whether the texture repeats itself in the middle of the region.
+
+    Parameters
+    ----------
+    images
+        One image a light.
+    region
+        What is measured.
+    speckle
+        Size of the speckle, px; None: not known.
+
+    Returns
+    -------
+    str or None
+        The distance and how well it agrees with itself there, in words; None: it does not repeat itself.
+    """
+    if speckle is None or not (pictures := _lit_pictures(images, region)):
+        return None
+    size = [next_fast_len(2 * side, real=True) for side in pictures[0].shape]
+    power = np.zeros((size[0], size[1] // 2 + 1))
+    for one in pictures:
+        texture = one - local_mean(one.astype(np.float32), 4 * speckle)
+        power += np.abs(rfft2(texture / max(float(texture.std()), 1e-6), s=size)) ** 2 / len(pictures)
+    reach = [side // 2 for side in pictures[0].shape]
+    lags = np.ix_(*(np.arange(-far, far + 1) for far in reach))
+    overlap = np.multiply(*(side - np.abs(lag) for side, lag in zip(pictures[0].shape, lags, strict=True)))
+    correlation = irfft2(power, s=size)[lags] / overlap
+    correlation[overlap < SUITABILITY.enough_speckles * speckle**2] = 0
+    # camera noise counts at distance 0 only: texture alone is what neighbours have in common
+    unit = max(float(correlation[reach[0] + 1, reach[1]]), float(correlation[reach[0], reach[1] + 1]), 1e-6)
+    peaks, count = label(correlation > SUITABILITY.repeated * unit)
+    best = maximum(correlation, peaks, range(1, count + 1)) if count else []
+    others = [number for number in range(1, count + 1) if number != peaks[reach[0], reach[1]]]
+    clear = [number for number in others if best[number - 1] > 0.9 * max(best[other - 1] for other in others)]
+    if not clear:
+        return None
+    places = [np.subtract(maximum_position(correlation, peaks, number), reach) for number in clear]
+    row, column = min(places, key=lambda place: float(np.hypot(*place)))
+    agreement = min(float(correlation[reach[0] + row, reach[1] + column]) / unit, 1.0)
+    return (
+        f"the texture repeats itself: displaced by ({abs(column)}, {abs(row)}) px it agrees with itself to "
+        f"{agreement:.2f}, so that displacements may be wrong by this distance; use a random speckle, or steps of less "
+        "than half of it from frame to frame"
+    )
+
+
+def background_fraction(
+    images: IlluminationImages, region: Region, speckle: float | None, noise: NoiseModel | None
+) -> float:
+    """Fraction of the region that is dark background: neither texture nor light (`LocalContrast.background`).
+
+    Of large regions some 2 million pixels are looked at, in rows and columns as far apart.
+    """
+    rows, columns = (np.flatnonzero(region.mask.any(axis=axis)) for axis in (1, 0))
+    step = int(np.ceil(np.sqrt(len(rows) * len(columns) / 2e6)))
+    part = slice(rows[0], rows[-1] + 1, step), slice(columns[0], columns[-1] + 1, step)
+    inside, box = region.mask[*part], replace(images, values=images.values[:, *part], valid=images.valid[:, *part])
+    shown = LocalContrast.of(box, [] if speckle is None else [speckle / step], inside, noise)
+    return float(shown.background(inside)[inside].mean())
+
+
+class ReferenceMotion:
+    """Motion of reference frames against the first of them, in the middle of the region, as they are read.
+
+    Attributes
+    ----------
+    largest : float
+        Largest shift of a frame so far, px.
+    """
+
+    def __init__(self, inside: BoolArray) -> None:
+        """Take the region (H, W)."""
+        self.largest, self._part = 0.0, _middle(inside)
+        self._first: FloatArray | None = None
+
+    def watch(self, states: Iterable[RawState]) -> Iterator[RawState]:
+        """Give back the states, one after the other, after a look at each."""
+        for state in states:
+            picture, step = self._picture(state)
+            if self._first is None:
+                self._first = picture
+            else:
+                self.largest = max(self.largest, step * _shift(self._first, picture))
+            yield state
+
+    def _picture(self, state: RawState) -> tuple[FloatArray, int]:
+        """Picture of a state, and the side of its pixels; the colours of a mosaic's cell are added."""
+        frame = state if isinstance(state, IlluminationImages) else state[0]
+        values = frame.values[..., *self._part].astype(np.float64)
+        if isinstance(frame, Mosaic):
+            rows, columns = (side // 2 * 2 for side in values.shape)
+            return values[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2).mean(axis=(1, 3)), 2
+        return np.nan_to_num(values).mean(axis=0), 1
+
+
+def unsteady(motion: float) -> str:
+    """What reference frames that move by so many px against each other mean."""
+    return (
+        f"the reference frames move against each other by up to {motion:.2g} px: their mean is blurred, and counts as "
+        "being at rest; state frames at rest as frames.reference, or one"
+    )
+
+
+def _shift(first: FloatArray, second: FloatArray) -> float:
+    """Length of the shift between two pictures in their pixels: of the best correlation, below a pixel by gradients."""
+    # of Gaussians of 2 px the differences are gradients, and little of them is noise
+    before, after = (
+        cv2.GaussianBlur(one, (0, 0), 2.0) - cv2.GaussianBlur(one, (0, 0), 20.0) for one in (first, second)
+    )
+    size = [next_fast_len(2 * side, real=True) for side in first.shape]
+    correlation = irfft2(rfft2(after, s=size) * np.conj(rfft2(before, s=size)), s=size)
+    best = np.unravel_index(int(correlation.argmax()), correlation.shape)
+    whole = np.linalg.norm([(int(at) + side // 2) % side - side // 2 for at, side in zip(best, size, strict=True)])
+    if whole > 1.5:
+        return float(whole)
+    along_y, along_x = np.gradient((before + after) / 2)
+    system = np.stack([part.ravel() for part in (along_x, along_y, after, np.ones_like(after))])
+    return float(np.hypot(*(np.linalg.pinv(system @ system.T) @ (system @ before.ravel()))[:2]))
 
 
 def check_texture(state: RawState, inside: BoolArray, name: str) -> None:
@@ -172,6 +329,18 @@ def saturated_fraction(state: RawState, inside: BoolArray) -> float:
     samples = np.count_nonzero(inside) / inside.size
     counts = [np.count_nonzero((frame.values >= frame.white_level) & inside) / frame.values.size for frame in state]
     return float(np.mean(counts) / samples)
+
+
+def clipping(state: RawState) -> tuple[float, str] | None:
+    """Level at which samples of raw frames pile up below their white level, and what it means; None: they do not."""
+    frames = () if isinstance(state, IlluminationImages) else state
+    for frame in frames:
+        if (level := saturation_pile(frame.values, frame.white_level)) is not None:
+            return level, (
+                f"samples pile up at {level:.0f} DN, below white_level {frame.white_level:g}, as where a camera "
+                f"saturates: clipped samples count as measured; state white_level = {level:.0f}"
+            )
+    return None
 
 
 def shifted_levels(samples: AnyArray, white: float) -> str | None:

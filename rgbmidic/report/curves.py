@@ -225,7 +225,7 @@ def history_figure(histories: Histories, panels: Sequence[Panel] = (), *, most: 
             if label:
                 _draw_quantities(axis, times, quantities)
                 style.finish_plot(axis, label_of_times, style.literal(label), whole=histories.times is None)
-                axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7)
+                _draw_legend(axis, len(quantities))
             else:
                 strain, stress = quantities
                 axis.plot(strain.values, stress.values, marker="o", markersize=2.5, linewidth=1)
@@ -236,10 +236,21 @@ def history_figure(histories: Histories, panels: Sequence[Panel] = (), *, most: 
     return style.draw_figure(draw, count=len(panels), aspect=0.45, beside=style.LEGEND, tallest=tallest)
 
 
+_NAMED = 14
+"""Names beside a panel at most: with 5 points they are as high as it is."""
+
+
+def _draw_legend(axis: Axes, count: int) -> None:
+    """Draw the names of `count` lines beside a panel, in letters that fit; where some are left out, say so."""
+    size, step = 7.0 * min(1.0, 10 / min(count, _NAMED)), -(-count // _NAMED)
+    title = f"{-(-count // step)} of {count} lines are named" if step > 1 else None
+    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=size, title=title, title_fontsize=size)
+
+
 def _draw_quantities(axis: Axes, times: FloatArray, quantities: Sequence[History]) -> None:
     """Draw quantities over the times (T,), with bands of two standard uncertainties; their values set the limits."""
     colours, drawn = dict[str, Any](), list[FloatArray]()
-    step = -(-len(quantities) // 14)  # more names of 7 points are higher than a panel: a crack has a quantity a node
+    step = -(-len(quantities) // _NAMED)  # a crack has a quantity a node
     for number, quantity in enumerate(quantities):
         values, std = quantity.values, quantity.std
         few = np.isfinite(values).sum() <= 60  # more markers would touch

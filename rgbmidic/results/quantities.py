@@ -265,6 +265,7 @@ _TABLE = (
         dtype=np.int64, blank=UNKNOWN_TIME),
     Quantity("status", (), "", "status", "status of the frame, see below", dtype=np.int64, blank=2, codes=_ENDS),
     Quantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
+    Quantity("warnings", ("warning",), "", "", "what is doubtful about it, a text each", **_TEXT),
     Quantity("unread", (), "", "",
         "1 if the frame failed because it could not be read (`--resume` tries again), else 0", dtype=np.int64, blank=0),
     Quantity("tries", (), "", "",

@@ -135,6 +135,7 @@ class FrameRecord(Quantities, Described):
     values: Mapping[str, Any]
     sizes: Mapping[str, int]
     reason = _Attribute()
+    warnings = _Attribute()
     history = _Attribute()
     inputs = _Attribute()
     machine = _Attribute()

@@ -17,6 +17,7 @@ from rgbmidic.results.files import read_arrays, read_json, write_json
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK, digest, fingerprint, now, read_provenance, sealed
 from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED
 from rgbmidic.results.records import FrameRecord, FrameTable, Quantities
+from rgbmidic.results.warnings import of_frames
 from rgbmidic.settings import read_section
 from rgbmidic.settings.schema import section_kinds
 from rgbmidic.text import Described
@@ -152,7 +153,8 @@ class Result(Portable, Quantities, Described):
             It is damaged, or another result took its place.
         """
         provenance = read_provenance(self.path)
-        if {**provenance, "finished": ""} != {**self.provenance, "finished": ""}:
+        ended = {"finished": "", "final_warnings": []}
+        if {**provenance, **ended} != {**self.provenance, **ended}:
             raise ResultError(f"{self.path} now holds another result; open it again")
         table = FrameTable.load(self.path, self.table.sizes, len(self), fingerprint(provenance))
         now = replace(self, table=table, provenance=provenance)
@@ -364,6 +366,13 @@ class Result(Portable, Quantities, Described):
         return tuple(self.each("reason"))
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the run warned of: of the test as a whole, then of frames, with their numbers."""
+        of_test = [*self.provenance.get("warnings", ()), *self.provenance.get("final_warnings", ())]
+        texts = zip(range(len(self)), self.each("warnings"), strict=True)
+        return (*of_test, *of_frames(((frame, each.tolist()) for frame, each in texts), self.names))
+
+    @property
     def inputs(self) -> dict[str, str]:
         """Path and SHA-256 of every file that the frames were read from."""
         return {path: digest for pairs in self.each("inputs") for path, digest in pairs.tolist()}
@@ -400,13 +409,15 @@ class Result(Portable, Quantities, Described):
         return shape and (shape[0], shape[1])
 
 
-def finish_result(path: Path | str) -> None:
+def finish_result(path: Path | str, warnings: Sequence[str] = ()) -> None:
     """Put the date of its end into the provenance of a result, once every record is read and found whole.
 
     Parameters
     ----------
     path
         The folder.
+    warnings
+        What only all frames together show, to be kept.
 
     Raises
     ------
@@ -416,7 +427,8 @@ def finish_result(path: Path | str) -> None:
     result = Result.open(path, partial=True, check=False)
     result.without_damaged()._check_complete()
     if "finished" not in result.provenance:
-        write_json(result.path / PROVENANCE, sealed({**result.provenance, "finished": now()}))
+        ended = {"final_warnings": list(warnings), "finished": now()}
+        write_json(result.path / PROVENANCE, sealed({**result.provenance, **ended}))
 
 
 def listed(frames: Sequence[int], names: Sequence[str], most: int = 5) -> str:

@@ -9,7 +9,7 @@ it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -220,12 +220,19 @@ class ResultStore:
         """Take the date of its end out of the provenance, before frames are written."""
         provenance = read_provenance(self.path)
         if provenance.pop("finished", None) is not None:
+            provenance.pop("final_warnings", None)
             write_json(self.path / PROVENANCE, sealed(provenance))
 
-    def finish(self) -> None:
-        """Release the store and call `finish_result`, when every frame is written."""
+    def finish(self, warnings: Sequence[str] = ()) -> None:
+        """Release the store and call `finish_result`, when every frame is written.
+
+        Parameters
+        ----------
+        warnings
+            What only all frames together show, to be kept.
+        """
         self.release()
-        finish_result(self.path)
+        finish_result(self.path, warnings)
 
 
 def _make_room(path: Path, *, overwrite: bool) -> None:

@@ -229,7 +229,7 @@ class RegionSettings(Checked):
     polygon
         Corners (x, y) in px.
     mask
-        Image file; non-zero pixels belong to the region.
+        Image file; pixels of at least half of its largest value belong to the region.
     holes
         Polygons, each of corners (x, y) in px, whose pixels do not belong to it.
     """

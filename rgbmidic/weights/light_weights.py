@@ -26,7 +26,7 @@ from rgbmidic.correlation.images import WINDOW, SlidingWindow, unmasked
 from rgbmidic.correlation.residual import Precision, Residual
 from rgbmidic.correlation.uncertainty import displacing_fraction
 from rgbmidic.errors import ConfigurationError, InputError
-from rgbmidic.frames import read_frame
+from rgbmidic.frames import read_mask
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.mesh import Region
 from rgbmidic.settings import TestSettings
@@ -107,8 +107,7 @@ class MaskWeights:
     def read(cls, paths: Sequence[Path]) -> MaskWeights:
         """Read one image per light.
 
-        An image of one value besides 0 counts fully where it is not 0; one of several values counts by their fraction
-        of the largest that its type has (255 in 8 bit, 65535 in 16 bit).
+        Values count by their fraction of the largest in the file (`rgbmidic.frames.read_mask`).
 
         Parameters
         ----------
@@ -122,16 +121,13 @@ class MaskWeights:
         Raises
         ------
         FrameError
-            An image is missing or damaged, or has colours.
+            An image is missing, damaged, or no mask.
         InputError
             They have different sizes.
         """
         masks = list[FloatImage]()
         for path in paths:
-            frame = read_frame(path, kind="monochrome")
-            values, one = frame.values[0], frame.values.max(initial=0)
-            plain = bool(((values == 0) | (values == one)).all())
-            masks.append((values > 0 if plain else values / frame.white_level).astype(np.float32))
+            masks.append(read_mask(path))
             if masks[-1].shape != masks[0].shape:
                 raise InputError(
                     f"weights.images need one size: {path} has {_size(masks[-1])} px, {paths[0]} {_size(masks[0])}"

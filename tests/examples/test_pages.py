@@ -45,13 +45,13 @@ PAGES = OUTSIDE + sorted(
 )
 NOT_RUN = 16
 """Blocks that do not run, at most: installation, servers, clusters, MATLAB, others' packages, minutes of work."""
-BLOCK = re.compile(r"(?:^<!-- (.*?) -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"(?:^<!-- ([^\n]*?) -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 def blocks(page: str) -> list[tuple[str, str, str]]:
-    """Mark, language and text of each block; directives of the site are none."""
+    """Mark, language and text of each block; directives of the site and what the code states are none."""
     text = (ROOT / page).read_text(encoding="utf-8")
-    text = re.sub(r"^```\{.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"^```\{.*?^```$|^<!-- generated: .*?^<!-- end -->$", "", text, flags=re.MULTILINE | re.DOTALL)
     return [(mark or "", language, code) for mark, language, code in BLOCK.findall(text)]
 
 

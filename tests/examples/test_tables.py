@@ -16,14 +16,15 @@ from benchmarks import ROOT
 from benchmarks import __main__ as driver
 from benchmarks.tables import (
     FOLDER,
+    PAGES,
     QUICK_FOLDER,
-    README,
     SCATTER_FOLDER,
     TABLES,
     Entry,
     MissingDataError,
     Table,
     disagreements,
+    filled,
     load,
     scatter_of,
     table,
@@ -31,16 +32,6 @@ from benchmarks.tables import (
 )
 
 BROKEN = load()
-PAGES = sorted((ROOT / "docs").rglob("*.md"))
-
-
-def shown(page: Path) -> list[tuple[str, str]]:
-    """Tables that a page shows: name and options."""
-    return re.findall(r"^ *```\{measured\} (\S+)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
-
-
-def options(text: str) -> dict[str, str]:
-    return dict(re.findall(r"^:(\w+): (.*)$", text, re.MULTILINE))
 
 
 def test_every_module_of_tables_can_be_imported():
@@ -50,43 +41,75 @@ def test_every_module_of_tables_can_be_imported():
 @pytest.mark.parametrize("name", TABLES)
 def test_each_table_is_committed_and_shown_by_its_page(name):
     Table.read(FOLDER / f"{name}.csv")
-    page = ROOT / "docs" / f"{TABLES[name].page}.md"
+    text = (ROOT / "docs" / f"{TABLES[name].page}.md").read_text(encoding="utf-8")
+    assert re.search(rf"<!-- measured: {name}\s|tables/{name}\.csv \"", text)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: f"{page.parent.name}_{page.stem}")
+def test_pages_show_tables_and_figures_as_the_files_have_them(page):
+    """`python -m benchmarks --pages` writes them."""
     text = page.read_text(encoding="utf-8")
-    assert name in dict(shown(page)) or f"{{measured}}`{name} |" in text
+    assert filled(text) == text
+    assert len(re.findall(r"<!-- measured: ", text)) == len(re.findall(r"<!-- end -->", text))
+    assert "{measured}" not in text
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_each_table_and_figure_of_a_page_resolves(page):
-    for name, given in shown(page):
-        found, chosen = Table.read(FOLDER / f"{name}.csv"), options(given)
-        assert set(chosen) <= {"columns", "rows", "caption"}
-        for column in chosen.get("columns", "").split(",") if "columns" in chosen else ():
-            found.column(column.strip())
-        for row in chosen.get("rows", "").split(";") if "rows" in chosen else ():
-            found.matching(row.split(","))
-    for text in re.findall(r"\{measured\}`([^`]+)`", page.read_text(encoding="utf-8")):
-        name, keys, column = (part.strip() for part in text.split("|"))
-        Table.read(FOLDER / f"{name}.csv").figure(keys.split(","), column)
+def test_a_table_and_a_figure_are_replaced_and_nothing_else(tmp_path):
+    header = {"date": "2026-01-02", "commit": "abc", "command": "python -m benchmarks sphere"}
+    Table.of(ENTRY, ROWS, header).write(tmp_path / "sphere.csv")
+    text = """before
+<!-- measured: sphere -->
+old
+<!-- end -->
+   <!-- measured: sphere
+   columns: camera, bias [px]
+   rows: 3-CCD, 8
+   caption: -
+   -->
+   <!-- end -->
+[0](../tables/sphere.csv "Bayer; bias [px]") and [a link](../tables/sphere.csv)
+"""
+    expected = """before
+<!-- measured: sphere -->
+
+ (measured 2026-01-02 at commit abc by `python -m benchmarks sphere`)
+
+| camera | angle [deg] | rms error [px] | bias [px] | lost |
+| --- | ---: | ---: | ---: | ---: |
+| Bayer | 8 | 0.0122 | 0.000400 | 3 |
+| 3-CCD | 8 | 0.0100 | – | 0 |
+
+<!-- end -->
+   <!-- measured: sphere
+   columns: camera, bias [px]
+   rows: 3-CCD, 8
+   caption: -
+   -->
+
+   | camera | bias [px] |
+   | --- | ---: |
+   | 3-CCD | – |
+
+   <!-- end -->
+[0.000400](../tables/sphere.csv "Bayer; bias [px]") and [a link](../tables/sphere.csv)
+"""
+    assert filled(text, tmp_path) == expected
+    assert filled(expected, tmp_path) == expected
 
 
-def test_the_readme_shows_its_tables_as_they_are():
-    text = README.read_text(encoding="utf-8")
-    names = re.findall(r"<!-- measured: (\w+) -->", text)
-    assert "reflections" in names
-    for name in names:
-        assert Table.read(FOLDER / f"{name}.csv").shown_in(text) == text
-
-
-def test_a_block_is_replaced_and_nothing_else():
-    text = "before\n<!-- measured: sphere -->\nold\n<!-- end -->\n<!-- measured: cube -->\nold\n<!-- end -->\n"
-    shown = Table.of(ENTRY, ROWS).shown_in(text)
-    assert shown.startswith("before\n<!-- measured: sphere -->\n\n| camera | angle [deg] | rms error [px] |")
-    assert (
-        "| --- | --- | ---: | ---: | ---: |\n| Bayer | 8 | 0.0122 | 0.000400 | 3 |\n| 3-CCD | 8 | 0.0100 | – | 0 |\n"
-        in shown
-    )
-    assert shown.endswith("\n\n<!-- end -->\n<!-- measured: cube -->\nold\n<!-- end -->\n")
-    assert Table.of(ENTRY, ROWS).shown_in(shown) == shown
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<!-- measured: cube -->\n<!-- end -->", "no table 'cube' in .*; tables are: sphere"),
+        ("<!-- measured: sphere\nrow: Bayer\n-->\n<!-- end -->", "states columns, rows and caption, not row"),
+        ("<!-- measured: sphere\nrows: Foveon\n-->\n<!-- end -->", "no row 'Foveon'"),
+        ('[1](tables/sphere.csv "Bayer; rms")', "no column 'rms'"),
+    ],
+)
+def test_what_a_page_asks_for_wrongly_is_said(tmp_path, text, message):
+    Table.of(ENTRY, ROWS).write(tmp_path / "sphere.csv")
+    with pytest.raises(ValueError, match=message):
+        filled(text, tmp_path)
 
 
 def test_each_file_is_of_a_table():

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import pytest
 
+from rgbmidic.command import Once
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.settings import TestSettings
 
@@ -34,3 +36,11 @@ def test_settings_with_huge_texts_are_refused_in_a_line(sections: dict[str, obje
     with pytest.raises(RgbmidicError) as caught:
         TestSettings.from_mapping(sections, tmp_path)
     assert len(str(caught.value)) < 4200
+
+
+def test_a_text_is_shown_once() -> None:
+    once = Once()
+    records = [
+        logging.makeLogRecord({"msg": text, "args": args}) for text, args in (("a %d", (1,)), ("b", ()), ("a 1", ()))
+    ]
+    assert [once.filter(record) for record in records] == [True, True, False]

@@ -38,15 +38,6 @@ class InspectionConstants:
     regressed, flattest
         Samples that are looked at, and the fraction of them, with the flattest surroundings, for the regression that
         finds unknown noise; chosen.
-    contrast_widths
-        Least and largest standard deviation (px) of the window in which the lights' local contrast is taken.
-    speckles
-        Of the window's standard deviation in between, in speckle sizes.
-    blind
-        Fraction of the usual contrast that no light reaches where the specimen cannot be seen; chosen.
-    shade
-        Fraction of the brightness of the brightest tenth below which an image is dark. Chosen: the background of the
-        DIC Challenge's open-hole specimen has 0.1; the parts of a specimen that are lit less keep their contrast.
     settled
         Standard deviation (px) of the window over which the model of the frame is averaged once more.
     typical
@@ -58,9 +49,8 @@ class InspectionConstants:
         Agreement of neighbouring colours below which the speckle is too fine for the colour lattice (docs: inspect).
     finest
         Size (px) of speckle whose colours agree so.
-    saturated, hidden, negative
-        Fractions of samples, of the region that no light shows, and of pixels where a light is negative, from which a
-        warning is given; chosen, as the next two.
+    negative
+        Fraction of the pixels where a light is negative from which a warning is given; chosen, as the next two.
     dark
         Fraction of the full scale that the 95 % quantile of a channel must reach.
     greens
@@ -75,18 +65,12 @@ class InspectionConstants:
     widths: int = 17
     regressed: int = 20_000
     flattest: float = 0.05
-    contrast_widths: tuple[float, float] = (10.0, 40.0)
-    speckles: float = 2.5
-    blind: float = 0.5
-    shade: float = 0.25
     settled: float = 32.0
     typical: int = 9
     frequencies: int = 64
     reach: int = 16
     too_fine: float = 0.75
     finest: float = 2.0
-    saturated: float = 0.01
-    hidden: float = 0.01
     negative: float = 0.01
     dark: float = 0.1
     greens: float = 0.05

@@ -13,6 +13,7 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames import open_series, open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
 from rgbmidic.illumination.calibration import Calibration
+from rgbmidic.illumination.contrast import CONTRAST, LocalContrast
 from rgbmidic.illumination.crosstalk import Crosstalk, align
 from rgbmidic.illumination.demosaicing import SMALLEST_FRAME
 from rgbmidic.illumination.frame_check import Frame, check_state
@@ -20,17 +21,17 @@ from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_m
 from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection.channels import (
-    CONSTANTS,
     Channel,
     channels_of,
     noise_estimate,
     speckle_texture,
     surroundings,
 )
-from rgbmidic.lab.inspection.prediction import LocalContrast, Prediction, predict, separated
+from rgbmidic.lab.inspection.prediction import Prediction, predict, separated
 from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import finite_elements_of, read_region
+from rgbmidic.pipeline.suitability import clipping, repetition
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
 from rgbmidic.typing import BoolArray, FloatImage, Progress
 
@@ -168,6 +169,8 @@ def inspect_frame(
     part = window.part_of(Window.whole(shape))
     region, known = region.part(*part), known.cropped(window.origin, window.shape)
     cut = [replace(shot, values=np.ascontiguousarray(shot.values[..., *part])) for shot in frames]
+    if clipped := clipping(frames):
+        cut = [replace(shot, white_level=clipped[0]) for shot in cut]
     linear = [linearise(shot, known.noise) for shot in cut]
     report(0, 3, "exposure, speckle and noise")
     channels = channels_of(linear)
@@ -210,6 +213,8 @@ def inspect_frame(
         mesh=mesh,
         prediction=prediction,
         greens=greens,
+        clipping="" if clipped is None else clipped[1],
+        repetition=repetition(images, region, None if speckle is None else speckle.diameter) or "",
     )
 
 
@@ -318,7 +323,7 @@ def _light_summaries(
     summaries = []
     for j, light in enumerate(images.names):
         values, valid = images.values[j][inside], images.valid[j][inside]
-        mean = local_mean(images.values[j], CONSTANTS.contrast_widths[0])[inside]
+        mean = local_mean(images.values[j], CONTRAST.contrast_widths[0])[inside]
         summaries.append(
             LightSummary(
                 name=light,

@@ -23,9 +23,10 @@ from scipy.ndimage import median_filter
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.colour_factors import LEAST, MEAN_BLOCK, enlarged
+from rgbmidic.illumination.contrast import LocalContrast
 from rgbmidic.illumination.crosstalk import Crosstalk, unmix
 from rgbmidic.illumination.demosaicing import Reconstruction, reconstruct
-from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
+from rgbmidic.illumination.images import IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
 from rgbmidic.illumination.mosaic_model import BLOCK
 from rgbmidic.illumination.prediction_filters import SPARKLE_VARIANCE
@@ -96,69 +97,6 @@ def separated(
     noisy = lights([replace(frame, values=_noisy(frame.values, noise, random)) for frame in full]).values
     change = np.nan_to_num(noisy - images.values)[None]
     return images, (change, change[:0])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LocalContrast:
-    """Local statistics of the lights.
-
-    Those of what is lit and of what lies in the dark, such as the background beside a specimen, are taken apart: the
-    edge between them is no texture.
-
-    Attributes
-    ----------
-    level : ndarray, shape (k, H, W), float32
-        Local mean, DN.
-    contrast : ndarray, shape (k, H, W), float32
-        Local standard deviation in units of that mean, 0 where the light is dark or unknown.
-    lit : ndarray, shape (k, H, W), bool
-        Where the paint around is as bright as in the rest of the image.
-    """
-
-    level: FloatImage
-    contrast: FloatImage
-    lit: BoolArray
-
-    @classmethod
-    def of(
-        cls, images: IlluminationImages, speckles: Sequence[float], inside: BoolArray, noise: NoiseModel
-    ) -> LocalContrast:
-        """Statistics in windows that hold many speckles, of which the sizes (px) are known or NaN, for a region.
-
-        In the dark, where it would look like texture, camera noise is subtracted.
-        """
-        sizes = [size for size in speckles if np.isfinite(size)]
-        size = CONSTANTS.speckles * np.median(sizes) if sizes else 0.0
-        window = float(np.clip(size, *CONSTANTS.contrast_widths))
-        level, contrast = np.zeros((2, *images.values.shape), dtype=np.float32)
-        lit = np.zeros(images.values.shape, dtype=bool)
-        closing = np.ones((round(window), round(window)), dtype=np.uint8)  # wider than dark speckle
-        for image, mean, relative, bright in zip(images.values, level, contrast, lit, strict=True):
-            filled = np.nan_to_num(image, nan=images.full_scale)  # what is not known is saturated
-            paint = cv2.morphologyEx(filled, cv2.MORPH_CLOSE, closing)
-            bright[:] = paint >= CONSTANTS.shade * np.quantile(paint[inside], 0.9)
-            core = cv2.erode((~bright).astype(np.uint8), closing) > 0  # without the blurred rim of what is lit
-            for part, sampled in ((bright, bright), (~bright, core)):
-                if not part.any():
-                    continue
-                values = np.where(sampled, image, np.float32(np.nan))
-                mean[part] = np.nan_to_num(local_mean(values, window))[part]
-                square = local_mean(values**2, window)
-                seen = part & np.isfinite(image) & (mean > DARK * images.full_scale)
-                variance = square[seen] - mean[seen] ** 2
-                if sampled is core:
-                    variance -= noise.variance(mean[seen])
-                relative[seen] = np.sqrt(np.maximum(variance, 0)) / mean[seen]
-        return cls(level=level, contrast=contrast, lit=lit)
-
-    def hidden(self, inside: BoolArray) -> BoolArray:
-        """Where (H, W) no light has half the contrast that is usual in the lit part of the region."""
-        best, lit = self.contrast.max(axis=0), inside & self.lit.any(axis=0)
-        return np.asarray(best < CONSTANTS.blind * np.quantile(best[lit if lit.any() else inside], 0.9))
-
-    def background(self, inside: BoolArray) -> BoolArray:
-        """Where (H, W) there is neither texture nor light: nothing can be measured."""
-        return np.asarray(self.hidden(inside) & ~self.lit.any(axis=0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic.illumination.checks import Check, reported
+from rgbmidic.illumination.contrast import CONTRAST
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.channels import CONSTANTS
 from rgbmidic.lab.inspection.prediction import Prediction
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.pipeline.suitability import SPECKLES
+from rgbmidic.pipeline.suitability import SPECKLES, SUITABILITY
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
@@ -145,6 +146,10 @@ class Inspection:
     greens : float
         Difference of the means of the two greens of a mosaic beyond the calibrated one, over their mean; 0 for other
         cameras.
+    clipping : str
+        Where samples pile up below the stated white level, which then counts as the white level; empty: nowhere.
+    repetition : str
+        How the texture repeats itself; empty: it does not.
     """
 
     name: str
@@ -168,6 +173,8 @@ class Inspection:
     mesh: Tri3Mesh
     prediction: Prediction
     greens: float
+    clipping: str
+    repetition: str
 
     @property
     def unmeasured(self) -> float:
@@ -206,12 +213,14 @@ def _of_set_up(inspection: Inspection) -> Iterator[Check]:
 
 
 def _of_exposure(inspection: Inspection) -> Iterator[Check]:
+    if inspection.clipping:
+        yield Check("white level", f"{inspection.clipping}, as the figures here assume")
     for channel in inspection.channels:
         bright = (
             f"channel {channel.name}: {channel.saturated:.1%} of the samples are saturated and will not be measured"
         )
         text = f"{bright}; less exposure, or another place of the lamp"
-        yield Check("saturated", text, channel.saturated, CONSTANTS.saturated)
+        yield Check("saturated", text, channel.saturated, SUITABILITY.clipped)
         dark = f"channel {channel.name} is dark: 95 % of its samples are below {channel.high:.1%} of the full scale"
         yield Check("dark", f"{dark}; more light or exposure", max(CONSTANTS.dark - channel.high, 0.0))
 
@@ -234,6 +243,8 @@ def _of_speckle(inspection: Inspection) -> Iterator[Check]:
             "pulled towards whole pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer lens",
             max(CONSTANTS.too_fine - texture.correlation, 0.0),
         )
+    if inspection.repetition:
+        yield Check("repetition", inspection.repetition)
     if np.isnan(size):
         yield Check("no texture", "no speckle is seen: its autocorrelation has no width")
     elif inspection.element_size < SPECKLES * size:
@@ -248,11 +259,11 @@ def _of_region(inspection: Inspection) -> Iterator[Check]:
     if len(inspection.lights) > 1:
         what, why = "no light shows", "all lights reflect or saturate there"
     reasons = []
-    if dark > CONSTANTS.hidden:
+    if dark > CONTRAST.hidden:
         reasons.append(f"it holds dark background ({dark:.1%}), draw it inside the specimen")
-    if hidden - dark > CONSTANTS.hidden or not reasons:
+    if hidden - dark > CONTRAST.hidden or not reasons:
         reasons.append(f"{why}, or there is no paint")
     text = f"{what} the texture on {hidden:.1%} of the region: {'; '.join(reasons)}"
-    yield Check("hidden", text, hidden, CONSTANTS.hidden)
+    yield Check("hidden", text, hidden, CONTRAST.hidden)
     lost = f"{inspection.unmeasured:.1%} of the nodes will not be measured"
     yield Check("not measured", lost, inspection.unmeasured)

@@ -7,16 +7,19 @@ import re
 import numpy as np
 import pytest
 from calibration_scene import BLACK, GAIN, MATRICES, READ, WHITE, captures, expose, registered_pictures, speckle_target
+from target_scene import imaged, pose, random_views, view_of
 
+from rgbmidic.command import execute
 from rgbmidic.errors import CalibrationError, ConfigurationError
 from rgbmidic.frames import read_frame
 from rgbmidic.frames.data import Mosaic
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic.illumination.linear import NoiseModel
+from rgbmidic_calibration.camera import estimate_lens, estimate_plane
 from rgbmidic_calibration.captures import block_means, stack_frames
-from rgbmidic_calibration.cli import read_limits
-from rgbmidic_calibration.verify import Limits, additivity, leakage, noise_ratio, registration_left
+from rgbmidic_calibration.cli import app, read_limits
+from rgbmidic_calibration.verify import Limits, additivity, check_distances, leakage, noise_ratio, registration_left
 
 MATRIX = MATRICES[1.5]
 LIGHTS = ("red", "green", "blue")
@@ -181,3 +184,52 @@ def test_coin_captures_add_up(real_data, together, single, mean, spread):
     assert difference(found)[1] < 2 * spread
     assert left.value < 3
     assert all(abs(change.value) < 5 for change in changes)
+
+
+@pytest.fixture(scope="module")
+def camera():
+    random = np.random.default_rng(4)
+    lens = estimate_lens(random_views(random))
+    return estimate_plane(view_of(pose(4.0, -3.0), random), lens.camera).camera
+
+
+def ends(length: float) -> np.ndarray:
+    """Places in px of two points of the plane so many mm apart."""
+    return imaged(np.array([[-0.5, 0.2], [0.5, 0.2]]) * [length, 10], pose(4.0, -3.0))
+
+
+def test_a_distance_on_the_plane_is_compared_with_the_true_one(camera):
+    good, wrong = check_distances(camera, [(ends(30.0), 30.0), (ends(30.0), 30.3)])
+    assert abs(good.value) < 0.05
+    assert good.passed
+    assert wrong.value == pytest.approx(-1.0, abs=0.05)
+    assert not wrong.passed
+    for place, length in (((-1, 5, 300, 5), 20.0), ((10, 5, 300, 5), 0.0), ((10, 5, 3000, 5), 20.0)):
+        with pytest.raises(CalibrationError, match="ends in the frame of 640 x 480 px"):
+            check_distances(camera, [(place, length)])
+
+
+def test_the_stated_uncertainty_of_a_distance_is_the_scatter_of_its_ends(camera):
+    random, exact = np.random.default_rng(0), ends(30.0)
+    (check,) = check_distances(camera, [(exact, 30.0)], corner_std=0.5)
+    drawn = camera.to_mm((exact + random.normal(0, 0.5, (2000, 2, 2))).reshape(-1, 2)).reshape(-1, 2, 2)
+    scatter = 100 * np.linalg.norm(drawn[:, 1] - drawn[:, 0], axis=1).std() / 30.0
+    assert scatter == pytest.approx(check.std, rel=4 / np.sqrt(2 * 2000) + 0.02)  # 2 %: lens and plane
+
+
+def test_the_command_checks_a_camera_by_distances(camera, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    camera.write("camera.json")
+    place = "{:.2f},{:.2f}:{:.2f},{:.2f}".format(*ends(30.0).ravel())
+    for options, status, text in (
+        (["--distance", f"{place}=30"], 0, "PASSED"),
+        (["--distance", f"{place}=30", "--distance", f"{place}=30.5mm"], 1, "FAILED: 1 of 2 figures"),
+        (["--distance", f"{place}=30.5", "--limit", "distance=3"], 0, "PASSED"),
+        ([], 2, "state a known distance, --distance X0,Y0:X1,Y1=MM"),
+        (["--distance", "1,2:3,4"], 2, "--distance is X0,Y0:X1,Y1=MM, such as 120,85:840,85=25, not '1,2:3,4'"),
+    ):
+        assert execute(app, ["check", "camera.json", *options]) == status
+        output = capsys.readouterr()
+        assert text in output.out + output.err
+    assert execute(app, ["check", "other.json", "--distance", f"{place}=30"]) == 2
+    assert "--distance is for a camera file" in capsys.readouterr().err

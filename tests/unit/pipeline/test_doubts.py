@@ -53,8 +53,7 @@ def test_an_overexposed_frame_is_warned_of(tmp_path, told):
     frames = [frame(0), frame(1), frame(2, exposure=3.8)]
     assert 0.2 < (frames[2] == 4095).mean() < 0.5
     measure(settings(), tmp_path / "out", source=frames)
-    assert "frame 2: 4" in told() or "frame 2: 3" in told()
-    assert "% of the samples in the region are saturated, 0 % in the reference" in told()
+    assert "frame 2: more than 10% of the samples in the region are saturated, 0% in the reference" in told()
     assert "frame 1" not in told()
 
 

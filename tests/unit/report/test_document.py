@@ -262,6 +262,21 @@ def test_a_quiet_test_has_no_warning(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_what_the_run_warned_of_stands_in_the_report(tmp_path: Path) -> None:
+    """Of the test, of frames in one line a text, and what only all frames together show."""
+    records = [still(index, 0.01, warnings=["a lamp is <out>"] if index in (1, 2, 4) else []) for index in range(5)]
+    with ResultStore.create(tmp_path / "r", make_origin(5, notes={"warnings": ["clipped"]})) as store:
+        for index, record in enumerate(records):
+            store.write_frame(index, record)
+        store.finish(["all repeat"])
+    result = Result.open(tmp_path / "r")
+    lines = f"frames 1 to 2, 4 ({result.names[1]}, ...): a lamp is <out>"
+    assert result.warnings == ("clipped", "all repeat", lines)
+    write_report(result, tmp_path / "a.html")
+    assert re.search(rf"Warnings\s*clipped\s*all repeat\s*{re.escape(lines)}", Reader(tmp_path / "a.html").words)
+
+
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("records", [[], [0], [1, 3]])
 def test_a_run_that_is_not_finished_is_told(tmp_path: Path, records: list[int]) -> None:
     with ResultStore.create(tmp_path / "r", make_origin(4)) as store:

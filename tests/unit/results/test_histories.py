@@ -162,6 +162,29 @@ def test_the_equivalent_strain_is_said_to_be_hencky_s(result: Result) -> None:
     assert said not in read(result, points=(PLACE,)).remarks
 
 
+def test_a_strain_gauge_that_holds_less_than_half_of_its_place_is_refused(result: Result) -> None:
+    """One on the edge holds half."""
+    x, y = result.nodes[:, 0].min(), result.nodes[:, 1].mean()
+    at_edge = read(result, strain_gauges=((x, y, 60),))
+    assert np.isfinite(at_edge["strain_gauge_1_exx"].values[:5]).all()
+    assert any("of its place at least" in remark for remark in at_edge.remarks)
+    with pytest.raises(InputError, match="half or more of strain_gauge_1 is outside"):
+        read(result, strain_gauges=((*result.nodes.min(axis=0), 60),))
+
+
+@pytest.mark.parametrize(("count", "title"), [(4, ""), (7, ""), (20, "14 of 40 lines are named")])
+def test_the_names_of_lines_fit_beside_their_panel(result: Result, count: int, title: str) -> None:
+    found = read(result, points=tuple((30.0 + number, 40.0) for number in range(count)))
+    figure = history_figure(found)
+    figure.canvas.draw()
+    (axis,) = figure.axes
+    legend, whole = axis.get_legend(), figure.bbox
+    box = legend.get_window_extent()
+    assert whole.y0 <= box.y0 < box.y1 <= whole.y1
+    assert box.x1 <= whole.x1
+    assert legend.get_title().get_text() == title
+
+
 def test_the_table_has_one_header_line_and_one_row_a_frame(result: Result, tmp_path: Path) -> None:
     found = read(result, points=(PLACE,), strain_gauges=((60, 40, 60),))
     write_histories(found, tmp_path / "a.csv")

@@ -207,7 +207,7 @@ def test_a_result_of_the_last_schema_is_refused_in_one_line_and_can_be_overwritt
     with pytest.raises(ResultError) as told:
         Result.open(out)
     assert str(told.value) == (
-        f"{out} has schema version 10, written by rgbmidic 0.0; this rgbmidic {__version__} reads schema version 11: "
+        f"{out} has schema version 10, written by rgbmidic 0.0; this rgbmidic {__version__} reads schema version 12: "
         "read it with the version that wrote it, or measure the test again"
     )
     make_result(out, frames=1, overwrite=True)
@@ -257,7 +257,7 @@ def test_damage_of_each_part_is_told(tmp_path: Path) -> None:
     assert "not a result folder" in damaged("provenance.json", None)
     assert "damaged" in damaged("provenance.json", b"{")
     assert "schema" in damaged("provenance.json", b"[]")
-    assert "schema version 12" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 12}')
+    assert "schema version 13" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 13}')
     assert "schema version 3" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 3}')
     whole = make_result(tmp_path / "whole").provenance
     for part, odd in {"frames": [1], "lights": [1], "settings": {"a": 1}, "references": ["a"], "inputs": None}.items():
