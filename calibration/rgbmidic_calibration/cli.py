@@ -293,7 +293,8 @@ def check(
     limit: Annotated[
         list[str] | None,
         Option(
-            help="NAME=VALUE: leakage, checkerboard, additivity, strength, noise, distance (in %), registration (in px)."
+            help="NAME=VALUE: leakage, checkerboard, additivity, strength, noise, distance (all in %), "
+            "registration (in px)."
         ),
     ] = None,
     region: Region = None,
