@@ -1,7 +1,7 @@
 """Displacement uncertainty expected from one frame: `rgbmidic.scene.forecast` with images of the frame's errors.
 
 Contrast and energy of the speckle's gradient follow from the frame; the errors are drawn (`separated`). The
-reflection-aware model of the frame (local means, slope of each channel on the common texture, channel-specific
+reflection-aware model of the frame (local means, slope of each light on the common texture, light-specific
 component, autocorrelation of the speckle) describes a random frame with the statistics of the one given. Such a frame
 is drawn with all its channels at every pixel and separated as the test does, behind the four phases of the colour
 filter array: what is the same in all of them moves with the specimen, the rest stays with the sensor.
@@ -20,6 +20,7 @@ import numpy.typing as npt
 from scipy.fft import fftfreq, irfft2, next_fast_len, rfft2, rfftfreq
 from scipy.ndimage import median_filter
 
+from rgbmidic._kernels.splines import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.colour_factors import LEAST, MEAN_BLOCK, enlarged
@@ -28,7 +29,7 @@ from rgbmidic.illumination.crosstalk import Crosstalk, unmix
 from rgbmidic.illumination.demosaicing import Reconstruction, reconstruct
 from rgbmidic.illumination.images import IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
-from rgbmidic.illumination.mosaic_model import BLOCK
+from rgbmidic.illumination.mosaic_model import BLOCK, CHANNEL, MosaicModel
 from rgbmidic.illumination.prediction_filters import SPARKLE_VARIANCE
 from rgbmidic.illumination.separation import DEFAULT_METHOD, reconstructed_lights, separate
 from rgbmidic.illumination.texture import TextureModel
@@ -72,19 +73,20 @@ def separated(
     """
     first, crosstalk = frames[0], known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
     if isinstance(first, LinearMosaic):
-        model = reconstruct(first, crosstalk)
+        calibration = replace(known, crosstalk=crosstalk)
+        model = reconstruct(first, crosstalk, registration=known.registration)
         images = reconstructed_lights(model, crosstalk)
         if method not in ("auto", DEFAULT_METHOD):
             other = separate(first, crosstalk, method)
-            images = replace(other, reflection=images.reflection, texture=images.texture)
-        channels = _drawn_channels(model, first.values.shape, random)
+            images = replace(images, values=other.values, valid=other.valid)
+        sites = _drawn_sites(model, MosaicModel.of(crosstalk, known.registration, first.values.shape), random)
 
         def lights_of(values: FloatImage, cfa: str) -> FloatImage:
             drawn = replace(first, values=values, cfa=cfa, saturated=np.zeros(values.shape, dtype=bool))
-            return np.nan_to_num(separate(drawn, crosstalk, method, texture=model.texture).values)
+            return np.nan_to_num(separate(drawn, calibration, method, texture=model.texture).values)
 
-        phases = separated_phases(channels, first.cfa, lights_of)
-        noisy = lights_of(_noisy(mosaic_samples(channels, first.cfa), noise, random), first.cfa)
+        phases = separated_phases(sites, first.cfa, lights_of)
+        noisy = lights_of(_noisy(mosaic_samples(sites, first.cfa), noise, random), first.cfa)
         return images, ((noisy - phases[0])[None], phases - phases.mean(axis=0))
     full = [frame for frame in frames if isinstance(frame, LinearChannels)]
     names = known.registration.lights if known.registration else ()
@@ -200,21 +202,49 @@ def gaussian_field(texture: TextureModel, shape: tuple[int, ...], random: np.ran
     return np.asarray(irfft2(spectrum, s=(rows, columns))[: shape[0], : shape[1]], dtype=np.float32)
 
 
-def _drawn_channels(model: Reconstruction, shape: tuple[int, ...], random: np.random.Generator) -> FloatImage:
-    """Channels (3, H, W) of a random state with the frame's statistics, DN."""
+def _drawn_sites(model: Reconstruction, sites: MosaicModel, random: np.random.Generator) -> FloatImage:
+    """Samples (4, H, W) that each kind of site would take everywhere of a random state with the frame's statistics.
+
+    Every light shows the texture where the registration says that it does, and a component of its own.
+    """
     factors, texture = model.factors, model.texture
+    shape = model.channels.values.shape[1:]
+    place = enlarged(sites.displacement.reshape(-1, *sites.displacement.shape[2:]), BLOCK, shape)
+    margin = int(np.ceil(np.abs(place).max())) + 2
+    common = gaussian_field(texture, (shape[0] + 2 * margin, shape[1] + 2 * margin), random)
     sparkle = TextureModel(weights=(1.0,), widths=(float(np.sqrt(2 * SPARKLE_VARIANCE)),))
-    channels = np.repeat(gaussian_field(texture, shape, random)[None], 3, axis=0)
     # by the median around: variances are cut off at zero, so that a mean would be too large
-    typical = median_filter(factors.specific - LEAST, size=(1, CONSTANTS.typical, CONSTANTS.typical), mode="reflect")
+    size = 1, CONSTANTS.typical, CONSTANTS.typical
+    typical = median_filter(factors.light_specific - LEAST, size=size, mode="reflect")
     deviation = np.sqrt(enlarged(np.maximum(typical, 0), BLOCK, shape))
-    for channel in range(3):
-        if deviation[channel].any():
+    slope = enlarged(_settled(factors.light_slope, BLOCK), BLOCK, shape)
+    mean = enlarged(_settled(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
+    response = sites.sites.astype(np.float32)
+    # of the greens each sees the lights' means in its own proportion
+    to_lights = np.linalg.pinv(sites.matrix).astype(np.float32)
+    beyond = (response - sites.matrix.astype(np.float32)[list(CHANNEL)]) @ to_lights
+    samples = mean[list(CHANNEL)] + np.tensordot(beyond, mean, axes=1)
+    for light, (x, y) in enumerate(place.reshape(-1, 2, *shape)):
+        contrast = _displaced(common, x, y, margin)
+        if deviation[light].any():
             coarse, fine = (gaussian_field(kind, shape, random) for kind in (texture, sparkle))
             specific = np.sqrt(texture.specific) * coarse + np.sqrt(1 - texture.specific) * fine
-            channels[channel] += deviation[channel] * specific
-    mean = enlarged(_settled(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
-    return np.asarray(mean + enlarged(_settled(factors.slope, BLOCK), BLOCK, shape) * channels, dtype=np.float32)
+            contrast += deviation[light] * specific
+        samples += response[:, light, None, None] * (slope[light] * contrast)
+    return np.asarray(samples, dtype=np.float32)
+
+
+def _displaced(image: FloatImage, x: FloatImage, y: FloatImage, margin: int) -> FloatImage:
+    """Return the image less a margin, displaced by fields x and y (H, W)."""
+    rows, columns = x.shape
+    if not (x.any() or y.any()):
+        return image[margin : margin + rows, margin : margin + columns].copy()
+    spline = np.empty((image.shape[0] + 2 * PAD, image.shape[1] + 2 * PAD), dtype=np.float32)
+    bspline_coefficients(image, spline)
+    row, column = np.mgrid[margin : margin + rows, margin : margin + columns].astype(np.float64)
+    sampled = np.empty((3, x.size), dtype=np.float32)
+    sample_with_gradient(spline, (column - x).ravel(), (row - y).ravel(), *sampled)
+    return np.asarray(sampled[0].reshape(x.shape))
 
 
 def _settled(grid: npt.NDArray[np.floating], block: int) -> FloatArray:
