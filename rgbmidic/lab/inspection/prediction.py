@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -41,14 +42,35 @@ from rgbmidic.scene.speckle import SpeckleSpectrum, separated_phases
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
+class ErrorDraw(Protocol):
+    """Draws errors of the separation of a state whose lights are so many times as strong."""
+
+    def __call__(self, random: np.random.Generator, strength: FloatArray, /) -> tuple[FloatImage, FloatImage]:
+        """Draw the errors.
+
+        Parameters
+        ----------
+        random
+            Source of random numbers.
+        strength : ndarray, shape (k,)
+            Of each light, relative to the frame's.
+
+        Returns
+        -------
+        tuple of ndarray, shapes (1, k, H, W) and (4, k, H, W), float32
+            Draw of the lights' change by the camera noise, DN; difference of the lights behind each phase of the colour
+            filter array from the mean of the four, none for a camera that has all channels at every pixel.
+        """
+        ...
+
+
 def separated(
     frames: Sequence[LinearMosaic | LinearChannels],
     known: Calibration,
     method: str,
     noise: NoiseModel,
-    random: np.random.Generator,
-) -> tuple[IlluminationImages, tuple[FloatImage, FloatImage]]:
-    """Separate a state as the test would, and draw the errors of that.
+) -> tuple[IlluminationImages, ErrorDraw]:
+    """Separate a state as the test would, and return what draws the errors of that.
 
     Reflection index and speckle of a mosaic are those of the default method.
 
@@ -60,16 +82,15 @@ def separated(
         The calibration; without crosstalk the channels are used as lights.
     method
         How the test separates its mosaics (`rgbmidic.illumination.separation`).
-    noise, random
-        Camera noise to draw; source of random numbers.
+    noise
+        Camera noise to draw.
 
     Returns
     -------
     images
         The lights.
-    errors : tuple of ndarray, shapes (1, k, H, W) and (4, k, H, W), float32
-        Draws of the lights' change by the camera noise, DN; difference of the lights behind each phase of the colour
-        filter array from the mean of the four, none for a camera that has all channels at every pixel.
+    draw
+        See `ErrorDraw`.
     """
     first, crosstalk = frames[0], known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
     if isinstance(first, LinearMosaic):
@@ -79,15 +100,19 @@ def separated(
         if method not in ("auto", DEFAULT_METHOD):
             other = separate(first, crosstalk, method)
             images = replace(images, values=other.values, valid=other.valid)
-        sites = _drawn_sites(model, MosaicModel.of(crosstalk, known.registration, first.values.shape), random)
+        seen = MosaicModel.of(crosstalk, known.registration, first.values.shape)
 
         def lights_of(values: FloatImage, cfa: str) -> FloatImage:
             drawn = replace(first, values=values, cfa=cfa, saturated=np.zeros(values.shape, dtype=bool))
             return np.nan_to_num(separate(drawn, calibration, method, texture=model.texture).values)
 
-        phases = separated_phases(sites, first.cfa, lights_of)
-        noisy = lights_of(_noisy(mosaic_samples(sites, first.cfa), noise, random), first.cfa)
-        return images, ((noisy - phases[0])[None], phases - phases.mean(axis=0))
+        def drawn_mosaic(random: np.random.Generator, strength: FloatArray) -> tuple[FloatImage, FloatImage]:
+            sites = _drawn_sites(model, seen, strength, random)
+            phases = separated_phases(sites, first.cfa, lights_of)
+            noisy = lights_of(_noisy(mosaic_samples(sites, first.cfa), noise, random), first.cfa)
+            return (noisy - phases[0])[None], phases - phases.mean(axis=0)
+
+        return images, drawn_mosaic
     full = [frame for frame in frames if isinstance(frame, LinearChannels)]
     names = known.registration.lights if known.registration else ()
 
@@ -96,9 +121,17 @@ def separated(
         return IlluminationImages.in_succession(state, names) if single else unmix(state[0], crosstalk)
 
     images = lights(full)
-    noisy = lights([replace(frame, values=_noisy(frame.values, noise, random)) for frame in full]).values
-    change = np.nan_to_num(noisy - images.values)[None]
-    return images, (change, change[:0])
+
+    def drawn(random: np.random.Generator, strength: FloatArray) -> tuple[FloatImage, FloatImage]:
+        more = (strength[:, None, None] - 1) * np.nan_to_num(images.values)
+        if len(full) == 1 and len(images.names) > 1:
+            more = np.tensordot(crosstalk.matrix, more, axes=1)[None]
+        state = [replace(frame, values=frame.values + part) for frame, part in zip(full, more, strict=True)]
+        noisy = lights([replace(frame, values=_noisy(frame.values, noise, random)) for frame in state]).values
+        change = np.nan_to_num(noisy - lights(state).values)[None]
+        return change, change[:0]
+
+    return images, drawn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,7 +235,9 @@ def gaussian_field(texture: TextureModel, shape: tuple[int, ...], random: np.ran
     return np.asarray(irfft2(spectrum, s=(rows, columns))[: shape[0], : shape[1]], dtype=np.float32)
 
 
-def _drawn_sites(model: Reconstruction, sites: MosaicModel, random: np.random.Generator) -> FloatImage:
+def _drawn_sites(
+    model: Reconstruction, sites: MosaicModel, strength: FloatArray, random: np.random.Generator
+) -> FloatImage:
     """Samples (4, H, W) that each kind of site would take everywhere of a random state with the frame's statistics.
 
     Every light shows the texture where the registration says that it does, and a component of its own.
@@ -219,18 +254,17 @@ def _drawn_sites(model: Reconstruction, sites: MosaicModel, random: np.random.Ge
     deviation = np.sqrt(enlarged(np.maximum(typical, 0), BLOCK, shape))
     slope = enlarged(_settled(factors.light_slope, BLOCK), BLOCK, shape)
     mean = enlarged(_settled(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
-    response = sites.sites.astype(np.float32)
-    # of the greens each sees the lights' means in its own proportion
-    to_lights = np.linalg.pinv(sites.matrix).astype(np.float32)
-    beyond = (response - sites.matrix.astype(np.float32)[list(CHANNEL)]) @ to_lights
-    samples = mean[list(CHANNEL)] + np.tensordot(beyond, mean, axes=1)
+    response = sites.sites * strength
+    # each green sees the lights' means in its own proportion
+    beyond = (response - sites.matrix[list(CHANNEL)]) @ np.linalg.pinv(sites.matrix)
+    samples = mean[list(CHANNEL)] + np.tensordot(beyond.astype(np.float32), mean, axes=1)
     for light, (x, y) in enumerate(place.reshape(-1, 2, *shape)):
         contrast = _displaced(common, x, y, margin)
         if deviation[light].any():
             coarse, fine = (gaussian_field(kind, shape, random) for kind in (texture, sparkle))
             specific = np.sqrt(texture.specific) * coarse + np.sqrt(1 - texture.specific) * fine
             contrast += deviation[light] * specific
-        samples += response[:, light, None, None] * (slope[light] * contrast)
+        samples += response[:, light, None, None].astype(np.float32) * (slope[light] * contrast)
     return np.asarray(samples, dtype=np.float32)
 
 
