@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -55,6 +55,8 @@ class HoledPlate:
     size: int = 512
     rest: int = 4
     moving: int = 12
+    arrives: int = 0
+    """Frames in motion until the glare is there; 0: always."""
 
     @classmethod
     def drawn(cls, draw: int) -> HoledPlate:
@@ -122,7 +124,8 @@ class _Renderer:
         """One raw frame."""
         seen = self.plate.origin(self.points, number)
         solid = np.clip(np.hypot(*np.moveaxis(seen - self.plate.hole, -1, 0)) - self.plate.radius + 0.5, 0, 1)
-        lights = 0.4 * (solid * (self._paint((seen + 200) * _FINE) + np.stack(self.glare)) + 0.03 * (1 - solid))
+        come = min(max(number - self.plate.rest + 1, 0) / self.plate.arrives, 1) if self.plate.arrives else 1.0
+        lights = 0.4 * (solid * (self._paint((seen + 200) * _FINE) + come * np.stack(self.glare)) + 0.03 * (1 - solid))
         channels = np.tensordot(CROSSTALK, lights, axes=1)
         signal = np.take_along_axis(channels, self.site[None], axis=0)[0] * (WHITE - BLACK) * 0.75
         rng = np.random.default_rng(10_000 * (self.plate.draw + 1) + number)
@@ -146,33 +149,54 @@ def standing_glare(quick: bool) -> Iterator[Row]:
     strain: nodes, how many are wild (error above .2 px and 4 times their stated uncertainty), those not measured, rms
     error, error over stated uncertainty.
     """
-    crosstalk = Crosstalk(matrix=CROSSTALK, lights=("red", "green", "blue"))
-    calibration = Calibration(crosstalk=crosstalk, noise=NoiseModel(gain=GAIN, read_noise=READ_NOISE))
-    solver = SolverSettings()
     for draw in range(1 if quick else 6):
-        plate = HoledPlate.drawn(draw)
-        renderer, region = _Renderer(plate), plate.region()
-        frames = [(renderer.mosaic(number),) for number in range(plate.rest + (2 if quick else plate.moving))]
-        images, separation = reference_images(
-            Separation(calibration=calibration), frames[: plate.rest], Window.whole(frames[0][0].values.shape[-2:])
+        yield _measured(HoledPlate.drawn(draw), 2 if quick else None)
+
+
+@table("arriving_glare", page="explanation/uncertainty", cost=60, keys=1, own_quick=True)
+def arriving_glare(quick: bool) -> Iterator[Row]:
+    """The same plates as in `standing_glare`, with reflections of all three lights at the rim of the hole, twice the
+    diffuse level, that arrive within six frames of motion.
+    """
+    for draw in range(1 if quick else 4):
+        plate, rng = HoledPlate.drawn(draw), np.random.default_rng(300 + draw)
+        angle = rng.uniform(0, 2 * np.pi)
+        rim = plate.hole + plate.radius * np.array([np.cos(angle), np.sin(angle)])
+        yield _measured(
+            replace(plate, spots=rim + rng.normal(0, 10, (3, 2)), spread=40.0, glare=2.0, arrives=6),
+            8 if quick else None,
         )
-        mesh = Tri3Mesh.from_region(region, ELEMENT_SIZE)
-        reference = Reference.prepare(correlated(images), region, mesh=mesh, prefilter=solver.prefilter)
-        start, errors, stated = Start(displacement=np.zeros_like(mesh.nodes)), [], []
-        for number in range(plate.rest, len(frames)):
-            ready = correlated(separation(frames[number]))
-            found = track(reference, Deformed.prepare(ready, prefilter=solver.prefilter), start, solver, Statistics())
-            start = start.after(mesh, found.displacement, found.measured)
-            errors.append(found.displacement - plate.displacement(mesh.nodes, number))
-            stated.append(found.displacement_std)
-        error = np.abs(np.concatenate(errors))
-        ratio = error / np.concatenate(stated)
-        yield {
-            "draw": draw,
-            "nodes": len(error),
-            "wild": int(((error > WILD[0]) & (ratio > WILD[1])).any(axis=1).sum()),
-            "not measured [%]": 100 * float(np.isnan(error[:, 0]).mean()),
-            "rms error [px]": rms(error),
-            "error/stated": rms(ratio),
-            "covered [%]": 100 * covered(ratio),
-        }
+
+
+def _measured(plate: HoledPlate, moving: int | None) -> Row:
+    """Row of a plate, for so many frames in motion; None: all."""
+    crosstalk = Crosstalk(matrix=CROSSTALK, lights=("red", "green", "blue"))
+    calibration, solver = (
+        Calibration(crosstalk=crosstalk, noise=NoiseModel(gain=GAIN, read_noise=READ_NOISE)),
+        SolverSettings(),
+    )
+    renderer, region = _Renderer(plate), plate.region()
+    frames = [(renderer.mosaic(number),) for number in range(plate.rest + (moving or plate.moving))]
+    images, separation = reference_images(
+        Separation(calibration=calibration), frames[: plate.rest], Window.whole(frames[0][0].values.shape[-2:])
+    )
+    mesh = Tri3Mesh.from_region(region, ELEMENT_SIZE)
+    reference = Reference.prepare(correlated(images), region, mesh=mesh, prefilter=solver.prefilter)
+    start, errors, stated = Start(displacement=np.zeros_like(mesh.nodes)), [], []
+    for number in range(plate.rest, len(frames)):
+        ready = correlated(separation(frames[number]))
+        found = track(reference, Deformed.prepare(ready, prefilter=solver.prefilter), start, solver, Statistics())
+        start = start.after(mesh, found.displacement, found.measured)
+        errors.append(found.displacement - plate.displacement(mesh.nodes, number))
+        stated.append(found.displacement_std)
+    error = np.abs(np.concatenate(errors))
+    ratio = error / np.concatenate(stated)
+    return {
+        "draw": plate.draw,
+        "nodes": len(error),
+        "wild": int(((error > WILD[0]) & (ratio > WILD[1])).any(axis=1).sum()),
+        "not measured [%]": 100 * float(np.isnan(error[:, 0]).mean()),
+        "rms error [px]": rms(error),
+        "error/stated": rms(ratio),
+        "covered [%]": 100 * covered(ratio),
+    }

@@ -5,14 +5,19 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import tifffile
 from results import make_result
 
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.results import FrameRecord, Maps
+from rgbmidic.settings import TestSettings
+from rgbmidic.view.address import ViewState
 from rgbmidic.view.picture import Overlay, Window, paint, palette
+from rgbmidic.view.shown import ShownFields
 
 from .tables import table
 
@@ -55,3 +60,43 @@ def viewer(quick: bool) -> Iterator[dict[str, object]]:
                 reading, painting = 1e3 * np.median(times[2:], axis=0)
                 row: dict[str, object] = {"nodes": str(len(mesh.nodes)), "field": name}
                 yield row | {"reading [ms]": float(reading), "painting [ms]": float(painting)}
+
+
+ROWS, COLUMNS = 2048, 2560
+"""Of a raw frame of 5 million pixels, as fast cameras have them."""
+
+
+@table("viewer_latency", page="how-to/view", cost=3, timing=True)
+def viewer_latency(quick: bool) -> Iterator[dict[str, object]]:
+    """Processor time of the viewer's server for a step to the next frame over raw frames of 5 Mpx (12 bit, TIFF;
+    strain on a mesh of 2,000 nodes): read when it is asked for, and where it was read ahead; median and largest of the
+    steps."""
+    mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, COLUMNS - 1, ROWS - 1), (ROWS, COLUMNS)), 50)
+    levels, count = np.random.default_rng(0).integers(0, 4096, (ROWS, COLUMNS), dtype=np.uint16), 4 if quick else FRAMES
+    fields = np.random.default_rng(1).normal(size=(2, len(mesh.nodes)))
+
+    def record(index: int) -> FrameRecord:
+        named = dict(zip(("u", "v"), fields, strict=True)) | {f"{name}_std": abs(fields[0]) + 0.1 for name in "uv"}
+        return FrameRecord.of(nodes=len(mesh.nodes), lights=1, number=index, status=0, **named)
+
+    with tempfile.TemporaryDirectory() as folder:
+        base = Path(folder)
+        for index in range(count):
+            tifffile.imwrite(base / f"f{index:02d}.tif", np.roll(levels, index))
+        stated = {"path": "f*.tif", "kind": "monochrome"}
+        region = {"rectangle": [0, 0, COLUMNS - 1, ROWS - 1]}
+        settings = TestSettings.from_mapping({"frames": stated, "region": region}, base)
+        parts = {"nodes": mesh.nodes, "elements": mesh.elements, "lights": ["light"], "settings": settings}
+        made = make_result(base / "result", frames=count, record=record, **parts)
+        window = Window(left=0, top=0, right=COLUMNS, bottom=ROWS, width=1100, height=700).fitted()
+        for ahead in (False, True):
+            shown, times = ShownFields(made, ViewState(field="exx", over="deformed", frame=0)), list[float]()
+            for frame in range(count):
+                shown.view = replace(shown.view, frame=frame)
+                start = time.process_time()
+                paint(window, shown.picture[0], shown.overlay("exx"))
+                times.append(1e3 * (time.process_time() - start))
+                if ahead:
+                    shown.read_ahead()
+            row: dict[str, object] = {"read ahead": "yes" if ahead else "no"}
+            yield row | {"median [ms]": float(np.median(times[1:])), "largest [ms]": float(max(times[1:]))}

@@ -133,7 +133,7 @@ def profile(
     frames: _Frames = "",
     curves: Annotated[str, Option(help="Frames drawn as curves, such as 10,20,30.")] = "",
     speed: Annotated[str, Option(metavar="WHAT", help="Fit the speed of a wave: front or peak.")] = "",
-    level: Annotated[float | None, Option(help="Fraction of the peak that defines the front; else 0.5.")] = None,
+    level: Annotated[str, Option(help="Value at which the front is, such as -0.005, or part of the peak; 50%.")] = "",
     overwrite: command.Overwrite = False,
 ) -> None:
     """A field along a line in every frame: table, position-time picture, curves, and the speed of a front or peak."""
@@ -145,18 +145,23 @@ def profile(
     picture, place = command.picture_beside(out), command.read_place(line, "--line", "X0,Y0:X1,Y1")
     for file in (out, picture, *([arrivals_file(out)] if speed else [])):
         check_file(file, overwrite=overwrite)
-    if level is not None and speed != "front":
+    if level and speed != "front":
         raise InputError("--level is of --speed front, which is not stated")
     read = read_profile(opened.maps(derived), field, place, opened.frames(frames))
     shown, there = command.read_frames(curves, "--curves") or [], list(read.frames)
     if beyond := [frame for frame in shown if frame not in there]:
         raise InputError(f"--curves {curves}: frames {beyond} are not among those read, {there[0]} to {there[-1]}")
     rows = [there.index(frame) for frame in dict.fromkeys(shown)]
-    wave = read.wave(speed, 0.5 if level is None else level) if speed else None
+    wave = read.wave(speed, level or "50%") if speed else None
     write_profile(read, out, wave, overwrite=overwrite)
     save_figure(profile_figure(read, wave, rows), picture)
     if wave is not None:
         print(f"{wave_text(read, wave)}; arrival times: {arrivals_file(out)}")
+        if wave.arrivals.cut.any():
+            command.note(
+                f"note: at {wave.arrivals.cut.sum()} of {len(wave.arrivals.cut)} positions the field still rises in "
+                "the last frames: its peak is not known, they are left out; --level takes a value, too, such as -0.005"
+            )
         if not wave.front.straight:
             command.note(
                 "note: the arrival times do not lie on a line within their uncertainty: the wave changes its speed or "

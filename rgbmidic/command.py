@@ -154,9 +154,11 @@ def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> i
         if status != INTERRUPTED:  # typer's own answer to Ctrl-C
             return int(status)
         raise KeyboardInterrupt
-    except (KeyboardInterrupt, typer.Abort):
+    except KeyboardInterrupt:
         return fail("interrupted; what was finished is kept", INTERRUPTED)
     except Exception as error:  # the last resort of a command: whatever it is becomes one line and an exit status
+        if isinstance(error, typer.Abort) and isinstance(error.__cause__, EOFError):
+            error = error.__cause__  # which typer takes for Ctrl-D; no command asks for input: a file ended early
         if debug:
             traceback.print_exc()
         if isinstance(error, RgbmidicError):

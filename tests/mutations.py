@@ -30,7 +30,7 @@ import h5py
 import numpy as np
 import tifffile
 from cine_files import write_cine
-from frames import noisy_mosaic
+from frames import noisy_mosaic, write_lossless_dng
 from mraw_files import write_mraw
 from seq_files import write_seq
 
@@ -90,7 +90,10 @@ WRITERS: dict[str, tuple[Callable[[Path], object], FrameSettings]] = {
     "zip.tif": (_tiff(FRAMES, bigtiff=True, compression="zlib"), STATED),
     "one_page.tif": (_behind_one_page, STATED),
     "grey.png": (_by_opencv, STATED),
+    "grey.bmp": (lambda path: cv2.imwrite(str(path), GREY.values.astype(np.uint8)), STATED),
+    "grey.pgm": (lambda path: path.write_bytes(b"P5\n45 31\n4095\n" + GREY.values.astype(">u2").tobytes()), STATED),
     "bayer.dng": (lambda path: write_dng(path, GREY), FILE),
+    "lossless.dng": (lambda path: write_lossless_dng(path, GREY), FILE),
     "samples.raw": (lambda path: GREY.values.tofile(path), replace(STATED, shape=SHAPE, dtype="uint16")),
     "grey.cine": (_cine(bits=8), FILE),
     "colour.cine": (_cine(bits=16, cfa="GBRG", annotation=b"noted"), FILE),

@@ -14,7 +14,7 @@ from scipy.sparse.linalg import spsolve
 from textures import Texture
 
 from rgbmidic import correlate
-from rgbmidic.fields.nodal import Places
+from rgbmidic.fields.interpolation import Places
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh
 from rgbmidic.results import FrameRecord
 from rgbmidic.results.comparison import Comparison, FrameComparison

@@ -149,6 +149,11 @@ def _standing_glare(table: Table) -> None:
     between(column(table, "error/stated"), *AS_STATED)
 
 
+def _arriving_glare(table: Table) -> None:
+    between(column(table, "wild"), 0, 0)
+    between(column(table, "error/stated"), *AS_STATED)
+
+
 def _study(table: Table) -> None:
     """At 8 degrees and more rgbmidic's P of the areas that reflections cross is less than half of plain DIC's."""
     for scene in dict.fromkeys(row[0] for row in table.rows):
@@ -212,6 +217,7 @@ def _noise(table: Table) -> None:
 
 LAWS: dict[str, Law] = {
     "areas": _areas,
+    "arriving_glare": _arriving_glare,
     "camera_coverage": _camera_coverage,
     "camera_strain": _camera_strain,
     "crack_jump": _crack_jump,

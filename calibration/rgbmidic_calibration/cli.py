@@ -292,10 +292,7 @@ def check(
     ] = None,
     limit: Annotated[
         list[str] | None,
-        Option(
-            help="NAME=VALUE: leakage, checkerboard, additivity, strength, noise, distance (all in %), "
-            "registration (in px)."
-        ),
+        Option(help="NAME=VALUE: leakage, checkerboard, additivity, strength, noise, distance (%), registration (px)."),
     ] = None,
     region: Region = None,
     distance: Annotated[

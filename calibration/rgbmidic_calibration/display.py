@@ -18,7 +18,7 @@ from rgbmidic.illumination.checks import Check, reported
 from rgbmidic.illumination.crosstalk import Crosstalk, Sensitivities
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise
-from rgbmidic.report.style import literal
+from rgbmidic.report.style import literal, save_figure
 from rgbmidic.text import uncertain
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
@@ -236,7 +236,9 @@ def draw_calibration(calibration: Calibration, path: Path) -> None:
     Raises
     ------
     CalibrationError
-        The calibration is empty, or the file cannot be written in the format of its ending.
+        The calibration is empty.
+    InputError, ResultError
+        The file cannot be written, or not in the format of its ending.
     """
     panels: list[Callable[[Axes], None]] = []
     if (crosstalk := calibration.crosstalk) is not None:
@@ -257,14 +259,11 @@ def _save(panels: list[Callable[[Axes], None]], path: Path) -> None:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    try:
-        with mpl.rc_context({"axes.titlesize": "medium"}):
-            figure: Figure = Figure(figsize=(5 * len(panels), 4.4), layout="constrained")
-            for draw, axes in zip(panels, np.atleast_1d(figure.subplots(1, len(panels))), strict=True):
-                draw(axes)
-            figure.savefig(path, dpi=130)
-    except (OSError, ValueError) as error:
-        raise CalibrationError(f"the picture {path} cannot be written: {error}") from None
+    with mpl.rc_context({"axes.titlesize": "medium"}):
+        figure: Figure = Figure(figsize=(5 * len(panels), 4.4), layout="constrained")
+        for draw, axes in zip(panels, np.atleast_1d(figure.subplots(1, len(panels))), strict=True):
+            draw(axes)
+        save_figure(figure, path, dpi=130)
 
 
 def _draw_matrix(axes: Axes, crosstalk: Crosstalk) -> None:
@@ -349,8 +348,8 @@ def draw_camera(camera: CameraCalibration, path: Path, residuals: Sequence[tuple
 
     Raises
     ------
-    CalibrationError
-        The file cannot be written in the format of its ending.
+    InputError, ResultError
+        The file cannot be written, or not in the format of its ending.
     """
     rows, columns = camera.shape
     y, x = np.mgrid[0 : rows - 1 : 24j, 0 : columns - 1 : 24j]

@@ -134,7 +134,7 @@ def linear_fit(reference: Reference, deformed: Deformed, solution: Solution, *, 
     every iteration (section 2.2).
     """
     assembly, mesh, lights = reference.assembly, reference.mesh, range(len(reference.values))
-    own = reference.gradient + reference.channel_specific if len(lights) > 1 else reference.gradient
+    own = reference.texture.images
     whole = np.repeat(solution.measured[mesh.elements].all(axis=1), np.diff(reference.pixels.offsets))
     moved = np.where(solution.measured[:, None], solution.displacement, np.nanmean(solution.displacement, axis=0))
 

@@ -257,10 +257,10 @@ def prediction_taps(
                         e = sites[phase, other, n]
                         matrix[m, other * size + n] = covariance[c, e, row + reach - other, column + reach - n]
                 matrix[m, m] += noise[entry, (c + 1) // 2]
-                i, j = row + reach - half, column + reach - half
-                wanted[0, m] = covariance[c, 0, i, j]
-                wanted[1, m] = (covariance[c, 1, i, j] + covariance[c, 2, i, j]) / 2
-                wanted[2, m] = covariance[c, 3, i, j]
+                below, right = row + reach - half, column + reach - half
+                wanted[0, m] = covariance[c, 0, below, right]
+                wanted[1, m] = (covariance[c, 1, below, right] + covariance[c, 2, below, right]) / 2
+                wanted[2, m] = covariance[c, 3, below, right]
             middle = count // two
             matrix[middle, middle] += held
             for q in range(count):  # Cholesky, column by column

@@ -22,6 +22,8 @@ At a lower price rates are noisier at rest, at a higher one the jerk that begins
 _OLD, _FAINT, _ROOM = 3, 6.0, 16
 """A piece's start is followed for so many windows, whatever its odds (a weak kink takes two to show), and longer if its
 log odds are above `-_FAINT`, 1 in 400, and it is among the so many first of those."""
+_NONE = np.int64(-1)
+"""No index; a literal would compile what it is given to once more."""
 _NEVER = 12.0
 """Log odds under those of the best cut at this place below which a start cannot come back."""
 _LEAST, _NOTHING = 3e-4, -30.0
@@ -54,7 +56,7 @@ def _pieces(t, y, w, young, starts, ends, logs, before):
 
     `before` (n + 1,) receives the log likelihood of what lies before each frame, summed over all ways to cut it.
     """
-    n, room, count, followed = t.size, young + _ROOM + 1, 0, 0
+    n, room, count, followed = t.size, young + _ROOM + 1, np.int64(0), 0
     corner, rotated = np.zeros((room, HIGHEST + 1, HIGHEST + 1)), np.zeros((room, HIGHEST + 1))
     rest, origin, odds, row = np.zeros(room), np.zeros(room, dtype=np.int64), np.zeros(room), np.zeros(HIGHEST + 1)
     before[:] = -np.inf
@@ -93,7 +95,11 @@ def _pieces(t, y, w, young, starts, ends, logs, before):
             never = length > HIGHEST and odds[i] < best - 0.5 * _PRICE * (LOWEST + 1 + _PLACE) - _NEVER
             if never or (length >= young and (odds[i] < best - _FAINT or kept == _ROOM)):
                 continue
-            corner[kept], rotated[kept], rest[kept], origin[kept] = corner[i], rotated[i], rest[i], origin[i]
+            rest[kept], origin[kept] = rest[i], origin[i]
+            for j in range(HIGHEST + 1):  # one assignment of slices in this file takes numba 3 s more to compile
+                rotated[kept, j] = rotated[i, j]
+                for k in range(HIGHEST + 1):
+                    corner[kept, j, k] = corner[i, j, k]
             kept += 1
         followed = kept
     return count
@@ -159,10 +165,10 @@ def _add_window(t, y, w, first, last, chance, times, low, high, begin, end, base
     variances; `lines` (T, 3, width) the weights of the values in the estimates.
     """
     norms, shifts, values, at, z, mixed = work
-    top = -1
+    top = _NONE
     for d in range(LOWEST, HIGHEST + 1):
         if chance[d - LOWEST] > _LEAST and last - first >= d:
-            top = d
+            top = np.int64(d)
     if top < 0:
         return
     _orthonormal(t, w, first, last, top, norms, shifts, values)
@@ -239,13 +245,13 @@ def _average(t, y, w, frames, times, count, starts, ends, chances, base, work, s
             if whole[k] > 0:
                 last = np.searchsorted(t, t[j] + reach, side="right") - 1
                 high = np.searchsorted(times, t[j] + reach / 2)
-                _add_window(t, y, w, j, last, whole, times, own, high - 1, own, -1, base, work, sums, lines)
+                _add_window(t, y, w, j, last, whole, times, own, high - 1, own, _NONE, base, work, sums, lines)
                 middle[high, k] += whole[k]
             whole[k] = ending[j, k]
             if whole[k] > 0:
                 first = np.searchsorted(t, t[j] - reach)
                 low = np.searchsorted(times, t[j] - reach / 2, side="right")
-                _add_window(t, y, w, first, j, whole, times, low, own, -1, own, base, work, sums, lines)
+                _add_window(t, y, w, first, j, whole, times, low, own, _NONE, own, base, work, sums, lines)
                 middle[low, k] -= whole[k]
         for i in range(times.size):
             if i:
@@ -254,7 +260,7 @@ def _average(t, y, w, frames, times, count, starts, ends, chances, base, work, s
             if whole[k] > _LEAST:
                 first = np.searchsorted(t, times[i] - reach / 2)
                 last = np.searchsorted(t, times[i] + reach / 2, side="right") - 1
-                _add_window(t, y, w, first, last, whole, times, i, i, -1, -1, base, work, sums, lines)
+                _add_window(t, y, w, first, last, whole, times, i, i, _NONE, _NONE, base, work, sums, lines)
 
 
 @helper()
@@ -305,14 +311,14 @@ def mean_rates(start, stop, times, values, noise, common, reference, most, out):
     top = HIGHEST + 1
     work = (np.zeros(top), np.zeros(top), np.zeros((top, size)), np.zeros((3, top)), np.zeros(top), np.zeros((3, top)))
     for column in range(start, stop):
-        n = 0
+        n, origin = np.int64(0), 0.0
         for i in range(size):
             if noise[column, i] > 0:
-                frames[n], t[n], y[n], w[n] = i, times[i], values[column, i], 1 / noise[column, i]
+                origin = values[column, i] if n == 0 else origin
+                frames[n], t[n], y[n], w[n] = i, times[i], values[column, i] - origin, 1 / noise[column, i]
                 n += 1
         if n < LOWEST + 2:
             continue
-        y[:n] -= y[0]
         for i in range(size):
             base[i] = np.searchsorted(t[:n], times[i] - reach)
         count = _pieces(t[:n], y[:n], w[:n], young, starts, ends, logs, before[: n + 1])
@@ -320,5 +326,6 @@ def mean_rates(start, stop, times, values, noise, common, reference, most, out):
         sums[:], lines[:] = 0.0, 0.0
         _average(t[:n], y[:n], w[:n], frames, times, count, starts, ends, logs, base, work, sums, lines)
         _conclude(w[:n], frames[:n], reference, base, sums, lines, out[column])
-        out[column, 0, 0] += values[column, frames[0]]
-        out[column, 1, 0] += common[column]
+        for i in range(size):
+            out[column, 0, 0, i] += origin
+            out[column, 1, 0, i] += common[column, i]

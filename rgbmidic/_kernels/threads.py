@@ -170,7 +170,11 @@ class Kernel:
         """Numba's, which knows the kernel's signatures and its place in the cache."""
         from numba import njit
 
-        return njit(**self._options)(self.__wrapped__)
+        from rgbmidic._kernels.cache import KernelCache
+
+        made = njit(**self._options)(self.__wrapped__)
+        made._cache = KernelCache(self.__wrapped__)
+        return made
 
     @property
     def _numba_type_(self) -> Any:  # what numba asks of a global of a function that it compiles
@@ -215,7 +219,7 @@ def compiled(over: str | None = None, **options: Any) -> Callable[[Callable[...,
         Those of ``numba.njit``.
     """
     # a division by zero gives what the processor gives, and C callers are not catered for: less code, sooner compiled
-    always: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+    always: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
     return partial(Kernel, over=over, **always | options)
 
 

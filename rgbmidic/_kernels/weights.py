@@ -10,42 +10,6 @@ _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 
 
-@compiled("mean", axis=1, grain=BLOCK, fastmath=FAST)
-def gradient_of_others(start, stop, gradient, weights, light, fewest, mean, products):
-    """Mean gradient of the lights other than `light`, and its products with that light's own.
-
-    For gradients (2, k, P) and weights (k, P): `mean` (2, P) receives the mean of the others that have weight; where
-    they are fewer than `fewest`, that of all that have. `products` (4, P) receives own times mean, mean times mean, own
-    times own and 1, all 0 where the light has no weight.
-    """
-    count, less, total = np.empty((3, BLOCK), dtype=np.float32)
-    own, lights = np.uint64(light), np.uint64(len(weights))
-    for block in range(start, stop, BLOCK):
-        first, number = np.uint64(block), np.uint64(min(BLOCK, stop - block))
-        count[:] = 0
-        for j in range(lights):
-            for i in range(number):
-                count[i] += _ONE if weights[j, first + i] > _ZERO else _ZERO
-        for i in range(number):
-            seen = _ONE if weights[own, first + i] > _ZERO else _ZERO
-            less[i] = seen if count[i] - seen >= fewest else _ZERO
-            products[3, first + i] = seen
-        for axis in range(np.uint64(2)):
-            total[:] = 0
-            for j in range(lights):
-                for i in range(number):
-                    total[i] += gradient[axis, j, first + i] if weights[j, first + i] > _ZERO else _ZERO
-            for i in range(number):
-                slope = gradient[axis, own, first + i]
-                mean[axis, first + i] = (total[i] - less[i] * slope) / max(count[i] - less[i], _ONE)
-        for i in range(number):
-            seen, x, y = products[3, first + i], gradient[0, own, first + i], gradient[1, own, first + i]
-            u, v = mean[0, first + i], mean[1, first + i]
-            products[0, first + i] = seen * (x * u + y * v)
-            products[1, first + i] = seen * (u * u + v * v)
-            products[2, first + i] = seen * (x * x + y * y)
-
-
 @compiled("fraction", axis=1, grain=BLOCK, fastmath=FAST)
 def best_mean(start, stop, fraction, weights, difference, mean, used):
     """Turn `fraction` (k, P) into the fractions of the lights in a mean: none below 0 or without weight, their sum 1.

@@ -48,6 +48,9 @@ class SolverConstants:
         Iterations of a pass after which a tenth of the nodes may still move: they wander where nothing matches, or
         faster with the weights of the next pass. Chosen; 1 to 3 give the same, with 5 a fragment that has turned takes
         one more.
+    swing
+        Part of an iteration's motion that the next one takes back, from which steps are shortened: with 1 they diverge,
+        and below .5 each halves the error (derived).
     longest_step
         Longest motion of a node in one iteration, px: a speckle (3 to 5 px), beyond which the gradient is another's.
     smoothness
@@ -69,6 +72,8 @@ class SolverConstants:
         Fraction of the largest texture below which a node has no part in that median: it is seen by no light, or blank.
     lost
         Uncertainty (px) from which a node is decorrelated: a position uncertain by half a pixel is no match.
+    probe
+        Motion (px) by which the sensitivity is observed: 20 times a node's noise, a fortieth of a speckle (derived).
     one_sided
         Texture in the worse direction over that in the better one under which the former may be noise... Chosen; half
         or twice of it matters in a deep shadow only.
@@ -87,10 +92,12 @@ class SolverConstants:
         Stretch (norm of C) beyond that of the elements around from which an element is torn, not strained: a strain of
         20 % in both directions more than theirs gives .6.
     shared
-        Correlation of a light's gradient with the mean of the others', median over the region, from which theirs takes
-        its place. Lights of one paint reach .95 to 1. At .85 the error of two lights with noise grows by an eighth so
-        (derived), that of three whose paint is their own by 18 % of the variance by a tenth (measured); below it they
-        would lose more.
+        Correlation of a light's gradient with that of the others, in a window, up to which it is matched with the mean
+        of all, and from which with that of the others. Lights of smooth paint reach .95 to 1. At .85 the others' mean
+        would cost three lights whose paint is their own by 18 % of the variance a tenth (measured).
+    follows
+        Displacement (px) of what a light alone shows against the solution at which it counts half in its gradient.
+        With half or twice of it the error on coarse paint differs by 1 % (measured).
     shown
         Fraction of its Schur complement that the images have of a rigid motion that is measured. The rest is the
         hold's, which holds no data. Lights that see within one element of one another leave .998 or more to the images,
@@ -137,6 +144,14 @@ class SolverConstants:
         Standard deviation (px) of the window in which a light's bias is found: it changes over some 50 px, and the mean
         of the lights that agree is known the better the wider it is. Half of it and 16 px give errors up to 5 % larger
         on raised droplets.
+    local_bias_range
+        The same (px) where the bias changes by more than chance within that window: a third of it. With 12 or 5 px a
+        light displaced within a disc of 35 px errs by a sixth more or a tenth less; with 5 px at rest, .82 of what is
+        stated (measured).
+    local_bias
+        Variances by chance (of both directions together: 2) that such a change must exceed (James and Stein 1961). With
+        half of it such a light errs by 5 % less and reflections are stated 4 % larger, with twice by 8 % more
+        (measured).
     """
 
     first_pass: float = 0.01
@@ -150,6 +165,7 @@ class SolverConstants:
     passes: int = 8
     pass_iterations: int = 12
     patience: int = 3
+    swing: float = 0.5
     longest_step: float = 4.0
     smoothness: float = 1e-4
     constant: float = 1e-9
@@ -158,6 +174,7 @@ class SolverConstants:
     informed: float = 0.01
     silent: float = 1e-3
     lost: float = 0.5
+    probe: float = 0.1
     one_sided: float = 0.3
     noisy: float = 0.3
     matched: tuple[float, float] = (0.4, 0.6)
@@ -165,7 +182,8 @@ class SolverConstants:
     worse: float = 8.0
     around: int = 61
     torn: float = 0.5
-    shared: float = 0.85
+    shared: tuple[float, float] = (0.85, 0.95)
+    follows: float = 0.1
     shown: float = 0.5
     named: float = 0.1
     lit: float = 0.3
@@ -181,6 +199,8 @@ class SolverConstants:
     even: float = 0.6
     prior: float = 0.1
     bias_range: float = 24.0
+    local_bias_range: float = 8.0
+    local_bias: float = 8.0
 
 
 USUAL = SolverConstants()

@@ -125,6 +125,7 @@ def discretisation_error(
     return replace(
         solution,
         displacement_std=std[:, :2],
+        bias_std=np.minimum(solution.bias_std, std[:, :2]),
         strain_std=std[:, 2:],
         displacement_error=np.where(np.isfinite(solution.displacement), error[:, :2], np.nan),
         strain_error=np.where(np.isfinite(solution.strain), error[:, 2:], np.nan),
@@ -347,8 +348,9 @@ def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
             place[:] = pixels.gather(old.scatter(row))
         return out
 
-    names = ("values", "gradient", "pixel_weights", "texture", "channel_specific")
-    fields: dict[str, Any] = {name: moved(getattr(reference, name)) for name in names}
+    fields: dict[str, Any] = {name: moved(getattr(reference, name)) for name in ("values", "gradient", "pixel_weights")}
+    texture = reference.texture
+    fields["texture"] = replace(texture, images=moved(texture.images), texture=moved(texture.texture))
     return replace(reference, mesh=mesh, material=mesh, pixels=pixels, assembly=Assembly.from_mesh(mesh), **fields)
 
 

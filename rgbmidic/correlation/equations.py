@@ -7,7 +7,7 @@ motions of the lights. They are factorised once a pass; each iteration solves fo
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,8 +47,8 @@ class Equations:
         Solves the normal equations with it.
     rigid
         The rigid motions of the lights after the first; None where there are none.
-    textured : ndarray, shape (N,), bool
-        Nodes that see enough texture.
+    observability : ndarray, shape (N,)
+        Texture, and information, in a node's worse direction over what it must have to be measured.
     light_fraction : ndarray, shape (N, k), float64
         Fraction of each light in what determines a node; 0 where nothing does.
     """
@@ -61,7 +61,7 @@ class Equations:
     smoothness: float
     solve: Callable[[FloatArray], FloatArray]
     rigid: RigidMotions | None
-    textured: BoolArray
+    observability: FloatArray
     light_fraction: FloatArray
 
     @classmethod
@@ -100,10 +100,13 @@ class Equations:
         functions = _turned_back(rotation, functions)
         own = assembly.node_blocks(blocks)
         least = constants.seen if given is None else constants.informed
-        textured, scale = _observability(own, assembly.nodal_area, least, constants)
+        observability = _observability(own, assembly.nodal_area, least, constants)
         if given is not None:
             texture = assembly.node_blocks(np.sum(reference.hessians(given), axis=0))
-            textured &= _observability(texture, assembly.nodal_area, constants.seen, constants)[0]
+            seen = _observability(texture, assembly.nodal_area, constants.seen, constants)
+            observability = np.minimum(observability, seen)
+        diagonal, textured = (own[0] + own[2]) / 2, observability > 1
+        scale = float(np.median(diagonal[textured]) if textured.any() else diagonal.max(initial=0.0)) or 1.0
         held = scale * (constants.smoothness * assembly.smoothness.data + constants.constant * assembly.diagonal)
         solve = assembly.factorise(assembly.matrix(blocks, held))
         light = np.stack([xx + yy for xx, _, yy in map(assembly.node_blocks, per_light)], axis=1)
@@ -122,9 +125,14 @@ class Equations:
             smoothness=constants.smoothness * scale,
             solve=solve,
             rigid=rigid,
-            textured=textured,
+            observability=observability,
             light_fraction=np.asarray(light / np.where(total > 0, total, 1.0)),
         )
+
+    @property
+    def textured(self) -> BoolArray:
+        """Nodes (N,) that see enough texture."""
+        return np.asarray(self.observability > 1)
 
     def information(self, reference: Reference) -> FloatArray:
         """Return texture times weight around each node, over its area, (N,): proportional to the inverse variance."""
@@ -176,12 +184,10 @@ def _turned_back(rotation: FloatArray, columns: FloatArray) -> FloatArray:
     return np.asarray(turned.reshape(columns.shape))
 
 
-def _observability(
-    own: FloatArray, area: FloatArray, least: float, constants: SolverConstants
-) -> tuple[BoolArray, float]:
-    """Find the nodes that see at least a fraction of the median texture, and the typical diagonal entry of the Hessian.
+def _observability(own: FloatArray, area: FloatArray, least: float, constants: SolverConstants) -> FloatArray:
+    """Texture that the nodes see in their worse direction, over a fraction `least` of the median, (N,).
 
-    The texture a node sees in its worse direction is the smaller eigenvalue of its own 2 x 2 block.
+    It is the smaller eigenvalue of a node's own 2 x 2 block.
     """
     xx, xy, yy = own
     half = (xx + yy) / 2
@@ -189,8 +195,7 @@ def _observability(
     smallest[smallest < constants.rounding * half] = 0  # texture in one direction only
     density = smallest / area
     typical = np.median(density[density > constants.silent * density.max()]) if density.max() > 0 else 0.0
-    seen = density > least * typical
-    return seen, float(np.median(half[seen]) if seen.any() else half.max(initial=0.0)) or 1.0
+    return np.asarray(density / (least * typical) if typical > 0 else np.zeros_like(density))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -274,9 +279,14 @@ def iterate(
     """
     known: FloatImage | None = residual.difference_from(values)
     constants, left = problem.constants, problem.options.max_iterations - len(estimate.increments)
+    relaxation, motion = 1.0, np.zeros_like(estimate.displacement)
     for turn in range(min(constants.pass_iterations, left)):
-        estimate = stepped(problem, equations, values, estimate, known)
-        known = None
+        before, last = estimate.displacement, motion
+        estimate = stepped(problem, equations, values, estimate, known, relaxation)
+        known, motion = None, estimate.displacement - before
+        # where the deformed images have more contrast than the reference, all nodes swing about the solution (Aitken)
+        swing = float((motion * last).sum()) / max(float((last * last).sum()), 1e-30)
+        relaxation /= 1 - swing if swing < -constants.swing else 1
         if not np.isfinite(estimate.displacement).all():
             raise UnsolvableError("the iteration diverged", estimate)
         # a few nodes that wander where nothing matches must not keep the others waiting
@@ -288,10 +298,16 @@ def iterate(
 
 
 def stepped(
-    problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, known: FloatImage | None
+    problem: Problem,
+    equations: Equations,
+    values: FloatImage,
+    estimate: Estimate,
+    known: FloatImage | None,
+    relaxation: float = 1.0,
 ) -> Estimate:
     """One Gauss-Newton iteration; `known` is the difference (k, P) of the states at the estimate, if it is."""
-    motion, shifts = equations.increment(*_right_sides(problem, equations, values, estimate, known))
+    steps = equations.increment(*_right_sides(problem, equations, values, estimate, known))
+    motion, shifts = (relaxation * step for step in steps)
     length = np.hypot(*motion.T)
     longest = float(length[equations.textured].max())
     rigid = estimate.rigid.copy()
@@ -328,6 +344,40 @@ def _right_sides(
         if light:
             rigid.append(equations.functions.T @ vector)
     return total, held, np.concatenate(rigid) if rigid else np.empty(0)
+
+
+def observed_sensitivity(
+    problem: Problem, equations: Equations, values: FloatImage, residual: Residual, estimate: Estimate
+) -> FloatArray:
+    """Sensitivity of the scores to a motion as the deformed images show it, over that of the Hessian, (N,).
+
+    The Hessian has the texture of the reference. Where glare or paint has changed since, the deformed images show less
+    of it. It is observed by a small motion of all nodes along each axis of the reference.
+
+    Parameters
+    ----------
+    problem, equations
+        Of the last pass.
+    values : ndarray, shape (k, P), float32
+        Reference grey levels.
+    residual
+        At the `estimate`.
+    estimate
+        The solution.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        1 where the Hessian shows nothing.
+    """
+    step, hessian = problem.constants.probe, problem.reference.assembly.matrix(equations.blocks)
+    before = _right_sides(problem, equations, values, estimate, residual.difference_from(values))[0]
+    observed, assumed = np.zeros((2, len(estimate.displacement)))
+    for axis in range(2):
+        moved = replace(estimate, displacement=estimate.displacement + step * equations.rotation[:, :, axis])
+        observed += (before - _right_sides(problem, equations, values, moved, None)[0])[axis::2] / step
+        assumed += (hessian @ np.tile(np.eye(2)[axis], len(observed)))[axis::2]
+    return np.divide(observed, assumed, out=np.ones_like(observed), where=assumed > 0)
 
 
 def _light_displacements(problem: Problem, estimate: Estimate) -> list[FloatArray]:

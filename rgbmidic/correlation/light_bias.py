@@ -10,16 +10,90 @@ independent; of two lights that disagree nobody knows which is right, and half t
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.illumination.displacement import agreement
 from rgbmidic.typing import FloatArray, FloatImage
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LightScores:
+    """Sums of the lights' scores and their information over blocks, from the residual at a solution.
+
+    Attributes
+    ----------
+    score : ndarray, shape (k, 2, h, w)
+        In x and y.
+    information : ndarray, shape (k, h, w)
+        In each direction.
+    side : int
+        Of the blocks, px.
+    reach : float
+        Standard deviation (px) of the window in which their scatter is taken.
+    """
+
+    score: FloatArray
+    information: FloatArray
+    side: int
+    reach: float
+
+    @classmethod
+    def of(cls, residual: Residual, weights: FloatImage, gradient: Callable[[int], FloatImage]) -> LightScores:
+        """Sum with pixel weights (k, P) and a `gradient` (2, P) of each light, on which its residual is regressed."""
+        reference, side = residual.reference, residual.reference.constants.block
+        lights = ((residual.difference[n], weights[n], *gradient(n)) for n in range(len(weights)))
+        sums = np.stack([reference.score_sums(side, *(field[None] for field in light))[:3] for light in lights])
+        return cls(score=sums[:, :2], information=sums[:, 2] / 2, side=side, reach=reference.constants.bias_range)
+
+    def displacement(self, range_: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Displacement of each light from the solution in a window of so many px (standard deviation).
+
+        Returns
+        -------
+        displacement : ndarray, shape (k, 2, h, w)
+            In x and y, px.
+        variance : ndarray, shape (k, h, w)
+            By chance in each direction, px²: from the scatter of the blocks' scores about it.
+        information : ndarray, shape (k, h, w)
+            Mean over the window.
+        """
+        information = np.maximum(self._around(self.information, range_), 1e-30)
+        displacement = self._around(self.score, range_) / information[:, None]
+        blocks = 4 * np.pi * (range_ / self.side) ** 2  # that a window holds
+        square = ((self.score - displacement * self.information[:, None]) ** 2).mean(axis=1)
+        return displacement, self._around(square, self.reach) / information**2 / blocks, information
+
+    def _around(self, grids: FloatArray, range_: float) -> FloatArray:
+        sigma = (0,) * (grids.ndim - 2) + (range_ / self.side,) * 2
+        return np.asarray(gaussian_filter(grids, sigma, mode="constant", truncate=3))
+
+
+def settled_gradient(residual: Residual, weights: FloatImage) -> Reference:
+    """Return the reference with the gradients for the rest of a solve, from the residual at a solution.
+
+    A light is matched with the mean of all lights only as far as what it alone shows follows the solution.
+    """
+    reference = residual.reference
+    texture, constants = reference.texture, reference.constants
+    if len(weights) < 3 or not texture.together.any():
+        return reference
+    scores = LightScores.of(residual, weights, reference.channel_specific)
+    displacement, variance, _ = scores.displacement(constants.bias_range)
+    beyond = np.maximum((displacement**2).sum(axis=1) - 2 * variance, 0)
+    consistency = 1 / (1 + beyond / constants.follows**2)
+    return replace(reference, gradient=texture.matched(reference.pixels, consistency, constants.block))
+
+
 def light_bias(residual: Residual, weights: FloatImage) -> tuple[FloatArray, FloatArray]:
     """Bias at the nodes, from the residual at a solution with these pixel weights (k, P); none with one light.
+
+    Where a light's displacement changes within the window by more than chance, it is taken in a window of a third.
 
     Returns
     -------
@@ -30,30 +104,26 @@ def light_bias(residual: Residual, weights: FloatImage) -> tuple[FloatArray, Flo
         changes by so much over it.
     """
     reference = residual.reference
-    mesh, pixels, count = reference.mesh, reference.pixels, len(weights)
-    block, reach = reference.constants.block, reference.constants.bias_range
+    mesh, pixels, count, constants = reference.mesh, reference.pixels, len(weights), reference.constants
+    reach = constants.bias_range
     if count == 1:
         return np.zeros_like(mesh.nodes), np.zeros((len(mesh.nodes), 5))
-    lights = zip(residual.difference, weights, *reference.gradient, strict=True)
-    # scores in x and y, and their information, (k, 3, h, w)
-    blocks = np.stack([reference.score_sums(block, *(field[None] for field in light))[:3] for light in lights])
-    sigma = (0, 0, reach / block, reach / block)
-    around = gaussian_filter(blocks, sigma, mode="constant", truncate=3)
-    half = np.maximum(around[:, 2] / 2, 1e-30)
-    displacement = around[:, :2] / half[:, None]
-    # scatter of the blocks' scores about the window's displacement, a window holding so many blocks
-    scatter = ((blocks[:, :2] - displacement * blocks[:, 2:] / 2) ** 2).mean(axis=1)
-    held = 4 * np.pi * (reach / block) ** 2
-    variance = gaussian_filter(scatter, sigma[1:], mode="constant", truncate=3) / half**2 / held
-    precision = half / np.maximum(half.sum(axis=0), 1e-30)
+    scores = LightScores.of(residual, weights, lambda light: reference.gradient[:, light])
+    displacement, variance, information = scores.displacement(reach)
+    local, chance, _ = scores.displacement(constants.local_bias_range)
+    beyond = local - displacement
+    beyond *= np.maximum(1 - constants.local_bias * chance / np.maximum((beyond**2).sum(axis=1), 1e-30), 0)[:, None]
+    displacement = displacement + beyond
+    precision = information / np.maximum(information.sum(axis=0), 1e-30)
     believed, agree = agreement(displacement, variance, precision)
     part = precision + agree * (believed - precision)
     mean = (part[:, None] * displacement).sum(axis=0)
     apart = np.maximum((displacement - mean) ** 2 - variance[:, None], 0)
     left = count / (count - 1) * (part[:, None] ** 2 * apart).sum(axis=0)
+    left += ((part - precision)[:, None] * beyond).sum(axis=0) ** 2
     off = mean - (precision[:, None] * displacement).sum(axis=0)
     top, left_edge = pixels.bounds[:2]
-    place = (mesh.nodes[:, ::-1] - (top, left_edge)).T / block - 0.5
+    place = (mesh.nodes[:, ::-1] - (top, left_edge)).T / scores.side - 0.5
     at_nodes = [map_coordinates(one, place, order=1, mode="nearest") for one in (*off, *left)]
     bias, square = np.stack(at_nodes, axis=1).reshape(-1, 2, 2).swapaxes(0, 1)
     x, y = np.sqrt(square).T

@@ -19,7 +19,14 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
-def judge(equations: Equations, residual: Residual, matched: BoolArray, std: FloatArray) -> npt.NDArray[np.uint8]:
+def judge(
+    equations: Equations,
+    residual: Residual,
+    matched: BoolArray,
+    std: FloatArray,
+    sensitivity: FloatArray,
+    inside: BoolArray,
+) -> npt.NDArray[np.uint8]:
     """`NodeStatus` of every node (N,) at the end of a solve: of the rules, the first that applies decides.
 
     Parameters
@@ -29,19 +36,24 @@ def judge(equations: Equations, residual: Residual, matched: BoolArray, std: Flo
     matched : ndarray, shape (E,), bool
         Elements whose images match.
     std : ndarray, shape (N, 2)
-        Standard uncertainty of u and v, px.
+        Standard uncertainty of u and v, px; NaN where not known.
+    sensitivity : ndarray, shape (N,)
+        As observed, over that of the equations.
+    inside : ndarray, shape (N,), bool
+        Nodes that lie in the deformed images.
     """
-    textured, one_sided = equations.textured, one_sided_texture(equations, residual)
+    textured = inside & (equations.observability * np.minimum(sensitivity, 1) > 1)
+    one_sided = one_sided_texture(equations, residual)
     mismatched = residual.reference.mesh.to_nodes((~matched).astype(np.float64)) > 0
     rules = (
         # the elements around it do not match, and the others have too little texture
         (mismatched & (one_sided | ~textured), NodeStatus.DECORRELATED),
-        # no light sees enough texture around it
+        # it has left the images, or no light sees enough texture around it
         (~textured, NodeStatus.NOT_SEEN),
         # the texture runs in one direction only: what lies along it cannot be measured
         (one_sided, NodeStatus.NOT_SEEN),
-        # its displacement is uncertain by half a pixel or more
-        (std.max(axis=1) > residual.reference.constants.lost, NodeStatus.DECORRELATED),
+        # its displacement is uncertain by half a pixel or more, or nobody knows by how much
+        (~(std.max(axis=1) <= residual.reference.constants.lost), NodeStatus.DECORRELATED),
     )
     status = [np.uint8(one) for _, one in rules]
     return np.select([applies for applies, _ in rules], status, np.uint8(NodeStatus.MEASURED))

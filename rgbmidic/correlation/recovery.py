@@ -26,9 +26,9 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic._kernels.factors import node_energies
-from rgbmidic.mesh import PixelMap, Tri3Mesh
+from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray
 
 Functional = tuple[sp.csr_matrix | None, sp.csr_matrix | None]
 """A quantity linear in the displacements around each node: its matrices (N, N) for u and for v, None for 0."""
@@ -176,31 +176,6 @@ def quadratic_fit(
         np.linalg.inv(normal) / (mesh.sizes[: len(other), None] ** np.array([0, 1, 1, 2, 2, 2]))[:, :, None]
     ) @ weighted
     return tuple(with_data(structure, fits[:, term].ravel()[known]) for term in range(6))
-
-
-def blended(mesh: Tri3Mesh, pixels: PixelMap, polynomials: Sequence[FloatArray]) -> FloatImage:
-    """Evaluate the nodes' polynomials at the owned pixels, each weighted by its shape function: (C, P), continuous.
-
-    Parameters
-    ----------
-    mesh, pixels
-        N nodes, P owned pixels.
-    polynomials : sequence of ndarray, shape (N, C)
-        Values of each of `TERMS`.
-    """
-    value, x, y, xx, xy, yy = polynomials
-    element = np.repeat(np.arange(len(mesh.elements)), np.diff(pixels.offsets))
-    columns, rows = pixels.columns, pixels.rows
-    out = np.zeros((value.shape[1], columns.size), dtype=np.float32)
-    for corner in range(3):
-        node = mesh.elements[element, corner]
-        constant, slope_x, slope_y = pixels.barycentric[element, corner].T
-        shape_function = constant + slope_x * pixels.local_x + slope_y * pixels.local_y
-        dx, dy = columns - mesh.nodes[node, 0], rows - mesh.nodes[node, 1]
-        for c in range(len(out)):
-            bent = xx[node, c] * dx * dx / 2 + xy[node, c] * dx * dy + yy[node, c] * dy * dy / 2
-            out[c] += shape_function * (value[node, c] + x[node, c] * dx + y[node, c] * dy + bent)
-    return out
 
 
 @lru_cache(maxsize=2)  # of a mesh and of its halves

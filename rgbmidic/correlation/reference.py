@@ -20,10 +20,10 @@ from rgbmidic._kernels.correlation import (
 from rgbmidic._kernels.owned_pixels import interpolate_nodal, score_sums
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
-from rgbmidic._kernels.weights import gradient_of_others
 from rgbmidic.correlation.assembly import Assembly, unfitted_fraction
 from rgbmidic.correlation.constants import USUAL, SolverConstants
-from rgbmidic.correlation.images import WINDOW, spline_coefficients, spline_values, usable_pixels, usable_reach
+from rgbmidic.correlation.images import spline_coefficients, spline_values, usable_pixels, usable_reach
+from rgbmidic.correlation.texture import TextureGradient
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -56,6 +56,21 @@ class Deformed:
     def __post_init__(self) -> None:
         """Count the blocks with a weight other than 1."""
         object.__setattr__(self, "partial", np.stack([_partial_blocks(weight) for weight in self.weights]))
+
+    def contains(self, points: FloatArray) -> BoolArray:
+        """Find the points that lie on pixels of the images.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 2)
+            x and y in px, counted from the first pixel.
+
+        Returns
+        -------
+        ndarray, shape (N,), bool
+        """
+        limits = np.array(self.weights.shape[:0:-1]) - 0.5
+        return np.asarray(((points >= -0.5) & (points <= limits)).all(axis=1))
 
     def pictures(self, registration: Registration | None = None) -> tuple[FloatImage, FloatImage]:
         """Return the images, holes filled and prefiltered, and the weights, both (k, H, W) on the first light's pixels.
@@ -142,11 +157,9 @@ class Reference:
     values, pixel_weights : ndarray, shape (k, P), float32
         The same at the owned pixels.
     gradient : ndarray, shape (2, k, P), float32
-        Gradient of the texture common to the lights, in grey levels per px of each.
-    texture : ndarray, shape (2, P), float32
-        Gradient of the lights' common texture: the sum of theirs.
-    channel_specific : ndarray, shape (2, k, P), float32
-        What each light's own gradient has beyond that of the common texture; of no light where there is but one.
+        Gradient of the texture common to the lights, in grey levels per px of each, that they are matched with.
+    texture : TextureGradient
+        Where it is from.
     prefilter : str
         One of `PREFILTERS`.
     constants : SolverConstants
@@ -164,8 +177,7 @@ class Reference:
     values: FloatImage
     gradient: FloatImage
     pixel_weights: FloatImage
-    texture: FloatImage
-    channel_specific: FloatImage
+    texture: TextureGradient
     prefilter: str
     registration: Registration | None = None
     constants: SolverConstants = USUAL
@@ -234,7 +246,8 @@ class Reference:
         else:
             values, weighted, own = _where_they_lie(state, mesh, pixels, pixels.gather(inside), registration)
         del state  # before what needs most memory
-        gradient = _common_gradient(own, weighted, pixels, constants.shared)
+        texture = TextureGradient.of_images(own, weighted, pixels, constants.shared)
+        gradient = texture.matched(pixels)
         return cls(
             mesh=mesh,
             pixels=pixels,
@@ -247,12 +260,25 @@ class Reference:
             values=values,
             gradient=gradient,
             pixel_weights=weighted,
-            texture=gradient[:, 0] if gradient is own else gradient.sum(axis=1),
-            channel_specific=own[:, :0] if gradient is own else np.subtract(own, gradient, out=own),
+            texture=texture,
             prefilter=prefilter,
             registration=registration,
             constants=constants,
         )
+
+    def channel_specific(self, light: int) -> FloatImage:
+        """Return what a light's own gradient has beyond the one that it is matched with, (2, P).
+
+        Parameters
+        ----------
+        light
+            Index of the light.
+
+        Returns
+        -------
+        ndarray, shape (2, P), float32
+        """
+        return self.texture.images[:, light] - self.gradient[:, light]
 
     def offset(self, deformed: Deformed) -> FloatArray:
         """Column and row of these images (2,) at which those of a deformed state begin.
@@ -448,45 +474,3 @@ def _gradient(coefficients: FloatImage, pixels: PixelMap) -> FloatImage:
     for light, spline in enumerate(coefficients):
         pixel_gradient(pixels.lines, spline, *pixels.bounds[:2], *gradient[:, light])
     return gradient
-
-
-def _common_gradient(gradient: FloatImage, weights: FloatImage, pixels: PixelMap, shared: float) -> FloatImage:
-    """Gradient (2, k, P) of the texture that each light has in common with the others, times its contrast in it.
-
-    The mean of the *other* lights' `gradient`. What one light alone shows (the sparkle of its reflection, what the
-    lattice of its camera colour makes of it) is in its own gradient and in its own residual alike. Their product does
-    not average out: it pulls to whole pixels, and to where a sparkle has stayed that does not follow the surface. The
-    others' gradient is an instrument in the statistical sense: it knows the texture and nothing of that. The contrast
-    is the regression on it, which makes the Hessian the light's sensitivity to a displacement.
-
-    A light whose gradient the others' do not predict (another pattern, or theirs are noise) keeps its own in the mean,
-    as it does where a single other one is seen: that one may be the one that reflects.
-    """
-    if gradient.shape[1] == 1:
-        return gradient
-    out, mean = np.empty_like(gradient), np.empty((2, weights.shape[1]), dtype=np.float32)
-    products = np.empty((4, weights.shape[1]), dtype=np.float32)
-    for light in range(len(weights)):
-        for fewest in (2, len(weights)):  # others; there are never so many
-            gradient_of_others(gradient, weights, light, fewest, mean, products)
-            contrast, correlation = _regression(products, pixels)
-            if correlation >= shared:
-                break
-        np.multiply(mean, contrast, out=out[:, light])
-    return out
-
-
-def _regression(products: FloatImage, pixels: PixelMap) -> tuple[FloatImage, float]:
-    """Regress a light's own gradient on another, locally; their `products` (4, P) are those of `gradient_of_others`.
-
-    Returns
-    -------
-    tuple
-        The coefficient (P,), at least 0, and the median of the correlation coefficient.
-    """
-    along, square, power = WINDOW.ratios(pixels, products)
-    known = (square > 0) & (power > 0)
-    correlation = along[known] / np.sqrt(square[known] * power[known])
-    contrast = np.divide(along, square, out=np.zeros_like(along), where=known)
-    around = pixels.from_blocks(np.maximum(contrast, 0)[None], WINDOW.step)[0]
-    return around, float(np.median(correlation)) if known.any() else 0.0

@@ -128,6 +128,7 @@ class ReferenceUpdate:
             elements=mesh.elements,
             displacement=self.displacement + step.displacement,
             displacement_std=np.sqrt(_single(last.displacement_std) ** 2 + own * step.displacement_std**2),
+            bias_std=np.sqrt(_single(last.bias_std) ** 2 + own * step.bias_std**2),
             strain=_single(last.strain) + step.strain,
             strain_std=np.sqrt(_single(last.strain_std) ** 2 + own * step.strain_std**2),
             rigid=last.rigid + step.rigid if step.rigid.size else step.rigid,

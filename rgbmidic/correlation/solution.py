@@ -23,6 +23,10 @@ NO_MATCH = "the images do not match anywhere in the region"
 """Reason of a frame in which nothing was found."""
 
 
+DISPUTED = 0.1
+"""Uncertainty (px) by the lights' bias from which, at 1 % of the nodes, they are said to disagree. Chosen."""
+
+
 class Status(IntEnum):
     """Status of a frame."""
 
@@ -57,6 +61,9 @@ class Solution(Described):
     displacement_std : ndarray, shape (N, 2), float64
         Standard uncertainty of the nodal values in px, from the residual (noise, demosaicing, irregular reflections,
         deviations from a quadratic); NaN where not measured.
+    bias_std : ndarray, shape (N, 2), float64
+        Part of it in px that the bias of the lights leaves (`light_bias`), alike over some 24 px: the variance beside
+        it, ``displacement_std**2 - bias_std**2``, follows the mesh. 0 with a single light; NaN where not measured.
     strain, strain_std : ndarray, shape (N, 3), float64
         Small strain (exx, eyy, exy), tensor shear, and its standard uncertainty: slopes of the quadratic through the
         neighbouring nodes; NaN where the node or a neighbour is not measured.
@@ -89,6 +96,7 @@ class Solution(Described):
     elements: npt.NDArray[np.int32]
     displacement: FloatArray
     displacement_std: FloatArray
+    bias_std: FloatArray
     strain: FloatArray
     strain_std: FloatArray
     displacement_error: FloatArray
@@ -120,6 +128,19 @@ class Solution(Described):
                 lines.append(f"{name}:      {least} to {most} (median)")
         return "\n".join(lines)
 
+    @property
+    def disagreement(self) -> str:
+        """Where the lights show displacements that their agreement does not settle; empty if they do not."""
+        mainly = self.bias_std**2 > 0.8 * self.displacement_std**2  # twice of all else together
+        std, measured = np.where(mainly, self.bias_std, 0).max(axis=1), int(self.measured.sum())
+        disputed, (x, y) = int((std > DISPUTED).sum()), self.nodes[std.argmax()]
+        if disputed <= 0.01 * measured:
+            return ""
+        return (
+            f"the lights show different displacements at {disputed} of {measured} nodes, most at x {x:.0f}, y {y:.0f}, "
+            f"and which is right is not known: their uncertainty holds it ({std.max():.2g} px at most)"
+        )
+
     @classmethod
     def failed(cls, mesh: Tri3Mesh, lights: int, reason: str, history: FloatArray) -> Solution:
         """Return a solution where nothing can be measured: NaN everywhere, and the reason.
@@ -145,6 +166,7 @@ class Solution(Described):
             elements=mesh.elements,
             displacement=np.full((count, 2), np.nan),
             displacement_std=np.full((count, 2), np.nan),
+            bias_std=np.full((count, 2), np.nan),
             strain=np.full((count, 3), np.nan),
             strain_std=np.full((count, 3), np.nan),
             displacement_error=np.full((count, 2), np.nan),

@@ -19,8 +19,16 @@ import numpy as np
 
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import rigid_functions
-from rgbmidic.correlation.equations import Equations, Estimate, Problem, UnsolvableError, compare, iterate
-from rgbmidic.correlation.light_bias import light_bias
+from rgbmidic.correlation.equations import (
+    Equations,
+    Estimate,
+    Problem,
+    UnsolvableError,
+    compare,
+    iterate,
+    observed_sensitivity,
+)
+from rgbmidic.correlation.light_bias import light_bias, settled_gradient
 from rgbmidic.correlation.nodes import judge, matching_elements, misfit, one_sided_texture
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
@@ -207,13 +215,15 @@ def solve(
     rigid = np.zeros((len(reference.images), problem.functions.shape[1]))
     try:
         with one_blas_thread():
-            return _conclude(problem, *_passes(problem, Estimate(displacement=initial, rigid=rigid), residual))
+            return _conclude(*_passes(problem, Estimate(displacement=initial, rigid=rigid), residual))
     except UnsolvableError as error:
         return Solution.failed(reference.mesh, len(reference.images), str(error), error.history)
 
 
-def _passes(problem: Problem, estimate: Estimate, residual: Residual | None) -> tuple[Estimate, Equations, Weighting]:
-    """Run passes until the weights have settled."""
+def _passes(
+    problem: Problem, estimate: Estimate, residual: Residual | None
+) -> tuple[Problem, Estimate, Equations, Weighting]:
+    """Run passes until the weights have settled; the problem is returned with the lights' gradients decided."""
     tolerance = problem.options.tolerance
     estimate, weighting = _begin(problem, estimate, residual)
     equations: Equations | None = None
@@ -224,6 +234,12 @@ def _passes(problem: Problem, estimate: Estimate, residual: Residual | None) -> 
         reached = max(tolerance, problem.constants.first_pass) if number == 0 else tolerance
         estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, reached)
         weighting = next_weighting(problem, weighting, equations, estimate, number)
+        if (
+            number == 0
+            and (found := settled_gradient(weighting.residual, weighting.weights())) is not problem.reference
+        ):
+            problem, equations = replace(problem, reference=found), None
+            weighting = replace(weighting, residual=replace(weighting.residual, reference=found))
     assert equations is not None
     if estimate.longest > tolerance:
         estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance)
@@ -235,7 +251,7 @@ def _passes(problem: Problem, estimate: Estimate, residual: Residual | None) -> 
             equations = _equations(problem, weighting, estimate)
             estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance)
         weighting = replace(weighting, residual=compare(problem, weighting.values, estimate))
-    return estimate, equations, weighting
+    return problem, estimate, equations, weighting
 
 
 @stage("search")
@@ -298,11 +314,20 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     fitted = estimate.displacement
     residual = weighting.residual.without(*recovery.bend(fitted))
     std = standard_uncertainty(residual, equations, weighting.precision, recovery)
+    bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
     if weighting.precision is not None:
         bias, bias_std = light_bias(weighting.residual, equations.weights)
-        fitted, std = fitted + bias, np.hypot(std, bias_std)
-    node_status = judge(equations, weighting.residual, weighting.matched, std[:, :2])
+    sensitivity = observed_sensitivity(problem, equations, weighting.values, weighting.residual, estimate)
+    scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
+    fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale
+    field = recovery.field(*fitted.T)
+    inside = problem.deformed.contains(mesh.nodes + field[:, :2] - reference.offset(problem.deformed))
+    node_status = judge(equations, weighting.residual, weighting.matched, std[:, :2], sensitivity, inside)
     measured = np.asarray(node_status == NodeStatus.MEASURED)
+    if not measured.any() and np.isnan(std[equations.textured]).all():
+        raise UnsolvableError(
+            "the region is too small for its elements: nothing is left of the noise to state an uncertainty", estimate
+        )
     if not measured.any():
         along = one_sided_texture(equations, weighting.residual) & (node_status == NodeStatus.NOT_SEEN)
         one_sided = "the texture runs in one direction only: what lies along it cannot be measured"
@@ -317,7 +342,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
             estimate,
         )
     inner = measured & ~mesh.beside(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
-    squares, field = weighting.residual.squares(equations.weights), recovery.field(*fitted.T)
+    squares = weighting.residual.squares(equations.weights)
     square, total, _ = squares.sum(axis=1).T
     some = equations.weights[:, :: max(1, equations.weights.shape[1] // 100_000)]
     seen, history = some.sum(axis=0), estimate.history(measured)
@@ -326,6 +351,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         Solution.failed(mesh, len(reference.images), "", history),
         displacement=np.where(measured[:, None], field[:, :2], np.nan),
         displacement_std=np.where(measured[:, None], std[:, :2], np.nan),
+        bias_std=np.where(measured[:, None], bias_std[:, :2], np.nan),
         strain=np.where(inner[:, None], field[:, 2:], np.nan),
         strain_std=np.where(inner[:, None], std[:, 2:], np.nan),
         node_status=node_status,

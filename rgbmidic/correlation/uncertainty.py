@@ -37,7 +37,7 @@ def displacing_fraction(reference: Reference, difference: FloatImage, weight: Fl
         Its inverse variance.
     """
     block = reference.constants.block
-    xx, _, yy = BlockScores.of(reference, block, difference, weight, *reference.texture).products()
+    xx, _, yy = BlockScores.of(reference, block, difference, weight, *reference.texture.texture).products()
     # at least 0.01: of images without noise it is not 0 (up to twice of it nothing changes)
     fraction = np.maximum(xx + yy, 0.01)
     return np.asarray(reference.pixels.from_blocks(fraction[None], block)[0])
@@ -224,6 +224,33 @@ def _rigid_variance(
     return np.stack(variance, axis=1)
 
 
+def _probed_std(
+    equations: Equations, scores: FloatArray, reference: Reference, asked: list[tuple[Functional, BoolArray]]
+) -> FloatArray:
+    """Evaluate `functional_std` for element blocks of `scores` (E, 3, 3, 3) without what lost nodes do to others.
+
+    Beside nodes that are hardly seen columns of M^-1 are a hundred times as large as others, which they still exceed
+    where they have decayed: the sums of these may vanish, or be negative. What is large is known itself, and left out
+    when the others are evaluated again. Beside them the least is what the information allows (Cramer and Rao): the
+    uncertainty with the scores' variance over their information as small as it is in any element around.
+    """
+    mesh, assembly, lost = reference.material, reference.assembly, reference.constants.lost
+    limits, covariance = [lost] * 2 + [lost / mesh.size] * (len(asked) - 2), assembly.matrix(scores)
+    found = functional_std(equations.solve, covariance, mesh, asked)
+    far = np.zeros(found.shape, dtype=bool)
+    while ((found > limits) & ~far).any():
+        far |= found > limits
+        others = [(functional, nodes & ~beyond) for (functional, nodes), beyond in zip(asked, far.T, strict=True)]
+        found = np.where(far, found, functional_std(equations.solve, covariance, mesh, others))
+    if not far.any():
+        return found
+    score, information = (np.einsum("eaad->ed", blocks)[:, ::2].sum(axis=1) for blocks in (scores, equations.blocks))
+    ratio, least = score / np.maximum(information, 1e-300), np.full(len(found), np.inf)
+    np.minimum.at(least, mesh.elements[information > 0], ratio[information > 0, None])
+    allowed = functional_std(equations.solve, assembly.matrix(equations.blocks), mesh, others)
+    return np.maximum(found, allowed * np.sqrt(np.where(least < np.inf, least, 0))[:, None])
+
+
 def standard_uncertainty(
     residual: Residual, equations: Equations, precision: Precision | None, recovery: Recovery | None = None
 ) -> FloatArray:
@@ -254,18 +281,18 @@ def standard_uncertainty(
     if recovery is not None:
         inner = textured & ~reference.mesh.beside(~textured)
         asked += [(one, inner) for one in recovery.strain_functionals]
-    covariance = reference.assembly.matrix(score_covariance(residual, equations.weights, equations.blocks))
-    std = functional_std(equations.solve, covariance, reference.material, asked)
+    scores = score_covariance(residual, equations.weights, equations.blocks)
+    std = _probed_std(equations, scores, reference, asked)
     if equations.rigid is not None:
         rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in asked])
         std = np.sqrt(np.maximum(std**2 + rigid, 0))
     if precision is not None:
         std = std * precision.robust_loss(reference, equations.weights)[:, None]
-    if recovery is None:
+    if recovery is None or len(equations.weights) == 1:
         return std
-    lights = zip(equations.weights, residual.difference, reference.channel_specific.swapaxes(0, 1), strict=False)
+    specific = map(reference.channel_specific, range(len(equations.weights)))
+    lights = zip(equations.weights, residual.difference, specific, strict=True)
     pulls = np.array([reference.assembly.vector(reference.projected(*light)) for light in lights])
-    pulls = pulls.reshape(-1, reference.assembly.size)  # none where there is but one light
     pull, rigid_pull = pulls.sum(axis=0), (pulls[1:] @ equations.functions).ravel()
     step, _ = equations.increment(pull, np.zeros_like(pull), rigid_pull)
     return np.hypot(std, recovery.field(*step.T))

@@ -3,17 +3,8 @@
 from rgbmidic.fields.crack_tip import StressIntensity, Williams, stress_intensity
 from rgbmidic.fields.cracks import Jump, crack_jump
 from rgbmidic.fields.history import SIGMA, History, Nodal, Probe, Rates, high_pass, rates
-from rgbmidic.fields.nodal import (
-    NodalCovariance,
-    Places,
-    RigidMotion,
-    at_nodes,
-    at_pixels,
-    difference_std,
-    field_rms,
-    frame_covariance,
-    reference_fraction,
-)
+from rgbmidic.fields.interpolation import Places, at_nodes, at_pixels, field_rms
+from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, difference_std, frame_covariance, reference_fraction
 from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.probes import Area, Mean, make_probe
 from rgbmidic.fields.profiles import ProfileLine

@@ -22,7 +22,8 @@ from scipy.linalg import cholesky, solve_triangular
 from rgbmidic.errors import InputError
 from rgbmidic.fields.cracks import at_some, crack_faces, listed, nearest_node
 from rgbmidic.fields.history import History, Nodal, Part, histories_of
-from rgbmidic.fields.nodal import NodalCovariance, Places
+from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray
@@ -253,7 +254,8 @@ class CrackTip:
         away = np.hypot(*(mesh.nodes - tip).T)
         self.nodes = np.flatnonzero((away >= inner) & (away <= outer))
         self.points, self.face = (mesh.nodes[self.nodes] - tip) @ self.axes.T, side[self.nodes]
-        self.correlation, per = covariance.part(self.nodes), _CONSTANTS.per_coefficient
+        part, per = covariance.part(self.nodes), _CONSTANTS.per_coefficient
+        self.correlations = np.stack([(root @ root.T).toarray() for root in (part.fit, part.bias)])
         self.least = per * ((williams.terms or 2) + 1)
         self.most_terms = williams.terms or min(_CONSTANTS.most_terms, len(self.nodes) // per - 1)
         self._check_annulus(mesh)
@@ -297,7 +299,7 @@ class CrackTip:
         to the least N from which all those beyond it lower no frame's chi-square by more than noise would, once in a
         thousand tests; where the tip is fitted the terms n = -1, which shift it, take part in that.
         """
-        fields = np.stack([nodal.u, nodal.v, nodal.u_std, nodal.v_std], axis=1)
+        fields = nodal.fields.swapaxes(0, 1)
         known: BoolArray = np.asarray(np.isfinite(fields).all(axis=1))
         frames = np.flatnonzero([self._enough(row) for row in known])
         data = {frame: _Weighted(self, fields[frame], known[frame]) for frame in frames.tolist()}
@@ -368,7 +370,7 @@ class CrackTip:
 
 
 class _Weighted:
-    """The displacements and uncertainties (4, m) of a frame in an annulus, without rotation, their errors independent.
+    """The displacements and uncertainties (6, m) of a frame in an annulus, without rotation, their errors independent.
 
     Attributes
     ----------
@@ -383,11 +385,14 @@ class _Weighted:
     """
 
     def __init__(self, probe: CrackTip, field: FloatArray, known: BoolArray) -> None:
-        std = field[2:, known]
+        std, bias = field[2:4, known], field[4:, known]
         level = float(np.median(std))
-        self.probe, self.certain = probe, not level > 0
-        self._factor = cholesky(probe.correlation[np.ix_(known, known)], lower=True)
-        self._std = np.ones_like(std) if self.certain else np.maximum(std, _CONSTANTS.least_std * level)
+        self.probe, self.certain, self._factors = probe, not level > 0, list[FloatArray]()
+        std = np.ones_like(std) if self.certain else np.maximum(std, _CONSTANTS.least_std * level)
+        correlations, shared = probe.correlations[:, known][..., known], np.minimum(bias, std)
+        for parts in np.stack([np.sqrt(std**2 - shared**2), shared], axis=1)[..., None]:
+            covariance = (parts * correlations * parts.swapaxes(1, 2)).sum(axis=0)
+            self._factors.append(cholesky(covariance, lower=True))
         self.points, self.face = probe.points[known], probe.face[known]
         arm = self.points @ probe.axes
         arm -= arm.mean(axis=0)
@@ -406,8 +411,8 @@ class _Weighted:
 
     def whiten(self, parts: FloatArray) -> FloatArray:
         """Divide fields (2, m, p) by their errors, (2 m, p)."""
-        scaled = parts / self._std[:, :, None]
-        return np.concatenate([solve_triangular(self._factor, part, lower=True) for part in scaled])
+        factors = zip(self._factors, parts, strict=True)
+        return np.concatenate([solve_triangular(factor, part, lower=True) for factor, part in factors])
 
     def series(self, orders: range, tip: float = 0.0) -> FloatArray:
         """Evaluate the terms, in (r / outer radius)^(n/2), for a tip so many px ahead; (2, m, p)."""

@@ -76,30 +76,38 @@ class JumpAlong:
         arrives = np.concatenate([steps[:1, :, 0], steps[:, :, 1]])
         leaves = np.concatenate([steps[:, :, 0], steps[-1:, :, 1]])
         one = (arrives == leaves).all(axis=1)  # else another crack branches off here
-        # `sides` (n, 2): node on the left and on the right of each of `points`, as place in `nodes`; the same at a tip
+        # sides (n, 2): node on the left and on the right of each of `points`, as place in `nodes`; the same at a tip.
+        # `used` (P, 6): those of each pair and of the points before and after it
         self.pairs = np.flatnonzero(one & (arrives[:, 0] != arrives[:, 1]))
         if not len(self.pairs):
             raise InputError(f"no pair of nodes lies on the crack between the points {listed(place)} px of {name}")
         self.name, self.points = name, mesh.nodes[path]
         self.nodes, index = np.unique(arrives, return_inverse=True)
-        self.sides, self.correlation = index.reshape(-1, 2), covariance.part(self.nodes)
+        sides = index.reshape(-1, 2)
+        self.used = sides[np.stack([self.pairs, *self._beside], axis=1)].reshape(-1, 6)
+        self.covariances = [covariance.part(self.nodes[row]) for row in self.used]
+
+    @property
+    def _beside(self) -> tuple[IntArray, IntArray]:
+        """Places on the crack before and after each pair."""
+        return np.maximum(self.pairs - 1, 0), np.minimum(self.pairs + 1, len(self.points) - 1)
 
     def read(self, nodal: Nodal) -> Jump:
         """Compute the jump from the displacements of the `nodes`; its uncertainty is that to first order."""
-        before, after = np.maximum(self.pairs - 1, 0), np.minimum(self.pairs + 1, len(self.points) - 1)
-        used = self.sides[np.stack([self.pairs, before, after], axis=1)].reshape(-1, 6)
+        before, after = self._beside
         across, along = np.array([1, -1, 0, 0, 0, 0]), np.array([0, 0, -0.5, -0.5, 0.5, 0.5])
-        u, std = np.stack([nodal.u, nodal.v])[:, :, used], np.stack([nodal.u_std, nodal.v_std])[:, :, used]
+        u, *stds = nodal.fields[..., self.used].reshape(3, 2, len(nodal.u), *self.used.shape)
         jump, arm = u @ across, (self.points[after] - self.points[before]).T[:, None] + u @ along
         length = np.hypot(*arm)
         tangent = arm / length
         normal = np.stack([tangent[1], -tangent[0]])
         opening, sliding = (jump * normal).sum(axis=0), (jump * tangent).sum(axis=0)
-        correlation = self.correlation[used[:, :, None], used[:, None]]
 
         def error(axis: FloatArray, turn: FloatArray) -> FloatArray:
-            parts = (axis[..., None] * across + turn[..., None] * along) * std
-            return np.asarray(np.sqrt(np.maximum(np.einsum("ctpm,pmn,ctpn->tp", parts, correlation, parts), 0)))
+            parts = axis[..., None] * across + turn[..., None] * along
+            pairs = enumerate(self.covariances)
+            square = [one.variance(parts[:, :, p], *(std[:, :, p] for std in stds)).sum(axis=0) for p, one in pairs]
+            return np.asarray(np.sqrt(np.stack(square, axis=1)))
 
         # the axes turn with the crack: d(normal) = tangent d(angle), d(angle) = -normal . d(arm) / length
         steps = np.hypot(*np.diff(self.points, axis=0, prepend=self.points[:1]).T)
@@ -191,5 +199,4 @@ def crack_jump(
 
 def at_some(nodal: Nodal, nodes: IntArray) -> Nodal:
     """Displacements at some of the nodes."""
-    parts = {name: np.asarray(getattr(nodal, name))[:, nodes] for name in ("u", "v", "u_std", "v_std")}
-    return Nodal(**parts)
+    return Nodal.of(nodal.fields[..., nodes])

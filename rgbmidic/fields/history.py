@@ -14,8 +14,8 @@ frames have in common, cancels.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import Protocol, Self
 
 import cv2
 import numpy as np
@@ -32,12 +32,48 @@ SIGMA = 40.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Nodal:
-    """Displacement of some nodes and its standard uncertainty, each (T, m), px; NaN where not measured."""
+    """Displacement of some nodes and its standard uncertainty, each (T, m), px; NaN where not measured.
+
+    Attributes
+    ----------
+    u, v, u_std, v_std : ndarray, shape (T, m)
+        Displacement and its standard uncertainty.
+    u_bias, v_bias : ndarray, shape (T, m)
+        The part of the uncertainty that the bias of the lights leaves, which nodes near each other have in common.
+    """
 
     u: FloatArray
     v: FloatArray
     u_std: FloatArray
     v_std: FloatArray
+    u_bias: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    v_bias: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+
+    @classmethod
+    def of(cls, fields: FloatArray) -> Self:
+        """Take all fields in one array.
+
+        Parameters
+        ----------
+        fields : ndarray, shape (6, T, m) or (4, T, m)
+            The fields in the order of the attributes; without the last two, nothing is left by the bias of lights.
+
+        Returns
+        -------
+        Nodal
+        """
+        return cls(**dict(zip(cls.__dataclass_fields__, fields, strict=False)))
+
+    @property
+    def fields(self) -> FloatArray:
+        """All of them in their order, (6, T, m)."""
+        parts = (self.u, self.v, self.u_std, self.v_std, self.u_bias, self.v_bias)
+        return np.stack(np.broadcast_arrays(*parts))
+
+    @property
+    def components(self) -> FloatArray:
+        """Value, uncertainty and bias of u and of v, (2, 3, T, m)."""
+        return self.fields.reshape(3, 2, *self.u.shape).swapaxes(0, 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,9 +1,10 @@
-"""Nodal fields: points in a mesh, nodes and pixels, the covariance of nodes and of frames, rigid motion.
+"""Nodal fields: the covariance of nodes and of frames, rigid motion.
 
 The solve is a least-squares fit of linear elements, whose covariance is the inverse of a Hessian: for a texture that is
 alike everywhere the inverse of the mesh's mass matrix. The displacement at a node is then that of a quadratic through
 the nodes around it, a linear function of theirs. Where the texture, the weights or the noise vary, the stated
-uncertainty of each node reports by how much; its correlation with the others is taken as the mesh's alone.
+uncertainty of each node reports by how much; its correlation with the others is taken as the mesh's alone, but for the
+part that the lights' bias leaves.
 
 The frames of a test have the noise of the reference in common, which cancels in differences and rates. The displacement
 of frame t has the error ``b_t - r``: that of the frame's own noise, less the mean of the same for the n frames of the
@@ -14,213 +15,56 @@ reference. With equal noise in all frames the variance stated for t is ``(1 + 1/
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
+from numpy.polynomial import Chebyshev, Polynomial
 
-from rgbmidic.correlation.recovery import Recovery, blended, quadratic_fit
+from rgbmidic.correlation.constants import USUAL
+from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
-from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage, IntArray
+from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 _LOW, _HIGH = 0.5, 2.0
 """Bounds of the eigenvalues of a TRI3 mass matrix over its diagonal, on any mesh (Wathen, IMA J Numer Anal 7, 1987)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Places:
-    """Points in a mesh: their elements and barycentric coordinates.
-
-    Attributes
-    ----------
-    mesh
-        The mesh.
-    points : ndarray, shape (P, 2)
-        In px on the reference.
-    inside : ndarray, shape (P,), bool
-    element : ndarray, shape (P,), int
-        The element that holds the point, the nearest one for a point outside.
-    barycentric : ndarray, shape (P, 3)
-        Value of the shape functions of that element's nodes at the point.
-    """
-
-    mesh: Tri3Mesh
-    points: FloatArray
-    inside: BoolArray
-    element: IntArray
-    barycentric: FloatArray
-
-    @classmethod
-    def of(cls, mesh: Tri3Mesh, points: npt.ArrayLike) -> Self:
-        """Find the elements of points (P, 2) in a mesh.
-
-        Parameters
-        ----------
-        mesh
-            N nodes, E elements.
-        points : array_like, shape (P, 2)
-            Points (x, y) on the reference, px.
-
-        Returns
-        -------
-        Places
-        """
-        from scipy.spatial import cKDTree
-
-        points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
-        corners, slopes = mesh.nodes[mesh.elements], mesh.shape_gradients()
-        middle = corners.mean(axis=1)
-        count = min(24, len(middle))  # the nearest elements: their sizes in one mesh differ by a factor of 2
-        near = np.asarray(cKDTree(middle).query(points, k=count)[1]).reshape(len(points), count)
-        shape = 1 / 3 + np.einsum("pced,pcd->pce", slopes[near], points[:, None] - middle[near])
-        best = shape.min(axis=2).argmax(axis=1)
-        row = np.arange(len(points))
-        barycentric = shape[row, best]
-        inside = barycentric.min(axis=1) >= -1e-6  # rounding, 1e-5 px
-        return cls(mesh=mesh, points=points, inside=inside, element=near[row, best], barycentric=barycentric)
-
-    def check(self, what: str) -> None:
-        """Refuse points outside the mesh.
-
-        Parameters
-        ----------
-        what
-            What the points are, for the message.
-
-        Raises
-        ------
-        InputError
-            One is; the message names it after `what`.
-        """
-        if not self.inside.all():
-            x, y = self.points[~self.inside][0]
-            raise InputError(f"{what} at ({x:g}, {y:g}) px is outside {self.where}")
-
-    @property
-    def where(self) -> str:
-        """Text for messages with the bounds of the region."""
-        (left, top), (right, bottom) = self.mesh.nodes.min(axis=0), self.mesh.nodes.max(axis=0)
-        return f"the region that was measured, which lies within x {left:g} to {right:g}, y {top:g} to {bottom:g}"
-
-    def mean(self) -> FloatArray:
-        """Compute the weight (N,) of every node in the mean over the points that are inside.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-            Of unit sum.
-        """
-        nodes, weights = self.mesh.elements[self.element[self.inside]], self.barycentric[self.inside]
-        sums = np.bincount(nodes.ravel(), weights=weights.ravel(), minlength=len(self.mesh.nodes))
-        return np.asarray(sums / max(self.inside.sum(), 1))
-
-
-def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> FloatImage:
-    """Interpolate a nodal field at the pixels of an image, by quadratics through the nodes around each node.
-
-    Each node's quadratic is weighted by its shape function. Linear interpolation of exact nodal values would lose a
-    tenth of the height of a wave of 6 elements; this one keeps .99 of it, .95 at 4 and .83 at 3 elements.
-
-    Parameters
-    ----------
-    mesh
-        The mesh.
-    values : ndarray, shape (N, 2)
-        At the nodes; NaN where a node has no data.
-    shape
-        Rows and columns (H, W) of the image.
-
-    Returns
-    -------
-    ndarray, shape (2, H, W), float32
-        NaN outside the mesh and in elements with a NaN node.
-    """
-    pixels = PixelMap.from_mesh(mesh, Region.from_mask(np.ones(shape, dtype=bool)))
-    used = np.asarray(np.isfinite(values)[mesh.elements].all(axis=(1, 2)))
-    known = np.nan_to_num(values)
-    out = blended(mesh, pixels, [values, *(operator @ known for operator in quadratic_fit(mesh, used)[1:])])
-    return np.stack([pixels.scatter(part, fill=np.nan) for part in out])
-
-
-def at_nodes(field: FloatArray, nodes: FloatArray) -> FloatArray:
-    """Interpolate a pixel field at nodes, bilinearly.
-
-    Parameters
-    ----------
-    field : ndarray, shape (C, H, W)
-        At the pixels.
-    nodes : ndarray, shape (N, 2)
-        Positions (x, y) in px; a node outside the image takes the value at its edge.
-
-    Returns
-    -------
-    ndarray, shape (N, C)
-        NaN where one of the four pixels around is NaN.
-    """
-    height, width = field.shape[1:]
-    x = np.clip(nodes[:, 0], 0, width - 1)
-    y = np.clip(nodes[:, 1], 0, height - 1)
-    column = np.minimum(x.astype(int), width - 2)
-    row = np.minimum(y.astype(int), height - 2)
-    tx, ty = x - column, y - row
-    above = (1 - tx) * field[:, row, column] + tx * field[:, row, column + 1]
-    below = (1 - tx) * field[:, row + 1, column] + tx * field[:, row + 1, column + 1]
-    return np.asarray(((1 - ty) * above + ty * below).T)
-
-
-def field_rms(mesh: Tri3Mesh, values: FloatArray, truth: FloatArray, *, border: float = 0.0) -> float:
-    """Compute the root mean square difference, over pixels and components, of a nodal field and a pixel field.
-
-    Parameters
-    ----------
-    mesh
-        The mesh.
-    values : ndarray, shape (N, 2)
-        At its nodes; the elements of NaN nodes are left out.
-    truth : ndarray, shape (2, H, W)
-        At the pixels; NaN pixels are left out.
-    border
-        Width in px of the rim of the mesh's bounding box that is left out.
-
-    Returns
-    -------
-    float
-    """
-    difference = at_pixels(mesh, values, truth.shape[1:]) - truth
-    low, high = mesh.nodes.min(axis=0) + border, mesh.nodes.max(axis=0) - border
-    rows = slice(int(np.ceil(low[1])), int(high[1]) + 1)
-    columns = slice(int(np.ceil(low[0])), int(high[0]) + 1)
-    inner = difference[:, rows, columns]
-    inner = inner[np.isfinite(inner)]
-    return float(np.sqrt(np.mean(inner**2))) if inner.size else float("nan")
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodalCovariance:
-    """Correlation of the errors of one displacement component between the nodes of a mesh; u and v are not correlated.
+    """Covariance of the errors of one displacement component between nodes; u and v are not correlated.
+
+    A nodal error is that of the fit, correlated by the mesh, and what the bias of the lights leaves, which is alike
+    over the window in which the lights are compared. Either correlation is kept as a factor ``F F^T``: an error is
+    ``F z`` with independent z of unit variance, and no combination of nodes has a negative variance.
 
     Attributes
     ----------
     mesh
         The mesh.
-    correlation : csr_matrix, shape (N, N)
-        1 on the diagonal.
+    fit : csr_matrix, shape (n, R)
+        Factor of the correlation of the fit's errors between the n nodes.
+    bias : csr_matrix, shape (n, S)
+        Factor of the correlation ``exp(-d^2 / (4 r^2))`` of the lights' bias at a distance d, with r its range: windows
+        ``exp(-d^2 / (2 r^2))`` at places r apart have it to 1e-4.
     """
 
     mesh: Tri3Mesh
-    correlation: sp.csr_matrix
+    fit: sp.csr_matrix
+    bias: sp.csr_matrix
 
     @classmethod
-    def from_mesh(cls, mesh: Tri3Mesh) -> Self:
+    def from_mesh(cls, mesh: Tri3Mesh, image_nodes: FloatArray | None = None) -> Self:
         """Propagate the covariance of the linear fit (inverse mass matrix) through the recovery of the nodal values.
 
         Parameters
         ----------
         mesh
             N nodes, E elements.
+        image_nodes : ndarray, shape (N, 2)
+            The nodes in px of the image, in which the lights' bias has its range; None: those of the mesh.
 
         Returns
         -------
@@ -228,64 +72,137 @@ class NodalCovariance:
         """
         mass = mesh.mass_matrix
         scale = sp.diags(1 / np.sqrt(mass.diagonal()))
-        inverse = scale @ _chebyshev_inverse(sp.csr_matrix(scale @ mass @ scale)) @ scale
         everywhere = np.ones(len(mesh.elements), dtype=bool)
         recovery = Recovery.over(mesh, everywhere, np.ones(len(mesh.nodes))).value
-        whole = sp.csr_matrix(recovery @ inverse @ recovery.T)
-        unit = sp.diags(1 / np.sqrt(whole.diagonal()))
-        return cls(mesh=mesh, correlation=sp.csr_matrix(unit @ whole @ unit))
+        fit = recovery @ scale @ _inverse_root(sp.csr_matrix(scale @ mass @ scale))
+        return cls(mesh=mesh, fit=unit_rows(fit), bias=_windows(mesh.nodes if image_nodes is None else image_nodes))
 
-    def variance(self, weights: FloatArray, std: FloatArray) -> FloatArray:
-        """Compute the variance of a weighted sum of nodal values.
+    @property
+    def correlation(self) -> sp.csr_matrix:
+        """Correlation (n, n) of the fit's errors."""
+        return sp.csr_matrix(self.fit @ self.fit.T)
+
+    def factor(self, std: FloatArray, bias: FloatArray | float = 0.0) -> sp.csr_matrix:
+        """Return the factor F (n, R + S) of the covariance ``F F^T`` of nodal values.
 
         Parameters
         ----------
-        weights : ndarray, shape (..., N)
+        std : ndarray, shape (n,)
+            Their standard uncertainty.
+        bias : ndarray, shape (n,)
+            The part of it that the lights' bias leaves.
+
+        Returns
+        -------
+        csr_matrix, shape (n, R + S)
+        """
+        shared = np.minimum(bias, std)
+        parts = sp.diags(np.sqrt(std**2 - shared**2)) @ self.fit, sp.diags(shared) @ self.bias
+        return sp.csr_matrix(sp.hstack(parts))
+
+    def errors(self, weights: FloatArray, std: FloatArray, bias: FloatArray | float = 0.0) -> FloatArray:
+        """Resolve the errors of weighted sums of nodal values into independent errors of unit variance.
+
+        The covariance of two sums is the product of their coefficients, the variance of one the sum of their squares.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (..., n)
             Of the nodes. Nodes of the weight 0 take no part, their uncertainty may be NaN.
-        std : ndarray, shape (..., N)
+        std : ndarray, shape (..., n)
             Standard uncertainty of the nodal values.
+        bias : ndarray, shape (..., n)
+            The part of it that the lights' bias leaves.
+
+        Returns
+        -------
+        ndarray, shape (..., R + S)
+        """
+        weights, std = np.asarray(weights), np.asarray(std)
+        shared = np.minimum(bias, std)
+        stds = np.sqrt(std**2 - shared**2), shared
+        parts = [np.where(weights != 0, weights * part, 0.0) for part in stds]
+        shape = parts[0].shape[:-1]
+        factors = zip(parts, (self.fit, self.bias), strict=True)
+        flat = [part.reshape(-1, part.shape[-1]) @ factor for part, factor in factors]
+        return np.concatenate(flat, axis=1).reshape(*shape, -1)
+
+    def variance(self, weights: FloatArray, std: FloatArray, bias: FloatArray | float = 0.0) -> FloatArray:
+        """Compute the variance of weighted sums of nodal values.
+
+        Parameters
+        ----------
+        weights, std, bias : ndarray, shape (..., n)
+            As of `errors`.
 
         Returns
         -------
         ndarray, shape (...)
         """
-        parts = np.where(weights != 0, np.asarray(weights) * np.asarray(std), 0.0)
-        flat = np.atleast_2d(parts.reshape(-1, parts.shape[-1]))
-        total = np.einsum("fn,fn->f", flat @ self.correlation, flat)
-        return np.asarray(np.maximum(total, 0)).reshape(parts.shape[:-1])
+        return np.asarray((self.errors(weights, std, bias) ** 2).sum(axis=-1))
 
-    def part(self, nodes: IntArray) -> FloatArray:
-        """Extract the correlation (m, m) of some nodes, given by their indices (m,).
+    def relative(self, matrices: Sequence[sp.csr_matrix]) -> Self:
+        """Return the covariance of quantities (n,), each over its standard uncertainty.
+
+        Parameters
+        ----------
+        matrices : length c, of csr_matrix, shape (n, N)
+            A quantity is the sum of so many displacement components, each weighted over the nodes by one of them.
+
+        Returns
+        -------
+        NodalCovariance
+        """
+        fit, bias = (unit_rows(sp.hstack([one @ root for one in matrices])) for root in (self.fit, self.bias))
+        return replace(self, fit=fit, bias=bias)
+
+    def part(self, nodes: IntArray) -> Self:
+        """Return the covariance of some nodes alone.
 
         Parameters
         ----------
         nodes : ndarray, shape (m,)
-            Indices of the nodes.
+            Their indices.
 
         Returns
         -------
-        ndarray, shape (m, m)
+        NodalCovariance
         """
-        return np.asarray(self.correlation[nodes][:, nodes].toarray())
+        fit, bias = (factor[nodes] for factor in (self.fit, self.bias))
+        return replace(self, fit=fit[:, np.unique(fit.indices)], bias=bias[:, np.unique(bias.indices)])
 
 
-def _chebyshev_inverse(matrix: sp.csr_matrix, degree: int = 4) -> sp.csr_matrix:
-    """Approximate the inverse of a matrix with eigenvalues in the bounds above by the best polynomial of a `degree`.
+def _inverse_root(matrix: sp.csr_matrix, degree: int = 4) -> sp.csr_matrix:
+    """Approximate the inverse root of a matrix with eigenvalues in the bounds above by a polynomial of a `degree`.
 
-    Saad, Iterative methods for sparse linear systems, algorithm 12.1, on the unit matrix. Every such polynomial is
-    positive within the bounds, so that no combination of nodes gets a negative variance. The degree is the number of
-    edges from a node up to which the inverse is kept: what lies beyond 4 is .8 % or less.
+    That through the root's values at Chebyshev's points: within .3 % of it. The degree is the number of edges from a
+    node up to which its row is kept.
     """
-    middle, half = (_HIGH + _LOW) / 2, (_HIGH - _LOW) / 2
-    residual: Any = sp.eye(matrix.shape[0], format="csr")
-    step = residual / middle
-    total, rho = step, half / middle
-    for _ in range(degree):
-        residual = residual - matrix @ step
-        before, rho = rho, 1 / (2 * middle / half - rho)
-        step = rho * before * step + (2 * rho / half) * residual
-        total = total + step
+    root = Chebyshev.interpolate(lambda x: x**-0.5, degree, domain=[_LOW, _HIGH]).convert(kind=Polynomial)
+    unit: Any = sp.eye(matrix.shape[0], format="csr")
+    total = 0 * unit
+    for coefficient in root.coef[::-1]:
+        total = total @ matrix + coefficient * unit
     return sp.csr_matrix(total)
+
+
+def _windows(nodes: FloatArray) -> sp.csr_matrix:
+    """Gaussian windows around places a range of the lights' bias apart, at nodes (N, 2) in px of the image, (N, S)."""
+    at = nodes / USUAL.bias_range
+    near = np.round(at - at.min(axis=0)).astype(np.int64)[:, :, None] + np.arange(7)  # three on either side
+    x, y = np.exp(-((at[:, :, None] - at.min(axis=0)[:, None] + 3 - near) ** 2) / 2).swapaxes(0, 1)
+    places = near[:, 1, :, None] * (near[:, 0].max() + 1) + near[:, 0, None]
+    heights = y[:, :, None] * x[:, None]
+    node, row, column = np.nonzero(heights > 0.007)  # of 1: the correlation is right to .01
+    return unit_rows(sp.csr_matrix((heights[node, row, column], (node, places[node, row, column]))))
+
+
+def unit_rows(matrix: sp.csr_matrix) -> sp.csr_matrix:
+    """Scale rows to unit length; those of zeros or NaN become zeros."""
+    length = np.sqrt(np.asarray(matrix.multiply(matrix).sum(axis=1)).ravel())
+    unit = sp.csr_matrix(sp.diags(np.divide(1, length, out=np.zeros_like(length), where=length > 0)) @ matrix)
+    unit.data = np.nan_to_num(unit.data)
+    return unit
 
 
 def reference_fraction(count: int) -> float:
@@ -374,17 +291,17 @@ class RigidMotion:
     rotation_std: float
 
     @classmethod
-    def of(
-        cls, covariance: NodalCovariance, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray
-    ) -> Self:
+    def of(cls, covariance: NodalCovariance, u: FloatArray, v: FloatArray, *std: FloatArray) -> Self:
         """Fit shift and rotation of any size (Kabsch, Acta Cryst A32, 1976).
 
         Parameters
         ----------
         covariance
             Of the mesh.
-        u, v, u_std, v_std : ndarray, shape (N,)
+        u, v : ndarray, shape (N,)
             In px; NaN where not measured.
+        *std : ndarray, shape (N,)
+            Their standard uncertainties u_std and v_std; u_bias and v_bias, the part that the lights' bias leaves.
 
         Returns
         -------
@@ -395,7 +312,7 @@ class RigidMotion:
         InputError
             Fewer than two nodes are measured.
         """
-        nodes, known = covariance.mesh.nodes, np.isfinite(u + v + u_std + v_std)
+        nodes, known = covariance.mesh.nodes, np.isfinite(u + v + sum(std))
         if known.sum() < 2:
             raise InputError("a rigid motion needs two measured nodes or more")
         centre = nodes[known].mean(axis=0)
@@ -409,11 +326,12 @@ class RigidMotion:
         c, s = np.cos(angle), np.sin(angle)
         lever[:, known] = np.stack([-(s * arm[:, 0] + c * arm[:, 1]), c * arm[:, 0] - s * arm[:, 1]])
         lever /= np.hypot(along, turned)
-        turning = covariance.variance(lever[0], u_std) + covariance.variance(lever[1], v_std)
+        u_std, v_std = std[::2], std[1::2]
+        turning = covariance.variance(lever[0], *u_std) + covariance.variance(lever[1], *v_std)
         return cls(
             centre=centre,
             shift=shift,
-            shift_std=np.sqrt(np.array([covariance.variance(even, part) for part in (u_std, v_std)])),
+            shift_std=np.sqrt(np.array([covariance.variance(even, *part) for part in (u_std, v_std)])),
             rotation=angle,
             rotation_std=float(np.sqrt(turning)),
         )
@@ -427,20 +345,20 @@ class RigidMotion:
         ----------
         nodes : ndarray, shape (N, 2)
             In px on the reference.
-        field : ndarray, shape (4, N)
-            u, v and their standard uncertainty, px. That of the rigid motion itself is not added: it is the less, the
-            more nodes there are.
+        field : ndarray, shape (4, N) or (6, N)
+            u, v, their standard uncertainty, and the part that the lights' bias leaves, px. The uncertainty of the
+            rigid motion itself is not added: it is the less, the more nodes there are.
 
         Returns
         -------
-        ndarray, shape (4, N)
+        ndarray, shape (4, N) or (6, N)
             As `field`.
         """
         c, s = np.cos(self.rotation), np.sin(self.rotation)
         back = np.array([[c, s], [-s, c]])
         arm = nodes - self.centre
         left = (arm + field[:2].T - self.shift) @ back.T - arm
-        return np.concatenate([left.T, np.sqrt(back**2 @ field[2:] ** 2)])
+        return np.concatenate([left.T, *np.sqrt(back**2 @ field[2:].reshape(-1, 2, len(nodes)) ** 2)])
 
     def at(self, points: FloatArray) -> FloatArray:
         """Compute the displacement (P, 2) in px of points (P, 2) by the rigid motion alone.

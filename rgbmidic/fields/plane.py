@@ -26,7 +26,7 @@ from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.text import uncertain
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, as_numbers
 
 logger = logging.getLogger(__name__)
 
@@ -110,9 +110,8 @@ class CameraCalibration:
             given = getattr(self, key)
             if given is None:
                 continue
-            values = np.asarray(given, dtype=np.float64)
-            if values.shape != shape or not np.isfinite(values).all():
-                raise CalibrationError(f"{self.name}: {key} must be finite with shape {shape}, not {values.shape}")
+            needed = f"{self.name}: {key} must be finite with shape {shape}"
+            values = as_numbers(given, needed, shape, error=CalibrationError)
             object.__setattr__(self, key, values)
         if self.lens is not None and self.lens[0] <= 0:
             raise CalibrationError(f"{self.name}: the focal length must be positive, not {self.lens[0]:g} px")
@@ -575,25 +574,25 @@ class Rectification:
         ends = np.array(place[: 2 * points], dtype=np.float64).reshape(-1, 2)
         return (*(self.camera.to_mm(ends) / self.units.mm_per_pixel).ravel().tolist(), *place[2 * points :])
 
-    def displacement(
-        self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def displacement(self, u: FloatArray, v: FloatArray, *std: FloatArray) -> tuple[FloatArray, ...]:
         """Rectify the displacement of every node and its standard uncertainty, (N,) each in px; NaN stays NaN.
 
         Parameters
         ----------
-        u, v, u_std, v_std : ndarray, shape (N,)
-            Displacement and its standard uncertainty, px of the image.
+        u, v : ndarray, shape (N,)
+            Displacement, px of the image.
+        *std : ndarray, shape (N,)
+            Its standard uncertainty along x and y, and any part of that, one after the other.
 
         Returns
         -------
-        u, v, u_std, v_std : ndarray, shape (N,)
-            In rectified px.
+        tuple of ndarray, shape (N,)
+            The same in rectified px.
         """
         if self.camera is None or self.units.mm_per_pixel is None:
-            return u, v, u_std, v_std
+            return u, v, *std
         moved = self.image.nodes + np.stack([u, v], axis=1)
         along = self.camera.to_mm(moved) / self.units.mm_per_pixel - self.mesh.nodes
         slopes = self.camera.jacobian(moved) / self.units.mm_per_pixel
-        std = np.sqrt(np.einsum("nij,jn->in", slopes**2, np.square([u_std, v_std], dtype=np.float64)))
-        return along[:, 0], along[:, 1], std[0], std[1]
+        square = np.square(std, dtype=np.float64).reshape(-1, 2, len(u))
+        return *along.T, *np.sqrt(np.einsum("nij,sjn->sin", slopes**2, square)).reshape(-1, len(u))

@@ -19,7 +19,8 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.crack_tip import CrackTip, Williams
 from rgbmidic.fields.cracks import JumpAlong
 from rgbmidic.fields.history import History, Nodal, Probe, histories_of
-from rgbmidic.fields.nodal import NodalCovariance, Places
+from rgbmidic.fields.interpolation import Places, PointSum
+from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.plane import Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
 from rgbmidic.fields.units import Units
@@ -62,27 +63,30 @@ class Mean:
 
     Attributes
     ----------
-    name, nodes
+    name
         See `Probe`.
-    weights : ndarray, shape (m,)
-        Of the nodes; their sum is 1.
-    correlation : ndarray, shape (m, m)
+    sum
+        Over points that stand for the place.
+    covariance
         Of the nodes' errors.
     least
-        Part of the weights that must be measured; the mean is that of the measured part.
-    inside
-        Part of the place that lies in the region.
+        Part of the points in the region that must be measured; the mean is that of the measured part.
     """
 
     name: str
-    nodes: IntArray
-    weights: FloatArray
-    correlation: FloatArray
+    sum: PointSum
+    covariance: NodalCovariance
     least: float = 1.0
-    inside: float = 1.0
 
     @classmethod
-    def over(cls, covariance: NodalCovariance, name: str, points: npt.ArrayLike, least: float = 1.0) -> Mean:
+    def over(
+        cls,
+        covariance: NodalCovariance,
+        name: str,
+        points: npt.ArrayLike,
+        least: float = 1.0,
+        factors: npt.ArrayLike | None = None,
+    ) -> Mean:
         """Average over points (P, 2) that stand for a place, px.
 
         Parameters
@@ -94,7 +98,9 @@ class Mean:
         points : array_like, shape (P, 2)
             Points (x, y) on the reference, px.
         least
-            Fraction of the weight that nodes with data must have in a frame.
+            Fraction of the points that must have data in a frame.
+        factors : array_like, shape (P,), optional
+            Of the points; None: equal ones, whose sum is 1.
 
         Returns
         -------
@@ -107,10 +113,14 @@ class Mean:
         """
         places = Places.of(covariance.mesh, points)
         places.check(name)
-        weights, least = places.mean(), least - _CONSTANTS.rounding
-        nodes = np.flatnonzero(weights).astype(np.int64)
-        correlation = covariance.part(nodes)
-        return cls(name=name, nodes=nodes, weights=weights[nodes], correlation=correlation, least=least)
+        equal = np.full(len(places.points), 1 / len(places.points))
+        points_sum = PointSum.over(places, equal if factors is None else np.asarray(factors, dtype=np.float64))
+        return cls(name=name, sum=points_sum, covariance=covariance.part(points_sum.nodes), least=least)
+
+    @property
+    def nodes(self) -> IntArray:
+        """See `Probe`."""
+        return self.sum.nodes
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px.
@@ -124,40 +134,70 @@ class Mean:
         -------
         list of History
         """
-        known = _known(nodal)
-        u, v = self.average(nodal.u, nodal.u_std, known), self.average(nodal.v, nodal.v_std, known)
-        note = _cut(self.name, "mean", self.inside * np.where(np.isfinite(u[0]), known @ self.weights, 1.0))
+        weights, measured = self.weights(_known(nodal))
+        return self._moved(nodal, weights[:, 0], measured)
+
+    def _moved(self, nodal: Nodal, weights: FloatArray, measured: FloatArray) -> list[History]:
+        u, v = (self.average(weights, *component) for component in nodal.components)
+        note = _cut(self.name, "mean", self.sum.inside * measured)
         return histories_of(self.name, [("u", "px", *u), ("v", "px", *v)], note)
 
-    def average(
-        self, values: FloatArray, std: FloatArray, known: BoolArray, *, alike: bool = False
-    ) -> tuple[FloatArray, FloatArray]:
-        """Average a quantity (T, m) of the nodes where it is known, with its standard uncertainty, each (T,).
-
-        The errors are correlated between nodes as those of a displacement, or where they are `alike` the same at all
-        nodes, which is the most that they can add up to.
+    def weights(self, has_data: BoolArray, *, linear: bool = False) -> tuple[FloatArray, FloatArray]:
+        """Compute the weights of the nodes in the mean, and for an area in those of the slopes, in every frame.
 
         Parameters
         ----------
+        has_data : ndarray, shape (T, m), bool
+            Nodes that have data.
+        linear
+            As of `PointSum.weights`.
+
+        Returns
+        -------
+        weights : ndarray, shape (T, S, m)
+            Of the S sums of `PointSum`; NaN where too few points are measured.
+        measured : ndarray, shape (T,)
+            Fraction of the points in the region that are measured; 1 where they are too few.
+        """
+        patterns, frame = np.unique(has_data, axis=0, return_inverse=True)
+        shape = len(patterns), len(self.sum.moments), has_data.shape[1]
+        weights, measured = np.full(shape, np.nan), np.ones(len(patterns))
+        for row, pattern in enumerate(patterns):
+            sums, fraction = self.sum.weights(pattern, linear=linear)
+            if fraction >= self.least - _CONSTANTS.rounding:
+                weights[row], measured[row] = sums / fraction, fraction
+        return weights[frame.ravel()], measured[frame.ravel()]
+
+    def average(
+        self, weights: FloatArray, values: FloatArray, std: FloatArray, bias: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Average a quantity (T, m) of the nodes, with its standard uncertainty, each (T,).
+
+        The errors are correlated between nodes as those of a displacement; of another quantity, without a `bias`, they
+        are taken as the same at all nodes, which is the most that they can add up to.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (T, m)
+            Of the nodes, see `weights`.
         values, std : ndarray, shape (T, m)
             The quantity and its standard uncertainty.
-        known : ndarray, shape (T, m), bool
-            Where it is known.
-        alike
-            Whether the errors are the same at all nodes.
+        bias : ndarray, shape (T, m)
+            The part of a displacement's uncertainty that the lights' bias leaves.
 
         Returns
         -------
         values, std : ndarray, shape (T,)
         """
-        measured = known @ self.weights
-        enough = measured >= self.least
-        weights = np.where(known, self.weights, 0) / np.where(enough, measured, 1)[:, None]
-        mean = (weights * np.where(known, values, 0)).sum(axis=1)
-        parts = weights * np.where(known, std, 0)
-        square = parts.sum(axis=1) ** 2 if alike else np.einsum("tm,tm->t", parts @ self.correlation, parts)
-        spread = np.sqrt(np.maximum(square, 0))
-        return np.where(enough, mean, np.nan), np.where(enough, spread, np.nan)
+        mean = _products(weights, values).sum(axis=1)
+        if bias is None:
+            return mean, _products(weights, std).sum(axis=1)
+        return mean, np.sqrt(self.covariance.variance(weights, std, bias))
+
+
+def _products(weights: FloatArray, values: FloatArray) -> FloatArray:
+    """Multiply values (T, m) by weights; those of the weight 0, which may be NaN, give 0."""
+    return np.multiply(weights, values, out=np.zeros(weights.shape), where=weights != 0)
 
 
 def _known(nodal: Nodal) -> BoolArray:
@@ -216,21 +256,17 @@ class Gauge:
         self.name, self.moving, self.arm = name, moving, ends[1] - ends[0]
         if not np.hypot(*self.arm) > 0:
             raise InputError(f"{name} needs two different points, not ({place[0]:g}, {place[1]:g}) twice")
-        Places.of(covariance.mesh, ends).check(name)
-        first, second = (Places.of(covariance.mesh, end).mean() for end in ends)
-        self.nodes = np.flatnonzero(second - first).astype(np.int64)
-        self.weights, self.correlation = (second - first)[self.nodes], covariance.part(self.nodes)
+        self._apart = Mean.over(covariance, name, ends, factors=(-1, 1))
+        self.nodes = self._apart.nodes
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute the extension in px and the strain from the displacements of its `nodes` in every frame."""
-        length = float(np.hypot(*self.arm))
-        apart = np.stack([nodal.u @ self.weights, nodal.v @ self.weights], axis=1)
+        length, weights = float(np.hypot(*self.arm)), self._apart.weights(_known(nodal))[0][:, 0]
+        apart, spread = np.stack([self._apart.average(weights, *one) for one in nodal.components], axis=2)
         now = self.arm + apart if self.moving else np.broadcast_to(self.arm, apart.shape)
         towards = now / np.hypot(*now.T)[:, None]
         extension = np.hypot(*now.T) - length if self.moving else (towards * apart).sum(axis=1)
-        errors = [self.weights * std for std in (nodal.u_std, nodal.v_std)]
-        spread = np.stack([np.einsum("tm,tm->t", part @ self.correlation, part) for part in errors], axis=1)
-        std = np.sqrt(np.maximum((towards**2 * spread).sum(axis=1), 0))
+        std = np.hypot(*(towards * spread).T)
         parts = [("extension", "px", extension, std), ("strain", "", extension / length, std / length)]
         return histories_of(self.name, parts)
 
@@ -262,7 +298,7 @@ class StrainGauge:
     ) -> None:
         gauges = StrainGauges.at_points(covariance, np.array([[x, y]]), length)
         self.name, self.measure, self.nodes = name, measure, np.unique(gauges.nodes)
-        self.gauges = gauges.of_nodes(self.nodes)
+        self.gauges, self.covariance = gauges.of_nodes(self.nodes), covariance.part(self.nodes)
         places = Places.of(covariance.mesh, _circle(x, y, gauges.length / 2))
         self.inside = float(places.inside.mean())
         if self.inside < _CONSTANTS.least - _CONSTANTS.edge:
@@ -273,14 +309,23 @@ class StrainGauge:
 
         They are NaN where less than half of the nodes, as they count, is measured.
         """
-        rows = zip(nodal.u, nodal.v, nodal.u_std, nodal.v_std, strict=True)
-        gradients, covariances = zip(*(self.gauges.gradient(*row) for row in rows), strict=True)
-        used = _known(nodal)[:, self.gauges.nodes] @ (self.gauges.fractions / self.gauges.fractions.sum())
-        gradient = np.concatenate(gradients)
-        gradient[used < _CONSTANTS.least - _CONSTANTS.rounding] = np.nan
-        strain = strain_of_gradient(gradient, np.concatenate(covariances), self.measure)
+        patterns, frame = np.unique(known := _known(nodal), axis=0, return_inverse=True)
+        slopes = np.stack([self.gauges.weights(pattern) for pattern in patterns])[frame.ravel()]
+        used = known[:, self.gauges.nodes] @ (self.gauges.fractions / self.gauges.fractions.sum())
+        slopes[used < _CONSTANTS.least - _CONSTANTS.rounding] = np.nan
+        strain = _strain(slopes, nodal, self.covariance, self.measure)
         kept = np.where(np.isfinite(strain.components[:, 0]), used, 1.0)
         return _strain_histories(self.name, strain, _cut(self.name, "strain", self.inside * kept))
+
+
+def _strain(slopes: FloatArray, nodal: Nodal, covariance: NodalCovariance, measure: str) -> Strain:
+    """Compute the strain (T,) of the displacement gradient that weights (T, 2, m) of the nodes give."""
+    gradient, spread = np.zeros((len(slopes), 2, 2)), np.zeros((len(slopes), 4, 4))
+    for row, (value, std, bias) in enumerate(nodal.components[:, :, :, None]):
+        gradient[:, row] = _products(slopes, value).sum(axis=2)
+        errors, own = covariance.errors(slopes, std, bias), slice(2 * row, 2 * row + 2)
+        spread[:, own, own] = errors @ errors.swapaxes(1, 2)
+    return strain_of_gradient(gradient, spread, measure)
 
 
 def _strain_histories(name: str, strain: Strain, note: str) -> list[History]:
@@ -295,8 +340,7 @@ def _strain_histories(name: str, strain: Strain, note: str) -> list[History]:
 class Area(Mean):
     """Mean displacement over an area, and the strain of the mean displacement gradient over it.
 
-    The gradient of a linear displacement is constant in an element, so that its mean over the area is one of the
-    elements, each by the part of the area that it holds. It is that of the nodes around the area alone (Gauss).
+    The mean gradient is that of the displacement around the area alone (Gauss).
 
     Parameters
     ----------
@@ -309,15 +353,6 @@ class Area(Mean):
     measure
         Strain measure, as of `strain_of`.
 
-    Attributes
-    ----------
-    elements : ndarray, shape (E, 3), int
-        Indices in `nodes` of the corners of the elements that the area touches.
-    parts : ndarray, shape (E,)
-        Fraction of the area within each; their sum is 1.
-    slopes : ndarray, shape (E, 3, 2)
-        Gradient of the shape functions, per px.
-
     Raises
     ------
     InputError
@@ -325,16 +360,12 @@ class Area(Mean):
     """
 
     def __init__(self, covariance: NodalCovariance, name: str, points: FloatArray, measure: str = MEASURES[0]) -> None:
-        mesh, places = covariance.mesh, Places.of(covariance.mesh, points)
-        if (inside := float(places.inside.mean())) < _CONSTANTS.least:
+        places = Places.of(covariance.mesh, points)
+        if places.inside.mean() < _CONSTANTS.least:
             raise InputError(f"half or more of {name} is outside {places.where}")
-        elements, count = np.unique(places.element[places.inside], return_counts=True)
-        nodes = np.unique(mesh.elements[elements]).astype(np.int64)
-        weights, correlation = places.mean()[nodes], covariance.part(nodes)
-        least = _CONSTANTS.least - _CONSTANTS.rounding
-        super().__init__(name=name, nodes=nodes, weights=weights, correlation=correlation, least=least, inside=inside)
-        self.elements, self.parts = np.searchsorted(nodes, mesh.elements[elements]), count / count.sum()
-        self.slopes, self.measure = mesh.shape_gradients()[elements], measure
+        area = PointSum.over(places, places.inside / places.inside.sum(), slopes=True)
+        super().__init__(name=name, sum=area, covariance=covariance.part(area.nodes), least=_CONSTANTS.least)
+        self.measure = measure
 
     def histories(self, nodal: Nodal) -> list[History]:
         """Compute u and v in px, then strain, principal strains and equivalent strain.
@@ -348,21 +379,9 @@ class Area(Mean):
         -------
         list of History
         """
-        moved, known = super().histories(nodal), _known(nodal)
-        gradient, covariance = np.full((len(known), 2, 2), np.nan), np.full((len(known), 4, 4), np.nan)
-        patterns, of_frame = np.unique(known[:, self.elements].all(axis=2), axis=0, return_inverse=True)
-        for place, there in enumerate(patterns):
-            if (measured := self.parts[there].sum()) < self.least:
-                continue
-            weights, frames = np.zeros((len(self.nodes), 2)), np.flatnonzero(of_frame.ravel() == place)
-            np.add.at(weights, self.elements[there], (self.parts[there] / measured)[:, None, None] * self.slopes[there])
-            covariance[frames] = 0
-            for row, (value, std) in enumerate(((nodal.u, nodal.u_std), (nodal.v, nodal.v_std))):
-                gradient[frames, row] = np.where(known, value, 0)[frames] @ weights
-                errors = np.where(known, std, 0)[frames, None] * weights.T
-                own = slice(2 * row, 2 * row + 2)
-                covariance[frames, own, own] = errors @ self.correlation @ errors.swapaxes(1, 2)
-        strain = strain_of_gradient(gradient, covariance, self.measure)
+        weights, measured = self.weights(_known(nodal))
+        moved = self._moved(nodal, weights[:, 0], measured)
+        strain = _strain(weights[:, 1:], nodal, self.covariance, self.measure)
         return [*moved, *_strain_histories(self.name, strain, moved[0].note)]
 
 
@@ -426,4 +445,9 @@ def make_probe(
     if kind == "tip":
         stated: dict[str, Any] = {name: getattr(settings, name) for name in _OF_TIPS}
         more["williams"] = Williams(units=Units() if rectified is None else rectified.units, **stated)
-    return make(covariance, name, *(place if rectified is None else rectified.place(place, points)), **more)
+    placed = np.asarray(place if rectified is None else rectified.place(place, points), dtype=np.float64)
+    nodes = covariance.mesh.nodes
+    if not (np.abs(placed) <= np.abs(nodes).max() + 2 * np.ptp(nodes, axis=0).max()).all():  # too far to be sampled
+        where = Places.of(covariance.mesh, nodes[:1]).where
+        raise InputError(f"half or more of {name} is outside {where}; given is {list(place)}")
+    return make(covariance, name, *placed.tolist(), **more)

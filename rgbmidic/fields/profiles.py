@@ -14,23 +14,21 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.special import chdtrc
 
-from rgbmidic.correlation.recovery import quadratic_fit
 from rgbmidic.errors import InputError
-from rgbmidic.fields.nodal import NodalCovariance, Places
+from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.strain import StrainGauges
-from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.text import uncertain
 from rgbmidic.typing import BoolArray, FloatArray
 
 ARRIVALS = ("front", "peak")
-"""What arrives: the rise through a fraction of the peak, or the peak."""
+"""What arrives: the rise through a fraction of the peak or through a value, or the peak."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,9 +44,6 @@ class ProfileConstants:
         Distance of the points along a line in elements, the golden section: the positions of a fit then lie
         anywhere between the nodes, and what interpolation leaves out shows in its chi-square. With half an
         element it was 3.4 times that.
-    around
-        Elements around a line whose nodes are read: the quadratic at a node is fitted to those within two edges
-        of it.
     lopsided
         Elements by which the middle of a gauge's nodes may lie off its own along a line: a tenth of what an
         edge does.
@@ -83,7 +78,6 @@ class ProfileConstants:
 
     least: float = 0.5
     step: float = 0.382
-    around: float = 4.0
     lopsided: float = 0.1
     clear: float = 5.0
     smoothest: float = 3.5
@@ -108,8 +102,8 @@ maximum."""
 class ProfileLine:
     """Points .38 elements apart along a line in a mesh, at which nodal fields are read.
 
-    A value is that of the quadratics through the nodes around each node, weighted by its shape function, as in
-    `at_pixels`; its uncertainty follows from the correlation of the nodes' errors.
+    A value is that of the field between the nodes (`Places`); its uncertainty follows from the correlation of their
+    errors.
 
     Parameters
     ----------
@@ -133,9 +127,9 @@ class ProfileLine:
     even : ndarray, shape (P,), bool
         Where the strain gauges around extend to both sides along the line: at an edge their strain is that of a place
         further inside.
-    correlations
-        Correlation (n, n) of the errors at these nodes of a displacement (``""``), of the strains ``"exx"`` and
-        ``"eyy"``, which are slopes along x and y, and of all other strains (``"strain"``), taken as the mean of both.
+    covariances
+        Of the errors at these nodes of a displacement (``""``), of the strains ``"exx"`` and ``"eyy"``, which are
+        slopes along x and y, and of all other strains (``"strain"``), taken as sums of both.
 
     Raises
     ------
@@ -154,25 +148,21 @@ class ProfileLine:
             raise InputError(
                 f"half or more of the line from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) px is outside {places.where}"
             )
-        way = points[-1] - points[0]
-        along = np.clip((mesh.nodes - points[0]) @ way / length**2, 0, 1)
-        away = mesh.nodes - points[0] - along[:, None] * way
-        near = np.hypot(*away.T) <= _CONSTANTS.around * mesh.size
-        elements = mesh.elements[near[mesh.elements].all(axis=1)]
-        self.nodes = nodes = np.unique(elements)
-        part = Tri3Mesh(nodes=mesh.nodes[nodes], elements=np.searchsorted(nodes, elements).astype(np.int32))
         self.points, self.positions = points, np.linspace(0, length, len(points))
-        self.places = Places.of(part, points)
-        slopes = [slope[nodes] for slope in gauges.slopes]
-        exx, eyy = (_unit(slope @ covariance.correlation @ slope.T) for slope in slopes)
-        self.correlations = {"": covariance.part(nodes), "exx": exx, "eyy": eyy, "strain": (exx + eyy) / 2}
+        self.nodes, self.places = places.nearby()
+        nodes = self.nodes
+        exx, eyy = (covariance.relative([slope[nodes]]) for slope in gauges.slopes)
+        both = covariance.relative([slope[nodes] for slope in gauges.slopes])
+        self.covariances = {"": covariance.part(nodes), "exx": exx, "eyy": eyy, "strain": both}
         count = np.bincount(gauges.rows, weights=gauges.fractions, minlength=len(mesh.nodes))
-        arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ way / length
+        arm = (mesh.nodes[gauges.nodes] - mesh.nodes[gauges.rows]) @ (points[-1] - points[0]) / length
         lopsided = np.abs(np.bincount(gauges.rows, weights=gauges.fractions * arm, minlength=len(mesh.nodes)) / count)
-        at_corners = lopsided[nodes][part.elements[self.places.element]]
-        self.even = (at_corners < _CONSTANTS.lopsided * mesh.size).all(axis=1)
+        at_corners = lopsided[mesh.elements[places.element]]
+        self.even = np.asarray((at_corners < _CONSTANTS.lopsided * mesh.size).all(axis=1))
 
-    def read(self, values: FloatArray, std: FloatArray, kind: str = "") -> tuple[FloatArray, FloatArray]:
+    def read(
+        self, values: FloatArray, std: FloatArray, kind: str = "", bias: FloatArray | float = 0.0
+    ) -> tuple[FloatArray, FloatArray]:
         """Interpolate a nodal field (N,) and its standard uncertainty at the points, each (P,).
 
         Parameters
@@ -180,57 +170,54 @@ class ProfileLine:
         values, std : ndarray, shape (N,)
             Of the mesh; NaN where not measured.
         kind
-            Key of `correlations`.
+            Key of `covariances`.
+        bias : ndarray, shape (N,)
+            The part of the uncertainty that the lights' bias leaves.
 
         Returns
         -------
         values, std : ndarray, shape (P,)
             NaN where a node around is not measured.
         """
-        values, std = values[self.nodes], std[self.nodes]
+        values, std, bias = (part[self.nodes] for part in np.broadcast_arrays(values, std, bias))
         weights = _weights(self, np.isfinite(values).tobytes())
-        parts = np.nan_to_num(weights) * std
-        spread = np.einsum("pn,nm,pm->p", parts, self.correlations[kind], parts, optimize=True)
         found = weights @ np.nan_to_num(values)
-        return found, np.where(np.isfinite(found), np.sqrt(np.maximum(spread, 0)), np.nan)
+        variance = self.covariances[kind].variance(np.nan_to_num(weights), std, bias)
+        return found, np.where(np.isfinite(found), np.sqrt(variance), np.nan)
 
-    def correlation(self, kind: str = "") -> FloatArray:
+    def correlation(self, kind: str = "", bias_fraction: float = 0.0) -> FloatArray:
         """Compute the correlation (P, P) of the noise of a field between the points; 0 outside the mesh.
 
         Parameters
         ----------
         kind
-            Key of `correlations`.
+            Key of `covariances`.
+        bias_fraction
+            Part of the variance that the lights' bias leaves.
 
         Returns
         -------
         ndarray, shape (P, P)
         """
         weights = np.nan_to_num(_weights(self, np.ones(len(self.nodes), dtype=bool).tobytes()))
-        return _unit(weights @ self.correlations[kind] @ weights.T)
+        errors = self.covariances[kind].errors(weights, np.ones(len(self.nodes)), bias_fraction**0.5)
+        return _unit(errors @ errors.T)
 
 
 @lru_cache(maxsize=4)
 def _weights(line: ProfileLine, measured: bytes) -> FloatArray:
     """Return the weight (P, n) of every node at each point; NaN outside the mesh and beside missing nodes."""
-    mesh, places = line.places.mesh, line.places
-    used = np.asarray(np.frombuffer(measured, dtype=bool)[mesh.elements].all(axis=1))
-    _, *slopes = (operator.toarray() for operator in quadratic_fit(mesh, used))
-    value, total = np.eye(len(mesh.nodes)), np.zeros((len(line.points), len(mesh.nodes)))
-    for node, shape in zip(mesh.elements[places.element].T, places.barycentric.T, strict=True):
-        x, y = (line.points - mesh.nodes[node]).T
-        terms = zip((np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2), (value, *slopes), strict=True)
-        total += shape[:, None] * sum(factor[:, None] * operator[node] for factor, operator in terms)
-    total[~(places.inside & used[places.element])] = np.nan
-    return total
+    has_data = np.frombuffer(measured, dtype=bool)
+    weights = line.places.weights(has_data).toarray()
+    weights[~line.places.measured(has_data)] = np.nan
+    return np.asarray(weights)
 
 
-def _unit(covariance: Any) -> FloatArray:
-    """Return the correlation of a covariance matrix, sparse or not; 0 where a variance is."""
-    whole = np.asarray(covariance.toarray() if hasattr(covariance, "toarray") else covariance)
-    scale = np.sqrt(np.maximum(np.nan_to_num(np.diag(whole)), 0))
+def _unit(covariance: FloatArray) -> FloatArray:
+    """Return the correlation of a covariance matrix; 0 where a variance is."""
+    scale = np.sqrt(np.diag(covariance))
     scale = np.divide(1, scale, out=np.zeros_like(scale), where=scale > 0)
-    return np.asarray(np.nan_to_num(whole) * scale * scale[:, None])
+    return np.asarray(covariance * scale * scale[:, None])
 
 
 def rate_correlation(times: FloatArray, window: float) -> FloatArray:
@@ -259,12 +246,15 @@ class Arrivals:
     abrupt
         Whether the rise is shorter than the frames resolve; a uniform distribution between two frames is then part of
         the uncertainty.
+    cut : ndarray, shape (P,), bool
+        Where the series still rises in the last frames: no peak, and no front that is a fraction of it, arrives.
     """
 
     times: FloatArray
     std: FloatArray
     weights: FloatArray
     abrupt: bool
+    cut: BoolArray
 
 
 def arrival_times(
@@ -273,15 +263,15 @@ def arrival_times(
     std: npt.ArrayLike,
     *,
     what: str = ARRIVALS[0],
-    level: float = 0.5,
+    level: float | str = "50%",
     common_fraction: float = 0.5,
     between_frames: FloatArray | None = None,
 ) -> Arrivals:
     """Find when a front or peak arrives at each of P positions, with its standard uncertainty.
 
-    The sign of the wave is that of the largest value over its uncertainty. The smoothing has a half-width of 1.5 times
-    the median rise from 20 to 80 % of the peak, for a peak of 3 times, and 3.5 frames at least; it shifts all arrivals
-    alike where the wave keeps its form.
+    The sign of the wave is that of the `level`; of a fraction, that of the largest value over its uncertainty. The
+    smoothing has a half-width of 1.5 times the median rise from 20 to 80 % of the peak, for a peak of 3 times, and 3.5
+    frames at least; it shifts all arrivals alike where the wave keeps its form.
 
     Parameters
     ----------
@@ -292,7 +282,7 @@ def arrival_times(
     what
         One of `ARRIVALS`.
     level
-        Fraction of the peak at which the front is taken.
+        Value at which the front is taken, or with a percent sign the fraction of the peak.
     common_fraction
         Fraction of the variance that all frames have in common, that of the reference.
     between_frames : (T, T), optional
@@ -301,16 +291,17 @@ def arrival_times(
     Returns
     -------
     Arrivals
-        NaN where the peak is below 5 standard uncertainties or at either end, or the series does not rise to it
-        through the level.
+        NaN where the peak is below 5 standard uncertainties or lies at either end, the series does not rise to it
+        through the level, or the level is a fraction of a peak to which it still rises in the last frames.
 
     Raises
     ------
     InputError
         `what` or `level` is none of those allowed, or there are fewer than 6 frames.
     """
-    if what not in ARRIVALS or not 0 < level < 1:
-        raise InputError(f"what arrives is {' or '.join(ARRIVALS)} at a level of 0 to 1, not {what!r} at {level:g}")
+    value, fraction = read_level(level)
+    if what not in ARRIVALS:
+        raise InputError(f"what arrives is {' or '.join(ARRIVALS)}, not {what!r}")
     when, y, spread = (np.asarray(part, dtype=np.float64) for part in (times, values, std))
     if len(when) < 6 or not (np.diff(when) > 0).all():
         raise InputError(f"arrival times need 6 frames or more whose times rise; there are {len(when)}")
@@ -318,25 +309,61 @@ def arrival_times(
     known = np.isfinite(y) & np.isfinite(spread)
     size = np.where(known, y / np.where(spread > 0, spread, np.inf), 0.0)
     signs = np.where(np.abs(size).max(axis=0) > 0, np.sign(size[np.abs(size).argmax(axis=0), np.arange(y.shape[1])]), 0)
-    series = (1.0 if signs.sum() >= 0 else -1.0) * y
+    sign = math.copysign(1.0, value or signs.sum() or 1.0)
+    series = sign * y
     first = _Smooth(when, _CONSTANTS.smoothest * interval)
     clear = np.flatnonzero((np.abs(size) > _CONSTANTS.clear).any(axis=0))
-    rises = np.array([first.rise(series[:, p], known[:, p]) for p in clear])
+    height = 2 * abs(value) or math.inf  # around a value, as around half of a peak
+    rises = np.array([first.rise(series[:, p], known[:, p], height) for p in clear])
     rise = float(np.median(rises[np.isfinite(rises)])) if np.isfinite(rises).any() else 0.0
     smooth = _Smooth(when, max(_CONSTANTS.smoothest * interval, _WIDTHS[what] * rise))
     found, errors, weights = np.full(y.shape[1], np.nan), np.full(y.shape[1], np.nan), np.zeros(y.T.shape)
     own = np.eye(len(when)) if between_frames is None else between_frames
     step = first.rise((when > when[len(when) // 2]) * 1.0, np.ones(len(when), dtype=bool))
-    abrupt = 0 < rise < _CONSTANTS.abrupt * step
+    abrupt, cut = 0 < rise < _CONSTANTS.abrupt * step, np.zeros(y.shape[1], dtype=bool)
     for p in range(y.shape[1]):
-        at = smooth.arrival(series[:, p], np.where(known[:, p], spread[:, p], np.nan), what, level)
+        at, is_rising = smooth.arrival(
+            series[:, p], np.where(known[:, p], spread[:, p], np.nan), what, (sign * value, fraction)
+        )
+        cut[p] = is_rising and at is None
         if at is not None:
             found[p], weights[p] = at
             parts = weights[p] * np.nan_to_num(spread[:, p])
             noise = (1 - common_fraction) * parts @ own @ parts + common_fraction * parts.sum() ** 2
             errors[p] = math.sqrt(noise + abrupt * interval**2 / 12)
-    weights *= 1.0 if signs.sum() >= 0 else -1.0
-    return Arrivals(times=found, std=errors, weights=weights, abrupt=abrupt)
+    return Arrivals(times=found, std=errors, weights=sign * weights, abrupt=abrupt, cut=cut)
+
+
+def read_level(level: float | str) -> tuple[float, float]:
+    """Return the value at which a front is taken, and the fraction of the peak; one of them is 0.
+
+    Parameters
+    ----------
+    level
+        The value, or with a percent sign the fraction.
+
+    Returns
+    -------
+    value, fraction : float
+
+    Raises
+    ------
+    InputError
+        It is neither, the value 0, or a fraction that is not between 0 and 100 %.
+    """
+    text = str(level).strip()
+    try:
+        number = float(text.removesuffix("%"))
+    except ValueError:
+        number = math.nan
+    if text.endswith("%") and 0 < number < 100:
+        return 0.0, number / 100
+    if text.endswith("%") or not math.isfinite(number) or not number:
+        raise InputError(
+            f"the level of a front is a value of the field other than 0, such as -0.005, or between 0% and 100% of the "
+            f"peak, not {level!r}"
+        )
+    return number, 0.0
 
 
 class _Smooth:
@@ -374,13 +401,16 @@ class _Smooth:
         first[enough] = np.linalg.inv(normal[enough])[:, 0]
         return np.asarray(w * np.einsum("gi,git->gt", first, powers))
 
-    def rise(self, series: FloatArray, known: BoolArray) -> float:
-        """Return how long a series rises between the `_CONSTANTS.rise` fractions of its peak; NaN where it does not."""
+    def rise(self, series: FloatArray, known: BoolArray, height: float = math.inf) -> float:
+        """Return how long a series rises between the `_CONSTANTS.rise` fractions of its peak, or of a lower `height`.
+
+        NaN where it does not.
+        """
         curve = self.operator(known) @ np.where(known, series, 0.0)
         if not np.isfinite(curve).any():
             return math.nan
         top = int(np.nanargmax(curve))
-        low, high = (self._crossing(curve, top, part * curve[top]) for part in _CONSTANTS.rise)
+        low, high = (self._crossing(curve, top, part * min(curve[top], height)) for part in _CONSTANTS.rise)
         return high - low
 
     def _crossing(self, curve: FloatArray, top: int, level: float) -> float:
@@ -392,19 +422,31 @@ class _Smooth:
         part = (level - curve[i]) / (curve[i + 1] - curve[i])
         return float(self.places[i] + part * (self.places[i + 1] - self.places[i]))
 
-    def arrival(self, series: FloatArray, std: FloatArray, what: str, level: float) -> tuple[float, FloatArray] | None:
-        """Return the arrival time in a series (T,), and its change (T,) by every value; None where nothing arrives."""
-        known = np.isfinite(std)
+    def arrival(
+        self, series: FloatArray, std: FloatArray, what: str, level: tuple[float, float]
+    ) -> tuple[tuple[float, FloatArray] | None, bool]:
+        """Find the arrival in a series (T,).
+
+        Returns
+        -------
+        arrival
+            Its time, and the change (T,) of that by every value; None where nothing arrives.
+        is_rising
+            Whether the series still rises above all before in the last frames, by more than its noise.
+        """
+        known, (value, fraction) = np.isfinite(std), level
         operator = self.operator(known)
         values = np.where(known, series, 0.0)
         curve = operator @ values
         if not np.isfinite(curve).any():
-            return None
+            return None, False
         top = int(np.nanargmax(curve))
         highest = operator[top].toarray().ravel()
-        noise = float(np.linalg.norm(highest * np.nan_to_num(std)))
-        if not (0 < top < len(curve) - 1 and curve[top] > _CONSTANTS.clear * noise):
-            return None
+        clear = _CONSTANTS.clear * float(np.linalg.norm(highest * np.nan_to_num(std)))
+        before = np.where(self.places <= self.times[-1] - self.half, np.nan_to_num(curve), 0.0).max()
+        is_rising = curve[top] - before > clear
+        if not curve[top] > clear or top == 0 or (what == "peak" and top == len(curve) - 1):
+            return None, False
         step = (self.places[-1] - self.places[0]) / (len(self.places) - 1)
         if what == "peak":
             at = float(self.places[top])
@@ -412,15 +454,15 @@ class _Smooth:
                 rows = self._rows(np.array([at - step, at, at + step]), known)
                 slope, bend = (rows[2] - rows[0]) / (2 * step), (rows[2] - 2 * rows[1] + rows[0]) / step**2
                 if not bend @ values < 0:
-                    return None
+                    return None, is_rising
                 at = min(max(at - float(slope @ values) / float(bend @ values), self.times[0]), self.times[-1])
-            return at, -slope / float(bend @ values)
-        at = self._crossing(curve, top, level * curve[top])
-        if not math.isfinite(at):
-            return None
+            return (at, -slope / float(bend @ values)), is_rising
+        at = self._crossing(curve, top, value + fraction * curve[top])
+        if (is_rising and fraction) or curve[top] < value or not math.isfinite(at):
+            return None, is_rising
         rows = self._rows(np.array([at - step, at, at + step]), known)
         slope = float((rows[2] - rows[0]) @ values) / (2 * step)
-        return (at, (level * highest - rows[1]) / slope) if slope > 0 else None
+        return ((at, (fraction * highest - rows[1]) / slope) if slope > 0 else None), is_rising
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -499,10 +541,12 @@ def fit_front(
         if not used or abs(correlation[p, used[-1]]) <= _CONSTANTS.independent:
             used.append(int(p))
     if len(used) < _CONSTANTS.fewest:
+        cut = int(arrivals.cut.sum())
+        rising = f"; at {cut} positions the field still rises in the last of them: take a value, not a part of the peak"
         raise InputError(
             f"no front: something arrives at {len(there)} of {len(positions)} positions, {len(used)} of them far "
             f"enough apart to be independent; a speed needs {_CONSTANTS.fewest}. A peak counts that exceeds "
-            f"{_CONSTANTS.clear:g} standard uncertainties and lies within the frames"
+            f"{_CONSTANTS.clear:g} standard uncertainties and lies within the frames{rising if cut else ''}"
         )
     parts = arrivals.weights[used] * np.nan_to_num(std.T[used])
     own = parts @ parts.T if between_frames is None else parts @ between_frames @ parts.T

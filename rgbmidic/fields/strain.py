@@ -22,12 +22,16 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.errors import InputError
-from rgbmidic.fields.nodal import NodalCovariance, Places
+from rgbmidic.fields.interpolation import Places
+from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
 SHORTEST = 3.0
 """Length of the shortest gauge in elements: a node and those around it."""
+_BEYOND = SHORTEST - 2 * np.sqrt(2)
+"""Elements by which a gauge is longer than to the farthest node of the elements around its centre: nothing on a regular
+mesh, where that is at the root of 2. At an edge, a gauge that did not hold these would hold the nodes of a line."""
 _Function = Callable[[FloatArray], FloatArray]
 _OF_STRETCH: dict[str, tuple[_Function, _Function]] = {
     "green-lagrange": (lambda c: (c - 1) / 2, lambda c: np.full_like(c, 0.5)),
@@ -234,9 +238,7 @@ def strain_of(
     elements: npt.NDArray[np.int32],
     u: FloatArray,
     v: FloatArray,
-    u_std: FloatArray,
-    v_std: FloatArray,
-    *,
+    *std: FloatArray,
     gauge: float | None = None,
     measure: str = MEASURES[0],
 ) -> Strain:
@@ -250,8 +252,8 @@ def strain_of(
         In px on the reference.
     elements : ndarray, shape (E, 3)
         Node indices.
-    u, v, u_std, v_std : ndarray, shape (N,)
-        In px; NaN where not measured.
+    u, v, *std : ndarray, shape (N,)
+        As of `StrainGauges.gradient`.
     gauge
         Length of the virtual strain gauge in px; None: the shortest, three elements.
     measure
@@ -268,7 +270,7 @@ def strain_of(
         The gauge is too short, or the measure unknown.
     """
     covariance = NodalCovariance.from_mesh(Tri3Mesh(nodes=nodes, elements=elements))
-    return StrainGauges.at_nodes(covariance, gauge).strain(u, v, u_std, v_std, measure=measure)
+    return StrainGauges.at_nodes(covariance, gauge).strain(u, v, *std, measure=measure)
 
 
 class StrainGauges:
@@ -283,7 +285,7 @@ class StrainGauges:
     length
         In px; None: the shortest, three elements. On a graded mesh each gauge has three elements as they are around it,
         and this length where that is more and the length is stated; if it is not, `length` is that of elements of the
-        mesh's size.
+        mesh's size. A gauge that would not hold the elements around its centre, which are stretched, is as much longer.
     needed : csr_matrix, shape (G, N)
         Nodes that must have data, else the gauge has none: the centre and those beside it.
 
@@ -301,7 +303,8 @@ class StrainGauges:
     slopes : list of csr_matrix, shape (G, N)
         The same as matrices.
     inflation : ndarray, shape (G, 3)
-        Variance of the slopes along x and y, and their covariance, over what independent nodes would give.
+        Variance of the slopes along x and y, and their covariance, over what independent nodes would give: of the fit's
+        errors, whose correlation reaches over some elements. That of the lights' bias is taken as it is.
 
     Raises
     ------
@@ -325,15 +328,20 @@ class StrainGauges:
         if mesh.is_graded:
             around = (needed @ mesh.sizes) / np.asarray(needed.sum(axis=1)).ravel()
             lengths = np.maximum(SHORTEST * around, length or 0)
+        far = np.zeros(len(centres))
+        row, node = needed.nonzero()
+        np.maximum.at(far, row, np.hypot(*(mesh.nodes[node] - centres[row]).T) + _BEYOND / 2 * mesh.sizes[node])
+        lengths = np.maximum(lengths, 2 * far)
         pattern = _reach(mesh, centres, lengths / 2, needed)
-        self.rows = np.repeat(np.arange(len(centres)), np.diff(pattern.indptr))
+        self.starts, self.bias = pattern.indptr, covariance.bias
+        self.rows = np.repeat(np.arange(len(centres)), np.diff(self.starts))
         self.nodes = pattern.indices.astype(np.int64)
         away = np.hypot(*(mesh.nodes[self.nodes] - centres[self.rows]).T)
         self.fractions = np.clip((lengths[self.rows] / 2 - away) / mesh.sizes[self.nodes], 0, 1)
-        self.whole = self._weights(np.ones(len(mesh.nodes), dtype=bool))
-        self.slopes = [sp.csr_matrix((w, (self.rows, self.nodes)), shape=needed.shape) for w in self.whole]
-        together = [np.asarray((a @ covariance.correlation).multiply(a).sum(axis=1)).ravel() for a in self.slopes]
-        alone = [np.asarray(a.multiply(a).sum(axis=1)).ravel() for a in self.slopes]
+        self.whole = self.weights(np.ones(len(mesh.nodes), dtype=bool))
+        self.slopes = self._matrices(self.whole)
+        alone = [_products(slope, slope) for slope in self.slopes]
+        together = [_products(part, part) for part in (slope @ covariance.fit for slope in self.slopes)]
         along, across = (a / np.where(b > 0, b, 1) for a, b in zip(together, alone, strict=True))
         self.inflation = np.stack([along, across, np.sqrt(along * across)], axis=1)
 
@@ -396,19 +404,19 @@ class StrainGauges:
         StrainGauges
         """
         gauges = copy(self)
-        gauges.points, gauges.needed = self.points[nodes], self.needed[:, nodes]
+        gauges.points, gauges.needed, gauges.bias = self.points[nodes], self.needed[:, nodes], self.bias[nodes]
         gauges.nodes, gauges.slopes = np.searchsorted(nodes, self.nodes), [part[:, nodes] for part in self.slopes]
         return gauges
 
-    def gradient(
-        self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def gradient(self, u: FloatArray, v: FloatArray, *std: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Fit the planes to the displacements of one frame.
 
         Parameters
         ----------
-        u, v, u_std, v_std : ndarray, shape (N,)
+        u, v : ndarray, shape (N,)
             In px; NaN where a node has no data.
+        *std : ndarray, shape (N,)
+            Their standard uncertainties u_std and v_std; u_bias and v_bias, the part that the lights' bias leaves.
 
         Returns
         -------
@@ -417,28 +425,29 @@ class StrainGauges:
         covariance : ndarray, shape (G, 4, 4)
             Of the gradient row by row.
         """
-        measured = np.isfinite(u + v + u_std + v_std)
-        known = self.needed @ (~measured * 1.0) == 0
-        weights = self.whole if measured.all() else self._weights(measured)
-        values, spread = np.zeros((len(known), 2, 2)), np.zeros((len(known), 4, 4))
-        for component, (value, std) in enumerate(((u, u_std), (v, v_std))):
-            moved, square = (np.where(measured, part, 0.0)[self.nodes] for part in (value, std**2))
-            values[:, component] = np.stack([self._sum(w * moved) for w in weights], axis=1)
-            products, own = weights[[0, 1, 0]] * weights[[0, 1, 1]] * square, slice(2 * component, 2 * component + 2)
-            sums = np.stack([self._sum(part) for part in products], axis=1) * self.inflation
+        measured = np.isfinite(u + v + sum(std))
+        weights = self.whole if measured.all() else self.weights(measured)
+        values, spread = np.zeros((len(self.centres), 2, 2)), np.zeros((len(self.centres), 4, 4))
+        matrices = self.slopes if measured.all() else self._matrices(weights)
+        for component, value in enumerate((u, v)):
+            whole, shared = (np.where(measured, part, 0.0) for part in (*std[component::2], np.zeros_like(u))[:2])
+            moved, square = np.where(measured, value, 0.0), np.maximum(whole**2 - shared**2, 0)
+            values[:, component] = np.stack([slope @ moved for slope in matrices], axis=1)
+            products, own = weights[[0, 1, 0]] * weights[[0, 1, 1]], slice(2 * component, 2 * component + 2)
+            sums = np.stack([self._sum(part * square[self.nodes]) for part in products], axis=1) * self.inflation
+            if shared.any():
+                x, y = (slope @ (sp.diags(shared) @ self.bias) for slope in matrices)
+                sums += np.stack([_products(x, x), _products(y, y), _products(x, y)], axis=1)
             spread[:, own, own] = sums[:, [[0, 2], [2, 1]]]
-        values[~known], spread[~known] = np.nan, np.nan
         return values, spread
 
-    def strain(
-        self, u: FloatArray, v: FloatArray, u_std: FloatArray, v_std: FloatArray, *, measure: str = MEASURES[0]
-    ) -> Strain:
+    def strain(self, u: FloatArray, v: FloatArray, *std: FloatArray, measure: str = MEASURES[0]) -> Strain:
         """Compute the strain of every gauge from the displacements (N,) of one frame; errors as `strain_of`.
 
         Parameters
         ----------
-        u, v, u_std, v_std : ndarray, shape (N,)
-            Displacement and its standard uncertainty, px; NaN where not measured.
+        u, v, *std : ndarray, shape (N,)
+            As of `gradient`.
         measure
             Strain measure, as of `strain_of`.
 
@@ -446,10 +455,24 @@ class StrainGauges:
         -------
         Strain
         """
-        return strain_of_gradient(*self.gradient(u, v, u_std, v_std), measure)
+        return strain_of_gradient(*self.gradient(u, v, *std), measure)
 
-    def _weights(self, measured: BoolArray) -> FloatArray:
-        """Compute the weight (2, M) of every node in the slopes of each gauge; NaN where its nodes lie on a line."""
+    def _matrices(self, weights: FloatArray) -> list[sp.csr_matrix]:
+        return [sp.csr_matrix((w, self.nodes, self.starts), shape=self.needed.shape) for w in weights]
+
+    def weights(self, measured: BoolArray) -> FloatArray:
+        """Compute the weight of every node of each gauge in its slopes.
+
+        Parameters
+        ----------
+        measured : ndarray, shape (N,), bool
+            Nodes that have data.
+
+        Returns
+        -------
+        ndarray, shape (2, M)
+            NaN where a node that it needs has no data, or its nodes lie on a line.
+        """
         use = measured[self.nodes] * self.fractions
         arm = (self.points[self.nodes] - self.centres[self.rows]).T
         count = np.maximum(self._sum(use), np.finfo(float).tiny)
@@ -458,12 +481,18 @@ class StrainGauges:
         determinant = xx * yy - xy * xy
         # a hundredth of the second moment across as along: the nodes lie on a line
         determinant = np.where(determinant > 1e-2 * ((xx + yy) / 2) ** 2, determinant, np.nan)
+        determinant[self.needed @ (~measured * 1.0) > 0] = np.nan
         xx, xy, yy = (part[self.rows] / determinant[self.rows] for part in (xx, xy, yy))
         return np.stack([use * (yy * x - xy * y), use * (xx * y - xy * x)])
 
     def _sum(self, values: AnyArray) -> FloatArray:
         sums = np.bincount(self.rows, weights=values, minlength=len(self.centres))
         return np.asarray(sums, dtype=np.float64)
+
+
+def _products(first: sp.csr_matrix, second: sp.csr_matrix) -> FloatArray:
+    """Scalar products of the rows of two matrices."""
+    return np.asarray(first.multiply(second).sum(axis=1)).ravel()
 
 
 def _ring(mesh: Tri3Mesh) -> sp.csr_matrix:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import math
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,9 +17,9 @@ import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import StoredFrame, check_size, complaints, damaged
+from rgbmidic.frames.stored import BROKEN_JPEG, StoredFrame, check_size, complaints, damaged
 from rgbmidic.frames.tiff_pages import Tag, is_stored_as_is, missing_data, tag, tiff_pages
-from rgbmidic.settings import BAYER_PATTERNS, regular
+from rgbmidic.settings import BAYER_PATTERNS, FrameKind, regular
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
@@ -36,10 +38,15 @@ _CAMERA_HEADERS = (
     *(b"\0MRM", b"FUJIFILM", b"FOVb"),  # Minolta, Fujifilm, Sigma
 )
 _CR3_HEADER = b"ftypcrx "
-_BROKEN_JPEG = ("Corrupt JPEG data", "Premature end of JPEG file", "Inconsistent progression sequence")
-"""How libjpeg's warnings begin (JWRN in its jerror.h) after which it goes on with invented samples."""
 _ODD_JPEG = ("Invalid SOS parameters", "Unknown Adobe color transform code", "Warning: unknown JFIF revision")
-"""And those of headers that it can read all the same."""
+"""How libjpeg's warnings begin of headers that it can read all the same."""
+
+_MALLOPT = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+"""Sets what allocated memory is filled with; only glibc has it."""
+_PERTURB = -6
+"""The option of `mallopt` that does so (M_PERTURB in malloc.h)."""
+_MARKS = (0xFE, 0x53)
+"""Bytes that memory is filled with before a raw is decoded into it; samples of two such bytes are rare."""
 
 
 class CameraRaw(FrameSource):
@@ -56,29 +63,60 @@ class CameraRaw(FrameSource):
             return int(raw.sizes.height), int(raw.sizes.width)
 
     def _stored(self, index: int) -> StoredFrame:
-        stored_as_is, black_by_tags = _tags(self.path)
-        with _libraw(self.path) as raw:
-            cell = _colour_cell(raw, self.path)
-            values = np.array(raw.raw_image_visible, dtype=np.uint16)
-            black = np.asarray(raw.black_level_per_channel, dtype=np.float64)[cell]
-            white, sizes, names = float(raw.white_level), raw.sizes, _names(raw, cell)
-            monochrome = raw.num_colors == 1
-        if values.shape != (sizes.height, sizes.width):
-            raise damaged(self.path, f"its visible part ({sizes.height} x {sizes.width}) reaches beyond its samples")
+        stored_as_is, black_by_tags, _ = _tags(self.path)
+        values, black, white, cfa, margin = self._decoded(_MARKS[0])
+        if _MALLOPT is None or (values == 257 * _MARKS[0]).any():
+            # LibRaw returns from some damage without an error: what it did not write is what memory held
+            undecoded = values != self._decoded(_MARKS[1])[0]
+            if undecoded.any():
+                raise damaged(self.path, f"LibRaw does not decode {undecoded.mean():.2%} of its samples")
         if black_by_tags is not None:
             # LibRaw moves odd margins to the next even row and column without moving the black levels along
-            black = np.roll(black_by_tags, (-sizes.top_margin, -sizes.left_margin), axis=(0, 1))
+            black = np.roll(black_by_tags, margin, axis=(0, 1))
         _check_filled(values, black, white, stored_as_is=stored_as_is, path=self.path)
-        return StoredFrame(
-            values=values,
-            kind="monochrome" if monochrome else "bayer",
-            cfa=None if monochrome else names,
-            black_level=black,
-            white_level=white,
-        )
+        kind: FrameKind = "bayer" if cfa else "monochrome"
+        return StoredFrame(values=values, kind=kind, cfa=cfa, black_level=black, white_level=white)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a user should know of the black levels."""
+        try:
+            _, _, spread = _tags(self.path)
+        except FrameError:  # reported when it is read
+            return ()
+        what = "its black level varies from row to row, column to column or over more than 2x2 pixels by {:.3g} DN"
+        return (f"{what.format(spread)}: the mean of each position is taken",) if spread > 1 else ()
+
+    def _decoded(self, mark: int) -> tuple[AnyArray, FloatArray, float, str | None, tuple[int, int]]:
+        """Decode the samples into memory filled with the byte `mark`: samples, levels, pattern, minus the margins."""
+        with _libraw(self.path) as raw:
+            with _filled_memory(mark):
+                raw.unpack()
+            cell = _colour_cell(raw, self.path)
+            values, sizes = np.array(raw.raw_image_visible, dtype=np.uint16), raw.sizes
+            black = np.asarray(raw.black_level_per_channel, dtype=np.float64)[cell]
+            white, cfa = float(raw.white_level), None if raw.num_colors == 1 else _names(raw, cell)
+            if _MALLOPT is None:
+                raw.raw_image[...] = ~raw.raw_image  # the next raw of this size is mostly decoded into this memory
+        if values.shape != (sizes.height, sizes.width):
+            raise damaged(self.path, f"its visible part ({sizes.height} x {sizes.width}) reaches beyond its samples")
+        return values, black, white, cfa, (-sizes.top_margin, -sizes.left_margin)
 
 
-def _tags(path: Path) -> tuple[bool, FloatArray | None]:
+@contextmanager
+def _filled_memory(byte: int) -> Iterator[None]:
+    """Have the memory that is allocated inside filled with a byte, where the C library can."""
+    if _MALLOPT is None:
+        yield
+        return
+    _MALLOPT(_PERTURB, byte ^ 0xFF)  # glibc fills with the complement
+    try:
+        yield
+    finally:
+        _MALLOPT(_PERTURB, 0)
+
+
+def _tags(path: Path) -> tuple[bool, FloatArray | None, float]:
     """Read what the TIFF tags of a raw state beyond what LibRaw gives, and check that its image data are all there.
 
     Returns
@@ -86,8 +124,10 @@ def _tags(path: Path) -> tuple[bool, FloatArray | None]:
     stored_as_is : bool
         Whether the samples are uncompressed and all there, so that zeros in them are real.
     black : ndarray, shape (2, 2), or None
-        DNG black level by position from the sensor's first pixel on; None where no tag states it or states more than a
-        2x2 cell can hold, in files that are not TIFF inside, or that only LibRaw can follow.
+        DNG black level by position from the sensor's first pixel on, the mean where it varies further; None where no
+        tag states it, in files that are not TIFF inside, or that only LibRaw can follow.
+    spread : float
+        By how many DN the black level of a position varies over the sensor.
 
     Raises
     ------
@@ -99,27 +139,44 @@ def _tags(path: Path) -> tuple[bool, FloatArray | None]:
             raw = [page for page in pages if page.photometric in (32803, 34892)] or pages  # CFA, linear raw
             page = max(raw, key=lambda page: page.imagewidth * page.imagelength)
             top, left, *_ = tag(page, Tag.ACTIVE_AREA) or (0, 0)
-            stored_as_is, black = is_stored_as_is(page), _black_cell(page)
+            stored_as_is, (black, spread) = is_stored_as_is(page), _black_cell(page)
             missing = [reason for page in raw if (reason := missing_data(page, path.stat().st_size))]
             black = None if black is None else np.roll(black, (top, left), axis=(0, 1))
     except FrameError:
-        return False, None
+        return False, None, 0.0
     if missing:
         raise damaged(path, missing[0])
-    return stored_as_is, black
+    return stored_as_is, black, spread
 
 
-def _black_cell(page: tifffile.TiffPage) -> FloatArray | None:
-    levels, repeat = tag(page, Tag.BLACK), tag(page, Tag.BLACK_REPEAT) or (1, 1)
-    varies = Tag.BLACK_DELTA_H in page.tags or Tag.BLACK_DELTA_V in page.tags
-    if levels is None or varies or not set(repeat) <= {1, 2}:
+def _black_cell(page: tifffile.TiffPage) -> tuple[FloatArray | None, float]:
+    """Return the mean black level (2, 2) of each position of a page's active area, and by how much it varies there.
+
+    The levels of a cell of any size, and what is added by column and by row (DNG 1.4, BlackLevelDeltaH and -V).
+    """
+    rows, columns = tag(page, Tag.BLACK_REPEAT) or (1, 1)
+    levels = _reals(page, Tag.BLACK)
+    if levels is None or levels.size != rows * columns:
+        return None, 0.0
+    cell = np.tile(levels.reshape(rows, columns), (math.lcm(rows, 2) // rows, math.lcm(columns, 2) // columns))
+    parts = [[cell[row::2, column::2] for column in (0, 1)] for row in (0, 1)]
+    black = np.array([[part.mean() for part in line] for line in parts])
+    spread = max(float(np.ptp(part)) for line in parts for part in line)
+    for code, shape in ((Tag.BLACK_DELTA_H, (1, 2)), (Tag.BLACK_DELTA_V, (2, 1))):
+        if (added := _reals(page, code)) is not None and added.size > 1:
+            black = black + np.array([added[0::2].mean(), added[1::2].mean()]).reshape(shape)
+            spread += max(float(np.ptp(added[0::2])), float(np.ptp(added[1::2])))
+    return black, spread
+
+
+def _reals(page: tifffile.TiffPage, code: int) -> FloatArray | None:
+    """Return the numbers of a tag; rationals come as numerator, denominator."""
+    values = tag(page, code)
+    if values is None:
         return None
-    numbers = np.array(levels, dtype=np.float64)
-    if len(numbers) == 2 * math.prod(repeat):  # rationals come as numerator, denominator
-        numbers = numbers[::2] / numbers[1::2]
-    if len(numbers) != math.prod(repeat):
-        return None
-    return np.tile(numbers.reshape(repeat), (2 // repeat[0], 2 // repeat[1]))
+    numbers = np.array(values, dtype=np.float64)
+    with np.errstate(all="ignore"):  # levels that are not finite are refused where the frame is checked
+        return numbers[::2] / numbers[1::2] if page.tags[code].dtype in (5, 10) else numbers
 
 
 @contextmanager
@@ -131,7 +188,7 @@ def _libraw(path: Path) -> Iterator[rawpy.RawPy]:
     import rawpy
 
     try:
-        starts = (os.fsencode(path), *(start.encode() for start in _BROKEN_JPEG + _ODD_JPEG))
+        starts = (os.fsencode(path), *(start.encode() for start in BROKEN_JPEG + _ODD_JPEG))
         with complaints(*starts) as lines, rawpy.imread(str(path)) as raw:
             needed = 2 * raw.sizes.raw_height * raw.sizes.raw_width
             check_size(path, needed=needed, stored=path.stat().st_size)
@@ -145,7 +202,7 @@ def _libraw(path: Path) -> Iterator[rawpy.RawPy]:
         reason = reason.decode(errors="replace") if isinstance(reason, bytes) else reason
         raise damaged(path, f"LibRaw reports: {reason}") from None
     for line in lines:
-        if line.startswith(_BROKEN_JPEG):
+        if line.startswith(BROKEN_JPEG):
             raise damaged(path, f"libjpeg reports: {line}")
         logger.warning("LibRaw reports: %s", line)
 

@@ -265,8 +265,17 @@ class Recording:
         they would be off by a quarter of a frame at a million frames a second.
     numbers : ndarray, shape (count,), int64, or None
         The camera's own numbers, with gaps where frames are lost.
+    saved_every
+        Of how many frames that the camera took one is in the file, as the file states.
+    planes
+        Number of frames that belong to one time, such as the channels of a hyperstack, each an image of one light.
+    planes_in_words
+        What these are.
+    count_is_certain
+        Whether the file holds no other frames: False where the list of them leads out of it.
     remarks
-        What else in the header a user should know.
+        What else in the header a user should know. Times that do not rise from frame to frame are left out, with a
+        remark; so is one made of a frame rate that is not theirs.
     """
 
     count: int = 1
@@ -276,7 +285,30 @@ class Recording:
     trigger: int | None = None
     times_ns: Integers | None = None
     numbers: Integers | None = None
+    saved_every: int = 1
+    planes: int = 1
+    planes_in_words: str = ""
+    count_is_certain: bool = True
     remarks: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Leave out times that cannot be."""
+        times = None if self.times_ns is None else np.asarray(self.times_ns)[:: self.planes]
+        if times is None or len(times) < 2:
+            return
+        if (falls := (times[1:] <= times[:-1]) | (times[:-1] == np.iinfo(np.int64).min)).any():
+            where = self.planes * (int(np.argmax(falls)) + 1)
+            remark = f"its time stamps do not rise (at frame {where}): they are not used"
+            object.__setattr__(self, "times_ns", None)
+        elif rate := self.frame_rate:
+            periods = int(self.numbered[-1]) if self.planes == 1 else len(times) - 1
+            stamped = self.saved_every * periods * SECOND / float(times[-1] - times[0])
+            if abs(rate / stamped - 1) <= max(0.01, rate * 1e-6):  # stamps may be whole microseconds
+                return
+            remark = f"it states {rate:g} frames per second, its time stamps {stamped:.6g}: these are taken"
+        else:
+            return
+        object.__setattr__(self, "remarks", (*self.remarks, remark))
 
     @property
     def numbered(self) -> Integers:
@@ -287,7 +319,7 @@ class Recording:
         """
         if self.numbers is not None:
             return np.asarray(self.numbers - self.numbers[0])
-        if self.times_ns is not None and self.count > 2:
+        if self.times_ns is not None and self.count > 2 and self.planes == 1:
             steps = np.diff(self.times_ns)
             period = float(np.median(steps))
             periods = np.round(steps / max(period, 1.0))

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal, NoReturn, TypedDict, Unpack
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
+from rgbmidic.frames.bitmaps import BmpFile, PgmFile
 from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera_header
 from rgbmidic.frames.cine import CINE_ENDINGS, CineFile
 from rgbmidic.frames.data import ChannelFrame, Mosaic
@@ -82,6 +83,8 @@ FORMATS = (
         source=HeaderlessFile,
     ),
     FrameFormat(name="PNG", endings=(".png",), source=PngFile),
+    FrameFormat(name="PGM", endings=(".pgm",), source=PgmFile),
+    FrameFormat(name="BMP", endings=(".bmp",), source=BmpFile),
     FrameFormat(
         name="TIFF stacks", recognises=lambda path, _: _is_tiff(path) and is_tiff_stack(path), source=TiffStack
     ),
@@ -145,7 +148,7 @@ _ADVICE = (
         "a movie or a stack: a folder stands for frames in files of their own; name the movie itself, or a pattern",
     ),
     (
-        (".jpg", ".jpeg", ".bmp", ".gif", ".heic", ".webp"),
+        (".jpg", ".jpeg", ".gif", ".heic", ".webp"),
         "a picture that is no raw frame: let the camera record DNG or 16-bit TIFF, without demosaicing",
     ),
     (

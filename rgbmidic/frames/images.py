@@ -19,11 +19,11 @@ import numpy as np
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import EvenFrames, StoredFrame, check_size, complaints, damaged
+from rgbmidic.frames.stored import BROKEN_JPEG, EvenFrames, StoredFrame, check_size, complaints, damaged
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import AnyArray
 
-_PLACE = re.compile(r"^\[ERROR\S*\] global \S+ \S+ ")
+_PLACE = re.compile(r"^\[ *(ERROR|WARN)\S*\] global \S+ \S+ ")
 """Where in OpenCV a line of its log comes from."""
 
 
@@ -51,16 +51,17 @@ def decode(content: bytes, path: Path) -> AnyArray:
 
     # OpenCV 4 has it at its top, OpenCV 5 in a module
     set_log_level = cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel
-    previous = set_log_level(2)  # LOG_LEVEL_ERROR
+    previous = set_log_level(3)  # LOG_LEVEL_WARNING
     try:
-        with complaints(b"libpng error", b"libpng warning", b"[ERROR", b"> ") as lines:
+        with complaints(b"libpng error", b"libpng warning", b"[ERROR", b"[ WARN", b"> ") as lines:
             # OpenCV opens no non-ASCII names on Windows, hence decoding from memory
             image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     finally:
         set_log_level(previous)
-    errors = [line for line in lines if not line.startswith("libpng warning")]  # of parts that are not used
+    of_unused_parts = [line for line in lines if line.startswith(("libpng warning", "[ WARN"))]
+    errors = [line for line in lines if line not in of_unused_parts or any(text in line for text in BROKEN_JPEG)]
     if image is None or errors:  # libtiff's errors do not always keep OpenCV from giving a picture
         raise damaged(path, _PLACE.sub("", errors[0]) if errors else "its image data cannot be decoded")
     return image[..., ::-1] if image.ndim == 3 and image.shape[2] == 3 else image

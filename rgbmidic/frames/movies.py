@@ -5,8 +5,8 @@ XML inside a binary file) wrote; samples of 12 bit are packed as in a file of a 
 to be so, too.
 
 The layout of .seq is that of NorPix, "The NorPix Sequence File Format (.seq)", 2015. Before version 5 of the header the
-frames begin behind its 1024 bytes, and time stamps have no microseconds. No file of a camera was at hand: the reader is
-tested with files that the tests write.
+frames begin behind its 1024 bytes, and time stamps have no microseconds. The 118 frames of a camera's file that pims
+tests with are read as by pims.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class MrawFile(Movie):
         found = _beside(self.path, *MRAW_ENDINGS[1:])
         if found is None:
             raise FrameError(f"{self.path} needs its header {self.path.stem}.cihx or {self.path.stem}.cih beside it")
-        return _mraw_header(found)
+        return _mraw_header(found).noting_rest(self.path.stat().st_size)
 
 
 def _beside(path: Path, *endings: str) -> Path | None:
@@ -86,7 +86,7 @@ def _mraw_header(path: Path) -> EvenFrames:
     whole = partial(_whole, path, entries)
     rows, columns, stored_bits = map(whole, ("Image Height", "Image Width", "Color Bit"))
     kind = entries.get("Color Type", "")
-    if kind.lower() not in ("mono", "raw") or stored_bits in (24, 30, 36, 48):
+    if kind.lower() not in ("mono", "raw", "bayer") or stored_bits in (24, 30, 36, 48):
         raise FrameError(
             f'{path} states {stored_bits} bit of colour type "{kind}": its samples are no longer the sensor\'s; save '
             "the movie as raw (Bayer) or monochrome"
@@ -106,7 +106,7 @@ def _mraw_header(path: Path) -> EvenFrames:
         recording=Recording(count=count),
         stored_bits=stored_bits,
         shift=0 if side == "lower" else max(stored_bits - depth, 0),
-        stated=StoredFrame(bits=min(stored_bits, depth)),
+        stated=StoredFrame(kind="bayer" if kind.lower() == "bayer" else None, bits=min(stored_bits, depth)),
     ).checked(path)
     return replace(header, recording=_recording(path, entries, count, depth))
 
@@ -162,6 +162,7 @@ def _recording(path: Path, entries: Mapping[str, str], count: int, depth: int) -
         frame_rate=float(rate) if rate else None,
         exposure_ns=round(exposure) if exposure else None,
         trigger=-first // step,
+        saved_every=step,
         times_ns=times,
     )
 
@@ -225,7 +226,7 @@ def _seq_header(path: Path) -> EvenFrames:
 
 
 def _stamps_ns(file: BinaryIO, header: EvenFrames, stamp: str) -> Integers | None:
-    """Read the time of every frame from the first; None where the file ends before the last or they do not grow."""
+    """Read the time of every frame from the first; None where the file ends before the last."""
     size, count, end = struct.calcsize(stamp), header.recording.count, file.seek(0, 2)
     if header.gap < size or end < header.start + count * (header.size + header.gap) - header.gap + size:
         return None
@@ -234,5 +235,4 @@ def _stamps_ns(file: BinaryIO, header: EvenFrames, stamp: str) -> Integers | Non
         file.seek(header.begin(index) + header.size)
         seconds, *parts = struct.unpack(stamp, file.read(size))
         times[index] = seconds * SECOND + sum(part * 10**power for part, power in zip(parts, (6, 3), strict=False))
-    times -= times[0]
-    return times if (np.diff(times) > 0).all() else None
+    return np.asarray(times - times[0])

@@ -5,26 +5,25 @@
 
 from __future__ import annotations
 
-import glob
 import hashlib
 import logging
 import math
 import os
-import re
 from bisect import bisect_right
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from rgbmidic.errors import ConfigurationError, FrameError, InputError, disk_faults, legible
+from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.formats import advice, known_formats, open_source
+from rgbmidic.frames.formats import known_formats, open_source
 from rgbmidic.frames.images import write_tiff
+from rgbmidic.frames.names import NamedFiles, list_frames
 from rgbmidic.frames.source import FrameSource, file_fingerprint
-from rgbmidic.frames.stacks import split_dataset
 from rgbmidic.frames.stored import Camera
 from rgbmidic.frames.tiff import TIFF_ENDINGS
 from rgbmidic.settings import FrameSettings
@@ -90,6 +89,20 @@ class FrameSeries:
     def recording(self) -> Recording:
         """How the frames were recorded, as the first file states it."""
         return self.lights[0][0].recording
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the headers state that a user should know, each once, with the file or files.
+
+        Of files of one frame each the first is looked at: one camera wrote them all.
+        """
+        found: dict[str, list[str]] = {}
+        stacks = any(len(source) > 1 for sources in self.lights for source in sources)
+        for source in (one for sources in self.lights for one in (sources if stacks else sources[:1])):
+            for remark in source.remarks:
+                found.setdefault(remark, []).append(legible(source.path.name))
+        more = {remark: f" and {len(names) - 1} more" if len(names) > 1 else "" for remark, names in found.items()}
+        return tuple(f"{names[0]}{more[remark]}: {remark}" for remark, names in found.items())
 
     @property
     def lost(self) -> int:
@@ -275,10 +288,11 @@ def open_series(
             "frames.path must name the frame files; it is empty, which is for a frame source that a script gives "
             "(rgbmidic.measure(settings, out, source=...))"
         )
-    files = [list_frames(text, base) for text in settings.path]
-    opened = [[open_source(path, settings, camera) for path in paths] for paths in files]
+    opened = [[open_source(path, settings, camera) for path in list_frames(text, base)] for text in settings.path]
     # a movie in two files, samples and header, is one source where a pattern matches both
     lights = tuple(tuple({source.path: source for source in sources}.values()) for sources in opened)
+    for text, sources in zip(settings.path, lights, strict=True):
+        _check_sources(text, sources, settings.lights)
     counts = [sum(map(len, sources)) for sources in lights]
     if len(set(counts)) > 1:
         numbers_given = ", ".join(f"{text}: {count}" for text, count in zip(settings.path, counts, strict=True))
@@ -297,6 +311,33 @@ def open_series(
                     f"{first.path} has {rows} of {columns}"
                 )
     return replace(series, chosen=chosen_frames(settings, len(series)))
+
+
+def _check_sources(text: str, sources: Sequence[FrameSource], lights: int) -> None:
+    """Refuse a frame in two files, planes that are not the lights', and files after an unknown number of frames.
+
+    Raises
+    ------
+    FrameError
+        So they are.
+    """
+    kinds = {source.path.with_suffix(""): source.path for source in sources}
+    for source in sources:
+        if (other := kinds[source.path.with_suffix("")]) != source.path:
+            pair = f"{text} stands for {source.path.name} and {other.name}: is that one frame in two files?"
+            raise FrameError(f"{pair} State the pattern of one kind of them, as in *{source.path.suffix}")
+        if (planes := source.recording.planes) not in (1, lights):
+            raise FrameError(
+                f"{source.path} holds {source.recording.planes_in_words} of {len(source) // planes} times: state "
+                f"frames.lights = {planes} where each shows one light, else save one of them alone; lights is {lights}"
+            )
+    if max(map(len, sources)) > 1:
+        for source in sources[:-1]:
+            if source.shape and not source.recording.count_is_certain:  # a header that cannot be read raises an error
+                raise FrameError(
+                    f"{source.path} is truncated or still being written: its list of frames ends early, so the numbers "
+                    f"of the frames in {sources[-1].path.name} are not known; leave it out, or read it alone"
+                )
 
 
 def _turns(numbers: Sequence[int], lights: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -332,13 +373,13 @@ def _numbers(settings: FrameSettings, lights: Sequence[Sequence[FrameSource]]) -
     """Return the frame numbers that the names or the headers of all lights hold; empty where they hold none."""
     found: dict[str, tuple[int, ...]] = {}
     for text, sources in zip(settings.path, lights, strict=True):
-        if counts := _counts(sources):
-            step = math.gcd(*(count - counts[0] for count in counts)) or 1
-            found[text] = tuple((count - counts[0]) // step for count in counts)
-            expected = range(counts[0], counts[-1] + 1, step)
+        if counts := _counts(text, sources):
+            scale = math.lcm(*(count.denominator for count in counts))
+            step = Fraction(math.gcd(*(int(scale * (count - counts[0])) for count in counts)) or 1, scale)
+            numbers = found[text] = tuple(int((count - counts[0]) / step) for count in counts)
             # where more numbers are missing than there are, somebody chose some frames
-            if len(counts) < len(expected) <= 2 * len(counts):
-                missing = sorted(set(expected) - set(counts))
+            if len(counts) <= numbers[-1] < 2 * len(counts):
+                missing = [counts[0] + step * number for number in sorted(set(range(numbers[-1])) - set(numbers))]
                 gaps = f"{len(missing)} in the numbering, {_listed(missing)}; the frames after keep their numbers"
                 logger.warning("frames are missing from %s: %s", text, gaps)
     if len(set(found.values())) > 1:
@@ -347,77 +388,19 @@ def _numbers(settings: FrameSettings, lights: Sequence[Sequence[FrameSource]]) -
     return next(iter(found.values()), ())
 
 
-def _counts(sources: Sequence[FrameSource]) -> tuple[int, ...]:
-    """Return the camera's numbers in a movie's header, else those in the names.
-
-    Empty where there are none: a counter is the only thing in which the names differ.
-    """
+def _counts(text: str, sources: Sequence[FrameSource]) -> tuple[Fraction, ...]:
+    """Return the camera's numbers in a movie's header, else those in the names; empty where there are none."""
     if len(sources) == 1 and len(sources[0]) > 1:
-        return tuple(sources[0].recording.numbered.tolist())
-    names = [re.split(r"([0-9]+)", str(source.path)) for source in sources]
-    if any(len(source) > 1 for source in sources) or len({len(name) for name in names}) > 1:
-        return ()
-    differing = [part for part in zip(*names, strict=True) if len(set(part)) > 1]
-    if len(differing) != 1 or not differing[0][0].isdecimal():
-        return ()
-    counts = tuple(int(part) for part in differing[0])
-    return counts if len(set(counts)) == len(counts) else ()
+        return tuple(map(Fraction, sources[0].recording.numbered.tolist()))
+    named = NamedFiles.ordered([source.path for source in sources])
+    if named.doubt:
+        logger.warning("the order of %s is uncertain (%s): taken as %s", text, named.doubt, named.listed)
+    return () if any(len(source) > 1 for source in sources) else named.counts
 
 
-def _listed(numbers: Sequence[int], most: int = 10) -> str:
-    return ", ".join(map(str, numbers[:most])) + (", ..." if len(numbers) > most else "")
-
-
-def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]:
-    """List frame files in natural order (frame9 before frame10).
-
-    Parameters
-    ----------
-    pattern
-        A file, a folder (its files with the ending of a frame), or a pattern with ``*``, ``?``, ``[...]`` or ``**``;
-        behind an HDF5 file or a pattern of them the dataset may be named, as in ``run.h5:/entry/data``.
-    base
-        Folder that a relative pattern starts from.
-
-    Returns
-    -------
-    tuple of Path
-
-    Raises
-    ------
-    FrameError
-        Nothing matches.
-    """
-    text, dataset = split_dataset(pattern)
-    place = Path(base) / text
-    with disk_faults(FrameError, f"the frames {pattern} cannot be looked for"):
-        if place.is_dir():
-            found = sorted(file for file in place.iterdir() if file.name[0] != ".")
-            endings = {ending for known in known_formats() for ending in known.endings}
-            files = [file for file in found if file.suffix.lower() in endings]
-        else:
-            found = files = _matching(Path(text), Path(base))
-        files = [file for file in files if not file.is_dir()]  # what else is no file is reported when it is read
-    if not files:
-        what = "a folder without frames" if place.is_dir() else "no file matches"
-        other = next((f"; {file.name} is {text}" for file in found if (text := advice(file))), "")
-        raise FrameError(f"no frames: {what}: {pattern} (looked for in {Path(base).resolve()}){other}")
-
-    def natural(file: Path) -> tuple[list[tuple[int, str]], str]:
-        parts = re.split(r"([0-9]+)", str(file).casefold())
-        return [(int(part), "") if place % 2 else (0, part) for place, part in enumerate(parts)], str(file)
-
-    return tuple(Path(f"{file}:{dataset}") if dataset else file for file in sorted(files, key=natural))
-
-
-def _matching(pattern: Path, base: Path) -> list[Path]:
-    """Find files that match; what exists of the pattern's beginning is taken literally, brackets included."""
-    parts = list(pattern.parts)
-    while parts and (base / parts[0]).exists():
-        base /= parts.pop(0)
-    if not parts:
-        return [base]
-    return [base / match for match in glob.glob(str(Path(*parts)), root_dir=base, recursive=True)]  # noqa: PTH207
+def _listed(numbers: Sequence[int | Fraction], most: int = 10) -> str:
+    texts = [str(number) if number == int(number) else str(float(number)) for number in numbers[:most]]
+    return ", ".join(texts) + (", ..." if len(numbers) > most else "")
 
 
 def describe(settings: FrameSettings) -> dict[str, Any]:
@@ -451,7 +434,9 @@ def describe(settings: FrameSettings) -> dict[str, Any]:
     stored = source.stored(0)
     frame, *_ = series.read(0)
     cfa, levels = getattr(frame, "cfa", None), tuple(frame.black_level.ravel().tolist())
-    warnings = list(recording.remarks)
+    warnings = list(series.remarks)
+    if recording.planes > 1:
+        warnings.append(f"it holds {recording.planes_in_words} of each time: frames.lights = {recording.planes}")
     try:
         series.read(len(series) - 1)
     except FrameError as error:  # a movie that is truncated, or still being written
@@ -512,6 +497,9 @@ def save_frame(settings: FrameSettings, index: int, path: Path, *, overwrite: bo
 
 def _opened(settings: FrameSettings) -> FrameSeries:
     """Open the frames; a mosaic whose pattern nobody states is read as it is, one grey level at every pixel."""
+    first = open_source(list_frames(settings.path[0])[0], settings)
+    if (planes := first.recording.planes) > 1:
+        settings = replace(settings, kind="monochrome", lights=planes)
     series = open_series(settings)
     if settings.kind is None and settings.cfa is None:
         stored = series.lights[0][0].stored(0)

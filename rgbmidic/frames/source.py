@@ -59,6 +59,11 @@ class FrameSource(ABC):
         """How the frames were recorded, from the header alone; a file of one frame states nothing and is not read."""
         return Recording()
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What else the header states that a user should know."""
+        return self.recording.remarks
+
     def __len__(self) -> int:
         """Return the number of frames."""
         return self.recording.count

@@ -65,7 +65,7 @@ class NpyFile(Movie):
 def _npy_header(path: Path) -> EvenFrames:
     with path.open("rb") as file:
         # numpy refuses to parse more than 10,000 bytes, but reads as many as a damaged header announces, up to 4 GB
-        head = io.BytesIO(file.read(2**16))
+        head, size = io.BytesIO(file.read(2**16)), file.seek(0, 2)
     try:
         version = np.lib.format.read_magic(head)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -77,7 +77,7 @@ def _npy_header(path: Path) -> EvenFrames:
         raise FrameError(
             f"{path} is stored in Fortran order; save it with numpy.save(file, numpy.ascontiguousarray(stack))"
         )
-    return EvenFrames(
+    header = EvenFrames(
         shape=(height, width),
         recording=Recording(count=count),
         start=head.tell(),
@@ -85,7 +85,8 @@ def _npy_header(path: Path) -> EvenFrames:
         stored_bits=8 * dtype.itemsize,
         order=dtype.str[0],
         stated=StoredFrame(kind="rgb" if channels else None),
-    ).checked(path)
+    )
+    return header.checked(path).noting_rest(size)
 
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".nxs")

@@ -113,8 +113,8 @@ def unpack_bits(packed: bytes | AnyArray, bits: int) -> AnyArray:
     Returns
     -------
     ndarray, shape (..., N), uint16
-        Groups of samples that end with a byte: 5 bytes hold 4 samples of 10 bits, 3 two of 12. A line that ends within
-        a group is filled up with zeros.
+        Groups of samples that end with a byte: 5 bytes hold 4 samples of 10 bits, 3 two of 12, 7 four of 14. A line
+        that ends within a group is filled up with zeros.
     """
     lines = np.frombuffer(packed, dtype=np.uint8) if isinstance(packed, bytes) else packed
     group = math.lcm(bits, 8)
@@ -124,10 +124,16 @@ def unpack_bits(packed: bytes | AnyArray, bits: int) -> AnyArray:
     values = np.empty((*groups.shape[:-1], group // bits), dtype=np.uint16)
     for sample in range(group // bits):
         byte, begin = divmod(sample * bits, 8)
-        both = groups[..., byte].astype(np.uint16) << 8 | groups[..., byte + 1]
-        values[..., sample] = both >> (16 - bits - begin) & (2**bits - 1)
+        over = -(begin + bits) % 8
+        joined: AnyArray = groups[..., byte].astype(np.uint16 if begin + bits <= 16 else np.uint32)
+        for part in range(byte + 1, byte + (begin + bits + over) // 8):
+            joined = joined << 8 | groups[..., part]
+        values[..., sample] = joined >> over & (2**bits - 1)
     return values.reshape(*lines.shape[:-1], -1)
 
+
+BROKEN_JPEG = ("Corrupt JPEG data", "Premature end of JPEG file", "Inconsistent progression sequence")
+"""How libjpeg's warnings begin (JWRN in its jerror.h) after which it goes on with invented samples."""
 
 _LOCK = threading.Lock()
 
@@ -285,6 +291,13 @@ class EvenFrames(MovieHeader):
         check_size(path, needed=self.size, stored=self.size)
         return self
 
+    def noting_rest(self, size: int) -> Self:
+        """Return the header with a remark where a file of `size` bytes goes on behind its frames."""
+        if (rest := size - self.start - self.recording.count * (self.size + self.gap)) <= 0:
+            return self
+        remark = f"it has {rest} bytes more than the {self.recording.count} frames that its header announces"
+        return replace(self, recording=replace(self.recording, remarks=(*self.recording.remarks, remark)))
+
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame."""
         with path.open("rb") as file:
@@ -383,6 +396,8 @@ def raw_frame(
         first = stored.values[..., :1]
         if (stored.values == first).all():  # one channel that was saved as three
             stored = StoredFrame(values=first[..., 0], bits=stored.bits)
+        elif stated.kind == "monochrome":  # a colour picture under one white light
+            stored = StoredFrame(values=stored.values[..., 1], bits=stored.bits)
     kind = _agreed("kind", [(None, stated.kind), (path, stored.kind)])
     if camera and kind and kind not in known:
         raise _differ("kind", (path if stated.kind is None else None, kind), (camera.name, " or ".join(known)))

@@ -6,20 +6,19 @@ ImageJ's hyperstacks and OME-TIFF are read as they store their frames and times.
 from __future__ import annotations
 
 import lzma
-import re
+import math
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from fractions import Fraction
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from xml.etree import ElementTree
 
 import numpy as np
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.data import SECOND, Integers, Recording, even_times, fraction
+from rgbmidic.frames.data import Integers, Recording
+from rgbmidic.frames.hyperstacks import Hyperstack
 from rgbmidic.frames.images import decode
 from rgbmidic.frames.source import FrameSource, Movie, remembered
 from rgbmidic.frames.stored import (
@@ -30,6 +29,7 @@ from rgbmidic.frames.stored import (
     check_count,
     check_size,
     damaged,
+    unpack_bits,
 )
 from rgbmidic.frames.tiff_pages import (
     UNCOMPRESSED,
@@ -52,12 +52,24 @@ TIFF_ENDINGS = (".tif", ".tiff")
 _BY_TIFFFILE: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
 """Compressions (deflate, LZMA) that tifffile undoes, without a limit, and what undoes them up to one."""
 _MIN_IS_WHITE, _PALETTE = 0, 3
+_PACKED = (10, 12, 14)
+"""Bits of samples that are stored without a gap; they have a white level of their own."""
+_MISSING = -1
+"""In place of the offset of a page that is announced, and that the list of pages does not lead to."""
 
 
 class TiffFile(FrameSource):
     """A TIFF file of one image with 1 or 3 channels; a table of colours is refused."""
 
     packages = ("tifffile",)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What else the header states that a user should know."""
+        try:
+            return _stack(self.path).recording.remarks
+        except FrameError:  # reported when it is read
+            return ()
 
     def _shape(self) -> tuple[int, int]:
         with _only_page(self.path) as page:
@@ -95,10 +107,11 @@ def _as_shown(values: AnyArray, page: tifffile.TiffPage, path: Path) -> StoredFr
         if values.dtype != np.uint8 or not (table // 256 == np.arange(table.shape[1])).all():
             raise FrameError(f"{path} shows its grey levels through a colour table; save it as a plain grey image")
     elif page.photometric == _MIN_IS_WHITE:
-        values = np.iinfo(values.dtype).max - values
+        values = values.dtype.type(2**page.bitspersample - 1) - values
     pattern = tag(page, Tag.CFA_PATTERN) or ()
     is_bayer = tag(page, Tag.CFA_REPEAT) == (2, 2) and set(pattern) <= {0, 1, 2}
-    return StoredFrame.plain(values, path, "".join("RGB"[channel] for channel in pattern if is_bayer) or None)
+    frame = StoredFrame.plain(values, path, "".join("RGB"[channel] for channel in pattern if is_bayer) or None)
+    return replace(frame, bits=page.bitspersample) if page.bitspersample in _PACKED else frame
 
 
 @contextmanager
@@ -114,9 +127,11 @@ def _only_page(path: Path) -> Iterator[tifffile.TiffPage]:
 
 def _check_page(page: tifffile.TiffPage, path: Path) -> None:
     """Refuse a page whose samples are no raw frame's or not all there, before anything is unpacked."""
-    if page.dtype is None or page.dtype.name not in ("uint8", "uint16"):
-        kind = page.dtype or f"{page.bitspersample}-bit"
-        raise FrameError(f"{path} has {kind} samples; allowed are unsigned 8 or 16 bit")
+    bits, integer = page.bitspersample, page.dtype is not None and page.dtype.kind == "u"
+    if not integer or bits not in ((8, 16, *_PACKED) if page.compression == UNCOMPRESSED else (8, 16)):
+        kind = page.dtype if bits in (8, 16, 32, 64) else f"{bits}-bit"
+        allowed = "unsigned 8 or 16 bit, and uncompressed 10, 12 or 14 bit"
+        raise FrameError(f"{path} has {kind or 'unknown'} samples; allowed are {allowed}")
     if not (page.imagelength and page.imagewidth and page.samplesperpixel):  # an entry that is damaged counts as 0
         told = f"{page.imagelength} rows of {page.imagewidth} pixels with {page.samplesperpixel} samples"
         raise damaged(path, f"its header announces {told}")
@@ -134,11 +149,32 @@ def _unpacked(page: tifffile.TiffPage, path: Path) -> AnyArray:
     if page.compression not in (UNCOMPRESSED, *_BY_TIFFFILE):
         name = getattr(page.compression, "name", page.compression)
         raise FrameError(f"{path} is stored in a way that is not read ({name}); save it as a plain uncompressed TIFF")
+    if page.bitspersample in _PACKED:
+        return _unpacked_bits(page, path)
     if page.compression in _BY_TIFFFILE:
         _check_unpacked(page, path)
     values = np.asarray(page.asarray())
     # where one plane lies after the other
     return np.moveaxis(values, 0, -1) if values.ndim == 3 and page.planarconfig == 2 else values
+
+
+def _unpacked_bits(page: tifffile.TiffPage, path: Path) -> AnyArray:
+    """Unpack samples (H, W, C) of 10, 12 or 14 bit, the highest bit first; every row begins with a byte (TIFF 6.0)."""
+    columns = page.imagewidth * page.samplesperpixel
+    line = -(-columns * page.bitspersample // 8)
+    if page.is_tiled or page.fillorder != 1 or (page.planarconfig == 2 and page.samplesperpixel > 1):
+        what = "in tiles, in planes or from the lowest bit on"
+        raise FrameError(f"{path} has packed samples of {page.bitspersample} bit {what}, which is not read")
+    needed, parts = page.imagelength * line, b""
+    with path.open("rb") as file:
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+            file.seek(offset)
+            parts += file.read(min(count, page.rowsperstrip * line, needed - len(parts)))
+    if len(parts) < needed:
+        raise damaged(path, f"its image data have {len(parts)} bytes, too few for its size")
+    lines = np.frombuffer(parts, dtype=np.uint8).reshape(page.imagelength, line)
+    values = unpack_bits(lines, page.bitspersample)[:, :columns]
+    return values.reshape(page.imagelength, page.imagewidth, page.samplesperpixel)
 
 
 def _by_opencv(page: tifffile.TiffPage, path: Path) -> AnyArray:
@@ -167,17 +203,12 @@ def _check_unpacked(page: tifffile.TiffPage, path: Path) -> None:
         raise damaged(path, f"its image data unpack to {total} bytes, too few for its size")
 
 
-_UNITS = {"s": 1, "sec": 1, "seconds": 1}
-_UNITS |= {"ms": 10**3, "msec": 10**3, "µs": 10**6, "us": 10**6, "usec": 10**6, "ns": SECOND}
-"""Of time, by how many make a second."""
-
-
 class TiffStack(Movie):
     """A TIFF file of several frames of one size, in the order of the file."""
 
     packages = ("tifffile",)
 
-    def _header(self) -> _Hyperstack:
+    def _header(self) -> _Pages:
         return _stack(self.path)
 
 
@@ -190,22 +221,18 @@ def is_tiff_stack(path: Path) -> bool:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Hyperstack(MovieHeader):
+class _Pages(MovieHeader):
     """Where the pages begin (one, where ImageJ stored all frames behind it), of which the first has the `shape`."""
 
     offsets: Integers
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame."""
-        import tifffile
-
-        if index >= len(self.offsets) > 1:
-            raise FrameError(f"{path}: its list of frames ends after {index - 1}: truncated or still being written")
-        count = self.recording.count
-        behind = len(self.offsets) == 1  # all frames lie behind the first, as ImageJ stores more than 4 GB
-        with opened_tiff(path) as tiff:
-            tiff.filehandle.seek(int(self.offsets[0 if behind else index]))
-            page = tifffile.TiffPage(tiff, index=0)
+        count, readable = self.recording.count, int((self.offsets != _MISSING).sum())
+        behind = len(self.offsets) == 1 and self.recording.count_is_certain  # as ImageJ stores more than 4 GB
+        if not behind and (index >= len(self.offsets) or self.offsets[index] == _MISSING):
+            raise FrameError(f"{path}: its list of frames ends after {readable - 1}: truncated or still being written")
+        with _page_at(path, int(self.offsets[0 if behind else index])) as page:
             _check_page(page, path)
             if (page.imagelength, page.imagewidth) != self.shape:
                 here = f"{page.imagelength} rows of {page.imagewidth} pixels"
@@ -220,50 +247,51 @@ class _Hyperstack(MovieHeader):
 
 
 @remembered
-def _stack(path: Path) -> _Hyperstack:
+def _stack(path: Path) -> _Pages:
     with regular(path).open("rb") as file:
         pages = PageList(file, path)
         offsets, ends_early = pages.offsets(path)
         entries, _ = pages.page(offsets[0]) or ({}, 0)
         text = pages.text(entries, Tag.DESCRIPTION)
         shape = (pages.value(entries, Tag.ROWS), pages.value(entries, Tag.COLUMNS))
-    images = re.search(r"^images=([0-9]{1,9})$", text, re.MULTILINE) if text.startswith("ImageJ=") else None
-    count = int(images[1]) if images and len(offsets) == 1 else len(offsets) + (ends_early and len(offsets) > 1)
+        samples = math.prod(shape) * (pages.value(entries, Tag.SAMPLES_PER_PIXEL) or 1)
+    stack, count, remarks = Hyperstack.parse(text, samples), len(offsets) + ends_early, list[str]()
+    if stack is None and "<OME" in text[:1000]:
+        remarks.append("its OME description cannot be read")
+    if stack and stack.by_imagej and len(offsets) == 1 < stack.count and (room := _room_behind(path, offsets[0])):
+        count = stack.count
+        if room > count:
+            remarks.append(f"its text announces {count} images, and it has room for {room}")
+    elif stack and ends_early and stack.count > len(offsets):
+        count, ends_early = stack.count, False
+        offsets += [_MISSING] * (count - len(offsets))
     check_count(path, count)
-    times = _imagej_times(text, count) if images else _ome_times(text, count)
-    return _Hyperstack(shape=shape, recording=Recording(count=count, times_ns=times), offsets=np.array(offsets))
+    order = stack.page_order if stack and len(offsets) == stack.count else [0]
+    if stack and (stack.count != count or sorted(order) != list(range(len(offsets)))):
+        what = f"its text announces {stack.count} images, it holds {count}: the text is not used"
+        stack, order, remarks = None, list(range(len(offsets))), remarks if ends_early else [*remarks, what]
+    recording = Recording(count=count, count_is_certain=not ends_early, remarks=tuple(remarks))
+    if stack:
+        times, planes = stack.times_ns, stack.planes
+        recording = replace(recording, times_ns=times, planes=planes, planes_in_words=stack.planes_in_words)
+        offsets = [offsets[page] for page in order]
+    return _Pages(shape=shape, recording=recording, offsets=np.array(offsets))
 
 
-def _imagej_times(text: str, count: int) -> Integers | None:
-    """Derive times from ImageJ's frame interval, where all images are frames in time."""
-    entries = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
-    others = {"channels", "slices"} & entries.keys()
-    if entries.get("frames", "" if others else str(count)) != str(count):
-        return None
-    interval = _seconds(entries.get("finterval", ""), entries.get("tunit", "s"))
-    return even_times(range(count), interval) if interval else None
+def _room_behind(path: Path, offset: int) -> int:
+    """Return for how many frames there is room from the samples of the only page on, as ImageJ stores more than 4 GB.
+
+    0 where none follows: ImageJ writes a page before its samples, and they end with the file.
+    """
+    with _page_at(path, offset) as page:
+        begin, size = min(page.dataoffsets, default=0), path.stat().st_size
+        return -(-(size - begin) // page.nbytes) if offset < begin and size > begin + page.nbytes > begin else 0
 
 
-def _ome_times(text: str, count: int) -> Integers | None:
-    """Derive times from OME's time increment or the time of every plane."""
-    if "<OME" not in text[:1000] or "<!ENTITY" in text:
-        return None
-    try:
-        pixels = ElementTree.fromstring(text.encode()).find(".//{*}Pixels")
-    except ElementTree.ParseError:
-        return None
-    if pixels is None or pixels.get("SizeT") != str(count):
-        return None
-    if increment := pixels.get("TimeIncrement"):
-        interval = _seconds(increment, pixels.get("TimeIncrementUnit", "s"))
-        return even_times(range(count), interval) if interval else None
-    planes = {plane.get("TheT"): plane for plane in pixels.iterfind("{*}Plane")}
-    each = [planes.get(str(index), pixels) for index in range(count)]
-    times = [_seconds(plane.get("DeltaT", ""), plane.get("DeltaTUnit", "s")) for plane in each]
-    known = [round(time * SECOND) for time in times if time is not None]
-    return np.array(known, dtype=np.int64) if len(known) == count else None
+@contextmanager
+def _page_at(path: Path, offset: int) -> Iterator[tifffile.TiffPage]:
+    import tifffile
 
-
-def _seconds(text: str, unit: str) -> Fraction | None:
-    number = fraction(text)
-    return None if number is None or unit not in _UNITS else number / _UNITS[unit]
+    with opened_tiff(path) as tiff:
+        tiff.filehandle.seek(offset)
+        yield tifffile.TiffPage(tiff, index=0)

@@ -25,11 +25,14 @@ from rgbmidic.settings import regular
 if TYPE_CHECKING:
     import tifffile
 
-# A file's faults come back as one FrameError; without a handler Python would print tifffile's log as well.
+# A file's faults come back as one FrameError, and tifffile's log of them would reach the terminal as well.
+logging.getLogger("tifffile").propagate = False
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 _HEADERS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 """Of TIFF and BigTIFF; several cameras' raws begin with II or MM, too, and are none."""
+_FIRST_OFFSET = 8
+"""Bytes of the header of a TIFF file, the shortest."""
 UNCOMPRESSED = 1
 """Code of the compression of samples that are not compressed."""
 
@@ -42,6 +45,7 @@ class Tag(IntEnum):
     ROWS = 257
     DESCRIPTION = 270
     ORIENTATION = 274
+    SAMPLES_PER_PIXEL = 277
     COLOUR_MAP = 320
     CFA_REPEAT = 33421
     CFA_PATTERN = 33422
@@ -169,6 +173,8 @@ def missing_data(page: tifffile.TiffPage, size: int) -> str | None:
         return f"the header announces image data up to byte {end}, the file has {size} bytes"
     if any(count == 0 for _, count in parts):
         return "a part of its image data has the length zero"
+    if any(offset < _FIRST_OFFSET for offset, _ in parts):
+        return "a part of its image data lies in the file's header"
     return None
 
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from rgbmidic._kernels import texture as kernels
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.illumination.mosaic_model import BLOCK, CHANNEL, MosaicModel, channel_means
+from rgbmidic.illumination.mosaic_model import BLOCK, CHANNEL, FAINTEST, MosaicModel, channel_means
 from rgbmidic.illumination.texture import LAGS, PAIRS, WHITE_ENERGY, LagProducts, TextureModel, fit_texture
 from rgbmidic.typing import FloatArray, FloatImage
 
@@ -27,8 +27,6 @@ MEAN_WIDTH, MOMENT_WIDTH = 8.0, 14.0
 """Standard deviation (px) of the windows over which means and moments are taken: several speckles wide."""
 LEAST = 0.001
 """Least channel-specific variance: how well two colours can agree."""
-FAINTEST = 0.02
-"""Least contrast of a light, relative to the largest one: what a filter is made for."""
 EQUALLY_APART = 0.2
 """Range (px) of the lights' displacement within the squares whose products of samples are taken together."""
 

@@ -29,7 +29,7 @@ import numpy.typing as npt
 from rgbmidic._kernels.illumination import unmix as unmix_kernel
 from rgbmidic._kernels.splines import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic.errors import CalibrationError, InputError
-from rgbmidic.illumination.images import IlluminationImages, fill_holes
+from rgbmidic.illumination.images import IlluminationImages, check_names, fill_holes
 from rgbmidic.illumination.linear import LinearChannels
 from rgbmidic.settings import regular, unique_keys
 from rgbmidic.typing import BoolArray, FloatArray
@@ -132,6 +132,7 @@ class Crosstalk:
 
     def __post_init__(self) -> None:
         """Check the values and convert them to their types."""
+        check_names(self.lights)
         matrix = np.asarray(self.matrix, dtype=np.float64)
         if matrix.ndim != 2 or matrix.shape[1] != len(self.lights) or matrix.shape[1] > matrix.shape[0]:
             raise CalibrationError(

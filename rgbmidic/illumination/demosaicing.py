@@ -47,7 +47,7 @@ from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
 from rgbmidic.illumination.mosaic_model import BLOCK, MosaicModel, channel_means
 from rgbmidic.illumination.prediction_filters import FilterTables, prediction_filters
-from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
@@ -169,10 +169,15 @@ def reconstruct(
     assert learnt is not None, "of the mosaic, where none is given"
     factors = colour_factors(moments, learnt, model)
     displacement = light_displacement(moments, factors, learnt)
+    if learnt.specific >= COLOURED:
+        # a coloured specimen has no texture in common that could tell how the channels see the lights
+        model = MosaicModel.of(None, None, values.shape)
+        factors = colour_factors(moments, learnt, model)
+        displacement = replace(displacement, values=np.zeros_like(displacement.values))
     frame = _Frame(
         mosaic=mosaic, model=model, moments=moments, factors=factors, glints=_per_tile(displacement.significant)
     )
-    if texture is None:
+    if texture is None and learnt.specific < COLOURED:
         learnt = replace(learnt, common=frame.shows_common_texture(learnt))
     mixing = np.eye(3) if mixing is None else mixing
     if learnt.common:
@@ -232,8 +237,10 @@ class _Frame:
         predict(padded, index, taps, size, ones, rows, zeros, rows, np.eye(3, dtype=np.float32), out)
         site = sampled_channels(self.mosaic.cfa, (rows, columns))
         sample = padded[pad : pad + rows, pad : pad + columns]
-        square = (np.take_along_axis(out, site[None], axis=0)[0] - sample) ** 2
-        return float(np.nanmean([np.nanmean(square[site == c]) / np.nanvar(sample[site == c]) for c in range(3)]))
+        difference = np.take_along_axis(out, site[None], axis=0)[0] - sample
+        finite = np.isfinite(difference)
+        squares = ([(part[finite & (site == c)] ** 2).sum() for c in range(3)] for part in (difference, sample))
+        return float(sum(error / max(whole, 1e-12) for error, whole in zip(*squares, strict=True)))
 
     def _filters(
         self,

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic._kernels.texture import CELLS, displacement_scores
-from rgbmidic.illumination.colour_factors import FAINTEST, ColourFactors, Moments, blurred, widened
+from rgbmidic.illumination.colour_factors import ColourFactors, Moments, blurred, widened
 from rgbmidic.illumination.images import frame_geometry, registration_basis
-from rgbmidic.illumination.mosaic_model import BLOCK
+from rgbmidic.illumination.mosaic_model import BLOCK, FAINTEST
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.typing import BoolArray, FloatArray
 

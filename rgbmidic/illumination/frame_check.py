@@ -213,8 +213,9 @@ def saturation_pile(samples: npt.NDArray[np.integer[Any]], white: float) -> floa
         make as frequent; None: it does not.
     """
     top = int(samples.max(initial=0))
-    count = np.count_nonzero(samples == top)
-    if top >= white or top < 8 or not 20 < count < samples.size:  # of a constant frame nothing is known
+    if top >= white or top < 8 or (count := np.count_nonzero(samples == top)) <= 20:
+        return None
+    if count == samples.size:  # a constant
         return None
     bits = int(np.bitwise_or.reduce(samples, axis=None))
     step = bits & -bits  # all samples are multiples of it

@@ -33,6 +33,19 @@ PARAMETERS = ("shift_x", "shift_y", "rotation", "scale", "radial")
 """Parameters of a light: px, px, rad (x towards y), relative magnification, relative magnification more at radius R."""
 
 
+def check_names(lights: Sequence[str]) -> None:
+    """Refuse names of lights that are no texts, are empty, or are the same.
+
+    Raises
+    ------
+    CalibrationError
+        A light has no name of its own.
+    """
+    texts = all(isinstance(name, str) and name.strip() for name in lights)
+    if not texts or len({*lights}) != len(lights):
+        raise CalibrationError(f"each light needs a name, different from the others'; given are {list(lights)}")
+
+
 def registration_basis(points: npt.ArrayLike, centre: tuple[float, float], radius: float) -> FloatArray:
     """Return the displacement (M, 2, 5) at points (x, y) of shape (M, 2) per unit of each of the `PARAMETERS`."""
     arm = np.asarray(points, dtype=np.float64) - np.asarray(centre)
@@ -68,6 +81,7 @@ class Registration:
 
     def __post_init__(self) -> None:
         """Check the values and convert them to their types."""
+        check_names(self.lights)
         count, terms = len(self.lights), len(PARAMETERS)
         parameters = np.asarray(self.parameters, dtype=np.float64)
         if parameters.shape != (count, terms) or not np.isfinite(parameters).all() or parameters[0].any():

@@ -25,6 +25,8 @@ BLOCK = 8
 """Side of the blocks (px) of the grid."""
 CHANNEL = (0, 1, 1, 2)
 """Channel of each kind of site: red, green in red rows, green in blue rows, blue."""
+FAINTEST = 0.02
+"""Least contrast of a light, relative to the largest one: what a filter is made for."""
 _COARSE = 4
 """Blocks over which the displacement changes so little that the energy of registered planes is interpolated."""
 
@@ -106,7 +108,7 @@ class MosaicModel:
         -------
         ndarray, shape (4, k)
         """
-        relative = np.maximum(contrast / contrast.max(), 0.02)
+        relative = np.maximum(contrast / max(contrast.max(), 1e-12), FAINTEST)
         rounded = np.exp2(np.round(8 * np.log2(relative)) / 8)
         return np.asarray(self.sites * rounded / (self.matrix @ rounded)[list(CHANNEL), None])
 

@@ -144,7 +144,7 @@ def reconstructed_lights(model: Reconstruction, crosstalk: Crosstalk, *, unmixed
     """
     height, width = model.factors.slope.shape[1:]
     level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in model.mean])
-    slope, light = model.factors.light_slope, np.tensordot(crosstalk.unmixing, level, axes=1)
+    slope, light = (np.tensordot(crosstalk.unmixing, seen, axes=1) for seen in (model.factors.slope, level))
     contrast = np.divide(slope, light, out=np.zeros_like(slope), where=light > 1e-3 * light.max())
     best = contrast.max(axis=0)
     relative = np.divide(contrast, best, out=np.ones_like(contrast), where=best > 0)
@@ -245,7 +245,10 @@ class Separation:
             raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
         elif known.crosstalk is None:
             what = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
-            raise ConfigurationError(f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk")
+            raise ConfigurationError(
+                f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk; of one white light, "
+                'state frames.kind = "monochrome"'
+            )
         else:
             images = _separated(linear[0], known, self.demosaic, self.texture, self.tables)
         return replace(images, registration=known.registration)

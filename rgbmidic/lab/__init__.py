@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rgbmidic._version import __version__
 from rgbmidic.errors import ResultError
-from rgbmidic.results.files import write_json, writing
+from rgbmidic.results.files import write_json, write_text, writing
 from rgbmidic.settings.conversion import plain
 
 if TYPE_CHECKING:
@@ -83,6 +83,6 @@ def write_findings(out: Path, files: Sequence[str], *contents: dict[str, Any] | 
             if isinstance(content, dict):
                 write_json(path, content)
             elif isinstance(content, str):
-                path.write_text(content, encoding="utf-8")
+                write_text(path, content)
             else:
                 save_figure(content, path)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.typing import BoolArray, FloatArray, IntArray
+from rgbmidic.typing import BoolArray, FloatArray, IntArray, as_numbers
 
 ROUNDING = 1e-4
 """What rounding leaves of a distance, as a fraction of the mesh's extent: single precision and the eight columns of
@@ -62,11 +62,11 @@ class FiniteElementMesh:
         for key, values, count in (
             ("points", points, len(points)),
             ("elements", elements, len(elements)),
-            ("node_numbers", np.array(self.node_numbers, dtype=np.int64), len(points)),
-            ("element_numbers", np.array(self.element_numbers, dtype=np.int64), len(elements)),
+            ("node_numbers", self.node_numbers, len(points)),
+            ("element_numbers", self.element_numbers, len(elements)),
         ):
-            if len(values) != count:
-                raise InputError(f"{self.name}: {key} needs {count} entries, not {len(values)}")
+            if "numbers" in key:
+                values = as_numbers(values, f"{self.name}: {key} needs {count} whole numbers", (count,), dtype=np.int64)
             values.setflags(write=False)
             object.__setattr__(self, key, values)
 
@@ -137,12 +137,10 @@ def oriented(
     points: npt.ArrayLike, elements: npt.ArrayLike, what: str
 ) -> tuple[FloatArray, npt.NDArray[np.int32], FloatArray]:
     """Copies of nodes and triangles, checked and of their types, with corners as the axes turn; and twice the areas."""
-    nodes = np.array(points, dtype=np.float64, order="C")
-    corners = np.array(elements, dtype=np.int32)
-    if nodes.ndim != 2 or nodes.shape[1] != 2 or corners.ndim != 2 or corners.shape[1] != 3 or not len(corners):
-        raise InputError(f"{what} has nodes (N, 2) and elements (E, 3), not {nodes.shape} and {corners.shape}")
-    if not np.isfinite(nodes).all() or corners.min() < 0 or corners.max() >= len(nodes):
-        raise InputError(f"{what}: nodes must be finite and elements must name existing nodes")
+    nodes = np.ascontiguousarray(as_numbers(points, f"{what} has finite nodes (N, 2)", (None, 2)))
+    corners = as_numbers(elements, f"{what} has elements (E, 3), indices of nodes", (None, 3), dtype=np.int32)
+    if not len(corners) or corners.min() < 0 or corners.max() >= len(nodes):
+        raise InputError(f"{what}: elements (E, 3) must be there and name existing nodes")
     area = cross(nodes, corners)
     corners[area < 0] = corners[area < 0][:, [0, 2, 1]]
     return nodes, corners, np.abs(area)

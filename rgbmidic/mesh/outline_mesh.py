@@ -17,7 +17,8 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.finite_elements import cross
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.mesh.region import FARTHEST
+from rgbmidic.typing import BoolArray, FloatArray, as_numbers
 
 EDGES = np.array([[0, 1], [1, 2], [2, 0]])
 """Corners of the edges of an element."""
@@ -189,9 +190,10 @@ def _crack_paths(
     """
     paths: list[FloatArray] = []
     for number, crack in enumerate(cracks):
-        corners = np.asarray(crack, dtype=np.float64)
-        if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 2 or not np.isfinite(corners).all():
-            raise InputError(f"mesh.cracks[{number}] is at least two finite corners (x, y) in px; given is {crack!r}")
+        needed = f"mesh.cracks[{number}] is at least two finite corners (x, y) in px, within {FARTHEST} px"
+        corners = as_numbers(crack, needed, (None, 2))
+        if len(corners) < 2 or np.abs(corners).max() > FARTHEST:
+            raise InputError(f"{needed}; given is {crack!r}")
         for part in _parts_within(corners, mask, size, number, constants.step):
             earlier = np.concatenate([np.empty((0, 2)), *paths])
             at_edge = constants.crowded * size

@@ -20,7 +20,7 @@ from rgbmidic.mesh.finite_elements import FiniteElementMesh
 from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
 from rgbmidic.text import uncertain
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, as_numbers
 
 logger = logging.getLogger(__name__)
 
@@ -86,9 +86,10 @@ class Placement:
         InputError
             Fewer than two pairs, or two at one place.
         """
-        given = np.array(pairs, dtype=np.float64)
-        if given.ndim != 2 or given.shape[1] != 4 or len(given) < 2 or not np.isfinite(given).all():
-            raise InputError(f"{where} is two or more pairs [x_mm, y_mm, x_px, y_px] of finite numbers, not {pairs!r}")
+        needed = f"{where} is two or more pairs [x_mm, y_mm, x_px, y_px] of finite numbers"
+        given = as_numbers(pairs, needed, (None, 4))
+        if len(given) < 2:
+            raise InputError(f"{needed}; given is {pairs!r}")
         for part, what in ((given[:, :2], "on the mesh"), (given[:, 2:], "on the image")):
             same = np.argwhere(np.triu((part[:, None] == part).all(axis=2), 1))
             if len(same):

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import logging
+import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import RegionError
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import BoolArray, FloatArray, as_numbers
 
 logger = logging.getLogger(__name__)
+
+FARTHEST = 1_000_000
+"""Coordinates of images are within so many px: OpenCV's fixed-point ones end at 8 million."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,14 +76,10 @@ class Region:
         RegionError
             Not four finite numbers with x0 < x1 and y0 < y1, or no overlap with the image.
         """
-        try:
-            corners = np.asarray(rectangle, dtype=np.float64)
-        except (TypeError, ValueError):
-            corners = np.array([])
-        if corners.shape != (4,) or not np.isfinite(corners).all():
-            raise RegionError(f"a rectangle is four finite numbers (x0, y0, x1, y1) in px; given is {rectangle!r}")
+        needed = "a rectangle is four finite numbers (x0, y0, x1, y1) in px"
+        corners = as_numbers(rectangle, needed, (4,), error=RegionError)
         x0, y0, x1, y1 = corners.tolist()
-        height, width = shape
+        height, width = shape = _image_shape(shape)
         if not (x0 < x1 and y0 < y1):
             raise RegionError(f"a rectangle (x0, y0, x1, y1) needs x0 < x1 and y0 < y1; given is {rectangle!r}")
         clipped = (max(x0, 0.0), max(y0, 0.0), min(x1, width - 1.0), min(y1, height - 1.0))
@@ -112,9 +113,7 @@ class Region:
         RegionError
             Fewer than three finite corners, or no overlap with the image.
         """
-        points = np.asarray(corners, dtype=np.float64)
-        if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3 or not np.isfinite(points).all():
-            raise RegionError(f"a polygon is at least three finite corners (x, y) in px; given is {corners!r}")
+        points, shape = _polygon(corners), _image_shape(shape)
         mask = _filled(points, shape)
         if not mask.any():
             raise RegionError(
@@ -138,11 +137,11 @@ class Region:
         Raises
         ------
         RegionError
-            Nothing is left.
+            A polygon is not three finite corners or more, or nothing is left.
         """
         if not len(holes):
             return self
-        inside = [_filled(np.asarray(corners, dtype=np.float64), self.mask.shape) for corners in holes]
+        inside = [_filled(_polygon(corners), self.mask.shape) for corners in holes]
         return Region(mask=self.mask & ~np.logical_or.reduce(inside))
 
     def part(self, rows: slice, columns: slice) -> Region:
@@ -185,9 +184,33 @@ class Region:
             The mask is empty or of another size.
         """
         pixels = np.asarray(mask)
-        if shape is not None and pixels.shape != shape:
+        if shape is not None and pixels.shape != (shape := _image_shape(shape)):
             raise RegionError(f"the mask is {pixels.shape[::-1]} px (width, height), the images are {shape[::-1]}")
         return cls(mask=pixels != 0)
+
+
+def _polygon(corners: npt.ArrayLike) -> FloatArray:
+    """Return the corners (M, 2) of a polygon.
+
+    Raises
+    ------
+    RegionError
+        They are not three or more, or beyond what fixed-point coordinates hold.
+    """
+    needed = f"a polygon is at least three finite corners (x, y) in px, within {FARTHEST} px"
+    points = as_numbers(corners, needed, (None, 2), error=RegionError)
+    if len(points) < 3 or np.abs(points).max() > FARTHEST:
+        raise RegionError(f"{needed}; given is {reprlib.repr(corners)}")
+    return points
+
+
+def _image_shape(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return the shape (H, W) of an image as integers; one that is none is a `RegionError`."""
+    needed = "the shape of an image is its numbers of rows and columns"
+    height, width = as_numbers(cast(Any, shape), needed, (2,), dtype=np.int64, error=RegionError).tolist()
+    if not (0 < height <= FARTHEST and 0 < width <= FARTHEST):
+        raise RegionError(f"{needed}; given is {shape!r}")
+    return height, width
 
 
 def _filled(points: FloatArray, shape: tuple[int, ...]) -> BoolArray:

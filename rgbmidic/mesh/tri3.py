@@ -109,7 +109,7 @@ class Tri3Mesh:
         """
         given: Any = element_size
         if not (isinstance(given, int | float | np.number) and math.isfinite(given) and given >= 4):
-            chosen = ': "auto" is for rgbmidic.measure' if given == "auto" else ""
+            chosen = ': "auto" is for rgbmidic.measure' if isinstance(given, str) and given == "auto" else ""
             raise InputError(f"element_size must be a number of at least 4 px; given is {given!r}{chosen}")
         # speckles are 3 to 5 px wide, and a pixel or two at each border serve the filters only
         if (width := region.width) < 10:
@@ -128,6 +128,28 @@ class Tri3Mesh:
     def centres(self) -> FloatArray:
         """Centre of each element, shape (E, 2), px."""
         return np.asarray(self.nodes[self.elements].mean(axis=1))
+
+    @cached_property
+    def centre_tree(self) -> cKDTree:
+        """Search tree of the `centres`."""
+        return cKDTree(self.centres)
+
+    def part(self, nodes: BoolArray) -> Tri3Mesh:
+        """Return the mesh of some nodes (N,) and of the elements between them, with their `sizes` in the whole.
+
+        Parameters
+        ----------
+        nodes : ndarray, shape (N,), bool
+            The nodes of the part.
+
+        Returns
+        -------
+        Tri3Mesh
+        """
+        number, kept = np.cumsum(nodes, dtype=np.int32) - 1, nodes[self.elements].all(axis=1)
+        part = Tri3Mesh(nodes=self.nodes[nodes], elements=number[self.elements[kept]])
+        vars(part).update(size=self.size, sizes=self.sizes[nodes], is_graded=self.is_graded)
+        return part
 
     @cached_property
     def copies(self) -> npt.NDArray[np.int32]:

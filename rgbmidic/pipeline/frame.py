@@ -200,6 +200,8 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         if plan.reference_motion > SUITABILITY.blur:  # of the reference, whatever else a frame shows
             causes = [unsteady(plan.reference_motion)]
         solution = replace(solution, reason="; ".join(causes))
+    if solution.disagreement:
+        warnings.append(solution.disagreement)
     key = place % STRIDE == 0 or place == len(plan.series.chosen) - 1
     if (settings.mesh.error is True or (settings.mesh.error == "key" and key)) and solution.measured.any():
         with stage("conclusion"):
@@ -214,7 +216,6 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         warnings.append("becomes the reference of those after it")
     warnings += _blur_warning(plan, index, start, solution)
     reflection = images.reflection_index(step, here)
-    samples = (there,) if isinstance(there, IlluminationImages) else there
     return {
         "solution": kept,
         "warnings": warnings,
@@ -228,8 +229,14 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         "reflection_thumbnail": None if reflection is None else _in_bytes(reflection),
         "inputs": inputs,
         "machine": machine(),
-        "checksum": zlib.crc32(b"".join(one.values.tobytes() for one in samples)),
+        "checksum": checksum(there),
     }
+
+
+def checksum(state: RawState) -> int:
+    """Return the CRC-32 of the samples of a state."""
+    samples = (state,) if isinstance(state, IlluminationImages) else state
+    return zlib.crc32(b"".join(one.values.tobytes() for one in samples))
 
 
 def _causes(

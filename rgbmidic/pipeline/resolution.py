@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from rgbmidic.correlation import Deformed, Solution, Start, Status, discretisation_error, track
-from rgbmidic.correlation.recovery import quadratic_fit
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionError, RgbmidicError
 from rgbmidic.fields import NodalCovariance, Places, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
@@ -157,21 +156,11 @@ def solved(plan: Plan, deformed: Deformed, start: FloatArray | None) -> Solution
 
 
 def _field_at(mesh: Tri3Mesh, solution: Solution, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Displacement and strain (P, 5) at points (P, 2), and their noise without the misfit of the elements.
-
-    They follow the quadratics through the nodes around each node (`rgbmidic.fields.at_pixels`).
-    """
-    values = np.hstack([solution.displacement, solution.strain])
-    used = np.asarray(np.isfinite(values)[mesh.elements].all(axis=(1, 2)))
-    _, x, y, xx, xy, yy = (operator @ np.nan_to_num(values) for operator in quadratic_fit(mesh, used))
-    places = Places.of(mesh, points)
-    node, weight = mesh.elements[places.element], places.barycentric
-    dx, dy = np.moveaxis(points[:, None] - mesh.nodes[node], -1, 0)[..., None]
-    bent = xx[node] * dx * dx / 2 + xy[node] * dx * dy + yy[node] * dy * dy / 2
-    out = np.einsum("pc,pci->pi", weight, values[node] + x[node] * dx + y[node] * dy + bent)
-    nodal = np.hstack([solution.displacement_std, solution.strain_std])[node]
-    noise = np.sqrt(np.einsum("pc,pci->pi", weight, nodal**2))
-    return np.where(places.inside[:, None] & used[places.element][:, None], out, np.nan), noise
+    """Displacement and strain (P, 5) at points (P, 2), and their noise without the misfit of the elements."""
+    places, nodal = Places.of(mesh, points), np.hstack([solution.displacement_std, solution.strain_std])
+    corners = mesh.elements[places.element]
+    noise = np.sqrt(np.einsum("pc,pci->pi", places.barycentric, nodal[corners] ** 2))
+    return places.read(np.hstack([solution.displacement, solution.strain])), noise
 
 
 def _apart(

@@ -18,7 +18,7 @@ from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, following, open_workers, rank_of
-from rgbmidic.pipeline.frame import Measured, Updated, messages, read_state
+from rgbmidic.pipeline.frame import Measured, Updated, checksum, messages, read_state
 from rgbmidic.pipeline.objects import check_object, check_type, describe
 from rgbmidic.pipeline.plan import Plan, dependants
 from rgbmidic.pipeline.resolution import Progress, choose, refine
@@ -36,7 +36,7 @@ logger = logging.getLogger(__name__)
 
 _OF_NODES = {
     array: [one.name for one in QUANTITIES.values() if one.source.startswith(f"{array}.")]
-    for array in ("displacement", "displacement_std", "strain", "strain_std")
+    for array in ("displacement", "displacement_std", "bias_std", "strain", "strain_std")
 }
 """Quantities of a frame that it makes a reference with, as columns of its solution's arrays."""
 
@@ -157,7 +157,7 @@ def measure(
         for line in of_frames(texts, origin.names):
             logger.warning("%s", line)
         with collected() as together:
-            _tell_repeated(store, places, origin.names)
+            _tell_repeated(plan, store, places, origin.names)
         if frames is None:
             store.finish([text for _, text in together])
     return Result.open(out, partial=frames is not None, check=False)
@@ -262,11 +262,23 @@ def _take_back(plan: Plan, store: ResultStore, names: Sequence[str], *, retry_fa
     store.discard({*lost, *dependants([*changed, *readable], tries)})
 
 
-def _tell_repeated(store: ResultStore, places: range, names: Sequence[str]) -> None:
-    """Warn of frames with the samples of the frame before, bit for bit."""
+def _tell_repeated(plan: Plan, store: ResultStore, places: range, names: Sequence[str]) -> None:
+    """Warn of frames with the samples of the frame before or of the reference, bit for bit."""
     sums = [kept["checksum"] for kept in store.table().each(["checksum"], places)]
     pairs = zip(places[1:], sums[1:], sums, strict=False)
     repeated = [place for place, mine, before in pairs if mine == before != NO_CHECKSUM]
+    chosen, references = plan.series.chosen, plan.settings.frames.reference
+    measured = dict(zip(chosen[places.start : places.stop], sums, strict=True))
+    with suppress(FrameError):
+        of_reference = {measured.get(one) or checksum(read_state(plan, one, plan.window)[0]) for one in references}
+        copies = [place for place, mine in zip(places, sums, strict=True) if mine in of_reference - {NO_CHECKSUM}]
+        copies = [place for place in copies if chosen[place] not in references and place not in repeated]
+        if copies:
+            logger.warning(
+                "frames are the reference, bit for bit, which camera noise makes impossible; their displacement of 0 "
+                "is not measured: %s; were frames lost and filled up, or files copied?",
+                listed(copies, names),
+            )
     if repeated:
         what = "all frames repeat" if len(repeated) == len(places) - 1 else "frames that repeat"
         logger.warning(

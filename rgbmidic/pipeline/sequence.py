@@ -114,8 +114,8 @@ def correlate(
         region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
     mesh = Tri3Mesh.from_region(region, element_size, cracks)
     cracked = len(mesh.crack_edges) > 0
-    if not (normalise in (None, "auto") or isinstance(normalise, int | float)):
-        raise InputError(f'normalise must be a width in px or "auto", not {normalise!r}')
+    if normalise is not None:
+        sections.IlluminationSettings(normalise=normalise)  # which checks it
     sigma, solver = grey_levels(0.0 if normalise is None else normalise, solver_settings(options), cracked=cracked)
     if sigma:
         f, g = (divide_by_local_mean(stack, sigma, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
@@ -129,6 +129,8 @@ def correlate(
         solution = track(first, second.result(), Start(displacement=None), solver, method)
     else:
         solution = solve(first, second.result(), start, solver, method)
+    if solution.disagreement:
+        logger.warning("%s", solution.disagreement)
     if mesh_error:
         solution = discretisation_error(first, second.result(), solution, solver, method)
     return fill(mesh, solution, solver.fill) if solver.fill else solution
@@ -241,6 +243,8 @@ def measure_sequence(
         The settings contradict themselves or the objects, or the reference is not usable.
     """
     check_type("settings", settings, TestSettings | None, "a TestSettings")
+    if not np.iterable(states):
+        raise InputError(f"the states are images, one after the other, not {states!r}")
     remaining = iter(states)
     own = reference is None
     if own and (reference := next(remaining, None)) is None:
@@ -248,8 +252,11 @@ def measure_sequence(
     latest = _Latest(reference=reference, light_images=settings is None)
     mask = region if isinstance(region, Region) else None
     if settings is None:
-        height, width = np.shape(getattr(reference, "values", reference))[-2:]
-        corners = (0, 0, width - 1, height - 1) if region is None or mask is not None else tuple(cast(Any, region))
+        if np.ndim(values := getattr(reference, "values", reference)) < 2:
+            raise InputError(f"the reference is an image (H, W) or one of each light (k, H, W), not {reference!r}")
+        height, width = np.shape(values)[-2:]
+        stated: Any = (0, 0, width - 1, height - 1) if region is None or mask is not None else region
+        corners = tuple(stated) if np.iterable(stated) else stated
         settings = TestSettings(
             frames=sections.FrameSettings(path=(), update_reference=update_reference),
             region=sections.RegionSettings(rectangle=corners),
@@ -307,6 +314,7 @@ class _Live:
 
     def __init__(self, plan: Plan) -> None:
         self._plan, self._starts, self._checksum = plan, dict[int, Start](), NO_CHECKSUM
+        self._of_reference = set[int]()
         self._updates: dict[tuple[int, ...], ReferenceUpdate] = {(): ReferenceUpdate.none(plan.reference)}
         self.solution: Solution
 
@@ -330,6 +338,10 @@ class _Live:
         checksum = record.values["checksum"]
         if checksum == self._checksum != NO_CHECKSUM:
             logger.warning("state %d repeats the one before, bit for bit", place)
+        elif plan.series.chosen[place] in plan.settings.frames.reference:
+            self._of_reference.add(checksum)
+        elif checksum in self._of_reference - {NO_CHECKSUM}:
+            logger.warning("state %d is the reference, bit for bit: its displacement of 0 is not measured", place)
         self._checksum = checksum
         for text in messages(record.values):
             logger.warning("state %d: %s", place, text)

@@ -8,6 +8,7 @@ unless it can itself what a series of files can.
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -25,6 +26,8 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.pipeline.objects import class_name, describe
 from rgbmidic.settings import FrameSettings, TestSettings
+
+logger = logging.getLogger(__name__)
 
 
 class FrameSequence(Protocol):
@@ -105,6 +108,11 @@ class SourceSeries:
         times = getattr(self.source, "times_ns", None)
         return Recording(count=len(self), times_ns=None if times is None else np.asarray(times, dtype=np.int64))
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a user should know of the times."""
+        return tuple(f"{class_name(self.source)}: {remark}" for remark in self.recording.remarks)
+
     def read(self, index: int, window: Window | None = None) -> RawState:
         """State `index`: raw frames, or one image per light.
 
@@ -175,7 +183,7 @@ class SourceSeries:
                 f"{where} has masked samples, which a raw frame cannot have: give it saturated there, or images of the "
                 "lights as floats"
             )
-        if kind not in "uif" or values.ndim not in (2, 3):
+        if kind not in "uif" or values.ndim not in (2, 3) or not values.size:
             raise FrameError(
                 f"{where} is {values.dtype} of shape {values.shape}; allowed are whole numbers (H, W) or (C, H, W), "
                 "floats (H, W) or (k, H, W), Mosaic, ChannelFrame and IlluminationImages"
@@ -215,6 +223,13 @@ def open_frames(settings: TestSettings, source: FrameSequence | Series | None, c
     FrameError
         A reference frame, or the first or last frame, does not exist or cannot be read.
     """
+    series = _opened(settings, source, camera)
+    for remark in series.remarks:
+        logger.warning("%s", remark)
+    return series
+
+
+def _opened(settings: TestSettings, source: FrameSequence | Series | None, camera: Camera | None) -> Series:
     stated = settings.frames
     if source is None:
         return open_series(stated, settings.base, camera)

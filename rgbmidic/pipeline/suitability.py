@@ -95,7 +95,8 @@ SUITABILITY = SuitabilityConstants()
 def light_levels(images: IlluminationImages, region: Region) -> dict[str, float]:
     """Median grey level of each light in the region, as a fraction of the full scale; 0 where nothing is usable."""
     known = (light[np.isfinite(light)] for light in images.values[:, region.mask])
-    medians = (float(np.median(light)) / images.full_scale if light.size else 0.0 for light in known)
+    usable = images.full_scale > 0
+    medians = (float(np.median(light)) / images.full_scale if light.size and usable else 0.0 for light in known)
     return dict(zip(images.names, medians, strict=True))
 
 

@@ -267,6 +267,9 @@ def _draw_quantities(axis: Axes, times: FloatArray, quantities: Sequence[History
         drawn.append(values[np.isfinite(values)])
         if std is not None:
             axis.fill_between(times, values - 2 * std, values + 2 * std, color=line.get_color(), alpha=0.2, linewidth=0)
+    named = sum(not str(line.get_label()).startswith("_") for line in axis.lines)
+    if step > 1:
+        axis.plot([], [], linestyle="none", label=f"and {len(colours) - named} more")
     known = np.concatenate(drawn)
     if known.size and np.ptp(known) > 0:
         axis.set_ylim(known.min() - 0.1 * np.ptp(known), known.max() + 0.1 * np.ptp(known))
@@ -362,7 +365,8 @@ def wave_text(profile: Profile, wave: Wave) -> str:
     if unit == "mm/s":
         speed, std, unit = speed / 1000, std / 1000, "m/s"
     fit = f"chi-square {front.chi_square:.3g} of {front.freedom}"
-    return f"{wave.what} of {profile.field.symbol}: {uncertain(speed, std, unit)} ({fit})"
+    level = f" at {wave.level}" if wave.what == "front" else ""
+    return f"{wave.what} of {profile.field.symbol}{level}: {uncertain(speed, std, unit)} ({fit})"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -18,7 +18,7 @@ from rgbmidic.report.gallery import REPORT
 from rgbmidic.report.noise_floor import noise_floor
 from rgbmidic.report.page import render
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, Result, speckle_diameter
-from rgbmidic.results.files import check_file, write_complete
+from rgbmidic.results.files import check_file, write_text
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings, SetupSettings, TestSettings
@@ -160,7 +160,7 @@ def write_report(
         endings={word: int((ends == code).sum()) for code, word in enumerate(QUANTITIES["status"].codes)},
         troubled=list(zip((result.names[index] for index in odd), result.each("reason", odd), strict=True)),
     )
-    write_complete(out, lambda file: file.write(text.encode()))
+    write_text(out, text)
 
 
 def _frame_rate(physical: Physical) -> tuple[float | None, str]:
@@ -217,4 +217,4 @@ def write_batch_page(header: Sequence[str], rows: Sequence[Sequence[str]], path:
         report = Path(folder) / REPORT
         links.append(quote(report.relative_to(path.parent).as_posix()) if folder and report.is_file() else "")
     text = render("batch.html", header=header, rows=rows, links=links, version=__version__)
-    write_complete(path, lambda file: file.write(text.encode()))
+    write_text(path, text)

@@ -8,7 +8,6 @@ from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from rgbmidic.report import style
 from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Maps, Quantity, Result
@@ -160,16 +159,17 @@ class MapDrawer:
         self.maps, self.result, self._dpi = maps, (result := maps.result), dpi
         self._unit, self._factor = maps.physical.axes
         self._figures: dict[int, Figure] = {}
-        self._mesh = Triangulation(result.nodes[:, 0], result.nodes[:, 1], result.elements)
         low, high = result.nodes.min(axis=0), result.nodes.max(axis=0)
         step = float((high - low).max()) / 450  # as many pixels as the panels of two maps have at 150 dpi
         x, y = (np.arange(start + step / 2, end, step) for start, end in zip(low, high, strict=True))
-        self._places = np.meshgrid(x, y)
+        self._grid = np.meshgrid(x, y)
         self._extent = (low[0], low[0] + step * len(x), low[1] + step * len(y), low[1])
         # matplotlib finds elements on meshes without two nodes at one place: those of a crack's sides count as one
         nodes, place = np.unique(result.nodes, axis=0, return_inverse=True)
         closed = Triangulation(nodes[:, 0], nodes[:, 1], place.reshape(-1)[result.elements])
-        self._element: npt.NDArray[np.int32] = np.asarray(closed.get_trifinder()(*self._places), dtype=np.int32)
+        self._points = np.stack(self._grid, axis=-1)
+        element = np.asarray(closed.get_trifinder()(*self._grid), dtype=np.int64).ravel()  # -1: of none
+        self._places = maps.places(self._points.reshape(-1, 2), element)
 
     def discretisation(self, frame: int) -> Figure | None:
         """Draw noise and discretisation error together, and where a finer mesh is needed.
@@ -243,9 +243,15 @@ class MapDrawer:
                 self._show(axis, values, norm, field)
                 axis.set_title(style.literal(field.label))
                 if hatched and np.isfinite(uncertainty).any():
-                    doubtful = self._raster(np.abs(values) - 2 * uncertainty)
+                    doubtful = self._places.linear(np.abs(values) - 2 * uncertainty)
                     with np.errstate(invalid="ignore"):
-                        axis.contourf(*self._places, doubtful, levels=[-np.inf, 0], hatches=["////"], colors="none")
+                        axis.contourf(
+                            *self._grid,
+                            doubtful.reshape(self._grid[0].shape),
+                            levels=[-np.inf, 0],
+                            hatches=["////"],
+                            colors="none",
+                        )
         return figure
 
     def fractions(self, frame: int) -> Figure:
@@ -388,19 +394,17 @@ class MapDrawer:
             style.freeze_axes(figure, self._dpi)
         return figure
 
-    def _raster(self, values: FloatArray, *, stepped: bool = False) -> FloatArray:
-        """Interpolate a nodal field, linear in each element as in the solve; NaN where one of its nodes has no data.
+    def _raster(self, values: FloatArray, field: Quantity) -> FloatArray:
+        """Evaluate a nodal field between the nodes; NaN where one of those around has no data.
 
         Where values between nodes mean nothing it is that of the nearest one.
         """
         from scipy.spatial import cKDTree
 
-        gradients = self._mesh.calculate_plane_coefficients(values)
-        x, y, constant = np.concatenate([gradients, np.full((1, 3), np.nan)])[self._element].transpose(2, 0, 1)
-        picture = x * self._places[0] + y * self._places[1] + constant  # of no element, -1: NaN, the last row
-        if stepped:
-            points = np.stack(self._places, axis=-1)
-            picture = np.where(np.isfinite(picture), values[cKDTree(self.result.nodes).query(points)[1]], np.nan)
+        read = self._places.read if field.signed else self._places.linear
+        picture = read(values).reshape(self._grid[0].shape)
+        if field.stepped:
+            picture = np.where(np.isfinite(picture), values[cKDTree(self.result.nodes).query(self._points)[1]], np.nan)
         return np.asarray(picture)
 
     def _show(
@@ -416,7 +420,7 @@ class MapDrawer:
             return
         codes = len(field.codes)
         colours = ListedColormap(style.STATUS_COLOURS[:codes]) if codes else field_colours(field)
-        picture = self._raster(values, stepped=field.stepped)
+        picture = self._raster(values, field)
         axis.imshow(picture, extent=self._extent, cmap=colours, norm=norm, interpolation="nearest")
         if bar:
             style.add_colour_bar(axis, norm, colours, shown=known, names=field.codes)

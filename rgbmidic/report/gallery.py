@@ -23,7 +23,7 @@ from rgbmidic.report.figures import (
     spread,
 )
 from rgbmidic.results import Maps, Result
-from rgbmidic.results.files import writing
+from rgbmidic.results.files import remove_parts, writing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -82,6 +82,7 @@ def write_figures(
     folder, result = Path(folder), maps.result
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
+        remove_parts(folder, "*")
     frames = _shown(result) if frames is None else frames
     for frame in frames:
         result.frame(frame)  # an error of one is raised before the first picture
@@ -137,6 +138,7 @@ def write_maps(
         maps.read(name, frame)  # an error of one is raised before the first picture
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
+        remove_parts(folder, "*")
     files = [_file(folder, f"map_{name.replace(' ', '_')}", frame) for name, frame in pictures]
     for file, (name, frame) in zip(files, pictures, strict=True):
         style.save_figure(drawer.fields(frame, [name], std=True, hatched=hatched), file)

@@ -353,10 +353,11 @@ class _Canvas:
         for (rows, columns), part, packed in zip(self._boxes, self._panels, self._packed, strict=True):
             read = movie.maps.read(part.field.name, frame)
             panel = np.empty(self._size, dtype=np.uint32)
-            places = ((read.moved if movie.images is not None else result.nodes) - self._first).T / self._step
-            x, y = (np.ascontiguousarray(axis, dtype=np.float64) for axis in places)
+            nodes = ((read.moved if movie.images is not None else result.nodes) - self._first) / self._step
+            drawn, elements = movie.maps.drawn(part.field, np.column_stack([nodes, read.values]))
+            x, y, values = np.ascontiguousarray(drawn.T)
             paint_field(
-                panel, grey, x, y, result.elements, read.values, *map(float, part.ends), packed, self._grey_part,
+                panel, grey, x, y, elements, values, *map(float, part.ends), packed, self._grey_part,
                 part.field.stepped,
             )  # fmt: skip
             page[rows, columns] = panel

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.results.files import writing
+from rgbmidic.results.files import write_complete
 from rgbmidic.typing import AnyArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:
@@ -269,12 +269,17 @@ def save_figure(figure: Figure, path: Path | str, *, dpi: int = DPI) -> None:
 
     Raises
     ------
+    InputError
+        There is no such format.
     ResultError
         The file cannot be written.
     """
-    with writing(path):
-        options: dict[str, Any] = {"pil_kwargs": _PNG} if Path(path).suffix == ".png" else {}
-        figure.savefig(path, dpi=dpi, **options)
+    path = Path(path)
+    form, formats = path.suffix[1:], figure.canvas.get_supported_filetypes()
+    if form not in formats:
+        raise InputError(f"{path} cannot be written: a figure is one of .{', .'.join(formats)}")
+    options: dict[str, Any] = {"pil_kwargs": _PNG} if form == "png" else {}
+    write_complete(path, lambda file: figure.savefig(file, format=form, dpi=dpi, **options))
 
 
 def embedded(figure: Figure, *, dpi: int = PAGE_DPI) -> str:

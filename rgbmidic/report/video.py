@@ -66,8 +66,9 @@ def video(file: BinaryIO, pages: Iterator[Page], fps: float, encoder: list[str],
 def _within(seconds: float, act: Callable[[], Any], late: Callable[[], object]) -> Any:
     """Call `act`; `late` is called where that takes longer, and lets it end."""
     timer = Timer(seconds, late)
-    timer.start()
+    timer.daemon = True  # an interrupted program does not wait for it
     try:
+        timer.start()
         return act()
     finally:
         timer.cancel()

@@ -15,6 +15,7 @@ from typing import Self
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.results.alignment import MIN_CORRELATION, MIN_FRAMES, Alignment
 from rgbmidic.settings import regular
 from rgbmidic.typing import FloatArray
 
@@ -25,8 +26,6 @@ _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 _NEWTONS = {"N": 1.0, "kN": 1e3}
 _DECIMAL = re.compile(r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:e[+-]?\d+)?|nan", re.IGNORECASE | re.ASCII)
 _UNIT = re.compile(r".*[\s_(\[](kN|N)[)\]]?")
-_FEWEST, _ALIKE = 8, 0.7
-"""Values that an alignment needs at least, and the correlation coefficient: half of the variance explained (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -157,7 +156,8 @@ class Channels:
         """Find the offset at which a channel correlates best with a history.
 
         Of every offset that leaves half of the frames within the channel's times, the largest absolute correlation
-        coefficient of the channel, interpolated at the frames, with the history counts.
+        coefficient of the channel, interpolated at the frames, with the history counts. Another that correlates as well
+        is named in a warning.
 
         Parameters
         ----------
@@ -171,8 +171,9 @@ class Channels:
         channels : Channels
             With that offset.
         std : float
-            Its standard uncertainty in seconds, from what the fit of the channel to the history leaves as noise, taken
-            as independent from frame to frame.
+            Its standard uncertainty in seconds, from what the fit of the channel to the history leaves as noise
+            (`Alignment.std`), and from the interval of the channel: how far the offsets differ that every other of its
+            values gives, taken as the width of a uniform distribution.
         coefficient : float
             The correlation coefficient.
 
@@ -181,40 +182,27 @@ class Channels:
         InputError
             There is no such channel, too little of the history is known, or the two do not correlate.
         """
-        from scipy.optimize import minimize_scalar  # half a second to import
-
         signal, there = self.named(name), np.isfinite(values) & np.isfinite(times)
         at, wanted = times[there], values[there]
-        if len(at) < _FEWEST or not np.ptp(wanted) > 0:
+        if len(at) < MIN_FRAMES or not np.ptp(wanted) > 0 or not np.nanstd(signal) > 0:
             raise InputError(f"{len(at)} values of the history are too few, or constant, to align {name} with")
-        least = len(at) // 2
-
-        def fit(offset: float) -> tuple[float, float]:
-            """Correlation coefficient and standard uncertainty of the offset."""
-            moved = np.interp(at, self.times + offset, signal, np.nan, np.nan)
-            used = np.isfinite(moved)
-            if used.sum() < max(least, _FEWEST) or not np.ptp(moved[used]) > 0:
-                return 0.0, math.nan
-            coefficient = float(np.corrcoef(moved[used], wanted[used])[0, 1])
-            slope = coefficient * np.std(wanted[used]) / np.std(moved[used])
-            noise = np.var(wanted[used]) * (1 - coefficient**2)
-            steep = np.gradient(moved[used], at[used]) * slope
-            return coefficient, float(np.sqrt(noise / max((steep**2).sum(), np.finfo(float).tiny)))
-
-        step = float(np.median(np.diff(at))) / 2
-        grid = np.arange(at[least] - self.times[-1], at[-least - 1] - self.times[0] + step, step)
-        scores = [abs(fit(offset)[0]) for offset in grid]
-        best = float(grid[int(np.argmax(scores))]) if scores else 0.0
-        offset = float(
-            minimize_scalar(lambda x: -abs(fit(x)[0]), bounds=(best - step, best + step), method="bounded").x
+        whole, *halves = (
+            Alignment.of(self.times[part], signal[part], at, wanted)
+            for part in (slice(None), slice(None, None, 2), slice(1, None, 2))
         )
-        coefficient, std = fit(offset)
-        if not abs(coefficient) > _ALIKE:
+        offsets, coefficients = whole.coefficients()
+        offset = whole.refined(offsets[np.argmax(np.abs(coefficients))], max(whole.intervals))
+        coefficient = whole.correlation(offset)
+        if not abs(coefficient) > MIN_CORRELATION:
             raise InputError(
-                f"the channel {name} of {self.path} correlates with the history by {coefficient:.2f} at best, {_ALIKE} "
-                "is needed to align them: state channels.offset"
+                f"the channel {name} of {self.path} correlates with the history by {coefficient:.2f} at best, "
+                f"{MIN_CORRELATION} is needed to align them: state channels.offset"
             )
-        return self.shifted(offset), std, coefficient
+        if len(others := whole.others(offsets, coefficients)):
+            text = "the channel %s of %s correlates as well with other offsets of its clock, such as %.6g s"
+            logger.warning(f"{text}: state channels.offset", name, self.path, others[0])
+        even, odd = (half.refined(offset, max(half.intervals)) for half in halves)
+        return self.shifted(offset), math.hypot(whole.std(offset), (even - odd) / math.sqrt(12)), coefficient
 
     def at(self, times: FloatArray) -> dict[str, FloatArray]:
         """Interpolate each channel linearly at the times (T,) of the frames; NaN beyond its values.

@@ -67,6 +67,20 @@ class Claim:
             f"give another folder, or delete {name} if that run is dead"
         )
 
+    def check(self) -> None:
+        """Refuse to write into a folder that no longer has this claim: another one lies in its place.
+
+        Raises
+        ------
+        ResultError
+            The claim is gone.
+        """
+        if not self.file.exists():
+            raise ResultError(
+                f"{self.file.parent} was replaced or emptied while this run wrote into it (its {self.file.name} is "
+                "gone); what is there now stays as it is"
+            )
+
     def release(self) -> None:
         """Remove the claim, so that other processes can write the frames."""
         if self.process == os.getpid():

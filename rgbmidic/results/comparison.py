@@ -25,12 +25,12 @@ import scipy.sparse as sp
 
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.errors import InputError
-from rgbmidic.fields import NodalCovariance, StrainGauges, strain_of_gradient
+from rgbmidic.fields import NodalCovariance, Places, StrainGauges, strain_of_gradient
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh
 from rgbmidic.results.physical import frame_times, rectification_of, shared_part
 from rgbmidic.results.quantities import FAILED
 from rgbmidic.results.result import Result
-from rgbmidic.results.simulation import Levelling, Simulation, places_among, reading
+from rgbmidic.results.simulation import Levelling, Simulation, places_among
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
@@ -93,14 +93,13 @@ class Fit:
         simulated.
     chi_square
         Of what the best multiple, shift and rotation leave, per degree of freedom.
-    template : ndarray, shape (2, N)
-        The simulation without a rigid motion over the standard uncertainty, at the measurement's nodes.
     projection, information
-        Sums of the template times the measured displacement over its uncertainty, and times itself: their quotient is
-        the scale.
+        Sums of the simulation without a rigid motion, over the standard uncertainty, times the measured displacement
+        over the same, and times itself: their quotient is the scale.
+    errors : ndarray, shape (2, R)
+        Errors of the projection of u and v, see `NodalCovariance.errors`.
     """
 
-    template: FloatArray
     scale: float = math.nan
     scale_std: float = math.nan
     rigid: FloatArray = field(default_factory=lambda: np.full(3, math.nan))
@@ -108,6 +107,7 @@ class Fit:
     chi_square: float = math.nan
     projection: float = 0.0
     information: float = 0.0
+    errors: FloatArray = field(default_factory=lambda: np.zeros((2, 1)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -201,7 +201,7 @@ class Comparison:
         self.mesh = Tri3Mesh(nodes=placement.to_mm(result.nodes), elements=result.elements)
         self.simulated_mesh = Tri3Mesh(nodes=simulation.mesh.points, elements=simulation.mesh.elements)
         self.levelling = Levelling(self.mesh, self.simulated_mesh)
-        self.covariance = NodalCovariance.from_mesh(self.mesh)
+        self.covariance = NodalCovariance.from_mesh(self.mesh, result.nodes)
         units = placement if placement.camera is None else rectification_of(result, scale, "mm").units
         self.relative_std = units.mm_per_pixel_std / units.mm_per_pixel if units.mm_per_pixel else 0.0
         image = Tri3Mesh(nodes=result.nodes, elements=result.elements)
@@ -222,8 +222,8 @@ class Comparison:
         moved = np.stack([record.u, record.v], axis=1).astype(np.float64)
         measured = self.placement.vectors_to_mm(nodes, moved).T
         slopes = self.placement.jacobian(np.where(np.isfinite(moved), nodes + moved, nodes))
-        variance = np.square(np.stack([record.u_std, record.v_std], axis=1), dtype=np.float64)
-        noise = np.sqrt(np.einsum("nij,nj->in", slopes**2, variance))
+        stds = [[record.u_std, record.v_std], [np.nan_to_num(record.u_bias_std), np.nan_to_num(record.v_bias_std)]]
+        noise = np.sqrt(np.einsum("nij,sjn->sin", slopes**2, np.square(stds, dtype=np.float64)))
         simulated = self.simulation.at(time)
         levelled = np.where(np.isfinite(measured), self.levelling(simulated), np.nan)
         fit, rigid, taken = self._fit(index, measured, noise, levelled)
@@ -232,15 +232,18 @@ class Comparison:
         gradient = self.simulated_mesh.nodal_gradient(simulated)
         strain = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4))).components
         values, own = self._at_nodes(measured, noise)
-        ways = {"nodes": np.concatenate([simulated.T, strain.T]), "levelled": self._at_nodes(levelled, noise)[0]}
+        ways = {
+            "nodes": np.concatenate([simulated.T, strain.T]),
+            "levelled": self._at_nodes(levelled, noise * [[[1]], [[0]]])[0],
+        }
         common = self.relative_std * values * np.array([1, 1, 0, 0, 0])[:, None]
-        std = np.hypot(own, common)
+        std = np.hypot(own[0], common)
         agreement = {}
         for way, of_simulation in ways.items():
             for name, rows in {"displacement": [0, 1], **{name: [row] for row, name in enumerate(QUANTITIES)}}.items():
                 left = taken * len(rows) / 2 if self.remove_rigid and max(rows) < 2 else 0.0
                 difference = (values - of_simulation)[rows]
-                agreement[way, name] = self._agreement(rows, difference, own[rows], common[rows], left)
+                agreement[way, name] = self._agreement(rows, difference, own[:, rows], common[rows], left)
         return FrameComparison(
             frame=index,
             time=time,
@@ -261,41 +264,41 @@ class Comparison:
         if not information:
             return math.nan, math.nan
         scale = sum(fit.projection for fit in known) / information
-        total = np.sum([fit.template for fit in known], axis=0)
-        variance = (1 - shared) * sum(self._energy(fit.template) for fit in known) + shared * self._energy(total)
+        errors = np.stack([fit.errors for fit in known])
+        variance = (1 - shared) * (errors**2).sum() + shared * (errors.sum(axis=0) ** 2).sum()
         return scale, math.hypot(math.sqrt(variance) / information, scale * self.relative_std)
-
-    def _energy(self, rows: FloatArray) -> float:
-        """Variance of the sum of some rows (2, N) times errors of the standard deviation 1."""
-        return float(sum(row @ self.covariance.correlation @ row for row in rows))
 
     def _fit(
         self, index: int, measured: FloatArray, noise: FloatArray, levelled: FloatArray
     ) -> tuple[Fit, FloatArray, float]:
         """Fit a multiple of the simulation and a rigid motion; return also the latter's displacement (2, N).
 
-        The third value is what the rigid motion is expected to take of the sum of squared ratios.
+        Of the `noise` (2, 2, N) the second half is the part that the lights' bias leaves. The third value is what the
+        rigid motion is expected to take of the sum of squared ratios.
         """
-        known = np.isfinite(measured + noise + levelled).all(axis=0) & (noise > 0).all(axis=0)
+        std, bias = noise
+        known = np.isfinite(measured + std + levelled).all(axis=0) & (std > 0).all(axis=0)
         if known.sum() < 3:
             logger.warning("frame %d has data at %d nodes that the simulation covers: too few", index, known.sum())
-            return Fit(template=np.zeros(measured.shape)), np.full(measured.shape, math.nan), 0.0
+            return Fit(), np.full(measured.shape, math.nan), 0.0
         x, y = self.mesh.nodes.T - self.mesh.nodes[known].mean(axis=0)[:, None]
         motions = np.array([[np.ones_like(x), 0 * x], [0 * x, np.ones_like(x)], [-y, x]])
-        weighted, ratios, template = (
-            np.where(known, part / np.where(known, noise, 1), 0) for part in (motions, measured, levelled)
+        weighted, ratios, template, relative_bias = (
+            np.where(known, part / np.where(known, std, 1), 0) for part in (motions, measured, levelled, bias)
         )
+        one = np.ones(std.shape)
         flat = weighted.reshape(3, -1)
         inverse = np.linalg.inv(flat @ flat.T)
         found, simulated = (inverse @ flat @ part.ravel() for part in (ratios, template))
-        spread = sum(part @ self.covariance.correlation @ part.T for part in weighted.transpose(1, 0, 2))
+        motion_errors = self.covariance.errors(weighted, one, relative_bias).reshape(3, -1)
+        spread = motion_errors @ motion_errors.T
         rest, template = ratios - np.tensordot(found, weighted, 1), template - np.tensordot(simulated, weighted, 1)
         information, projection = float((template**2).sum()), float((template * rest).sum())
         rigid, taken = found - simulated, float(np.trace(inverse @ spread))
-        std = np.sqrt(np.diag(inverse @ spread @ inverse))
         scale, scale_std, by_scale = math.nan, math.nan, 0.0
+        errors = self.covariance.errors(template, one, relative_bias)
         if information > _RIGID * 2 * known.sum():
-            scale, energy = projection / information, self._energy(template)
+            scale, energy = projection / information, float((errors**2).sum())
             scale_std = math.hypot(math.sqrt(energy) / information, scale * self.relative_std)
             rest, by_scale = rest - scale * template, energy / information
         unit = np.array([1, 1, 180 / np.pi])
@@ -303,11 +306,11 @@ class Comparison:
             scale=scale,
             scale_std=scale_std,
             rigid=rigid * unit,
-            rigid_std=std * unit,
+            rigid_std=np.sqrt(np.diag(inverse @ spread @ inverse)) * unit,
             chi_square=float((rest**2).sum() / (2 * known.sum() - taken - by_scale)),
-            template=template,
             projection=projection,
             information=information,
+            errors=errors,
         )
         return fit, np.tensordot(rigid, motions, 1), taken
 
@@ -326,68 +329,87 @@ class Comparison:
         return own if len(np.unique(own[own >= 0])) == len(self.mesh.nodes) else np.full(len(points), -1)
 
     @cached_property
-    def _read(self) -> tuple[sp.csr_matrix, BoolArray]:
-        """Matrix (M, N) that reads the measurement at the simulation's nodes, and which of them lie in it (M,)."""
-        if (inside := self._own >= 0).any():
-            entries = np.ones(inside.sum()), (np.flatnonzero(inside), self._own[inside])
-            return sp.csr_matrix(entries, shape=(len(inside), len(self.mesh.nodes))), inside
-        matrix, depth = reading(self.mesh, self.simulation.mesh.points)
-        inside = depth > -_SAME
-        if not inside.any():
+    def _places(self) -> Places:
+        """The simulation's nodes in the measurement's mesh."""
+        places = Places.of(self.mesh, self.simulation.mesh.points)
+        if not places.inside.any():
             raise InputError(f"no node of {self.simulation.name} lies in the region that was measured")
-        return sp.csr_matrix(sp.diags(1.0 * inside) @ matrix), inside
+        return places
+
+    def _read(self, has_data: BoolArray | None = None) -> tuple[sp.csr_matrix, BoolArray]:
+        """Matrix (M, N) that reads nodes (N,) with data at the simulation's, and which of these it reaches (M,)."""
+        valid = np.ones(len(self.mesh.nodes), dtype=bool) if has_data is None else has_data
+        if (same := self._own >= 0).any():
+            entries = np.ones(same.sum()), (np.flatnonzero(same), self._own[same])
+            return sp.csr_matrix(entries, shape=(len(same), len(valid))), same & valid[self._own]
+        return self._places.weights(valid), self._places.measured(valid)
 
     @cached_property
     def _gauges(self) -> tuple[StrainGauges, sp.csr_matrix]:
         """The shortest strain gauges, and the matrix (M, G) that gives each node of the simulation its own."""
-        read, inside = self._read
+        read, inside = self._read()
         if (self._own >= 0).any():
             return StrainGauges.at_nodes(self.covariance), read
         gauges = StrainGauges.at_points(self.covariance, self.simulation.mesh.points[inside])
         return gauges, sp.eye(len(inside), format="csr")[:, inside]
 
     @cached_property
-    def _correlations(self) -> list[tuple[sp.csr_matrix, sp.csr_matrix]]:
-        """Correlation (M, M) of each of the `QUANTITIES` between the nodes, and its squares, entry by entry."""
-        read, (gauges, given), whole = self._read[0], self._gauges, self.covariance.correlation
-        slopes = [given @ slope for slope in gauges.slopes]
-        moved, x, y = (_unit(matrix @ whole @ matrix.T) for matrix in (read, *slopes))
-        shear = _unit(sum(slope @ whole @ slope.T for slope in slopes))
-        return [(one, sp.csr_matrix(one.multiply(one))) for one in (moved, moved, x, y, shear)]
+    def _correlations(self) -> list[tuple[list[sp.csr_matrix], list[sp.csr_matrix]]]:
+        """Correlations C and K (M, M) between nodes of each of the `QUANTITIES`: of fit and lights' bias.
+
+        With them their products C C, 2 C K and K K, entry by entry.
+        """
+        read, (gauges, given) = self._read()[0], self._gauges
+        x, y = (given @ slope for slope in gauges.slopes)
+        found = []
+        for matrices in ([read], [x], [y], [x, y]):
+            relative = self.covariance.relative(matrices)
+            fit, bias = (sp.csr_matrix(root @ root.T) for root in (relative.fit, relative.bias))
+            products = [sp.csr_matrix(one) for one in (fit.multiply(fit), 2 * fit.multiply(bias), bias.multiply(bias))]
+            found.append(([fit, bias], products))
+        return [found[0], *found]
 
     def _at_nodes(self, displacement: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Displacement (2, N) and the strain of it at the simulation's nodes, and their noise, (5, M) each."""
-        read, inside = self._read
-        values, std = np.full((2, len(QUANTITIES), len(inside)), np.nan)
-        for row, (part, error) in enumerate(zip(displacement, noise, strict=True)):
-            known = np.isfinite(part + error)
-            there = inside & (abs(read) @ ~known == 0)
-            scaled = sp.csr_matrix(read @ sp.diags(np.where(known, error, 0)))
-            variance = np.asarray((scaled @ self.covariance.correlation).multiply(scaled).sum(axis=1)).ravel()
-            values[row] = np.where(there, read @ np.where(known, part, 0), np.nan)
-            std[row] = np.where(there, np.sqrt(np.maximum(variance, 0)), np.nan)
-        gauges, given = self._gauges
-        strain = gauges.strain(*displacement, *noise)
+        """Displacement (2, N) and its strain at the simulation's nodes, (5, M), and their noise, (2, 5, M)."""
+        has_data = np.asarray(np.isfinite(displacement + noise[0]).all(axis=0))
+        read, measured = self._read(has_data)
+        values, *own = np.full((3, len(QUANTITIES), len(measured)), np.nan)
+        (gauges, given), bias = self._gauges, noise[1]
         node, gauge = given.nonzero()
-        values[2:, node], std[2:, node] = strain.components[gauge].T, strain.components_std[gauge].T
-        return values, std
+        cases = [(own[0], noise), (own[1], np.stack([bias, bias]))]
+        own[1][:] = 0.0
+        for std, stds in cases if (bias > 0).any() else cases[:1]:
+            for row, (part, *errors) in enumerate(zip(displacement, *stds, strict=True)):
+                factor = read @ self.covariance.factor(*np.where(has_data, errors, 0))
+                values[row] = np.where(measured, read @ np.where(has_data, part, 0), np.nan)
+                variance = np.asarray(factor.multiply(factor).sum(axis=1)).ravel()
+                std[row] = np.where(measured, np.sqrt(variance), np.nan)
+            strain = gauges.strain(*displacement, *stds[0], *stds[1])
+            values[2:, node], std[2:, node] = strain.components[gauge].T, strain.components_std[gauge].T
+        return values, np.stack(own)
 
     def _agreement(
         self, rows: list[int], difference: FloatArray, own: FloatArray, common: FloatArray, taken: float
     ) -> Agreement:
-        """Compare some rows of the `QUANTITIES`, (r, M) each, of which a fit took a part of the squared ratios."""
+        """Compare some rows of the `QUANTITIES`, (r, M) each, of which a fit took a part of the squared ratios.
+
+        `own` (2, r, M) is their noise, and the part of it that the lights' bias leaves.
+        """
         from scipy.stats import f as fisher
 
-        std = np.hypot(own, common)
+        std = np.hypot(own[0], common)
         known = np.isfinite(difference) & (std > 0)
         count, scale = int(known.sum()), np.where(known, std, 1)
         if not count:
             return Agreement(values=0)
-        ratio, noise, shared = (np.where(known, part / scale, 0) for part in (difference, own, common))
+        ratio, noise, bias, shared = (np.where(known, part / scale, 0) for part in (difference, *own, common))
         square = float((shared**2).sum()) ** 2
-        for row, s, b in zip(rows, noise, shared, strict=True):
-            correlation, squares = self._correlations[row]
-            square += float(s**2 @ squares @ s**2 + 2 * (b * s) @ correlation @ (b * s))
+        fit = np.sqrt(np.maximum(noise**2 - bias**2, 0))
+        for row, n, m, s in zip(rows, fit, bias, shared, strict=True):
+            correlations, products = self._correlations[row]
+            pairs = [(n * n, products[0]), (n * m, products[1]), (m * m, products[2])]
+            pairs += [(2**0.5 * s * std, one) for std, one in zip((n, m), correlations, strict=True)]
+            square += sum(float(std @ one @ std) for std, one in pairs)
         chi_square, freedom = float((ratio**2).sum() / (count - taken)), count**2 / square
         return Agreement(
             values=count,
@@ -399,13 +421,6 @@ class Comparison:
             degrees_of_freedom=freedom,
             probability=float(fisher.sf(chi_square, freedom, len(rows) * self._blocks)),
         )
-
-
-def _unit(covariance: sp.csr_matrix) -> sp.csr_matrix:
-    """Return the correlation of a covariance; a row without variance stays empty."""
-    variance = covariance.diagonal()
-    scale = sp.diags(np.divide(1, np.sqrt(variance), out=np.zeros_like(variance), where=variance > 0))
-    return sp.csr_matrix(scale @ covariance @ scale)
 
 
 def measured_mesh(result: Result) -> FiniteElementMesh | None:

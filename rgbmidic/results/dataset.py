@@ -16,7 +16,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from rgbmidic.results.maps import Maps
-from rgbmidic.results.physical import Physical, frame_times
+from rgbmidic.results.physical import MOVED, Physical, frame_times
 from rgbmidic.results.quantities import QUANTITIES, SHARED
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
@@ -80,10 +80,10 @@ def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset
     plane = "" if physical.rectified.camera is None else "on the plane of the specimen"
     for name, entry in QUANTITIES.items():
         dimension = _PARTS[name][0] if name in _PARTS else ""
-        if not entry.stackable or name.removesuffix("_std") in _COMPONENTS or name == "number":
+        if not entry.stackable or name.removesuffix("_std") in _COMPONENTS or name in ("number", "time_ns"):
             continue
         axes = ("frame", *(axis if isinstance(axis, str) else dimension for axis in entry.axes))
-        moved = name.removesuffix("_std") in ("u", "v")
+        moved = name in MOVED
         about = entry.attributes | ({"units": maps.field(name).unit} if moved else {})
         if moved and plane:
             about["description"] = plane

@@ -25,7 +25,7 @@ from rgbmidic._version import __version__
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.fields.units import column
 from rgbmidic.results.files import check_file, write_complete, write_table, writing
-from rgbmidic.results.physical import Physical
+from rgbmidic.results.physical import Physical, frame_times
 from rgbmidic.results.quantities import FAILED, FINITE_ELEMENTS, QUANTITIES, SHARED, Quantity
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ScaleSettings
@@ -243,8 +243,11 @@ def _write_npz(physical: Physical, file: BinaryIO) -> None:
         for name in ("nodes", "elements", "names", "lights", *stated):
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(getattr(result, name)), allow_pickle=False)
+        times = frame_times(result, physical.scale)
+        with archive.open("time_s.npy", "w") as member:
+            np.lib.format.write_array(member, np.full(len(result), np.nan) if times is None else times)
         for quantity in QUANTITIES.values():
-            if not quantity.stackable:
+            if not quantity.stackable or quantity.name == "time_ns":
                 continue
             blank = quantity.unmeasured(result.table.sizes)
             head = {"descr": blank.dtype.str, "fortran_order": False, "shape": (len(result), *blank.shape)}

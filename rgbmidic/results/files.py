@@ -8,6 +8,7 @@ import io
 import json
 import os
 import socket
+import threading
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, suppress
@@ -87,8 +88,12 @@ def write_table(file: BinaryIO, head: Iterable[str], rows: Iterable[Iterable[obj
 
 def write_json(path: Path, document: Any, *, new: bool = False) -> None:
     """Write a JSON file; a `new` one is not written where there is one, also where several processes begin at once."""
-    content = json.dumps(document, indent=2).encode() + b"\n"
-    write_complete(path, lambda file: file.write(content), new=new)
+    write_text(path, json.dumps(document, indent=2) + "\n", new=new)
+
+
+def write_text(path: Path, text: str, *, new: bool = False) -> None:
+    """Write a text file, as `write_complete`."""
+    write_complete(path, lambda file: file.write(text.encode()), new=new)
 
 
 def read_json(path: Path) -> Any:
@@ -122,7 +127,7 @@ def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool
         Whether a file of this name stays as it is, also one that another process writes at the same time; else it is
         replaced.
     """
-    temporary = path.with_name(f"{path.name}.{socket.gethostname()}.{os.getpid()}.part")
+    temporary = path.with_name(f"{path.name}.{socket.gethostname()}.{threading.get_ident()}.{os.getpid()}.part")
     try:
         with writing(path), temporary.open("w+b") as file:
             write(file)

@@ -24,7 +24,7 @@ from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.fields.units import Units
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.files import check_file, write_complete, write_table
-from rgbmidic.results.physical import MOVED, Physical, displacements, frame_times, reference_frames, shared_part
+from rgbmidic.results.physical import Physical, displacements, frame_times, reference_frames, shared_part
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
 from rgbmidic.text import rounded
@@ -232,7 +232,7 @@ def _read(
             field = motion.removed(physical.mesh.nodes, field) if rigid == "remove" else field
         for fields, probe in zip(kept, probes, strict=True):
             fields.append(field[:, probe.nodes])
-    nodal = [Nodal(**dict(zip(MOVED, np.stack(fields, axis=1), strict=True))) for fields in kept]
+    nodal = [Nodal.of(np.stack(fields, axis=1)) for fields in kept]
     motions[:, 2] = np.degrees(motions[:, 2])
     names = {"rigid_u": "px", "rigid_v": "px", "rigid_rotation": "deg"} if rigid != "none" else {}
     histories = [

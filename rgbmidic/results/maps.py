@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields.history import FEWEST, rate_frames, rate_words, rates
+from rgbmidic.fields.interpolation import Places
 from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
 from rgbmidic.fields.units import Units
@@ -31,6 +32,9 @@ WINDOW = 9
 of a displacement per frame, and a change within 4 frames is still seen."""
 _AROUND = 2
 """Windows of frames that are read at once, and on either side of these: the widest fit takes in 5/3 of a window."""
+_PARTS = 80_000
+"""Parts of the elements in a picture, each side in 4 at most: what a picture leaves out that is linear in the elements
+is then a sixteenth."""
 _AT_ONCE = 4096
 """Nodes whose rates are computed at once: 25 MB of results at the default window."""
 
@@ -237,8 +241,8 @@ class Maps(Portable):
             raise InputError(f"there is no frame {frame} in a result of {len(self.result)} frames")
         base = name.removesuffix("_std")
         derived = base in DERIVED or name in WITH_ERROR
-        stored = ("light_fraction",) if kind == "fraction" else () if derived else (base,)
-        read = next(self.result.table.each([*MOVED, "node_status", *stored], [frame]))
+        stored = ("light_fraction",) if kind == "fraction" else () if derived or name in MOVED else (name,)
+        read = next(self.result.table.each(["u", "v", "node_status", *stored], [frame]))
         nothing = np.full(len(self.result.nodes), np.nan)
         if name in WITH_ERROR:
             values, std = self._with_error(WITH_ERROR[name], frame), nothing
@@ -248,6 +252,8 @@ class Maps(Portable):
         elif kind == "fraction":
             light = self.result.lights.index(name.removeprefix("fraction of "))
             values, std = np.where(read["node_status"] == 0, read["light_fraction"][:, light], np.nan), nothing
+        elif name in MOVED:
+            values, std = self.physical.length * next(self._displacements([frame]))[MOVED.index(name)], nothing
         else:
             values, std = np.asarray(read[name], dtype=np.float64), nothing
         return MapValues(
@@ -284,7 +290,7 @@ class Maps(Portable):
             parts = [self._rates(part, frame, entry.order) for part in entry.parts]
         else:
             moved = self.displacement(frame)
-            parts = [moved[UV.index(part) :: 2] for part in entry.parts]
+            parts = [moved[UV.index(part) : 4 : 2] for part in entry.parts]
         values, std = parts[0]
         if len(parts) > 1:
             vector, error = (np.stack(each, axis=1) for each in zip(*parts, strict=True))
@@ -292,7 +298,9 @@ class Maps(Portable):
         return self._units.lengths(values, std) if entry.unit else (values, std)
 
     def displacement(self, frame: int) -> FloatArray:
-        """Return u, v and their standard uncertainties (4, N) in rectified px, since `since`, rigid motion removed.
+        """Return u, v, their standard uncertainties and what the lights' bias leaves of these, (6, N) in rectified px.
+
+        They are those since `since`, the rigid motion removed.
 
         Parameters
         ----------
@@ -301,11 +309,55 @@ class Maps(Portable):
 
         Returns
         -------
-        ndarray, shape (4, N)
+        ndarray, shape (6, N)
         """
         moved = self._since(frame)
         motion = self._rigid(moved)
         return moved if motion is None else motion.removed(self._covariance.mesh.nodes, moved)
+
+    def drawn(self, field: Quantity, values: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
+        """Return nodal values as pictures draw them, linear in triangles, and the triangles.
+
+        They are parts of the elements, or the elements of what has no sign: it stays within the values of its nodes.
+
+        Parameters
+        ----------
+        field
+            Whether it has a sign.
+        values : ndarray, shape (N, C)
+            At the nodes; NaN where a node has no data.
+
+        Returns
+        -------
+        values : ndarray, shape (M, C)
+            At the corners of the triangles.
+        triangles : ndarray, shape (F, 3), int32
+        """
+        if not field.signed:
+            return values, self.result.elements
+        places, parts = self._parts
+        return places.read(values), parts
+
+    @cached_property
+    def _parts(self) -> tuple[Places, npt.NDArray[np.int32]]:
+        mesh = self.physical.mesh
+        return Places.parts(mesh, int(np.clip((_PARTS / len(mesh.elements)) ** 0.5, 1, 4)))
+
+    def places(self, points: FloatArray, element: IntArray) -> Places:
+        """Take points of the image whose elements are known, to read nodal values there.
+
+        Parameters
+        ----------
+        points : ndarray, shape (P, 2)
+            Points (x, y) of the image, px.
+        element : ndarray, shape (P,), int
+            Their elements.
+
+        Returns
+        -------
+        Places
+        """
+        return Places.within(Tri3Mesh(nodes=self.result.nodes, elements=self.result.elements), points, element)
 
     def strain_at(self, frame: int, x: float, y: float, length: float) -> dict[str, FloatArray]:
         """Compute the strain of one virtual gauge at a place of the image, px; each quantity, (1,), by its name.
@@ -341,7 +393,7 @@ class Maps(Portable):
         return displacements(self.result, self.physical.rectified, frames)  # `physical` may be of an earlier state
 
     def _since(self, frame: int) -> FloatArray:
-        """Return u, v and their uncertainties (4, N) since the frame that is the reference here."""
+        """Return u, v and their uncertainties (6, N) since the frame that is the reference here."""
         moved = next(self._displacements([frame]))
         if self.since is None:
             return moved
@@ -440,7 +492,7 @@ class Maps(Portable):
         frames, clock = self._there[outer], self._clock[outer]
         plain = replace(self, since=None, rigid_removed=False)
         if name in UV:
-            each = (moved[UV.index(name) :: 2] for moved in self._displacements(frames.tolist()))
+            each = (moved[UV.index(name) : 4 : 2] for moved in self._displacements(frames.tolist()))
         else:
             each = (np.stack(plain._derived(name, frame)) for frame in frames.tolist())
         series = np.stack([*each], axis=1)

@@ -8,7 +8,7 @@ declared in the field table and here.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, Self
@@ -28,8 +28,8 @@ from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
 
-MOVED = ("u", "v", "u_std", "v_std")
-"""Displacement and its standard uncertainty, in the order in which functions take them."""
+MOVED = ("u", "v", "u_std", "v_std", "u_bias_std", "v_bias_std")
+"""Displacement, its standard uncertainty and the part that the lights' bias leaves, as functions take them."""
 
 
 def rectification_of(
@@ -158,9 +158,14 @@ def shared_part(result: Result) -> float:
 
 
 def displacements(result: Result, rectified: Rectification, frames: Iterable[int]) -> Iterator[FloatArray]:
-    """Read u, v and their uncertainties (4, N) in some frames, in rectified px."""
-    for read in result.table.each(MOVED, frames):
-        yield np.stack(rectified.displacement(*(np.asarray(read[name], np.float64) for name in MOVED)))
+    """Read u, v and their uncertainties (6, N) in some frames, in rectified px."""
+    return (_moved(rectified, read) for read in result.table.each(MOVED, frames))
+
+
+def _moved(rectified: Rectification, read: Mapping[str, AnyArray]) -> FloatArray:
+    moved = np.stack([np.asarray(read[name], np.float64) for name in MOVED])
+    moved[4:][np.isnan(moved[4:]) & np.isfinite(moved[2:4])] = 0.0  # of records that were made without it
+    return np.stack(rectified.displacement(*moved))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -241,8 +246,8 @@ class Physical(Portable):
 
     @cached_property
     def covariance(self) -> NodalCovariance:
-        """Correlation of the nodes' errors."""
-        return NodalCovariance.from_mesh(self.mesh)
+        """Covariance of the nodes' errors."""
+        return NodalCovariance.from_mesh(self.mesh, self.result.nodes)
 
     @cached_property
     def gauges(self) -> StrainGauges:
@@ -294,11 +299,12 @@ class Physical(Portable):
         """Return the `quantities` of one frame, each in its type; errors as `Result.frame`."""
         record = self.result.frame(index)
         values = {name: np.asarray(record.values[name]) for name in self.quantities if name in record.values}
-        u, v, u_std, v_std = self.rectified.displacement(*(values[name].astype(np.float64) for name in MOVED))
-        for component, pair in {"u": (u, u_std), "v": (v, v_std)}.items():
-            values |= zip((component, f"{component}_std"), self.units.lengths(*pair), strict=True)
-        values |= named(self.gauges.strain(u, v, u_std, v_std, measure=self.measure))
-        gradient = self.mesh.element_gradient(np.stack([u, v], axis=1))
+        moved = _moved(self.rectified, values)
+        for component, (value, std, bias) in zip("uv", moved.reshape(3, 2, -1).swapaxes(0, 1), strict=True):
+            values |= zip((component, f"{component}_std"), self.units.lengths(value, std), strict=True)
+            values[f"{component}_bias_std"] = self.length * bias
+        values |= named(self.gauges.strain(*moved, measure=self.measure))
+        gradient = self.mesh.element_gradient(moved[:2].T)
         elements = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4)), self.measure)
         return values | {entry.name: entry.of(elements) for entry in ELEMENT_STRAIN}
 

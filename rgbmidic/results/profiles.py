@@ -16,6 +16,7 @@ from rgbmidic.fields.units import column
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.maps import Maps
 from rgbmidic.results.physical import frame_times, shared_part
+from rgbmidic.results.quantities import UV
 from rgbmidic.typing import AnyArray, FloatArray
 
 
@@ -33,7 +34,7 @@ class Wave:
     """
 
     what: str
-    level: float
+    level: float | str
     arrivals: Arrivals
     front: Front
 
@@ -66,6 +67,8 @@ class Profile:
         Of lengths and time.
     values, std : ndarray, shape (T, P)
         At each point in each frame; NaN where not measured.
+    bias_fractions : ndarray, shape (T,)
+        Part of the variance of u or v along the line that the lights' bias leaves.
     common_fraction
         Fraction of the variance that all frames have in common.
     rate_window
@@ -92,6 +95,7 @@ class Profile:
         self.times = None if times is None else times[self.frames]
         self.units = replace(physical.units, timed=times is not None)
         self.values, self.std = np.full((2, len(self.frames), len(self.line.points)), np.nan)
+        self.bias_fractions = np.zeros(len(self.frames))
         self.common_fraction, self.rate_window = shared_part(result), 0.0
         if self.field.group == "Rates" and len(self.frames) > 1:
             self.rate_window = (maps.window - 1) * float(np.median(np.diff(self.clock)))
@@ -107,8 +111,14 @@ class Profile:
             Indices of the rows, one a frame.
         """
         for row in rows:
-            read = maps.read(self.field.name, int(self.frames[row]))
-            self.values[row], self.std[row] = self.line.read(read.values, read.std, self.kind)
+            name, frame, bias = self.field.name, int(self.frames[row]), np.zeros(1)
+            read = maps.read(name, frame)
+            if name in UV:
+                bias = (self.units.mm_per_pixel or 1.0) * maps.displacement(frame)[4 + UV.index(name)]
+                variances = np.square([bias, read.std])[:, self.line.nodes]
+                shared, whole = np.nansum(variances, axis=1)
+                self.bias_fractions[row] = shared / whole if whole else 0.0
+            self.values[row], self.std[row] = self.line.read(read.values, read.std, self.kind, bias)
 
     @property
     def positions(self) -> FloatArray:
@@ -122,12 +132,12 @@ class Profile:
 
     @property
     def kind(self) -> str:
-        """Key of `ProfileLine.correlations`: how the errors of the field hang together."""
+        """Key of `ProfileLine.covariances`: how the errors of the field hang together."""
         if self.field.name[:3] in ("exx", "eyy"):
             return self.field.name[:3]
         return "strain" if self.field.unit in ("", "deg") or "_rate" in self.field.name else ""
 
-    def wave(self, what: str = "front", level: float = 0.5) -> Wave:
+    def wave(self, what: str = "front", level: float | str = "50%") -> Wave:
         """Fit the speed of a front or peak.
 
         Parameters
@@ -151,7 +161,7 @@ class Profile:
             "between_frames": between,
         }
         arrivals = arrival_times(clock, self.values, self.std, what=what, level=level, **more)
-        correlation = self.line.correlation(self.kind)
+        correlation = self.line.correlation(self.kind, float(self.bias_fractions.mean()))
         front = fit_front(self.positions, arrivals, self.std, correlation, usable=self.line.even, **more)
         scale = self.units.mm_per_pixel_std / (self.units.mm_per_pixel or 1.0)
         front = replace(front, speed_std=float(np.hypot(front.speed_std, scale * front.speed)))

@@ -13,12 +13,12 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, Protocol, TypeVar
 
 import numpy as np
 
@@ -94,6 +94,8 @@ class Quantities:
     v = _Attribute()
     u_std = _Attribute()
     v_std = _Attribute()
+    u_bias_std = _Attribute()
+    v_bias_std = _Attribute()
     exx = _Attribute()
     eyy = _Attribute()
     exy = _Attribute()
@@ -236,7 +238,7 @@ def record_file(folder: Path, frame: int) -> Path:
     return folder / f"{frame:06d}.npz"
 
 
-def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes) -> None:
+def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes, check: Callable[[], None]) -> None:
     """Write a frame, which counts from the moment this returns; a record that is there is replaced.
 
     Parameters
@@ -249,11 +251,14 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes) -> N
         What is kept of it.
     run : bytes, length 16
         Digest of what the frames of the result share.
+    check
+        It is called when the file has been made under another name in the folder: a folder that takes the place of this
+        one before then fails the check, and one that does so later has no such file to rename.
 
     Raises
     ------
     ResultError
-        The disk is full or refuses; nothing is left of the frame.
+        The disk is full or refuses, or the check fails; nothing is left of the frame.
     """
     (files, directory, _), parts, entries, end = _layout(tuple(QUANTITIES)), list[bytes](), list[Any](), 0
     for name, file in files.items():
@@ -268,7 +273,12 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes) -> N
     count, length = len(files), directory.size + _CHECK.size - _COMMENT - _END
     tail = directory.pack(*entries, b"PK\x05\x06", 0, 0, count, count, length, end, _COMMENT, run, frame)
     content = b"".join([*parts, tail, _CHECK.pack(zlib.crc32(tail))])
-    write_complete(record_file(folder, frame), lambda file: file.write(content))
+
+    def write(file: BinaryIO) -> None:
+        check()
+        file.write(content)
+
+    write_complete(record_file(folder, frame), write)
 
 
 def _read_record(path: Path, frame: int, names: Iterable[str], run: bytes) -> dict[str, Any]:

@@ -22,7 +22,8 @@ from scipy.sparse.linalg import splu
 
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
-from rgbmidic.fields.nodal import Places
+from rgbmidic.fields.interpolation import Places
+from rgbmidic.frames.names import NamedFiles
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh, read_mesh
 from rgbmidic.results.physical import placement_of, rectification_of
 from rgbmidic.results.result import Result
@@ -33,7 +34,10 @@ logger = logging.getLogger(__name__)
 
 _FIELDS = ("displacement", "displacements", "u", "disp")
 """Names, in small letters, under which a displacement is written: by ParaView and CalculiX, by Abaqus, by others."""
-_COMPONENT = re.compile(r"(?:u|v|u[xy12]|u_[xy12])(?:_(mm|m|um|inch))?", re.IGNORECASE)
+_COMPONENTS = tuple(
+    re.compile(rf"(?:{name})(?:_(mm|m|um|inch))?", re.IGNORECASE) for name in ("u|u_?[x1]", "v|u_?[y2]")
+)
+"""Names of the columns of a table: the displacement along the first and the second axis, and its unit."""
 _TIMES = {"time": 1.0, "time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6}
 
 
@@ -154,14 +158,16 @@ def _listed(path: Path, interval: float | None) -> list[tuple[float | None, Path
 
 def _numbered(path: Path, interval: float | None) -> list[tuple[float | None, Path]]:
     """Return the files of a folder by the last number in their names, times the `interval`."""
-    files = {file: re.findall(r"\d+", file.stem) for file in path.iterdir() if file.suffix.lower() in (".vtu", ".vtk")}
-    if not files or not all(files.values()):
+    files = NamedFiles.ordered([file for file in path.iterdir() if file.suffix.lower() in (".vtu", ".vtk")])
+    if not files.paths or not all(files.numbers):
         raise InputError(f"{path} must hold one .pvd file, or .vtu or .vtk files with a number in their names")
     if interval is None or not interval > 0:
         raise InputError(
             f"the times of the files in {path} are not known: state --interval, the time between two numbers (above 0)"
         )
-    return sorted((interval * int(numbers[-1]), file) for file, numbers in files.items())
+    return sorted(
+        (interval * float(numbers[-1]), file) for numbers, file in zip(files.numbers, files.paths, strict=True)
+    )
 
 
 def _displacement(mesh: FiniteElementMesh, field: str | None) -> FloatArray:
@@ -183,11 +189,13 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read: {error}") from None
     names = [name.strip() for name in next(csv.reader(lines[:1]), [])]
-    moved = [name for name in names if _COMPONENT.fullmatch(name)]
-    clock = next((name for name in names if name.lower() in _TIMES), None)
-    if "node" not in names or len(moved) != 2:
-        raise InputError(f'{path} needs a header line with "node", "u_mm" and "v_mm" (and "time_s"), not {names}')
-    wanted = [names.index(name) for name in ("node", *moved, *([clock] if clock else []))]
+    components = [[match for name in names if (match := pattern.fullmatch(name))] for pattern in _COMPONENTS]
+    clocks = [name for name in names if name.lower() in _TIMES]
+    if names.count("node") != 1 or [len(found) for found in components] != [1, 1] or len(clocks) > 1:
+        raise InputError(
+            f'{path} needs a header line with one column each "node", "u_mm" and "v_mm" (and "time_s"), not {names}'
+        )
+    wanted = [names.index(name) for name in ("node", *(match.string for (match,) in components), *clocks)]
     rows = []
     for number, row in enumerate(csv.reader(lines[1:]), 2):
         try:
@@ -204,16 +212,15 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
     if not known.all():
         logger.warning("%s: %d rows name nodes that %s does not have", path, int((~known).sum()), mesh.name)
         table, places = table[known], places[known]
-    times = table[:, 3] * _TIMES[clock.lower()] if clock else np.zeros(len(table))
+    times = table[:, 3] * _TIMES[clocks[0].lower()] if clocks else np.zeros(len(table))
     steps, state = np.unique(times, return_inverse=True)
     cells, count = np.unique(state * len(mesh.points) + places, return_counts=True)
     if (count > 1).any():
         node = mesh.node_numbers[cells[count.argmax()] % len(mesh.points)]
         raise InputError(f"{path} has two rows or more for node {node} at one time: several states need a time_s")
     values = np.full((len(steps), len(mesh.points), 2), np.nan)
-    factors = [LENGTH_UNITS[(found[1] or unit).lower()] for name in moved if (found := _COMPONENT.fullmatch(name))]
-    values[state, places] = table[:, 1:3] * factors
-    return values, steps if clock else None
+    values[state, places] = table[:, 1:3] * [LENGTH_UNITS[(match[1] or unit).lower()] for (match,) in components]
+    return values, steps if clocks else None
 
 
 def places_among(numbers: IntArray, wanted: npt.NDArray[Any]) -> IntArray:
@@ -279,12 +286,16 @@ class Levelling:
         # of their number, and is 1 % of what levelling changes at 3 (derived)
         inner = _middles(int(np.clip(math.ceil(2 * mesh.size / simulated.size), 3, 12)))
         points = np.einsum("qc,ecd->eqd", inner, mesh.nodes[mesh.elements])
-        read, depth = reading(simulated, points.reshape(-1, 2))
+        places = Places.of(simulated, points.reshape(-1, 2))
         # it is continued linearly by half an element: the outline of a region drawn by hand differs by some px (chosen)
-        used: BoolArray = np.asarray((depth.reshape(points.shape[:2]) > -0.5).all(axis=1))
+        depth: FloatArray = np.asarray(places.barycentric.min(axis=1)).reshape(points.shape[:2])
+        used: BoolArray = np.asarray((depth > -0.5).all(axis=1))
         if not used.any():
             raise InputError("the simulation's mesh covers no element of the measurement's: check where it is placed")
-        row = np.arange(len(depth))
+        row = np.arange(depth.size)
+        # the simulation is linear in its elements
+        entries = places.barycentric.ravel(), (np.repeat(row, 3), simulated.elements[places.element].ravel())
+        read = sp.csr_matrix(entries, shape=(len(row), len(simulated.nodes)))
         columns, values = np.repeat(mesh.elements, len(inner), axis=0), np.tile(inner, (len(mesh.elements), 1))
         shape = sp.csr_matrix((values.ravel(), (np.repeat(row, 3), columns.ravel())), shape=(len(row), len(mesh.nodes)))
         weighted = sp.csr_matrix(sp.diags(np.repeat(used * mesh.areas / len(inner), len(inner))) @ shape).T
@@ -297,7 +308,7 @@ class Levelling:
         """Displacement (2, N) at the measurement's nodes of a simulated one (M, 2); NaN where that does not reach."""
         moments = self._moments @ np.nan_to_num(displacement)
         unknown: FloatArray = np.asarray(np.isnan(displacement).any(axis=1), dtype=np.float64)
-        lost = (abs(self._moments) @ unknown) > 0
+        lost = np.asarray(abs(self._moments) @ unknown) > 0
         recovered = (self._recovery.value @ self._factors.solve(moments)).T
         return np.where(self._covered & ~lost, recovered, np.nan)
 
@@ -308,14 +319,3 @@ def _middles(parts: int) -> FloatArray:
     down = [(i + 2 / 3, j + 2 / 3) for i in range(parts - 1) for j in range(parts - 1 - i)]
     first, second = np.array(up + down).T / parts
     return np.stack([first, second, 1 - first - second], axis=1)
-
-
-def reading(mesh: Tri3Mesh, points: FloatArray) -> tuple[sp.csr_matrix, FloatArray]:
-    """Matrix (P, N) that reads a nodal field at points (P, 2), and the least barycentric coordinate there (P,)."""
-    at_once = 20_000  # points: some 60 MB (derived)
-    parts = [Places.of(mesh, points[start : start + at_once]) for start in range(0, len(points), at_once)]
-    values = np.concatenate([part.barycentric for part in parts])
-    nodes = mesh.elements[np.concatenate([part.element for part in parts])]
-    row = np.repeat(np.arange(len(points)), 3)
-    matrix = sp.csr_matrix((values.ravel(), (row, nodes.ravel())), shape=(len(points), len(mesh.nodes)))
-    return matrix, values.min(axis=1)

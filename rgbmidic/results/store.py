@@ -171,13 +171,13 @@ class ResultStore:
         InputError
             There is no such frame, or the record has another number of nodes or lights.
         ResultError
-            The disk is full or refuses; the frames before are kept.
+            The disk is full or refuses, or another folder took the place of this one; the frames before are kept.
         """
         if not 0 <= index < self.frame_count:
             raise InputError(f"there is no frame {index} in a result of {self.frame_count} frames")
         if record.sizes != self.sizes:
             raise InputError(f"frame {index} has the sizes {record.sizes}, the result {self.sizes}")
-        write_record(self.path / FRAMES, index, record, self._run)
+        write_record(self.path / FRAMES, index, record, self._run, self._claim.check)
 
     def discard(self, frames: Collection[int]) -> None:
         """Discard frames that are to be measured again.
@@ -193,7 +193,7 @@ class ResultStore:
             The disk refuses.
         """
         if frames:
-            self.reopen()
+            self.reopen()  # which checks the claim
         for frame in frames:
             with writing(file := record_file(self.path / FRAMES, frame)):
                 file.unlink(missing_ok=True)
@@ -218,6 +218,7 @@ class ResultStore:
 
     def reopen(self) -> None:
         """Take the date of its end out of the provenance, before frames are written."""
+        self._claim.check()
         provenance = read_provenance(self.path)
         if provenance.pop("finished", None) is not None:
             provenance.pop("final_warnings", None)
@@ -231,6 +232,7 @@ class ResultStore:
         warnings
             What only all frames together show, to be kept.
         """
+        self._claim.check()
         self.release()
         finish_result(self.path, warnings)
 

@@ -111,7 +111,7 @@ class IlluminationSettings(Checked):
     section = "illumination"
 
     demosaic: Literal["auto", "reflection-aware", "malvar", "normalised"] = "auto"
-    normalise: float | Literal["auto"] = bounded("auto", at_least=0)
+    normalise: float | Literal["auto"] = bounded("auto", at_least=0, at_most=10_000)
 
 
 FrameCheck = Literal["noise", "levels", "greens", "lights", "demosaiced"]

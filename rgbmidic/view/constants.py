@@ -48,8 +48,6 @@ class ViewerConstants:
         Raw frames that are kept as pictures: those around the one in view.
     frames_at_once
         Frames whose status is read before the page is served again. Measured: 10 ms.
-    least_weight
-        Part of the weights of a point's nodes that must be measured: all but what rounding leaves of a node beside it.
     play_ms
         Least time between two frames that are played: 6 to 7 a second, which the eye can follow.
     view_ms, mark_ms
@@ -58,6 +56,8 @@ class ViewerConstants:
     progress_ms, idle_ms, run_ms
         Time between two parts of the time line; between two checks whether a result has grown, and pictures of that;
         between two reports of a run.
+    ahead_ms
+        Time between two frames that are read beside the one in view: less than between two that are played.
     slice_s
         Time for which frames are read along a line before they are drawn, or before another line has its turn.
     settled_ns
@@ -87,13 +87,13 @@ class ViewerConstants:
     range_frames: int = 24
     raw_frames: int = 8
     frames_at_once: int = 100
-    least_weight: float = 1 - 1e-9
     play_ms: int = 150
     view_ms: int = 40
     mark_ms: int = 60
     progress_ms: int = 200
     idle_ms: int = 1000
     run_ms: int = 500
+    ahead_ms: int = 100
     slice_s: float = 0.25
     settled_ns: int = 2_000_000_000
     forgotten_ms: int = 15_000

@@ -19,7 +19,7 @@ from tomlkit.exceptions import TOMLKitError
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.mesh import Region
 from rgbmidic.results import Result
-from rgbmidic.results.files import write_complete
+from rgbmidic.results.files import write_text
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings, read_section, read_toml
 from rgbmidic.view.address import Mark
 from rgbmidic.view.constants import VIEWER
@@ -237,7 +237,7 @@ class Draft:
             The file cannot be written.
         """
         self.check()
-        write_complete(self.file, lambda file: file.write(self.text.encode("utf-8")))
+        write_text(self.file, self.text)
 
 
 class Confirmation:

@@ -385,12 +385,13 @@ class MapPanel:
     def _draw_layers(self, nodes: FloatArray) -> str:
         """Draw what lies over the first field: lines, arrows, extremes, nodes without data, marks."""
         shown, view, window = self._shown, self._shown.view, self.canvas.window
-        field, values, elements = shown.maps.all[view.field], shown.values(view.field), shown.result.elements
+        field, values = shown.maps.all[view.field], shown.values(view.field)
         direction = shown.values("direction").values if view.directions else None
         self._directions.show(None if direction is None else direction_lines(window, nodes, direction))
         levels = np.linspace(*shown.ends(view.field), min(view.levels, VIEWER.contour_steps) + 1)[1:-1]
-        smooth = view.contours and not field.stepped
-        self._contours.show(contour_lines(nodes, elements, values.values, levels.tolist()) if smooth else None)
+        over = shown.overlay(view.field) if view.contours and not field.stepped else None
+        contours = None if over is None else contour_lines(over.nodes, over.elements, over.values, levels.tolist())
+        self._contours.show(contours)
         arrows, title = None, "times their length (0: as there is room)"
         if view.vectors:
             moved = shown.displacement[:2].T

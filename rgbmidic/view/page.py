@@ -155,6 +155,7 @@ class ResultPage:
         self.maps.canvas.resize()
         self.show()
         every(VIEWER.progress_ms, self.document, lambda: self.progress.advance(self.result), self.complain)
+        every(VIEWER.ahead_ms, self.document, self.shown.read_ahead, self.complain)
         for act in (self._grow, self._draw_progress, self.film.tell):
             every(VIEWER.idle_ms, self.document, act, self.complain)
 

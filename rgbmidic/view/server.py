@@ -6,6 +6,7 @@ import asyncio
 import gc
 import html
 import logging
+import re
 import secrets
 import webbrowser
 from collections.abc import Callable, Mapping
@@ -129,6 +130,8 @@ def start(path: Path, *, port: int = 0, statement: Mapping[str, Any] | None = No
         include_cookies=[],
     )
     application.add_handlers(".*", [(".*%00.*", ErrorHandler, {"status_code": 404})])  # no name of a file
+    # another name of this machine is one that a page of the web gave it, to be taken for the same origin
+    application.add_handlers(rf"(?!{re.escape(_HOST)}$).*", [(".*", ErrorHandler, {"status_code": 403})])
     http = HTTPServer(application)
     http.add_sockets(sockets)
     server = BaseServer(IOLoop.current(), application, http)

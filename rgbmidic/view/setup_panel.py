@@ -248,6 +248,13 @@ class SetupControls(Controls):
             bk.Spinner(title=title, name=title.lower(), value=at, low=0, high=last, step=1, **wide)
             for title, at in chosen.items()
         )
+        if (count := len(frames.reference)) > 1:  # the control has the first of them; another value is one frame
+
+            def state(_name: str, _old: object, at: float) -> None:
+                self.reference.title = f"Reference, {count} from" if at == frames.reference[0] else "Reference"
+
+            self.reference.on_change("value", state)
+            state("value", None, frames.reference[0])
         calibration = str(draft.section("calibration").get("file", ""))
         texts = {"Calibration file": calibration, "Write to": str(draft.file), "Result folder": str(out)}
         self.calibration, self.file, self.out = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
@@ -28,6 +29,8 @@ from rgbmidic.view.picture import Overlay, Picture, RawPictures, element_at, pal
 
 _REASONS = ("measured", "no light sees enough texture here", "the images around it do not match", "carried over")
 """What a node's status means, under the pointer."""
+_UNREADABLE = (RgbmidicError, OSError, IndexError, KeyError)
+"""What a field or a raw frame that cannot be read raises."""
 
 
 def palette_name(field: Quantity, *, symmetric: bool) -> str:
@@ -72,7 +75,8 @@ class ShownFields:
 
     def _take(self, maps: Maps) -> None:
         self.maps = maps
-        self._read, self._moved = lru_cache(4)(maps.read), lru_cache(2)(maps.displacement)
+        self._read, self._moved = lru_cache(3 * (1 + len(BESIDE)))(maps.read), lru_cache(2)(maps.displacement)
+        self._ahead: tuple[tuple[Any, ...], ...] = ()
         self._test_range = lru_cache(8)(partial(range_of_test, maps))
 
     @property
@@ -129,6 +133,21 @@ class ShownFields:
         named = [f"{self.view.field}_std" if name == UNCERTAINTY else name for name in asked]
         return [self.view.field, *(name for name in named if name in self.maps.all)]
 
+    def read_ahead(self) -> None:
+        """Read the next frame or the one before, whichever is not read yet, so that a step there does not wait."""
+        view, result = self.view, self.result
+        for frame in (view.frame + 1, view.frame - 1):
+            wanted = (frame, view.over, *self.names)
+            if not 0 <= frame < len(result) or not result.finished[frame] or wanted in self._ahead:
+                continue
+            self._ahead = (wanted, *self._ahead[:1])  # also where it cannot be read, which a step there reports
+            with suppress(*_UNREADABLE):
+                for name in self.names:
+                    self._read(name, frame)
+                if view.over == "deformed":
+                    self._raw(frame)
+            return
+
     @property
     def gauge(self) -> float:
         """Length of the virtual strain gauges, px."""
@@ -152,15 +171,17 @@ class ShownFields:
         """Return a field as it is painted; palette, range by hand and number of colours are those of the first."""
         view, field, values, first = self.view, self.maps.all[name], self.values(name), name == self.view.field
         suits = palette_name(field, symmetric=view.symmetric)
+        painted, elements = self.maps.drawn(field, np.column_stack([self.nodes, values.values]))
+        beyond = (np.abs(values.values) - 2 * values.std)[:, None]
         return Overlay(
-            nodes=self.nodes,
-            elements=self.result.elements,
-            values=values.values,
+            nodes=painted[:, :2],
+            elements=elements,
+            values=np.ascontiguousarray(painted[:, 2]),
             ends=self.ends(name, by_hand=first),
             colours=palette((first and not field.codes and view.palette) or suits, view.levels),
             opacity=view.opacity,
             stepped=field.stepped,
-            beyond=np.abs(values.values) - 2 * values.std if view.hatched else None,
+            beyond=self.maps.drawn(field, beyond)[0][:, 0] if view.hatched else None,
         )
 
     @property
@@ -179,7 +200,7 @@ class ShownFields:
             return self._reference, ""
         try:
             return self._raw(self.view.frame), ""
-        except (RgbmidicError, OSError, IndexError, KeyError) as error:
+        except _UNREADABLE as error:
             return self._reference, f"the raw frame cannot be shown ({error}): this is the reference image"
 
     @property
@@ -231,9 +252,8 @@ class ShownFields:
         found = element_at(self.nodes, self.result.elements, x, y)
         if found is None:
             return f"{place}: &nbsp; outside the mesh"
-        nodes, told = found[0].astype(np.int64), []
-        correlation, least = physical.covariance.part(nodes), VIEWER.least_weight
-        mean = Mean(name="", nodes=nodes, weights=found[1], correlation=correlation, least=least)
+        nodes, told = found[0], []
+        mean = Mean.over(physical.covariance, "the pointer", [found[1] @ physical.mesh.nodes[nodes]])
         for name in self.names:
             field, blank = self.maps.all[name], self.values(name).status[nodes].max()
             value, std = self._mean(field, mean)
@@ -270,7 +290,7 @@ class ShownFields:
         wanted = of_gauge or (name if isinstance(probe, Area) and group == "Strain" else None)
         if wanted and maps.since is None and not maps.rigid_removed:
             moved = self.displacement[:, None, probe.nodes]
-            part = Nodal(**dict(zip(("u", "v", "u_std", "v_std"), moved, strict=True)))
+            part = Nodal.of(moved)
             whole = (one for one in probe.histories(part) if one.name == f"{probe.name}_{wanted}")
             for one in (read for history in whole for read in in_units(history, maps.physical.units, None)):
                 if one.std is not None:
@@ -289,12 +309,15 @@ class ShownFields:
         """
         name, values = _measured(field), self.values(field.name)
         if field.stepped:
-            return float(values.values[mean.nodes[mean.weights.argmax()]]), math.nan
+            nearest = mean.sum.weights(np.ones(len(mean.nodes), dtype=bool), linear=True)[0][0].argmax()
+            return float(values.values[mean.nodes[nearest]]), math.nan
         exact = name in ("u", "v")
         read = self.displacement["uv".index(name) :: 2] if exact else np.stack([values.values, values.std])
-        of_nodes, stds = read[:, None, mean.nodes]
+        of_nodes, stds, *bias = read[:, None, mean.nodes]
         stated = bool(np.isfinite(stds).any())
-        pair = mean.average(of_nodes, stds, np.isfinite(of_nodes + (stds if stated else 0)), alike=not exact)
+        has_data = np.isfinite(of_nodes + (stds if stated else 0))
+        weights, _ = mean.weights(has_data, linear=not (exact or field.signed))
+        pair = mean.average(weights[:, 0], of_nodes, stds, *bias)
         (value,), (std,) = self.maps.physical.units.lengths(*pair) if exact else pair
         if exact and name != field.name:
             return float(std), math.nan

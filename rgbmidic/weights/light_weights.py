@@ -223,6 +223,10 @@ def precision_method(weights: Any, method: str) -> PrecisionMethod | None:
     return Statistics() if method == "statistics" else None
 
 
+_LARGEST = 1e9
+"""Weight whose square, summed over the pixels of a mesh, single precision still holds."""
+
+
 def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str) -> FloatImage | None:
     """Return weights as a float32 stack, or None where none are given.
 
@@ -251,8 +255,8 @@ def as_weights(weights: npt.ArrayLike | None, shape: tuple[int, ...], name: str)
         raise InputError(f"{name} must be real numbers, not {values.dtype}")
     if values.shape not in (shape, shape[1:]):
         raise InputError(f"{name} must have shape {shape[1:]} or {shape}; given is {values.dtype} {values.shape}")
-    if not (values.min() >= 0 and values.max() < np.inf):  # NaN spreads to both
-        raise InputError(f"{name} must be finite and not negative")
+    if not (values.min(initial=0) >= 0 and values.max(initial=0) <= _LARGEST):  # NaN spreads to both
+        raise InputError(f"{name} must be finite, not negative, and {_LARGEST:g} at most")
     return np.ascontiguousarray(np.broadcast_to(values, shape), dtype=np.float32)
 
 

@@ -34,8 +34,11 @@ def test_chi_square_scatters_as_its_degrees_of_freedom_say(comparisons):
 
 
 def test_resolution_is_difference_at_the_nodes_and_none_when_levelled(comparisons):
-    """Elements as wide as the hole's radius miss the concentration of strain beside it."""
-    assert chi_square(comparisons[1.0], "nodes", "displacement") > 2
+    """Elements as wide as the hole's radius miss the concentration of strain beside it.
+
+    Read linearly between the measurement's nodes displacement had 2.6; by the field between them it has 1.4.
+    """
+    assert chi_square(comparisons[1.0], "nodes", "displacement") > RATIO[1] ** 2
     assert chi_square(comparisons[1.0], "nodes", "eyy") > 8
 
 

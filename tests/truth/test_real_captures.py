@@ -65,7 +65,6 @@ def test_even_strengths_displace_nothing_whether_the_bayer_phase_changes_or_not(
         assert error.lost == 0
 
 
-@pytest.mark.xfail(strict=True, reason="the separation does not know the registration and the two greens yet")
 @pytest.mark.parametrize("strengths", [(1.0, 1.0, 4.0), (1.0, 1.0, 10.0)])
 def test_one_strong_band_displaces_no_more_than_with_malvar(bands, calibration, strengths):
     ours, malvar = (

@@ -135,10 +135,11 @@ def test_challenge_sample_12_agrees_with_dice_away_from_the_hole(grey, real_data
     assert np.isfinite(difference).all()
     assert len(difference) > 120
     assert np.sqrt((difference**2).mean(axis=0)).max() <= SECOND_OPINION
-    # the hole is seen as such, the rest is measured
-    distance = np.hypot(*(found.nodes - hole).T)
+    # the hole is seen as such; the rest is measured, but for what has moved out of the cropped frame
+    distance, shift = np.hypot(*(found.nodes - hole).T), np.nanmedian(found.displacement[:, 1])
     assert not found.measured[distance < 25].any()
-    assert found.measured[distance > 70].all()
+    row = found.nodes[:, 1] + shift
+    assert found.measured[(distance > 70) & (row > 1) & (row < rows - 2)].all()
     exx, eyy, _ = np.nanmedian(strains(found), axis=1)
     assert 0.001 < eyy < 0.02
     assert -0.5 < exx / eyy < -0.05

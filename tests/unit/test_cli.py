@@ -133,6 +133,18 @@ def test_bad_frames_are_status_2_and_an_interruption_130(
         assert error.splitlines()[-1].startswith("error: ")
 
 
+def test_a_file_that_ends_early_is_no_interruption(
+    command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
+) -> None:
+    def measure(*_: Any, **__: Any) -> Result:
+        raise EOFError("Ran out of input")
+
+    _replace_pipeline(monkeypatch, measure)
+    status, _, error = command("run", test_file, "--out", test_file.parent / "out")
+    assert status == 1
+    assert error.strip() == "error: EOFError: Ran out of input (run again with --debug for the details)"
+
+
 def test_too_many_open_files_are_told_with_their_limit(
     command: Run, monkeypatch: pytest.MonkeyPatch, test_file: Path
 ) -> None:

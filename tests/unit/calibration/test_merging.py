@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from rgbmidic.errors import CalibrationError, ConfigurationError
+from rgbmidic.errors import CalibrationError, ConfigurationError, InputError
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField
 from rgbmidic.illumination.images import Registration
@@ -86,7 +86,7 @@ def test_the_same_file_twice_is_no_contradiction(files):
 def test_picture_of_every_section(files, tmp_path):
     draw_calibration(merge_files(files), tmp_path / "all.png")
     assert (tmp_path / "all.png").stat().st_size > 10_000
-    with pytest.raises(CalibrationError, match="cannot be written"):
+    with pytest.raises(InputError, match="cannot be written"):
         draw_calibration(merge_files(files), tmp_path / "all.unknown")
     with pytest.raises(CalibrationError, match="nothing to draw"):
         draw_calibration(Calibration(), tmp_path / "none.png")

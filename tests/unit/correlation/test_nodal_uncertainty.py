@@ -138,12 +138,14 @@ def test_a_crack_leaves_intact_material_as_certain_as_before():
     found = correlate(first, noisy(cracked, 1))
     apart = np.abs(found.nodes[:, 0] - middle)
     true = np.stack([np.full(len(apart), 0.3), np.where(found.nodes[:, 0] < middle, jump, -jump)], axis=1)
+    place = found.nodes + true
+    stays = ((place >= -0.5) & (place <= 299.5)).all(axis=1)
     intact = (apart > 60) & found.measured
-    assert intact.sum() == (apart > 60).sum()
+    np.testing.assert_array_equal(intact, (apart > 60) & stays)
     assert (~found.measured[apart < 13]).mean() > 0.62
     ratio = (found.displacement - true)[intact] / found.displacement_std[intact]
     assert 0.7 < np.sqrt(np.mean(ratio**2)) < 1.3
-    assert np.median(found.displacement_std[intact]) < 1.3 * np.median(whole.displacement_std)
+    assert np.median(found.displacement_std[intact]) < 1.3 * np.nanmedian(whole.displacement_std)
 
 
 def test_stretched_edges_state_their_error():

@@ -53,7 +53,7 @@ def test_every_probe_is_covered_by_what_it_states(kind):
 def test_a_mean_over_neighbours_is_less_certain_than_their_number_says():
     probe = make_probe(COVARIANCE, "region", 1, (20, 30, 150, 160))
     mean, *_ = probe.histories(nodal(probe.nodes, NOISE))
-    parts = probe.weights * STD[probe.nodes]
+    parts = probe.weights(np.ones((1, len(probe.nodes)), dtype=bool))[0][0, 0] * STD[probe.nodes]
     together = dense_correlation(MESH)[np.ix_(probe.nodes, probe.nodes)]
     assert mean.std[0] == pytest.approx(np.sqrt(parts @ together @ parts), rel=0.01)
     assert mean.std[0] > 1.03 * np.sqrt(parts @ parts)

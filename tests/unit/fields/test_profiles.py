@@ -100,6 +100,45 @@ def test_noise_alone_and_uniform_motion_have_no_front() -> None:
         fit_front(LINE.positions, arrivals, std, LINE.correlation())
 
 
+POSITIONS, CLOCK = np.arange(0.0, 200, 10), np.arange(60.0)
+BEHIND = CLOCK[:, None] - 5 - POSITIONS / 8
+"""Frames since a front that travels at 8 px a frame has come to each position."""
+
+
+def test_a_front_that_still_rises_at_the_end_is_taken_at_a_value_only() -> None:
+    """A ramp of -.001 a frame, as a strain: half of what the frames hold of it is no front."""
+    random, std = np.random.default_rng(5), np.full(BEHIND.shape, 2e-4)
+    values = -0.001 * np.maximum(BEHIND, 0) + random.normal(0, 2e-4, BEHIND.shape)
+    cut = arrival_times(CLOCK, values, std, common_fraction=0.0)
+    assert cut.cut.all()
+    assert np.isnan(cut.times).all()
+    with pytest.raises(InputError, match="at 20 positions the field still rises in the last of them"):
+        fit_front(POSITIONS, cut, std, np.eye(20), common_fraction=0.0)
+    found = arrival_times(CLOCK, values, std, level=-0.005, common_fraction=0.0)
+    front = fit_front(POSITIONS, found, std, np.eye(20), common_fraction=0.0)
+    assert not found.cut.any()
+    assert abs(front.speed - 8) < 3 * front.speed_std < 0.2
+    assert front.start == pytest.approx(10, abs=0.3)
+    assert np.isnan(arrival_times(CLOCK, values, std, level=0.005).times).all()
+
+
+def test_a_plateau_up_to_the_last_frame_is_a_peak() -> None:
+    random, std = np.random.default_rng(6), np.full(BEHIND.shape, 2e-4)
+    values = 0.01 * np.clip(BEHIND / 6, 0, 1) + random.normal(0, 2e-4, BEHIND.shape)
+    for level in ("50%", 0.005):
+        found = arrival_times(CLOCK, values, std, level=level, common_fraction=0.0)
+        assert np.isfinite(found.times).all()
+        assert not found.cut.any()
+        front = fit_front(POSITIONS, found, std, np.eye(20), common_fraction=0.0)
+        assert abs(front.speed - 8) < 3 * front.speed_std < 0.2
+
+
+@pytest.mark.parametrize("level", ["0%", "100%", 0.0, "nan", "half", "%"])
+def test_a_level_is_a_value_or_part_of_the_peak(level: float | str) -> None:
+    with pytest.raises(InputError, match=r"a value of the field other than 0, such as -0.005, or between 0% and 100%"):
+        arrival_times(CLOCK, BEHIND, np.ones(BEHIND.shape), level=level)
+
+
 def test_arrival_times_state_their_noise_and_skip_missing_frames() -> None:
     random, times = np.random.default_rng(2), np.delete(np.arange(60.0), [20, 27])
     pulse = np.exp(-(((times - 30.3) / 6) ** 2))[:, None]

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import rawpy
 import tifffile
-from frames import colour_mosaic, noisy_mosaic, write_cropped_dng, write_monochrome_dng
+from frames import colour_mosaic, noisy_mosaic, write_cropped_dng, write_lossless_dng, write_monochrome_dng
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from real_files import CROPS, RealData
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames import camera_raw, open_source, read_frame
+from rgbmidic.frames import camera_raw, open_series, open_source, read_frame
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.frames.images import write_dng
 from rgbmidic.settings import BAYER_PATTERNS, FrameSettings
@@ -45,6 +45,32 @@ def test_pattern_and_black_levels_follow_odd_margins(tmp_path: Path, cfa: str, m
     np.testing.assert_array_equal(cell % 1000 + 60, frame.black_level)
     assert frame.values.min() >= 1000, "a masked margin is in the frame"
     assert open_source(path, STATED).shape == frame.values.shape
+
+
+@pytest.mark.parametrize("margin", [(0, 0), (1, 2), (3, 1)])
+def test_black_levels_that_vary_are_averaged_by_position_with_a_word(tmp_path: Path, margin: tuple[int, int]) -> None:
+    top, left, shape = *margin, (40, 44)
+    by_row, by_column = np.arange(40) % 2 * 4.0 + np.arange(40) / 4, np.arange(44) % 2 * -2.0
+    rows, columns = ([int(part) for one in line for part in (round(4 * one), 4)] for line in (by_row, by_column))
+    added = [(50715, "2i", 44, columns, True), (50716, "2i", 40, rows, True)]
+    cell = [(50713, "H", 2, (1, 4), True), (50714, "I", 4, (60, 61, 62, 63), True)]
+    path = tmp_path / "varies.dng"
+    for extra, exact in (
+        (added, 64 + by_row[:, None] + by_column),
+        (cell, np.tile([60, 61, 62, 63], (40, 11))),
+        ([*added, *cell], by_row[:, None] + by_column + np.tile([60, 61, 62, 63], (40, 11))),
+    ):
+        write_cropped_dng(path, noisy_mosaic(shape).values, top=top, left=left, cfa="RGGB", black=64, extra=extra)
+        frame = read_frame(path)
+        expected = [[exact[row::2, column::2].mean() for column in (0, 1)] for row in (0, 1)]
+        # LibRaw moves an odd margin to the next row or column
+        np.testing.assert_allclose(frame.black_level, np.roll(expected, (-top, -left), axis=(0, 1)), atol=1e-9)
+        (remark,) = open_series(FrameSettings(path=(str(path),))).remarks
+        spread = max(np.ptp(exact[row::2, column::2]) for column in (0, 1) for row in (0, 1))
+        assert remark.startswith("varies.dng: its black level varies")
+        assert f"by {spread:.3g} DN" in remark
+    write_cropped_dng(path, noisy_mosaic(shape).values, top=top, left=left, cfa="RGGB", black=64)
+    assert open_series(FrameSettings(path=(str(path),))).remarks == ()
 
 
 def test_monochrome_camera_raw_is_one_channel(tmp_path: Path) -> None:
@@ -286,3 +312,25 @@ def test_rows_without_noise_mean_that_nothing_was_decoded(black: int, fill: int)
                 camera_raw._check_filled(broken, level, 4095.0, stored_as_is=False, path=Path("x.rw2"))
         else:
             camera_raw._check_filled(broken, level, 4095.0, stored_as_is=False, path=Path("x.rw2"))
+
+
+@pytest.mark.parametrize("fills_memory", [True, False], ids=["glibc", "another C library"])
+@pytest.mark.parametrize("shape", [(40, 50), (300, 320)], ids=str)
+def test_a_raw_that_libraw_does_not_decode_is_refused_whatever_memory_holds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int], fills_memory: bool
+) -> None:
+    """A lossless JPEG without its start of scan: LibRaw raises nothing, and its buffer holds the file read before."""
+    if not fills_memory:
+        monkeypatch.setattr(camera_raw, "_MALLOPT", None)
+    whole, bad = tmp_path / "whole.dng", tmp_path / "bad.dng"
+    values = noisy_mosaic(shape).values.copy()
+    values[:, :7] = 257 * camera_raw._MARKS[0]  # grey levels, too
+    write_lossless_dng(whole, Mosaic(values=values, cfa="RGGB", black_level=64, white_level=65535))
+    np.testing.assert_array_equal(read_frame(whole).values, values)
+    content = bytearray(whole.read_bytes())
+    content[content.index(b"\xff\xda")] = 191
+    bad.write_bytes(content)
+    for _ in range(3):
+        read_frame(whole)
+        with pytest.raises(FrameError, match=r"bad\.dng is damaged or truncated"):
+            read_frame(bad)

@@ -6,16 +6,20 @@ import json
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import tifffile
 from cine_files import even_times, write_cine
 from frames import noisy_mosaic
 from real_files import RealData, count
+from seq_files import write_seq
 
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames import write_dng, write_tiff
+from rgbmidic.frames.data import Recording
 from rgbmidic.frames.series import describe, description_text, save_frame
+from rgbmidic.results import UNKNOWN_TIME
 from rgbmidic.settings import FrameSettings
 
 KEYS = [
@@ -131,3 +135,53 @@ def test_real_files(real_data: RealData) -> None:
     assert grey["exposure"] == pytest.approx(99e-6, rel=1e-3)
     dng = _seen(real_data("raw_colorchart_dng"))
     assert (dng["count"], dng["kind"]) == (1, "bayer")
+
+
+@pytest.mark.parametrize(
+    ("times", "remark"),
+    [
+        ([0, 0, 0, 0], "its time stamps do not rise (at frame 1): they are not used"),
+        ([0, 10, 20, 15], "its time stamps do not rise (at frame 3): they are not used"),
+        ([0, 10, 10, 20], "its time stamps do not rise (at frame 2): they are not used"),
+        ([UNKNOWN_TIME, 10, 20, 30], "its time stamps do not rise (at frame 1): they are not used"),
+        ([0, 10, 20, UNKNOWN_TIME], "its time stamps do not rise (at frame 3): they are not used"),
+        ([0, 30, 60, 90], "it states 100 frames per second, its time stamps 33.3333: these are taken"),
+        ([0, 10, 20, 30], ""),
+        ([-5, 6, 14, 25], ""),
+    ],
+)
+def test_times_that_cannot_be_are_left_out_with_a_word(times: list[int], remark: str) -> None:
+    stamps = np.array([one if one == UNKNOWN_TIME else one * 10**6 for one in times])
+    recording = Recording(count=4, frame_rate=100.0, times_ns=stamps)
+    assert recording.remarks == ((remark,) if remark else ())
+    assert (recording.times_ns is None) == ("not used" in remark)
+    assert recording.numbered.tolist() == [0, 1, 2, 3]
+
+
+def test_movies_whose_times_do_not_rise_say_so_once(tmp_path: Path) -> None:
+    frames, stamps = np.random.default_rng(1).integers(0, 4096, (6, 12, 16)).astype(np.uint16), [0, 10, 20, 20, 30, 40]
+    write_cine(tmp_path / "m.cine", frames, count=6, rate=100, times_ns=[one * 10**6 for one in stamps])
+    write_seq(tmp_path / "m.seq", frames, bits=12, times_us=[one * 1000 for one in stamps])
+    plane = {"Plane": {"DeltaT": [one * 1e-3 for one in stamps], "DeltaTUnit": ["s"] * 6}}
+    tifffile.imwrite(tmp_path / "m.ome.tif", frames, metadata={"axes": "TYX", **plane}, photometric="minisblack")
+    with h5py.File(tmp_path / "m.h5", "w") as file:
+        file.create_dataset("d", data=frames).attrs["times_ns"] = np.array(stamps) * 10**6
+    for name in ("m.cine", "m.seq", "m.ome.tif", "m.h5"):
+        seen = _seen(tmp_path / name, kind="monochrome")
+        assert seen["warnings"] == [f"{name}: its time stamps do not rise (at frame 3): they are not used"]
+        assert (seen["first_time_ns"], seen["last_time_ns"]) == (None, None)
+
+
+def test_a_frame_rate_that_is_not_that_of_the_time_stamps_is_reported(tmp_path: Path) -> None:
+    frames = np.random.default_rng(1).integers(0, 4096, (6, 12, 16)).astype(np.uint16)
+    write_seq(tmp_path / "m.seq", frames, bits=12, frame_rate=10.0, times_us=list(range(0, 6 * 33_784, 33_784)))
+    told = "m.seq: it states 10 frames per second, its time stamps 29.5998: these are taken"
+    assert _seen(tmp_path / "m.seq", kind="monochrome")["warnings"] == [told]
+
+
+def test_planes_of_one_time_are_described(tmp_path: Path) -> None:
+    frames = np.random.default_rng(1).integers(0, 4096, (6, 2, 12, 16)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "m.tif", frames, imagej=True, metadata={"axes": "TCYX", "finterval": 0.5})
+    seen = _seen(tmp_path / "m.tif")
+    assert (seen["count"], seen["last_time_ns"]) == (6, 2_500_000_000)
+    assert seen["warnings"] == ["it holds 2 channels of each time: frames.lights = 2"]

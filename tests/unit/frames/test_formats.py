@@ -27,6 +27,7 @@ from rgbmidic.frames.formats import FORMATS
 from rgbmidic.settings import FrameSettings
 
 STATED = FrameSettings(path=("frame",))
+MONO = FrameSettings(path=("frame",), kind="monochrome")
 GREY = noisy_mosaic((31, 45)).values
 RGB = np.random.default_rng(1).integers(0, 65536, (31, 45, 3)).astype(np.uint16)
 
@@ -131,12 +132,14 @@ def test_what_is_no_raw_frame_is_refused(tmp_path: Path) -> None:
         read_frame(tmp_path / "f.png")
 
 
-def test_three_equal_channels_count_as_grey_only_where_that_is_stated(tmp_path: Path) -> None:
+def test_colour_pictures_are_grey_only_where_that_is_stated(tmp_path: Path) -> None:
     file = _png(tmp_path / "f.png", np.repeat(GREY[..., None], 3, axis=2))
     assert len(read_frame(file).values) == 3
     np.testing.assert_array_equal(read_frame(file, kind="monochrome").values[0], GREY)
-    with pytest.raises(FrameError, match=r"kind is stated as monochrome, but .*rgb"):
-        read_frame(_png(tmp_path / "g.png", RGB), kind="monochrome")
+    other = _png(tmp_path / "g.png", RGB)
+    np.testing.assert_array_equal(read_frame(other, kind="monochrome").values[0], RGB[..., 1])
+    with pytest.raises(FrameError, match=r"kind is stated as bayer, but .*rgb"):
+        read_frame(other, kind="bayer", cfa="RGGB")
 
 
 def test_a_mosaic_needs_its_pattern(tmp_path: Path) -> None:
@@ -148,6 +151,91 @@ def test_a_mosaic_needs_its_pattern(tmp_path: Path) -> None:
     for kind in ("monochrome", "rgb"):
         with pytest.raises(FrameError, match=r"cfa|kind"):
             read_frame(file, kind=kind, cfa="RGGB")
+
+
+def _pack(values: np.ndarray, bits: int) -> np.ndarray:
+    """Rows of samples without a gap between them, the highest bit first."""
+    single = values[..., None] >> np.arange(bits)[::-1] & 1
+    return np.packbits(single.reshape(len(values), -1).astype(np.uint8), axis=1)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14])
+@pytest.mark.parametrize(("rows_per_strip", "columns"), [(31, 45), (7, 45), (7, 44)])
+def test_packed_samples_of_a_tiff(tmp_path: Path, bits: int, rows_per_strip: int, columns: int) -> None:
+    values, path = GREY[:, :columns] % 2**bits, tmp_path / "f.tif"
+    for kind, shown in (("minisblack", values), ("miniswhite", 2**bits - 1 - values)):
+        tifffile.imwrite(path, _pack(values, bits), photometric=kind, rowsperstrip=rows_per_strip, metadata=None)
+        with tifffile.TiffFile(path, mode="r+") as tiff:
+            tiff.pages.first.tags["ImageWidth"].overwrite(columns)
+            tiff.pages.first.tags["BitsPerSample"].overwrite(bits)
+        frame = read_frame(path, kind="monochrome")
+        np.testing.assert_array_equal(frame.values[0], shown)
+        assert frame.white_level == 2**bits - 1
+        window = Window(origin=(0, 8), shape=(16, columns), frame=values.shape)
+        np.testing.assert_array_equal(open_source(path, MONO).read(0, window).values[0], shown[8:24])
+    path.write_bytes(path.read_bytes()[:-10])
+    with pytest.raises(FrameError, match=r"f\.tif is damaged or truncated"):
+        read_frame(path, kind="monochrome")
+
+
+def test_packed_samples_that_are_not_read_are_named(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "f.tif", _pack(GREY, 12), metadata=None)
+    for tag, value, reason in (
+        ("BitsPerSample", 13, "13-bit samples; allowed are unsigned 8 or 16 bit, and uncompressed 10, 12 or 14 bit"),
+        ("BitsPerSample", 4, "4-bit samples; allowed"),
+        ("Compression", 5, "12-bit samples; allowed"),
+    ):
+        tifffile.imwrite(tmp_path / "f.tif", _pack(GREY, 12), metadata=None)
+        with tifffile.TiffFile(tmp_path / "f.tif", mode="r+") as tiff:
+            tiff.pages.first.tags["BitsPerSample"].overwrite(12)
+            tiff.pages.first.tags[tag].overwrite(value)
+        with pytest.raises(FrameError, match=reason):
+            read_frame(tmp_path / "f.tif", kind="monochrome")
+
+
+@pytest.mark.parametrize(
+    ("largest", "white"), [(255, 255), (4095, 4095), (65535, 65535), (1000, 1000), (200, 200), (1, 1)]
+)
+def test_pgm(tmp_path: Path, largest: int, white: float) -> None:
+    values, path = (GREY.astype(int) % (largest + 1)).astype(">u2" if largest > 255 else "u1"), tmp_path / "f.pgm"
+    path.write_bytes(b"P5 # by a camera\n45 31\n#\n%d\n" % largest + values.tobytes())
+    frame = read_frame(path, kind="monochrome")
+    np.testing.assert_array_equal(frame.values[0], values)
+    assert frame.white_level == white
+    window = Window(origin=(0, 8), shape=(16, 45), frame=values.shape)
+    np.testing.assert_array_equal(open_source(path, MONO).read(0, window).values[0], values[8:24])
+    content = path.read_bytes()
+    for damaged in (content[:-1], content + b"\0", content.replace(b"45 31", b"45 0 "), content[:12]):
+        path.write_bytes(damaged)
+        with pytest.raises(FrameError, match=r"f\.pgm"):
+            read_frame(path, kind="monochrome")
+    path.write_bytes(b"P2 45 31 255 0 0")
+    with pytest.raises(FrameError, match=r"f\.pgm is no binary grey picture \(P5\)"):
+        read_frame(path, kind="monochrome")
+
+
+@pytest.mark.parametrize("columns", [44, 45])
+def test_grey_and_coloured_bmp(tmp_path: Path, columns: int) -> None:
+    grey, path = (GREY[:, :columns] % 256).astype(np.uint8), tmp_path / "f.bmp"
+    assert cv2.imwrite(str(path), grey)
+    frame = read_frame(path, kind="monochrome")
+    np.testing.assert_array_equal(frame.values[0], grey)
+    assert frame.white_level == 255
+    content = bytearray(path.read_bytes())
+    top_down = content[:22] + struct.pack("<i", -31) + content[26:]
+    path.write_bytes(top_down)
+    np.testing.assert_array_equal(read_frame(path, kind="monochrome").values[0], grey[::-1])
+    content[54 + 4 * 7] = 200  # the table's entry of 7
+    path.write_bytes(content)
+    with pytest.raises(FrameError, match=r"f\.bmp shows its grey levels through a colour table"):
+        read_frame(path, kind="monochrome")
+    path.write_bytes(top_down[:-1])
+    with pytest.raises(FrameError, match=r"f\.bmp is damaged or truncated"):
+        read_frame(path, kind="monochrome")
+    assert cv2.imwrite(str(path), (RGB[:, :columns] % 256).astype(np.uint8)[..., ::-1])
+    np.testing.assert_array_equal(read_frame(path, kind="rgb").values, np.moveaxis(RGB[:, :columns] % 256, -1, 0))
+    assert cv2.imwrite(str(path), np.repeat(grey[..., None], 3, axis=2))
+    np.testing.assert_array_equal(read_frame(path, kind="monochrome").values[0], grey)
 
 
 def test_levels_must_fit_the_samples(tmp_path: Path) -> None:
@@ -203,6 +291,19 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     _png(folder / "lzw.tif", GREY)
     _png(folder / "grey.png", GREY)
     return {file.name: file for file in folder.iterdir()}
+
+
+def test_a_jpeg_in_a_tiff_that_libjpeg_fills_up_is_refused(tmp_path: Path) -> None:
+    path, values = tmp_path / "f.tif", np.random.default_rng(0).integers(0, 200, (64, 96)).astype(np.uint8)
+    assert cv2.imwrite(str(path), values, [cv2.IMWRITE_TIFF_COMPRESSION, 7])
+    assert read_frame(path, kind="monochrome").values.shape == (1, 64, 96)
+    with tifffile.TiffFile(path) as tiff:
+        start, length = tiff.pages.first.dataoffsets[0], tiff.pages.first.databytecounts[0]
+    content = bytearray(path.read_bytes())
+    content[start + length // 2 : start + length - 2] = bytes(length - 2 - length // 2)
+    path.write_bytes(content)
+    with pytest.raises(FrameError, match=r"f\.tif is damaged .*Corrupt JPEG data"):
+        read_frame(path, kind="monochrome")
 
 
 @pytest.mark.parametrize("name", ["plain.tif", "zip.tif", "lzw.tif", "grey.png"])

@@ -150,6 +150,29 @@ def test_a_missing_companion_is_named(tmp_path: Path) -> None:
         _series(tmp_path / "other.mraw")
 
 
+@pytest.mark.parametrize("ending", [".cihx", ".cih"])
+def test_a_bayer_movie_is_no_monochrome_one(tmp_path: Path, ending: str) -> None:
+    frames = _frames(12)
+    path = write_mraw(tmp_path, frames, bits=12, ending=ending, **{"Color Type": "Bayer"})
+    np.testing.assert_array_equal(open_source(path, FrameSettings(path=("m",), cfa="GRBG")).read(1).values, frames[1])
+    for stated, reason in (({}, "does not state its colour filter array"), ({"kind": "monochrome"}, "states bayer")):
+        with pytest.raises(FrameError, match=reason):
+            open_source(path, FrameSettings(path=("m",), **stated)).read(0)
+
+
+def test_a_movie_that_goes_on_behind_its_frames_says_so(tmp_path: Path) -> None:
+    path = write_mraw(tmp_path, _frames(8), bits=8)
+    path.write_bytes(path.read_bytes() + bytes(7))
+    told = "bytes more than the 5 frames that its header announces"
+    assert _series(path).remarks == (f"movie.mraw: it has 7 {told}",)
+    np.save(tmp_path / "m.npy", _frames(8))
+    assert _series(tmp_path / "m.npy").remarks == ()
+    (tmp_path / "m.npy").write_bytes((tmp_path / "m.npy").read_bytes() + bytes(3))
+    assert _series(tmp_path / "m.npy").remarks == (
+        "m.npy: it has 3 bytes more than the 5 frames that its header announces",
+    )
+
+
 def test_a_folder_with_movies_only_names_one(tmp_path: Path) -> None:
     write_mraw(tmp_path, _frames(12), bits=12)
     with pytest.raises(FrameError, match=r"folder without frames.*movie\.cihx is a movie .*name the movie itself"):

@@ -117,8 +117,53 @@ def test_a_number_missing_in_the_names_is_told_and_kept_as_a_gap(
 ) -> None:
     series = _series(tmp_path, [f"{name}.tif" for name in names])
     assert list(series.numbers) == numbers
-    told = [record.getMessage() for record in caplog.records]
+    told = [text for text in caplog.messages if "frames are missing" in text]
     assert [message.split("in the numbering, ")[1].split(";")[0] for message in told] == ([missing] if missing else [])
+
+
+@pytest.mark.parametrize(
+    ("names", "numbers", "doubt"),
+    [
+        ("shot_-00002 shot_-00001 shot_000000 shot_+00001", range(4), ""),
+        ("shot-2 shot-1 shot0 shot1 shot3", (0, 1, 2, 3, 5), ""),
+        ("foo_-002 foo_-001 foo_0000 foo_0001", range(4), ""),
+        ("DSC_9997 DSC_9998 DSC_9999 DSC_0001 DSC_0002 DSC_0004", (0, 1, 2, 3, 4, 6), "counter seems to begin again"),
+        ("IMG_170431 IMG_170431(1) IMG_170431(2) IMG_170431(10)", range(4), "several forms"),
+        ("test test-1 test-2 test-10", range(4), "several forms"),
+        ("load_0kN load_0.25kN load_0.5kN load_0.75kN load_1kN load_1.5kN", (0, 1, 2, 3, 4, 6), ""),
+        ("load_-1,5 load_-1 load_0 load_0,5", (0, 1, 3, 4), ""),
+        ("plate_0.25 plate_0.5 plate_0.75", range(3), "may be counters"),
+        ("run1.1 run1.2 run1.9 run1.10", (0, 1, 8, 9), ""),
+        ("run1.0 run1.5 run2.0", range(3), ""),
+        ("scan-1 scan-2 scan-10", (0, 1, 9), ""),
+        ("2026-11-09_1 2026-11-10_1 2026-11-10_2", range(3), ""),
+        ("f0001 f0002 f9998", (0, 1, 9997), ""),
+        ("f0002 f0500 f9000", (0, 249, 4499), ""),
+        ("x001 x98 x99", (0, 97, 98), ""),
+        ("ref_1 ref_2 stage_1", range(3), "several forms"),
+    ],
+)
+def test_signs_and_fractions_count_where_the_series_has_them(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, names: str, numbers: Sequence[int], doubt: str
+) -> None:
+    ordered = [f"{name}.tif" for name in names.split()]
+    _write(tmp_path, sorted(ordered, key=lambda name: hashlib.sha256(name.encode()).digest()))
+    series = open_series(FrameSettings(path=("*.tif",), cfa="RGGB"), tmp_path)
+    assert [series.name(index) for index in range(len(series))] == ordered
+    assert list(series.numbers) == list(numbers)
+    doubts = [text for text in caplog.messages if "order of *.tif is uncertain" in text]
+    assert len(doubts) == bool(doubt)
+    assert all(doubt in text and f"taken as {ordered[0]}, {ordered[1]}" in text for text in doubts)
+
+
+def test_a_frame_in_two_formats_is_not_measured_twice(tmp_path: Path) -> None:
+    _write(tmp_path, ["f1.tif", "f2.tif"])
+    for index in (1, 2):
+        write_dng(tmp_path / f"f{index}.dng", noisy_mosaic((24, 30), seed=index))
+    with pytest.raises(FrameError, match=r"f1\.dng and f1\.tif: is that one frame in two files\? .*\*\.dng"):
+        open_series(FrameSettings(path=(str(tmp_path),), cfa="RGGB"))
+    assert len(open_series(FrameSettings(path=("*.dng",)), tmp_path)) == 2
+    assert len(open_series(FrameSettings(path=("*.dng", "*.tif"), kind="monochrome"), tmp_path)) == 2
 
 
 def test_captures_in_no_order_have_no_gaps(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

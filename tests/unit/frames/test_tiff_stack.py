@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import time
 import tracemalloc
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ STATED = FrameSettings(path=("frame",), kind="monochrome")
 
 
 def _write(path: Path, frames: Any = FRAMES, **options: Any) -> Path:
+    path.parent.mkdir(exist_ok=True)
     tifffile.imwrite(path, frames, **{"photometric": "minisblack", **options})
     return path
 
@@ -251,3 +254,118 @@ def test_a_hundred_thousand_pages_are_followed_once(tmp_path: Path) -> None:
     for index in (99_999, 0, 50_000):
         assert (source.read(index).values == index % 251).all()
     assert time.process_time() - begin < 1.0
+
+
+def _planes(path: Path, order: str, **options: Any) -> np.ndarray:
+    """Three times of two planes, stored in the order of the axes; the samples say time and plane."""
+    frames = np.empty((3, 2, 12, 17), dtype=np.uint16)
+    frames[...] = np.arange(6).reshape(3, 2, 1, 1)
+    stored = frames.swapaxes(0, 1) if order.endswith("TYX") else frames
+    tifffile.imwrite(path, np.ascontiguousarray(stored), photometric="minisblack", metadata={"axes": order}, **options)
+    return frames
+
+
+@pytest.mark.parametrize(
+    ("order", "options", "planes"),
+    [
+        ("TCYX", {"imagej": True}, "2 channels of 3 times"),
+        ("TZYX", {"imagej": True}, "2 slices of 3 times"),
+        ("TCYX", {"ome": True}, "2 channels of 3 times"),
+        ("CTYX", {"ome": True}, "2 channels of 3 times"),
+        ("ZTYX", {"ome": True}, "2 slices of 3 times"),
+    ],
+    ids=str,
+)
+def test_planes_of_one_time_are_lights_and_no_frames(
+    tmp_path: Path, order: str, options: dict[str, Any], planes: str
+) -> None:
+    frames = _planes(tmp_path / "m.tif", order, **options)
+    with pytest.raises(FrameError, match=rf"m\.tif holds {planes}: state frames\.lights = 2"):
+        _series(tmp_path / "m.tif")
+    with pytest.raises(FrameError, match=r"lights is 3"):
+        open_series(FrameSettings(path=(str(tmp_path / "m.tif"),), kind="monochrome", lights=3))
+    series = open_series(FrameSettings(path=(str(tmp_path / "m.tif"),), kind="monochrome", lights=2))
+    assert len(series) == 3
+    for index in range(3):
+        read = np.stack([frame.values[0] for frame in series.read(index)])
+        np.testing.assert_array_equal(read, frames[index])
+
+
+def test_pages_lie_where_ome_states(tmp_path: Path) -> None:
+    _planes(tmp_path / "m.tif", "TCYX", ome=True)
+    places = {(time, channel): page for page, (channel, time) in enumerate(np.ndindex(2, 3))}  # channel after channel
+    parts = "".join(
+        f'<TiffData IFD="{page}" FirstT="{time}" FirstC="{channel}" PlaneCount="1"/>'
+        for (time, channel), page in places.items()
+    )
+    with tifffile.TiffFile(tmp_path / "m.tif") as tiff:
+        text = re.sub(r"<TiffData[^>]*/>", parts, tiff.ome_metadata)
+    _description(tmp_path / "m.tif", text)
+    series = open_series(FrameSettings(path=(str(tmp_path / "m.tif"),), kind="monochrome", lights=2))
+    assert [[int(frame.values[0, 0, 0]) for frame in series.read(index)] for index in range(3)] == [
+        [0, 3],
+        [1, 4],
+        [2, 5],
+    ]
+
+
+@pytest.mark.parametrize("axes", ["CYX", "ZYX", "TYX"])
+def test_the_only_axis_of_a_stack_is_time(tmp_path: Path, axes: str) -> None:
+    path = _write(tmp_path / "m.tif", imagej=True, metadata={"axes": axes})
+    assert len(_series(path)) == 6
+
+
+def test_one_page_with_the_text_of_a_stack_is_one_frame(tmp_path: Path) -> None:
+    """As programs that split a stack leave it."""
+    for number, text in enumerate(("ImageJ=1.54\nimages=5\nframes=5\n", '{"shape": [5, 12, 17]}')):
+        _write(tmp_path / f"one_{number}.tif", FRAMES[number], metadata=None, description=text)
+    series = _series(tmp_path)
+    assert (len(series), list(series.numbers)) == (2, [0, 1])
+    np.testing.assert_array_equal(series.read(1)[0].values[0], FRAMES[1])
+    _description(_write(tmp_path / "m.tif", FRAMES[:3]), "ImageJ=1.54\nimages=5\nframes=5\nfinterval=0.1\n")
+    source = _open(tmp_path / "m.tif")
+    assert (len(source), source.recording.times_ns) == (3, None)
+    assert source.recording.remarks == ("its text announces 5 images, it holds 3: the text is not used",)
+    assert series.remarks == ("one_0.tif: its text announces 5 images, it holds 1: the text is not used",)
+
+
+def test_what_is_lost_of_a_description_is_reported(tmp_path: Path) -> None:
+    path = _description(_behind_one_page(tmp_path / "m.tif"), "ImageJ=1.54\nimages=4\nframes=4\n")
+    assert _series(path).remarks == ("m.tif: its text announces 4 images, and it has room for 6",)
+    path = _description(_write(tmp_path / "o.tif"), '<OME><Image><Pixels SizeT="6"')
+    assert _series(path).remarks == ("o.tif: its OME description cannot be read",)
+    for number, frames in enumerate((FRAMES, FRAMES, FRAMES)):
+        _write(tmp_path / "several" / f"{number}.tif", frames)
+    with tifffile.TiffFile(tmp_path / "several" / "1.tif") as tiff:
+        following = tiff.pages[1].offset
+    content = (tmp_path / "several" / "1.tif").read_bytes()
+    (tmp_path / "several" / "1.tif").write_bytes(content.replace(struct.pack("<I", following), bytes(4), 1))
+    remark = "1.tif: its text announces 6 images, it holds 1: the text is not used"
+    assert _series(tmp_path / "several").remarks == (remark,)
+
+
+@pytest.mark.parametrize("options", [{}, {"metadata": None}, {"imagej": True, "metadata": {"axes": "TYX"}}], ids=str)
+def test_a_stack_that_is_cut_anywhere_loses_no_frame_in_silence(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, options: dict[str, Any]
+) -> None:
+    for number in range(3):
+        _write(tmp_path / f"{number}.tif", **options)
+    whole, opened = (tmp_path / "1.tif").read_bytes(), 0
+    for length in np.linspace(16, len(whole) - 1, 40).astype(int):
+        (tmp_path / "1.tif").write_bytes(whole[:length])
+        try:
+            series = _series(tmp_path)
+        except FrameError as error:
+            assert re.search(r"1\.tif is (damaged|truncated)", str(error))  # noqa: PT017
+            continue
+        opened += 1
+        assert len(series) == 18
+        for index in (0, 5, 6, 7, 11, 12, 17):
+            with suppress(FrameError) if 6 <= index < 12 else nullcontext():
+                np.testing.assert_array_equal(series.read(index)[0].values[0], FRAMES[index % 6])
+    assert opened > (0 if options.get("metadata", "") is None else 10)
+    assert not [record for record in caplog.records if record.name.startswith("rgbmidic")]
+    (tmp_path / "1.tif").write_bytes(whole[: len(whole) // 2])
+    alone = _series(tmp_path / "1.tif")
+    with pytest.raises(FrameError, match=r"1\.tif.* truncated"):
+        alone.read(len(alone) - 1)

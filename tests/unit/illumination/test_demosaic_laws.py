@@ -86,8 +86,9 @@ def test_dead_pixels_are_missing_data_and_hurt_nobody_else(lights):
     broken = replace(clean, values=np.where(dead, np.float32(4000), clean.values), saturated=clean.saturated | dead)
     good, found = (separate(one, scenes.CROSSTALK, texture=TEXTURE) for one in (clean, broken))
     near = cv2.dilate(dead.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
-    # farther off only the trust in a tile may be rounded differently: below the camera noise of 13 to 25 DN
-    assert np.sqrt(np.mean((found.values - good.values)[:, ~near] ** 2)) < 8
+    # farther off only the trust in a tile may be rounded differently, 7 to 10 DN in draws of noise and dead pixels:
+    # below the camera noise of 13 to 25 DN
+    assert np.sqrt(np.mean((found.values - good.values)[:, ~near] ** 2)) < 12
     error = scenes.error(found, lights)
     assert (error < 1.25 * scenes.error(good, lights)).all()
     assert found.valid.mean() > 0.9

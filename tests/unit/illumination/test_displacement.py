@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import shift
 
-from rgbmidic._kernels.demosaicing import displacement_sums
+from rgbmidic._kernels.texture import displacement_scores
+from rgbmidic.illumination.colour_factors import enlarged, widened
 from rgbmidic.illumination.displacement import agreement
 from rgbmidic.illumination.separation import separate
 
@@ -63,17 +64,19 @@ def test_a_light_counts_by_its_precision_and_by_those_that_agree():
     assert agree.item() < 0.05
 
 
-def test_sums_are_those_written_out():
-    rng, shape, block = np.random.default_rng(4), (20, 37), 8
-    padded = rng.normal(size=(shape[0] + 4, shape[1] + 4)).astype(np.float32)
-    padded[9, 11] = np.nan
-    pair = rng.normal(size=(2, 3, 25, 2)).astype(np.float32)
-    sums = np.empty((3, 5, *(-(-side // block) for side in shape)), dtype=np.float32)
-    displacement_sums(padded, np.tile(pair, 16), block, 0, 1, sums)
+def test_scores_are_those_written_out():
+    rng, half = np.random.default_rng(4), 4
+    planes = rng.normal(size=(3, 11, 18)).astype(np.float32)
+    planes[1, 5, 7] = np.nan
+    slope = rng.uniform(1, 2, (3, 3, 5)).astype(np.float32)
+    sums = np.empty((3, 3, 3, 5), dtype=np.float32)
+    displacement_scores(planes, widened(slope, half, 18), half, sums)
+    texture = planes / enlarged(slope, half, (11, 18))
     expected = np.zeros_like(sums)
-    for i, j in np.ndindex(*shape):
-        r, x, y = pair[i % 2, :, :, j % 2] @ padded[i : i + 5, j : j + 5].ravel()
-        channel = 1 if i % 2 == j % 2 else 0 if i % 2 == 0 else 2
-        if np.isfinite(r):
-            expected[channel, :, i // block, j // block] += r * x, r * y, (x * x + y * y) / 2, r * r, 1
-    np.testing.assert_allclose(sums, expected, rtol=1e-4, atol=2e-2)
+    for light, i, j in np.ndindex(3, 9, 16):
+        others = np.delete(texture, light, axis=0).mean(axis=0)
+        r = texture[light, i + 1, j + 1] - others[i + 1, j + 1]
+        gx, gy = (others[i + 1, j + 2] - others[i + 1, j]) / 2, (others[i + 2, j + 1] - others[i, j + 1]) / 2
+        if np.isfinite(r + gx + gy):
+            expected[light, :, (i + 1) // half, (j + 1) // half] += -r * gx, -r * gy, (gx * gx + gy * gy) / 2
+    np.testing.assert_allclose(sums, expected, rtol=1e-4, atol=1e-4)

@@ -6,7 +6,7 @@ import pytest
 
 from rgbmidic._kernels import demosaicing as kriging
 from rgbmidic._kernels import texture
-from rgbmidic.illumination.colour_factors import colour_moments, of_mosaic, widened
+from rgbmidic.illumination.colour_factors import _channel_moments, _planes, of_mosaic, widened
 from rgbmidic.illumination.demosaicing import red_position
 from rgbmidic.settings import BAYER_PATTERNS
 
@@ -54,12 +54,41 @@ def test_division_by_the_local_mean(shape, block):
 @pytest.mark.parametrize("cfa", BAYER_PATTERNS)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_moments_of_the_planes(cfa, shape):
-    values = make_contrast(shape, unknown=0.005)
-    sums = np.empty((11, *(-(-n // 8) for n in shape)), dtype=np.float32)
-    texture.cell_moments(values, 8, sums)
+    values, grid = make_contrast(shape, unknown=0.005), tuple(-(-n // 8) for n in shape)
+    planes = np.empty((4, shape[0] // 2, shape[1] // 2), dtype=np.float32)
+    texture.low_passed_planes(values, np.argsort(_planes(red_position(cfa))), planes)
+    sums = np.empty((11, *grid), dtype=np.float32)
+    texture.plane_products(planes, texture.CELLS, sums)
+    pairs = np.zeros((4, 4), dtype=int)
+    pairs[np.triu_indices(4)] = np.arange(10)
     expected = naive_texture.cell_moments(values, cfa, 8)
     np.testing.assert_array_equal(sums[10], expected[1])
-    np.testing.assert_allclose(colour_moments(sums[:10], red_position(cfa)), expected[0], rtol=1e-4, atol=1e5)
+    moments = _channel_moments(sums[np.maximum(pairs, pairs.T)])
+    np.testing.assert_allclose(moments, expected[0], rtol=1e-4, atol=1e5)
+
+
+@pytest.mark.parametrize("width", [21, 150])
+def test_planes_are_read_where_they_show_the_texture(width):
+    """Waves of eight cells, displaced by as much more from block to block as a lens does."""
+    y, x = np.mgrid[:30, :width].astype(float)
+    displacement = np.zeros((2, 2, 8, -(-width // 4)))
+    displacement[1] = np.linspace(-2.6, 1.9, displacement[1].size).reshape(displacement[1].shape)
+    blocks = (np.arange(30) // 4)[:, None], np.arange(width) // 4
+    at_x, at_y = (displacement[:, axis][:, *blocks] for axis in (0, 1))
+
+    def wave(x, y):
+        return np.sin(2 * np.pi * (x + 0.3 * y) / 8)
+
+    planes = np.stack([wave(x, y), wave(x, y)]).astype(np.float32)
+    planes[0, 3, 9] = np.nan
+    out = np.empty_like(planes)
+    texture.register_planes(planes, displacement, out)
+    expected = wave(x + at_x, y + at_y)
+    known = np.isfinite(out)
+    assert known[1, 8:-8, 8:-8].all()
+    assert not known[0, 3, 9]
+    assert not known[:, :3].any()
+    assert np.abs(out - expected)[known].max() < 0.009  # .0065
 
 
 @pytest.mark.parametrize("cfa", ["RGGB", "GBRG"])

@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import pickle
+import runpy
 import subprocess
 import sys
 import threading
@@ -16,6 +17,7 @@ from textures import Texture
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from rgbmidic import correlate
+from rgbmidic._kernels.cache import _warn_once
 from rgbmidic._kernels.owned_pixels import block_sums
 from rgbmidic._kernels.threads import aside, compiled, one_blas_thread, set_threads, threads
 from rgbmidic.errors import InputError
@@ -153,3 +155,43 @@ def test_the_environment_sets_the_number():
 def test_fewer_than_one_thread_is_refused():
     with pytest.raises(InputError, match="at least 1; given is 0"):
         set_threads(0)
+
+
+_KERNEL = """
+from rgbmidic._kernels.threads import compiled
+
+@compiled()
+def doubled(values):
+    values *= 2
+"""
+
+
+def _doubled(folder):
+    """Whether the kernel of a module works, as a new process has it; and the files of its cache."""
+    module = runpy.run_path(str(folder / "doubling.py"))
+    values = np.ones(3)
+    module["doubled"](values)
+    assert (values == 2).all()
+    hits = sum(module["doubled"].dispatcher.stats.cache_hits.values())
+    return hits, [next((folder / "__pycache__").glob(f"*.{ending}")) for ending in ("nbi", "nbc")]
+
+
+def test_a_damaged_cache_is_stated_and_compiled_anew(tmp_path, caplog):
+    (tmp_path / "doubling.py").write_text(_KERNEL)
+    hits, (index, data) = _doubled(tmp_path)
+    assert not hits
+    for file, content in ((index, b""), (index, index.read_bytes()[:-9]), (data, data.read_bytes()[:-99])):
+        file.write_bytes(content)
+        caplog.clear()
+        _warn_once.cache_clear()
+        hits, _ = _doubled(tmp_path)
+        assert not hits
+        (warning,) = caplog.messages
+        assert warning.startswith(f"compiled kernels in {tmp_path}/__pycache__ are damaged and are compiled anew (")
+        assert _doubled(tmp_path)[0] == 1
+        assert caplog.messages == [warning]
+    index.unlink()
+    index.mkdir()
+    (index / "in the way").touch()
+    assert not _doubled(tmp_path)[0]
+    assert caplog.messages[-1].startswith(f"compiled kernels cannot be kept in {tmp_path}/__pycache__: ")

@@ -7,7 +7,6 @@ import pytest
 from bits import assert_same_on_threads
 
 from rgbmidic._kernels.owned_pixels import product_sums, score_sums
-from rgbmidic._kernels.weights import gradient_of_others
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
 
@@ -64,23 +63,6 @@ def test_scores_of_all_lights_together(pixels, side):
     np.testing.assert_allclose(out, expected_sums(pixels, fields, side), atol=2e-4)
 
 
-@pytest.mark.parametrize("fewest", [2, 3])
-@pytest.mark.parametrize("light", [0, 2])
-def test_gradient_of_the_other_lights(light, fewest):
-    random = np.random.default_rng(5)
-    gradient, weights = random.normal(size=(2, 3, 5000)).astype(np.float32), random.uniform(-1, 1, size=(3, 5000))
-    mean, products = np.full((2, 5000), 7, dtype=np.float32), np.full((4, 5000), 7, dtype=np.float32)
-    gradient_of_others(gradient, weights.astype(np.float32), light, fewest, mean, products)
-    for i in range(5000):
-        every = [j for j in range(3) if weights[j, i] > 0]
-        others = [j for j in every if j != light]
-        chosen = others if len(others) >= fewest else every
-        wanted, own = gradient[:, chosen, i].sum(axis=1) / max(len(chosen), 1), gradient[:, light, i]
-        np.testing.assert_allclose(mean[:, i], wanted, atol=1e-5)
-        expected = np.array([own @ wanted, wanted @ wanted, own @ own, 1]) * (light in every)
-        np.testing.assert_allclose(products[:, i], expected, atol=1e-5)
-
-
 def test_the_same_bits_on_one_and_three_threads(pixels):
     values = np.random.default_rng(3).uniform(size=(2, pixels.rows.size)).astype(np.float32)
 
@@ -88,11 +70,8 @@ def test_the_same_bits_on_one_and_three_threads(pixels):
         sums, summed = np.zeros((6, *pixels.grid(4)), np.float32), np.zeros((4, *pixels.grid(4)), np.float32)
         product_sums(values, values, pixels.lines, pixels.run_offsets, pixels.offsets, 4, sums)
         score_sums(values, values, values, values, pixels.lines, pixels.run_offsets, pixels.offsets, 4, summed)
-        many = np.resize(values, (2, 20000))
-        mean, products = np.zeros((2, 20000), np.float32), np.zeros((4, 20000), np.float32)
-        gradient_of_others(np.stack([many, many**2]), many, 1, 1, mean, products)
         blocks = pixels.block_sums(values, 5)
-        return sums, summed, mean, products, blocks, pixels.from_blocks(blocks, 5), pixels.scatter(values[1])
+        return sums, summed, blocks, pixels.from_blocks(blocks, 5), pixels.scatter(values[1])
 
     assert_same_on_threads(found)
 

@@ -69,6 +69,15 @@ def test_a_frame_that_repeats_the_one_before_is_warned_of(tmp_path, told):
     assert "2 (frame 2);" in told()
 
 
+@pytest.mark.parametrize("frames", [{}, {"reference": "0:2"}, {"first": 2}])
+def test_a_frame_that_is_the_reference_is_warned_of(tmp_path, told, frames):
+    source = [frame(0), frame(1), frame(2), frame(0), frame(3)]
+    measure(settings(frames=frames), tmp_path / "out", source=source)
+    assert told().startswith("frames are the reference, bit for bit, which camera noise makes impossible")
+    assert f"not measured: {3 - frames.get('first', 0)} (frame 3);" in told()
+    assert len(told().splitlines()) == 1
+
+
 def test_frames_that_are_all_the_same_are_warned_of(tmp_path, told):
     measure(settings(), tmp_path / "out", source=[frame(0)] * 3)
     assert told().startswith("all frames repeat the one before, bit for bit")
@@ -83,6 +92,11 @@ def test_a_run_in_parts_warns_of_a_repeated_frame(tmp_path, told):
 def test_a_state_that_repeats_the_one_before_is_warned_of(told):
     list(measure_sequence([frame(0), frame(1), frame(1)], settings()))
     assert told() == "state 2 repeats the one before, bit for bit"
+
+
+def test_a_state_that_is_the_reference_is_warned_of(told):
+    list(measure_sequence([frame(0), frame(1), frame(0), frame(2)], settings()))
+    assert told() == "state 2 is the reference, bit for bit: its displacement of 0 is not measured"
 
 
 def test_a_threshold_that_excludes_nothing_is_warned_of(told):

@@ -107,6 +107,7 @@ def test_samples_pile_up_where_a_camera_saturates_below_its_white_level(step):
     assert saturation_pile(clipped, 65535) == 2000 * step
     assert saturation_pile(clipped, 2000 * step) is None
     assert saturation_pile(bright.astype(np.uint16), 65535) is None
+    assert saturation_pile(np.full(99, 700, dtype=np.uint16), 65535) is None
     mosaic = Mosaic(values=clipped, cfa="RGGB", black_level=0, white_level=65535)
     assert clipping((mosaic,))[0] == 2000 * step
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import os
 import subprocess
 import sys
 from itertools import pairwise
@@ -13,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
 from matplotlib.text import Text
 from results import LIGHTS, MESH, NODES, make_origin, make_result
 
@@ -78,8 +81,9 @@ def test_a_map_of_a_mesh_with_a_crack_has_the_values_of_both_sides(tmp_path: Pat
     shown = picture.get_array()
     assert not np.ma.getmaskarray(np.ma.masked_invalid(shown)).any()
     column = np.argmin(np.abs(x - 20))
-    assert shown[y < 40][:, column].max() == pytest.approx(-1)
-    assert shown[y > 40][:, column].min() == pytest.approx(1)
+    # two elements from the step to 0 the field swings by 1 %
+    assert shown[y < 40][:, column].max() == pytest.approx(-1, abs=0.02)
+    assert shown[y > 40][:, column].min() == pytest.approx(1, abs=0.02)
 
 
 def test_a_reference_that_shows_a_part_of_the_frame_lies_where_it_belongs(tmp_path: Path) -> None:
@@ -132,7 +136,8 @@ def test_every_map_shows_its_quantities_around_the_mesh(tmp_path: Path, kind: st
     for axis, name in zip(figure.axes, figures.MAPS[kind], strict=False):
         assert axis.get_title() == maps.field(name).label
         picture, values = axis.images[-1].get_array(), maps.read(name, 0).values
-        assert np.nanmin(values) <= np.nanmin(picture) <= np.nanmax(picture) <= np.nanmax(values)
+        beyond = 0.1 * np.ptp(values[np.isfinite(values)]) + 1e-9  # the field may be curved between the nodes
+        assert np.nanmin(values) - beyond <= np.nanmin(picture) <= np.nanmax(picture) <= np.nanmax(values) + beyond
         (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
         assert left < 10 < 110 < right < 150
         assert top < 5 < 75 < bottom < 100
@@ -450,3 +455,21 @@ def test_matplotlib_is_imported_only_for_a_figure() -> None:
     code = "import sys, rgbmidic.report, rgbmidic.results; print({'matplotlib', 'numba'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_a_picture_appears_when_all_of_it_is_written_and_only_in_a_format_that_there_is(tmp_path: Path) -> None:
+    path, figure = tmp_path / "a.png", Figure()
+    save_figure(figure, path)
+    before = path.read_bytes()
+    assert before[:4] == b"\x89PNG"
+
+    def draw(renderer: object) -> None:
+        assert [file.name for file in tmp_path.glob("a.png.*.part")]
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    figure.draw = draw  # type: ignore[method-assign]
+    with pytest.raises(ResultError, match=r"a\.png cannot be written: No space"):
+        save_figure(figure, path)
+    assert [file.read_bytes() for file in tmp_path.iterdir()] == [before]
+    with pytest.raises(InputError, match=r"a\.xyz cannot be written: a figure is one of .*\.png, "):
+        save_figure(figure, tmp_path / "a.xyz")

@@ -18,7 +18,7 @@ from results import NODES, make_result, smooth_record
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.errors import FrameError, InputError, ResultError
-from rgbmidic.report import movie
+from rgbmidic.report import movie, video
 from rgbmidic.report.curves import Curve
 from rgbmidic.report.movie import Movie, MovieConstants, _Canvas, write_movie
 from rgbmidic.results import FrameRecord, Maps
@@ -193,6 +193,25 @@ def test_nothing_is_left_of_a_movie_whose_command_is_terminated(
     assert execute(cli.app, ["movie", str(maps.result.path), "--out", str(out), "--width", "320"]) == 130
     assert signal.getsignal(signal.SIGTERM) is before
     assert not list(tmp_path.iterdir())
+
+
+def test_an_interruption_while_its_timer_starts_ends_the_timer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    timers: list[video.Timer] = []
+
+    class Interrupted(video.Timer):
+        def start(self) -> None:
+            super().start()
+            timers.append(self)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(video, "Timer", Interrupted)
+    pages = iter([np.zeros((2, 2, 4), dtype=np.uint8)] * 2)
+    with (tmp_path / "m.mp4").open("wb") as file, pytest.raises(KeyboardInterrupt):
+        video.video(file, pages, 25.0, ["cat"], 300.0)
+    for timer in timers:
+        timer.join(10)
+    assert timers
+    assert not any(timer.is_alive() for timer in timers)
 
 
 def test_wrong_input_is_refused_and_nothing_is_overwritten(maps: Maps, tmp_path: Path) -> None:

@@ -42,12 +42,15 @@ def stretch(mesh: Tri3Mesh = MESH, strain: float = 0.01, bend: float = 0.05) -> 
     return np.stack([-0.3 * strain * x, strain * (y + bend * y**2)], axis=1)
 
 
-def measured(path: Path, displacement: np.ndarray, std: float = STD, timed: bool = True, **options: object) -> Result:
+def measured(
+    path: Path, displacement: np.ndarray, std: float = STD, timed: bool = True, bias: float = 0.0, **options: object
+) -> Result:
     """A result of displacements (T, N, 2) in mm along the mesh's axes, each frame against the one reference."""
 
     def record(index: int) -> FrameRecord:
         u, v = PLACEMENT.vectors_to_px(PLACEMENT.to_mm(MESH.nodes), displacement[index]).T
         stated = {"u_std": np.full(NODES, std), "v_std": np.full(NODES, std)}
+        stated |= {"u_bias_std": np.full(NODES, bias), "v_bias_std": np.full(NODES, bias)}
         stated |= {"time_ns": 1_000_000 * index} if timed else {}
         return FrameRecord.of(nodes=NODES, lights=3, number=index, status=0, u=u, v=v, **stated)
 
@@ -76,6 +79,30 @@ def test_chi_square_is_1_and_scatters_as_its_degrees_of_freedom_state(tmp_path, 
         assert 0.6 < squares.var() * agreements[0].degrees_of_freedom / 2 < 1.6, name
         assert np.mean([one.beyond_2 for one in agreements]) == pytest.approx(0.0455, abs=0.015)
     assert np.isnan(frames[0].fit.scale)  # nothing has moved
+
+
+def test_the_lights_bias_is_alike_over_its_range_and_leaves_fewer_degrees_of_freedom(tmp_path):
+    mesh = OTHER
+    away = ((MESH.nodes[:, None] - MESH.nodes) ** 2).sum(axis=-1)
+    root = np.linalg.cholesky(np.exp(-away / (4 * 24**2)) + 1e-9 * np.eye(NODES))
+    bias = 2 * STD * MM * (root @ np.random.default_rng(9).normal(size=(60, NODES, 2)))
+    field = 0.05 * stretch(mesh)
+    moved = noise(60) + bias + 0.05 * stretch()
+    comparison = compared(measured(tmp_path / "r", moved, std=5**0.5 * STD, bias=2 * STD), field, mesh)
+    plain = compared(measured(tmp_path / "p", moved[:1], std=5**0.5 * STD), field, mesh).frame(0)
+    frames = list(comparison.each())
+    for name, tolerance in {"u": 0.15, "exx": 0.1, "exy": 0.1}.items():
+        agreements = [made.agreement["levelled", name] for made in frames]
+        squares = np.array([one.chi_square for one in agreements])
+        assert abs(squares.mean() - 1) < tolerance, name
+        assert 0.5 < squares.var() * agreements[0].degrees_of_freedom / 2 < 1.8, name
+    assert frames[0].agreement["levelled", "u"].degrees_of_freedom < 0.6 * (
+        plain.agreement["levelled", "u"].degrees_of_freedom
+    )
+    pulls = [(one.fit.scale - 1) / one.fit.scale_std for one in frames]
+    assert 0.75 < np.sqrt(np.mean(np.square(pulls))) < 1.25
+    shifts = [(one.fit.rigid / one.fit.rigid_std) for one in frames]
+    assert (np.abs(np.sqrt(np.mean(np.square(shifts), axis=0)) - 1) < 0.25).all()
 
 
 def test_the_scale_of_several_frames_holds_its_uncertainty(tmp_path):
@@ -217,6 +244,15 @@ def test_a_simulation_is_read_with_its_times_and_interpolated(states, name):
     assert read.mesh.node_numbers.tolist() == finite_elements().node_numbers.tolist()
 
 
+@pytest.mark.parametrize("numbers", [(0.25, 0.5, 0.75), (-0.5, 0, 0.25, 1), (9, 10, 11)])
+def test_signs_and_fractions_in_the_names_of_states_count(tmp_path, numbers):
+    for number in numbers:
+        write_state(tmp_path / f"plate_{number}.vtu", number * stretch())
+    read = Simulation.read(tmp_path, interval=2.0)
+    assert read.times.tolist() == [2.0 * number for number in numbers]
+    assert read.at(2.0 * numbers[1]) == pytest.approx(numbers[1] * stretch(), abs=1e-9)
+
+
 def test_what_may_be_meant_otherwise_is_stated(tmp_path, states, caplog):
     table = states.parent / "table.csv"
     mesh = finite_elements()
@@ -292,6 +328,31 @@ def test_a_result_of_mesh_file_is_compared_by_number_where_the_simulation_has_an
     (tmp_path / "t.csv").write_text("\n".join(["node,u_mm,v_mm", *rows, rows[3]]))
     with pytest.raises(InputError, match=f"two rows or more for node {mesh.node_numbers[order[3]]} at one time"):
         Simulation.read(tmp_path / "t.csv", mesh=measured_mesh(result))
+
+
+@pytest.mark.parametrize(
+    ("header", "row"),
+    [
+        ("node,u_mm,v_mm", "100,1,2"),
+        ("v_mm,node,u_mm", "2,100,1"),
+        ("node,UY_um,time_ms,ux", "100,2000,7,1"),
+        ("u2,w_mm,u_1,node", "2,3,1,100"),
+    ],
+)
+def test_the_columns_of_a_table_are_taken_by_their_names(tmp_path, header, row):
+    (tmp_path / "t.csv").write_text(f"{header}\n{row}")
+    read = Simulation.read(tmp_path / "t.csv", mesh=finite_elements())
+    assert read.displacement[0, 0].tolist() == [1, 2]
+    assert read.times is None or read.times.tolist() == [0.007]
+
+
+@pytest.mark.parametrize(
+    "header", ["node,u_mm,u_mm", "node,v_mm,uy", "node,u_mm,v_mm,ux", "node,u,v,node", "node,u,v,time_s,time_ms", "u,v"]
+)
+def test_each_column_of_a_table_must_be_there_once(tmp_path, header):
+    (tmp_path / "t.csv").write_text(f"{header}\n1,1,1,1,1")
+    with pytest.raises(InputError, match='one column each "node", "u_mm" and "v_mm"'):
+        Simulation.read(tmp_path / "t.csv", mesh=finite_elements())
 
 
 def test_nodes_on_two_sides_of_a_crack_are_told_apart_by_their_numbers(tmp_path):

@@ -46,10 +46,11 @@ def test_npz_holds_every_array(result: Result, tmp_path: Path) -> None:
         assert archive["u"].shape == archive["v_std"].shape == (3, NODES)
         assert archive["names"].tolist() == ["frame 0", "frame 1", "frame 2"]
         assert archive["lights"].tolist() == list(LIGHTS)
-        stackable = {name for name, quantity in QUANTITIES.items() if quantity.stackable}
-        assert set(archive.files) == {"nodes", "elements", "names", "lights"} | stackable
-        for name in archive.files:
+        stackable = {name for name, quantity in QUANTITIES.items() if quantity.stackable} - {"time_ns"}
+        assert set(archive.files) == {"nodes", "elements", "names", "lights", "time_s"} | stackable
+        for name in {*archive.files} - {"time_s"}:
             np.testing.assert_array_equal(archive[name], getattr(result, name), err_msg=name)
+        np.testing.assert_allclose(archive["time_s"], result.time_ns * 1e-9)
 
 
 def test_csv_has_one_row_per_node_and_frame(result: Result, tmp_path: Path) -> None:
@@ -76,11 +77,13 @@ def test_csv_is_in_millimetres_where_the_scale_is_known(result: Result, tmp_path
     np.testing.assert_allclose(column(rows, "u_std_mm"), spread, rtol=1e-6)
 
 
-def test_csv_has_no_time_where_nobody_knows_it(tmp_path: Path) -> None:
+def test_an_unknown_time_is_left_out_of_csv_and_nan_in_npz(tmp_path: Path) -> None:
     with ResultStore.create(tmp_path / "out", make_origin(1)) as store:
         store.write_frame(0, FrameRecord.of(nodes=NODES, lights=len(LIGHTS)))
     export_result(Result.open(tmp_path / "out"), "csv", tmp_path / "fields.csv")
     assert "time" not in (tmp_path / "fields.csv").read_text(encoding="utf-8")
+    export_result(Result.open(tmp_path / "out"), "npz", tmp_path / "fields.npz")
+    assert np.isnan(np.load(tmp_path / "fields.npz")["time_s"]).all()
 
 
 def test_a_quantity_of_the_table_is_kept_read_and_exported_by_its_entry_alone(

@@ -9,6 +9,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import threading
 import tracemalloc
 import zipfile
 import zlib
@@ -175,7 +176,7 @@ def test_a_forged_record_is_told(copy: Path, part: str, name: str, size: int, mo
         return file.getvalue() + values.tobytes()
 
     monkeypatch.setattr(records, "npy_bytes", forged)
-    records.write_record(copy / "solution", 0, record, result.table.run)
+    records.write_record(copy / "solution", 0, record, result.table.run, lambda: None)
     if part == "length":
         file = copy / "solution" / "000000.npz"
         content = bytearray(file.read_bytes())
@@ -242,7 +243,8 @@ def test_json_that_cannot_be_read_is_told(copy: Path, text: str) -> None:
 @pytest.mark.parametrize("to", [to for to in EXPORT_FORMATS if to != "crackpy"])
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 def test_export_to_a_full_disk_is_told(result: Result, tmp_path: Path, to: str) -> None:
-    (tmp_path / f"fields.{socket.gethostname()}.{os.getpid()}.part").symlink_to("/dev/full")
+    part = f"fields.{socket.gethostname()}.{threading.get_ident()}.{os.getpid()}.part"
+    (tmp_path / part).symlink_to("/dev/full")
     with pytest.raises(ResultError, match=r"fields cannot be written: No space left"):
         export_result(result, to, tmp_path / "fields")
     assert not list(tmp_path.iterdir())

@@ -616,6 +616,14 @@ def test_of_many_channels_the_first_are_drawn(tmp_path: Path, caplog: pytest.Log
     assert "the picture shows 24 of 40 kinds" in caplog.text
 
 
+def test_a_legend_states_how_many_it_does_not_name() -> None:
+    curves = [History(name=f"point_{i}_u", unit="px", values=np.arange(4.0) + i, std=np.ones(4)) for i in range(48)]
+    legend = history_figure(histories_of(np.arange(4.0), *curves)).axes[0].get_legend()
+    names = [text.get_text() for text in legend.get_texts()]
+    assert len(names) == 13
+    assert names[-1] == "and 36 more"
+
+
 def test_without_a_file_the_table_is_printed_and_nothing_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,7 +8,10 @@ import pickle
 import socket
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
+from threading import Barrier
 
 import numpy as np
 import pytest
@@ -101,6 +104,55 @@ def test_parts_are_written_side_by_side_and_exclude_only_each_other(tmp_path: Pa
         first.write_frame(0, random_record(0))
     finish_result(out)
     np.testing.assert_array_equal(Result.open(out).u, [random_record(index).u for index in range(4)])
+
+
+@pytest.mark.parametrize("other", [True, False], ids=["another result", "nothing"])
+def test_a_result_in_the_place_of_that_of_a_running_test_is_not_written_into(tmp_path: Path, other: bool) -> None:
+    path = tmp_path / "out"
+    with _create(path) as store:
+        store.write_frame(0, random_record(0))
+        path.rename(tmp_path / "moved")
+        kept = make_result(path) if other else None
+        content = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+        for write in (partial(store.write_frame, 1, random_record(1)), partial(store.discard, [0]), store.finish):
+            with pytest.raises(ResultError, match=r"was replaced or emptied while|cannot be written"):
+                write()
+    assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == content
+    assert kept is None or kept.refresh().finished.all()
+
+
+def test_a_folder_replaced_between_the_check_and_the_end_of_a_record_is_not_written_into(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "out"
+
+    def check(claim: Claim) -> None:
+        monkeypatch.undo()
+        claim.check()
+        path.rename(tmp_path / "moved")
+        make_result(path)
+
+    with _create(path) as store:
+        monkeypatch.setattr(Claim, "check", check)
+        with pytest.raises(ResultError, match="cannot be written"):
+            store.write_frame(0, random_record(5))
+    np.testing.assert_array_equal(Result.open(path).frame(0).u, random_record(0).u)
+
+
+def test_threads_of_one_process_write_parts_of_one_result(tmp_path: Path) -> None:
+    origin, count = make_origin(24), 6
+    barrier = Barrier(count)
+
+    def write(first: int) -> None:
+        barrier.wait()
+        with ResultStore.join(tmp_path / "out", origin, frames=range(first, first + 4)) as store:
+            for index in range(first, first + 4):
+                store.write_frame(index, random_record(index))
+
+    with ThreadPoolExecutor(count) as pool:
+        list(pool.map(write, range(0, 24, 4)))
+    finish_result(tmp_path / "out")
+    assert not list((tmp_path / "out").glob("*.part"))
 
 
 def test_a_copy_in_another_process_writes_into_the_same_result(tmp_path: Path) -> None:

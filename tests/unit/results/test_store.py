@@ -316,6 +316,7 @@ def test_every_quantity_of_a_solution_is_taken_from_it() -> None:
         elements=np.array([[0, 1, 2]], dtype=np.int32),
         displacement=values.random((nodes, 2)),
         displacement_std=values.random((nodes, 2)),
+        bias_std=values.random((nodes, 2)),
         strain=values.random((nodes, 3)),
         strain_std=values.random((nodes, 3)),
         displacement_error=values.random((nodes, 2)),
@@ -337,6 +338,7 @@ def test_every_quantity_of_a_solution_is_taken_from_it() -> None:
     np.testing.assert_array_equal(np.stack([record.u_std, record.v_std], axis=1), single["displacement_std"])
     np.testing.assert_array_equal(np.stack([record.exx, record.eyy, record.exy], axis=1), single["strain"])
     np.testing.assert_array_equal(np.stack([record.exx_std, record.eyy_std, record.exy_std], 1), single["strain_std"])
+    np.testing.assert_array_equal(record.v_bias_std, solution.bias_std[:, 1].astype(np.float32))
     np.testing.assert_array_equal(record.v_mesh_error, solution.displacement_error[:, 1].astype(np.float32))
     np.testing.assert_array_equal(record.exy_mesh_error, solution.strain_error[:, 2].astype(np.float32))
     for name in ("node_status", "light_fraction", "misfit", "rigid", "residual", "weight_fraction", "history"):

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from results import LIGHTS, MESH, NODES, corrupt, make_origin, make_result, random_record, smooth_record
 
 from rgbmidic import CameraCalibration
+from rgbmidic.errors import FrameError
 from rgbmidic.fields import MEASURES
 from rgbmidic.report.style import time_axis
 from rgbmidic.results import QUANTITIES, FrameRecord, Maps, MapValues, Result, ResultStore
@@ -217,6 +218,9 @@ def test_fields_are_those_of_the_table_in_the_units_of_the_reader(result):
     np.testing.assert_allclose(read.std, np.hypot(0.5 * record.u_std, 0.01 * record.u))
     np.testing.assert_allclose(read.moved, result.nodes + np.stack([record.u, record.v], axis=1))
     np.testing.assert_allclose(fields.read("magnitude", 3).values, 0.5 * np.hypot(record.u, record.v))
+    bias = np.where(np.isfinite(record.u_std), 0.5 * np.nan_to_num(record.u_bias_std), np.nan)
+    for found in (fields.read("u_bias_std", 3).values, fields.physical.frame(3)["u_bias_std"]):
+        np.testing.assert_allclose(found, bias)
     np.testing.assert_array_equal(fields.read("node_status", 3).values, record.node_status)
     np.testing.assert_allclose(fields.read("e1", 3).values, fields.physical.frame(3)["e1"])
     fraction = fields.read("fraction of green", 3).values
@@ -272,6 +276,32 @@ def shown_fields(result, **view):
     shown = ShownFields(result, ViewState(**view))
     shown.choose()
     return shown
+
+
+def test_the_frames_beside_the_one_in_view_are_read_ahead_and_each_once(tmp_path, monkeypatch):
+    result, seen = make_result(tmp_path / "result", frames=6, record=smooth_record), []
+    shown = shown_fields(result, frame=3, field="exx", over="deformed")
+
+    def read(kind, frame):
+        if kind == "raw" and frame == 2:
+            raise FrameError("it is gone")
+        seen.append((kind, frame))
+
+    monkeypatch.setattr(shown, "_read", lambda name, frame: read(name, frame))
+    monkeypatch.setattr(shown, "_raw", lambda frame: read("raw", frame))
+    for _ in range(4):
+        shown.read_ahead()
+    assert seen == [("exx", 4), ("raw", 4), ("exx", 2)]
+    seen.clear()
+    shown.view = replace(shown.view, frame=4)
+    for _ in range(4):
+        shown.read_ahead()
+    assert seen == [("exx", 5), ("raw", 5), ("exx", 3), ("raw", 3)]
+    seen.clear()
+    shown.view = replace(shown.view, frame=5, over="reference")
+    for _ in range(4):
+        shown.read_ahead()
+    assert seen == [("exx", 4)]
 
 
 def spread_of(text):

@@ -106,6 +106,16 @@ def test_another_page_of_the_web_cannot_speak_with_the_server(address):
     assert ask(address, "GET", path, {**UPGRADE, "Origin": "http://elsewhere.example"})[0] == 403
 
 
+def test_the_server_answers_under_its_own_address_only(address):
+    """A page of the web may give its own name the address of this machine: to a browser both are then of one origin."""
+    parts = urlsplit(address)
+    for host in ("elsewhere.example", "127.0.0.1.elsewhere.example", "localhost", "[::1]", ""):
+        upgrade = UPGRADE | {"Origin": f"http://{host}:{parts.port}"}
+        for path, headers in ((parts.path, {}), (f"{parts.path}ws", upgrade)):
+            for name in (host, f"{host}:{parts.port}"):
+                assert ask(address, "GET", path, {**headers, "Host": name})[0] in (400, 403), name
+
+
 def test_the_server_listens_to_this_machine_only(address):
     parts = urlsplit(address)
     assert parts.hostname == "127.0.0.1"

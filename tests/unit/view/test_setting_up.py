@@ -65,6 +65,19 @@ def test_a_size_that_the_run_finds_is_kept_unless_it_is_changed(tmp_path):
     assert SetupPage._changed(page).section("mesh")["element_size"] == 30
 
 
+def test_a_reference_of_several_frames_is_stated_and_kept_unless_it_is_changed(tmp_path):
+    file = tmp_path / "TEST.toml"
+    file.write_text(TEXT.replace('"monochrome"', '"monochrome"\nreference = "1:4"'), encoding="utf-8")
+    controls = SetupControls(Draft.of(file), 4, tmp_path / "out", dark=False)
+    page = SimpleNamespace(parts=controls, draft=Draft.of(file), drawing=SimpleNamespace(marks=[]))
+    page.source = SimpleNamespace(series=range(5))
+    assert (controls.reference.title, controls.reference.value) == ("Reference, 3 from", 1)
+    assert SetupPage._changed(page).frames.reference == (1, 2, 3)
+    controls.reference.value = 2
+    assert controls.reference.title == "Reference"
+    assert SetupPage._changed(page).frames.reference == (2,)
+
+
 def test_nothing_is_changed_by_no_change(tmp_path):
     file = tmp_path / "TEST.toml"
     file.write_text(TEXT, encoding="utf-8")

@@ -141,14 +141,16 @@ def slope_along_x(reference, image):
     return ((np.roll(image, -1, axis=1) - np.roll(image, 1, axis=1)) / 2)[rows, columns]
 
 
-def test_what_a_light_alone_shows_is_not_in_the_gradient_it_is_matched_with(prepared):
+def test_what_a_light_alone_shows_is_not_in_the_gradient_it_is_matched_with_where_it_is_displaced(prepared):
     a, alone = speckle(1), [speckle(seed) - 1000 for seed in (5, 6, 7)]
     reference = prepared(*(a + 0.4 * one for one in alone))
+    displaced = reference.texture.matched(reference.pixels, np.zeros((3, 1, 1)))[0]
     for light, one in enumerate(alone):
-        gradient = reference.gradient[0][light]
+        gradient = displaced[light]
+        assert np.corrcoef(gradient, reference.gradient[0][light])[0, 1] < 0.999
         assert np.corrcoef(gradient, slope_along_x(reference, a))[0, 1] > 0.9
         assert abs(np.corrcoef(gradient, slope_along_x(reference, one))[0, 1]) < 0.08
-        beyond = reference.channel_specific[0, light]
+        beyond = reference.channel_specific(light)[0]
         assert np.corrcoef(beyond, slope_along_x(reference, one))[0, 1] > 0.7
 
 
@@ -191,7 +193,8 @@ def test_the_uncertainty_holds_what_a_light_alone_still_pulls():
     )
     error = pulled.displacement - (0.5, 0)
     assert np.abs(error / pulled.displacement_std).max() < 4
+    assert np.sqrt(np.mean((error / pulled.displacement_std) ** 2)) < 1.2
     along, across = np.sqrt(np.mean(error**2, axis=0))
     assert along < 1.2 * across  # 1.5 times with the mean gradient of all lights
     usual, stated = (np.median(one.displacement_std, axis=0) for one in (clean, pulled))
-    assert stated[0] > 1.5 * usual[0]
+    assert stated[0] > 1.25 * usual[0]  # the error is 1.4 times as large

@@ -1,0 +1,117 @@
+"""What the library refuses: wrong shapes, types and extremes of arguments are one line each, never a foreign error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from results import make_result, smooth_record
+
+import rgbmidic
+from rgbmidic import Calibration, CameraCalibration, FiniteElementMesh, Placement, Region, Tri3Mesh
+from rgbmidic.errors import InputError, RgbmidicError
+from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.illumination.images import Registration
+from rgbmidic.settings import ProbeSettings
+from rgbmidic.typing import as_numbers
+
+STRANGE: list[Any] = [
+    "x", b"ab", np.nan, np.inf, -1, 1e300, 10**30, [], [[]], [None, 1], ["a", 1], [np.nan] * 4, [1e300] * 4,
+    [0, 0, 10**30, 1], np.zeros(0), np.zeros((3, 0, 2)), np.array(["a", "b"]), np.array([1j, 2]),
+    np.full((4, 2), np.nan), np.array([[1, 2], [3, 4]], dtype=object), np.array(5.0), np.zeros((2, 2, 2, 2)),
+    [[1e18, 0], [1, 1], [2, 5]], [[-1e300, 0], [1, 1], [2, 5]], [[1, 2, 3, np.inf]] * 3,
+    np.zeros((20, 20)),
+]  # fmt: skip
+"""None of them is right for any of the arguments below."""
+REGION = Region.from_rectangle((2, 2, 17, 17), (20, 20))
+PLATE: dict[str, Any] = {
+    "name": "plate",
+    "points": [[0, 0], [1, 0], [1, 1]],
+    "elements": [[0, 1, 2]],
+    "node_numbers": [1, 2, 3],
+    "element_numbers": [1],
+}
+TEXTURE = np.random.default_rng(0).uniform(100, 200, (20, 20))
+
+
+def correlated(**given: Any) -> object:
+    return rgbmidic.correlate(TEXTURE, TEXTURE, **{"element_size": 8, **given})
+
+
+def measured(state: Any, **given: Any) -> object:
+    return next(rgbmidic.measure_sequence([state], **{"element_size": 8, **given}))
+
+
+ARGUMENTS: dict[str, Callable[[Any], object]] = {
+    "rectangle": lambda value: Region.from_rectangle(value, (20, 20)),
+    "shape of a rectangle": lambda value: Region.from_rectangle((1, 1, 5, 5), value),
+    "polygon": lambda value: Region.from_polygon(value, (20, 20)),
+    "shape of a polygon": lambda value: Region.from_polygon([[1, 1], [5, 1], [1, 5]], value),
+    "shape of a mask": lambda value: Region.from_mask(REGION.mask, value),
+    "hole": lambda value: REGION.without([value]),
+    "element size": lambda value: Tri3Mesh.from_region(REGION, value),
+    "crack": lambda value: Tri3Mesh.from_region(REGION, 8, [value]),
+    "nodes": lambda value: Tri3Mesh(nodes=value, elements=[[0, 1, 2]]),
+    "elements": lambda value: Tri3Mesh(nodes=PLATE["points"], elements=value),
+    **{key: lambda value, key=key: FiniteElementMesh(**PLATE | {key: value}) for key in PLATE if key != "name"},
+    "pairs of points": Placement.fit,
+    **{
+        key: lambda value, key=key: CameraCalibration(shape=(20, 20), **{key: value})
+        for key in ("lens", "homography", "covariance")
+    },
+    "reference": lambda value: rgbmidic.correlate(value, TEXTURE),
+    **{key: lambda value, key=key: correlated(**{key: value}) for key in ("weights", "initial", "normalise", "region")},
+    "state": lambda value: measured(value),
+    "region of states": lambda value: measured(TEXTURE, region=value),
+}
+
+
+@pytest.mark.parametrize("name", ARGUMENTS)
+@pytest.mark.filterwarnings("ignore")
+def test_strange_arguments_are_refused_in_one_line(name: str) -> None:
+    refused = 0
+    for value in STRANGE:
+        with suppress(RgbmidicError):
+            ARGUMENTS[name](value)
+            continue
+        refused += 1
+    assert refused >= len(STRANGE) - 4
+
+
+@pytest.mark.parametrize("lights", [("red", "red"), ("", "red"), (" ", "red"), (1, 2)])
+def test_lights_need_names_of_their_own(lights: tuple[Any, Any]) -> None:
+    with pytest.raises(RgbmidicError, match="each light needs a name, different from the others'"):
+        Crosstalk(matrix=np.eye(3)[:, :2], lights=lights)
+    with pytest.raises(RgbmidicError, match="each light needs a name"):
+        Registration(lights=lights, parameters=np.zeros((2, 5)), centre=(1, 1), radius=10.0)
+    document = Calibration(crosstalk=Crosstalk(matrix=np.eye(3)[:, :2], lights=("red", "blue"))).to_document()
+    document["crosstalk"]["lights"] = list(lights)
+    with pytest.raises(RgbmidicError):
+        Calibration.from_document(document)
+
+
+@pytest.mark.parametrize("kind", ["points", "lines", "circles", "regions", "gauges", "strain_gauges"])
+def test_probes_far_away_are_refused_at_once(tmp_path: Path, kind: str) -> None:
+    result = make_result(tmp_path / "out", record=smooth_record)
+    for far in (1e5, 1e18, 1e300):
+        numbers = {"points": 2, "circles": 3, "strain_gauges": 3}.get(kind, 4)
+        place = (*(50.0, 40.0, 60.0, 50.0)[: numbers - 1], far)
+        with pytest.raises(InputError, match="outside the region that was measured"):
+            rgbmidic.read_histories(result, ProbeSettings(**{kind: (place,)}))
+
+
+def test_a_reference_without_light_is_no_division_by_zero() -> None:
+    for dark in (np.zeros((20, 20)), -TEXTURE):
+        with pytest.raises(RgbmidicError):
+            list(rgbmidic.measure_sequence([TEXTURE], reference=dark, element_size=8))
+
+
+def test_numbers_are_taken_as_they_are_or_refused() -> None:
+    assert as_numbers([[1, 2.0]], "x", (None, 2), dtype=np.int32).tolist() == [[1, 2]]
+    for value in ([1.5], [2**40], [np.nan], ["1"], [True, None], [1 + 0j], [[1]]):
+        with pytest.raises(InputError, match="a whole number is needed; given is"):
+            as_numbers(value, "a whole number is needed", (1,), dtype=np.int32)
