@@ -52,6 +52,13 @@ class LightDisplacement:
         gain = 1 - chance / np.maximum((self.values**2).sum(axis=(0, 1)), 1e-12)
         return np.asarray(self.values * np.maximum(gain, 0))
 
+    @property
+    def without_glints(self) -> LightDisplacement:
+        """The part alone that lateral colour explains: lights whose textures differ show nothing else."""
+        lateral = self.lateral(np.ones(self.std.shape[1:], dtype=bool))
+        values = np.moveaxis(lateral - lateral.mean(axis=0), 2, 1).reshape(self.values.shape)
+        return LightDisplacement(values=values, std=self.std)
+
     def lateral(self, inside: BoolArray) -> FloatArray:
         """Displacement from the first light that varies over the field as lateral colour does (`registration_basis`).
 

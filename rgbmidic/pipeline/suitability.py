@@ -215,7 +215,8 @@ def separation_doubts(images: IlluminationImages, region: Region) -> list[Check]
                 "no common texture",
                 "the samples contradict one texture common to the lights, as prints of dots with sharp edges do, or a "
                 "lens that blurs one light more than another: each channel is demosaiced by itself (malvar), without "
-                "what the others see; the same focus for all lights, or a softer print",
+                "what the others see, and inspect expects too little uncertainty (a half to a quarter on printed "
+                "disks); the same focus for all lights, or a softer print",
             )
         )
     return doubts

@@ -19,7 +19,7 @@ from rgbmidic.illumination.demosaicing import SMALLEST_FRAME
 from rgbmidic.illumination.frame_check import Frame, check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
-from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.channels import (
     Channel,
     channels_of,
@@ -196,7 +196,8 @@ def inspect_frame(
 
     prediction = expected(np.ones(len(images.names)))
     doubts = separation_doubts(state, region)
-    if known.crosstalk is not None and len(known.crosstalk.matrix) == len(channels):
+    coloured = texture is not None and texture.specific >= COLOURED  # of one light more than of another
+    if known.crosstalk is not None and len(known.crosstalk.matrix) == len(channels) and not coloured:
         balance = LampBalance.of(shown, channels, known.crosstalk.matrix, region.mask)
         doubts += balance.advice(images.names, prediction, expected, noise_calibrated=known.noise is not None)
     report(3, 3, "done")

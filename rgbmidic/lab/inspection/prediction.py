@@ -30,10 +30,10 @@ from rgbmidic.illumination.crosstalk import Crosstalk, unmix
 from rgbmidic.illumination.demosaicing import Reconstruction, reconstruct
 from rgbmidic.illumination.images import IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
-from rgbmidic.illumination.mosaic_model import BLOCK, CHANNEL, MosaicModel
+from rgbmidic.illumination.mosaic_model import BLOCK, CHANNEL
 from rgbmidic.illumination.prediction_filters import SPARKLE_VARIANCE
 from rgbmidic.illumination.separation import DEFAULT_METHOD, reconstructed_lights, separate
-from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.channels import CONSTANTS
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.scene.camera import mosaic_samples
@@ -53,7 +53,7 @@ class ErrorDraw(Protocol):
         random
             Source of random numbers.
         strength : ndarray, shape (k,)
-            Of each light, relative to the frame's.
+            Of each light, relative to the frame's; those of a coloured specimen are not changed.
 
         Returns
         -------
@@ -100,14 +100,13 @@ def separated(
         if method not in ("auto", DEFAULT_METHOD):
             other = separate(first, crosstalk, method)
             images = replace(images, values=other.values, valid=other.valid)
-        seen = MosaicModel.of(crosstalk, known.registration, first.values.shape)
 
         def lights_of(values: FloatImage, cfa: str) -> FloatImage:
             drawn = replace(first, values=values, cfa=cfa, saturated=np.zeros(values.shape, dtype=bool))
             return np.nan_to_num(separate(drawn, calibration, method, texture=model.texture).values)
 
         def drawn_mosaic(random: np.random.Generator, strength: FloatArray) -> tuple[FloatImage, FloatImage]:
-            sites = _drawn_sites(model, seen, strength, random)
+            sites = _drawn_sites(model, strength if model.texture.specific < COLOURED else np.ones(3), random)
             phases = separated_phases(sites, first.cfa, lights_of)
             noisy = lights_of(_noisy(mosaic_samples(sites, first.cfa), noise, random), first.cfa)
             return (noisy - phases[0])[None], phases - phases.mean(axis=0)
@@ -235,14 +234,12 @@ def gaussian_field(texture: TextureModel, shape: tuple[int, ...], random: np.ran
     return np.asarray(irfft2(spectrum, s=(rows, columns))[: shape[0], : shape[1]], dtype=np.float32)
 
 
-def _drawn_sites(
-    model: Reconstruction, sites: MosaicModel, strength: FloatArray, random: np.random.Generator
-) -> FloatImage:
+def _drawn_sites(model: Reconstruction, strength: FloatArray, random: np.random.Generator) -> FloatImage:
     """Samples (4, H, W) that each kind of site would take everywhere of a random state with the frame's statistics.
 
     Every light shows the texture where the registration says that it does, and a component of its own.
     """
-    factors, texture = model.factors, model.texture
+    factors, texture, sites = model.factors, model.texture, model.model
     shape = model.channels.values.shape[1:]
     place = enlarged(sites.displacement.reshape(-1, *sites.displacement.shape[2:]), BLOCK, shape)
     margin = int(np.ceil(np.abs(place).max())) + 2
