@@ -328,6 +328,7 @@ def _blind():
 def test_troubles_are_told(lights, code):
     seen = inspect_frame(raw(lights()), calibration=CALIBRATION)
     assert code in codes(seen)
+    assert "lights apart" not in codes(seen)
     assert all(finding.text for finding in seen.findings)
 
 
