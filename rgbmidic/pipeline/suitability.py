@@ -68,8 +68,8 @@ class SuitabilityConstants:
         is 3 DN, a third of usual camera noise.
     lateral, unregistered
         Displacement (px, rms over the region) of a light's texture from the first light's, smooth over the field, from
-        which a warning is given: beyond a calibrated registration, and without one. Of eight scenes without either the
-        largest is .03 px, raised droplets and glare included (tests/unit/pipeline/test_suitability.py).
+        which a warning is given: beyond a calibrated registration, and without one. On eight rendered scenes that lie
+        in register, or are registered, it is .04 px at most, raised droplets and glare included.
     blur
         Motion (px) during the exposure from which a warning is given: the speckle's gradient is resolved to 1 px.
     """
