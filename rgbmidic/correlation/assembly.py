@@ -298,12 +298,13 @@ def unfitted_fraction(
     solve = assembly.factorise(assembly.matrix(hessian, anchor * assembly.diagonal))
     solutions, ratio = solve(sides), 1.0
     if prefilter != "none":
-        inner = (~mesh.on_boundary)[:, None]
-        moved = solve((inner * np.random.default_rng(0).choice([-1.0, 1.0], mesh.nodes.shape)).ravel())
-        sign[np.arange(rows) % apart > 0] = 0
-        sign[:, np.arange(columns) % apart > 0] = 0
-        sign = sign[(pixels.rows - top) // side, (pixels.columns - left) // side]
-        residual = _passed(mesh, pixels, images, prefilter, solutions[:, :2].T, sign)
+        inner = ~mesh.on_boundary | mesh.on_boundary.all()
+        moved = solve((inner[:, None] * np.random.default_rng(0).choice([-1.0, 1.0], mesh.nodes.shape)).ravel())
+        sign, fitted = (
+            sign[(pixels.rows - top) // side, (pixels.columns - left) // side],
+            solutions.reshape(-1, apart**2, 2),
+        )
+        residual = _passed(mesh, pixels, images, prefilter, fitted.sum(axis=1).T, sign)
         ratio = residual / _passed(mesh, pixels, images, prefilter, moved[None])
     if not mesh.is_graded:
         fraction = 1 - float((sides * solutions).sum()) / total
