@@ -299,13 +299,14 @@ def unfitted_fraction(
     solutions, ratio = solve(sides), 1.0
     if prefilter != "none":
         inner = ~mesh.on_boundary | mesh.on_boundary.all()
-        moved = solve((inner[:, None] * np.random.default_rng(0).choice([-1.0, 1.0], mesh.nodes.shape)).ravel())
-        sign, fitted = (
-            sign[(pixels.rows - top) // side, (pixels.columns - left) // side],
-            solutions.reshape(-1, apart**2, 2),
-        )
-        residual = _passed(mesh, pixels, images, prefilter, fitted.sum(axis=1).T, sign)
-        ratio = residual / _passed(mesh, pixels, images, prefilter, moved[None])
+        unit = np.zeros((len(mesh.nodes), 2, 2))
+        unit[:, [0, 1], [0, 1]] = inner[:, None] * np.random.default_rng(0).choice([-1.0, 1.0], mesh.nodes.shape)
+        moved = solve(unit.reshape(-1, 2)).T
+        fitted = solutions.reshape(-1, apart**2, 2).sum(axis=1).T
+        sign = sign[(pixels.rows - top) // side, (pixels.columns - left) // side]
+        each = mesh, pixels, images, prefilter
+        passed = [(_passed(*each, fitted[a], (sign * (1 - a), sign * a)), _passed(*each, moved[a])) for a in (0, 1)]
+        ratio = float(np.sqrt(np.prod([residual / motion for residual, motion in passed])))
     if not mesh.is_graded:
         fraction = 1 - float((sides * solutions).sum()) / total
         return ratio * fraction if fraction > constants.least_unfitted else float("nan")
@@ -329,19 +330,18 @@ def _passed(
     images: tuple[FloatImage, FloatImage],
     prefilter: str,
     nodal: FloatArray,
-    sign: FloatImage | None = None,
+    blocks: tuple[FloatImage | float, FloatImage | float] = (0.0, 0.0),
 ) -> float:
     """Return the fraction of the energy of ``sqrt(w) grad f . d`` that a prefilter passes.
 
-    The motions d are those of nodes (n, 2 N); with the `sign` (P,) of blocks, that of its number taken off.
+    The motion d is that of nodes (2 N,) less that of the `blocks` along x and y, (P,).
     """
     energy, passed, motion = 0.0, 0.0, np.empty((2, pixels.local_x.size), dtype=np.float32)
-    for axis, values in enumerate(nodal):
-        interpolate_nodal(values.reshape(-1, 2), mesh.elements, *pixels.positions, motion)
-        if sign is not None:
-            motion[axis] -= sign
-        for gx, gy, weight in zip(*images[0], images[1], strict=True):
-            image = np.sqrt(weight) * (gx * motion[0] + gy * motion[1])
-            energy += float((image**2).sum(dtype=np.float64))
-            passed += float((apply_prefilter(pixels.scatter(image), prefilter) ** 2).sum(dtype=np.float64))
+    interpolate_nodal(nodal.reshape(-1, 2), mesh.elements, *pixels.positions, motion)
+    motion[0] -= blocks[0]
+    motion[1] -= blocks[1]
+    for gx, gy, weight in zip(*images[0], images[1], strict=True):
+        image = np.sqrt(weight) * (gx * motion[0] + gy * motion[1])
+        energy += float((image**2).sum(dtype=np.float64))
+        passed += float((apply_prefilter(pixels.scatter(image), prefilter) ** 2).sum(dtype=np.float64))
     return passed / energy if energy else 1.0
