@@ -106,8 +106,8 @@ def _down(above, here, below, first, last, planes, number):
 
 
 @compiled("low", axis=1, fastmath={"contract"})
-def low_passed_planes(start, stop, contrast, order, low):
-    """Low-pass the four planes of a mosaic at the middle of each 2x2 cell.
+def low_passed_planes(start, stop, contrast, order, unmixing, low, lights):
+    """Low-pass the four planes of a mosaic at the middle of each 2x2 cell, and unmix the lights' from them.
 
     There the binomial [1 5 10 10 5 1] along both axes takes from each plane its own share, with the same weight, 16²,
     and the same centroid. `low` (4, H // 2, W // 2) float32 receives the planes ``2 a + b`` of row a and column b of
@@ -119,6 +119,7 @@ def low_passed_planes(start, stop, contrast, order, low):
     first, second, third, fourth = order
     for ci in range(start, stop):
         low[:, ci] = nan
+        lights[:, ci] = nan
         i = 2 * ci
         if i < 2 or i >= rows - REACH:
             continue
@@ -133,6 +134,11 @@ def low_passed_planes(start, stop, contrast, order, low):
             known = np.isfinite(p0 + p1 + p2 + p3)
             low[first, ci, d], low[second, ci, d] = p0 if known else nan, p1 if known else nan
             low[third, ci, d], low[fourth, ci, d] = p2 if known else nan, p3 if known else nan
+        for light in range(len(lights)):
+            target, (a, b, c, d) = lights[light, ci], unmixing[light]
+            first_line, second_line, third_line, fourth_line = low[0, ci], low[1, ci], low[2, ci], low[3, ci]
+            for j in range(target.size):
+                target[j] = a * first_line[j] + b * second_line[j] + c * third_line[j] + d * fourth_line[j]
 
 
 @compiled("sums", axis=1, fastmath={"contract"})
@@ -171,65 +177,54 @@ def plane_products(start, stop, planes, half, sums):
                 sums[moment, bi, b] = value_sum
 
 
-@helper()
-def lanczos_weights(fraction, weights):
-    """Weights of the eight neighbours of a place between the middle two (Duchon 1979), of unit sum."""
-    total = 0.0
-    for k in range(8):
-        x = np.pi * (k - 3 - fraction)
-        weights[k] = 4 * np.sin(x) * np.sin(x / 4) / (x * x) if abs(x) > 1e-6 else 1.0
-        total += weights[k]
-    for k in range(8):
-        weights[k] /= total
-
-
 @compiled("out", axis=1, grain=CELLS, fastmath={"contract"})
-def register_planes(start, stop, planes, displacement, out):
-    """Read low-passed planes (k, H, W) where each shows the texture, by interpolation (Lanczos 4).
+def register_planes(start, stop, planes, displacement, weights, out):
+    """Read low-passed planes (k, H, W) where each shows the texture, by interpolation between eight samples.
 
     `displacement` (k, 2, h, w) float64: x and y, in cells, by which a plane shows it farther on, in each block of 4 x 4
-    cells. `out`, like `planes`, is NaN where a sample is not finite or outside.
+    cells. `weights` (8, F) float32: of the samples, by F fractions from one cell to the next. `out`, like `planes`, is
+    NaN where a sample is not finite or outside.
     """
     height, width = planes.shape[1:]
     lines = np.empty((CELLS + 7, width), np.float32)
-    wx, wy, tall = np.empty((8, width), np.float32), np.empty((8, width), np.float32), np.empty(8, np.float32)
+    wx, wy = np.empty((8, width), np.float32), np.empty((8, width), np.float32)
+    left, top = np.empty(displacement.shape[3], np.int64), np.empty(displacement.shape[3], np.int64)
+    steps = weights.shape[1]
     out[:, start:stop] = np.nan
     for bi in range(start // CELLS, -(-stop // CELLS)):
         for light in range(len(planes)):
             for bj in range(-(-width // CELLS)):
-                for axis in range(2):
-                    at = displacement[light, axis, bi, bj]
-                    lanczos_weights(at - np.floor(at), tall)
+                x, y = displacement[light, 0, bi, bj], displacement[light, 1, bi, bj]
+                left[bj], top[bj] = int(np.floor(x)), int(np.floor(y))
+                # a place just before a sample is rounded to it
+                at_x = min(int((x - left[bj]) * steps), steps - 1)
+                at_y = min(int((y - top[bj]) * steps), steps - 1)
+                for k in range(8):
                     for j in range(bj * CELLS, min((bj + 1) * CELLS, width)):
-                        for k in range(8):
-                            (wx if axis == 0 else wy)[k, j] = tall[k]
+                        wx[k, j], wy[k, j] = weights[k, at_x], weights[k, at_y]
             first = 0
             while first < width:  # a run of blocks whose places lie between the same samples
-                left, top = np.floor(displacement[light, :, bi, first // CELLS])
-                last = first
-                while last < width:
-                    x, y = displacement[light, :, bi, last // CELLS]
-                    if np.floor(x) != left or np.floor(y) != top:
-                        break
-                    last += CELLS
-                i0, j0 = bi * CELLS + int(top) - 3, int(left) - 3
-                begin, end = max(first, -j0), min(min(last, width), width - j0 - 7)
+                bj = last = first // CELLS
+                while last * CELLS < width and left[last] == left[bj] and top[last] == top[bj]:
+                    last += 1
+                i0, j0 = bi * CELLS + top[bj] - 3, left[bj] - 3
+                begin, end = max(first, -j0), min(min(last * CELLS, width), width - j0 - 7)
                 if i0 >= 0 and i0 + CELLS + 7 <= height:
                     for i in range(CELLS + 7):
-                        source, line = planes[light, i0 + i], lines[i]
-                        for j in range(begin, end):
-                            value = np.float32(0)
-                            for k in range(8):
-                                value += wx[k, j] * source[j0 + j + k]
-                            line[j] = value
+                        line = lines[i, begin:end]
+                        line[:] = 0
+                        for k in range(8):
+                            source, weight = planes[light, i0 + i, j0 + k + begin :], wx[k, begin:end]
+                            for j in range(line.size):
+                                line[j] += weight[j] * source[j]
                     for i in range(CELLS):
-                        target = out[light, bi * CELLS + i]
-                        for j in range(begin, end):
-                            value = np.float32(0)
-                            for k in range(8):
-                                value += wy[k, j] * lines[i + k, j]
-                            target[j] = value
-                first = last
+                        target = out[light, bi * CELLS + i, begin:end]
+                        target[:] = 0
+                        for k in range(8):
+                            line, weight = lines[i + k, begin:end], wy[k, begin:end]
+                            for j in range(target.size):
+                                target[j] += weight[j] * line[j]
+                first = last * CELLS
 
 
 @compiled("sums", axis=2, fastmath={"contract"})
@@ -241,32 +236,47 @@ def displacement_scores(start, stop, planes, slope, half, sums):
     difference of that mean in a cell. `sums` (k, 3, h, w) float32; what is not finite is left out.
     """
     count, height, width = planes.shape
-    fraction = np.float32(1 / (count - 1))
-    texture, mean = np.empty((count, 3, width), np.float32), np.empty((3, width), np.float32)
+    fraction, zero = np.float32(1 / (count - 1)), np.float32(0)
+    # of the rows of a block, and one above and below
+    texture, mean = np.empty((count, half + 2, width), np.float32), np.empty((half + 2, width), np.float32)
+    total = np.empty((count, 3, width), np.float32)
     for bi in range(start, stop):
-        sums[:, :, bi] = 0
-        for i in range(max(bi * half, 1), min((bi + 1) * half, height - 1)):
-            for n in range(3):
-                low, high, part = between(i - 1 + n, half, slope.shape[1])
-                for light in range(count):
-                    above, below, line = slope[light, low], slope[light, high], planes[light, i - 1 + n]
-                    for j in range(width):
-                        texture[light, n, j] = line[j] / (above[j] + part * (below[j] - above[j]))
+        total[:] = 0
+        first, last = max(bi * half, 1), min((bi + 1) * half, height - 1)
+        for i in range(first - 1, last + 1):
+            low, high, part = between(i, half, slope.shape[1])
             for light in range(count):
-                mean[:] = 0
+                above, below, line = slope[light, low], slope[light, high], planes[light, i]
+                target = texture[light, i - first + 1]
+                for j in range(width):
+                    target[j] = line[j] / (above[j] + part * (below[j] - above[j]))
+        for light in range(count):
+            along_x, along_y, square = total[light]
+            for i in range(last - first + 2):
+                target = mean[i]
+                target[:] = 0
                 for other in range(count):
                     if other != light:
-                        for n in range(3):
-                            for j in range(width):
-                                mean[n, j] += fraction * texture[other, n, j]
+                        line = texture[other, i]
+                        for j in range(width):
+                            target[j] += fraction * line[j]
+            for i in range(1, last - first + 1):
+                own, above, here, below = texture[light, i], mean[i - 1], mean[i], mean[i + 1]
                 for j in range(1, width - 1):
-                    r = texture[light, 1, j] - mean[1, j]
-                    gx = np.float32(0.5) * (mean[1, j + 1] - mean[1, j - 1])
-                    gy = np.float32(0.5) * (mean[2, j] - mean[0, j])
-                    if np.isfinite(r + gx + gy):
-                        sums[light, 0, bi, j // half] -= r * gx
-                        sums[light, 1, bi, j // half] -= r * gy
-                        sums[light, 2, bi, j // half] += np.float32(0.5) * (gx * gx + gy * gy)
+                    r = own[j] - here[j]
+                    gx = np.float32(0.5) * (here[j + 1] - here[j - 1])
+                    gy = np.float32(0.5) * (below[j] - above[j])
+                    finite = np.isfinite(r + gx + gy)
+                    along_x[j] -= r * gx if finite else zero
+                    along_y[j] -= r * gy if finite else zero
+                    square[j] += np.float32(0.5) * (gx * gx + gy * gy) if finite else zero
+        for light in range(count):
+            for n in range(3):
+                for b in range(sums.shape[3]):
+                    value = np.float32(0)
+                    for j in range(b * half, min((b + 1) * half, width)):
+                        value += total[light, n, j]
+                    sums[light, n, bi, b] = value
 
 
 @compiled()

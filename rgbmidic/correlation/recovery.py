@@ -191,7 +191,7 @@ def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, Index, FloatArray, sp.c
         weights (N, W); and the matrix of these nodes.
     """
     elements = np.frombuffer(used, dtype=bool)
-    surrounded = _surrounded(mesh, elements)
+    surrounded = angle_fraction(mesh, elements)
     is_tip = mesh.on_boundary & (surrounded > 0.8)  # of a crack that opens by less than 70 degrees
     reach = _reached(mesh, elements, ~is_tip)
     number = np.diff(reach.indptr)
@@ -209,7 +209,7 @@ def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, Index, FloatArray, sp.c
     return other, np.flatnonzero(known), weight, reach
 
 
-def _surrounded(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:
+def angle_fraction(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:
     """Return the fraction (N,) of the full angle around each node that `used` elements fill; 1 where there are none."""
     corners = mesh.nodes[mesh.elements]
     ahead, back = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners

@@ -18,7 +18,15 @@ import numpy.typing as npt
 from rgbmidic._kernels import texture as kernels
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.mosaic_model import BLOCK, CHANNEL, FAINTEST, MosaicModel, channel_means
-from rgbmidic.illumination.texture import LAGS, PAIRS, WHITE_ENERGY, LagProducts, TextureModel, fit_texture
+from rgbmidic.illumination.texture import (
+    LAGS,
+    PAIRS,
+    WHITE_ENERGY,
+    LagProducts,
+    TextureModel,
+    fit_texture,
+    lanczos_weights,
+)
 from rgbmidic.typing import FloatArray, FloatImage
 
 MEAN_BLOCK = 4
@@ -130,23 +138,23 @@ def gather_moments(
     contrast = np.empty_like(values)
     kernels.subtract_mean(values, of_mosaic(mean, MEAN_BLOCK, values.shape[1], red), MEAN_BLOCK, contrast)
     height, width = (-(-side // BLOCK) for side in values.shape)
-    planes = np.empty((4, values.shape[0] // 2, values.shape[1] // 2), dtype=np.float32)
-    kernels.low_passed_planes(contrast, np.argsort(_planes(red)), planes)
-    to_lights = np.linalg.pinv(model.sites)
-    lights = (to_lights.astype(np.float32) @ planes.reshape(4, -1)).reshape(-1, *planes.shape[1:])
+    to_lights = np.asarray(np.linalg.pinv(model.sites), dtype=np.float64)
+    half = (values.shape[0] // 2, values.shape[1] // 2)
+    planes, lights = np.empty((4, *half), dtype=np.float32), np.empty((len(to_lights), *half), dtype=np.float32)
+    kernels.low_passed_planes(contrast, np.argsort(_planes(red)), to_lights.astype(np.float32), planes, lights)
     by_site = _second_moments(planes, (height, width))
     moments = _channel_moments(by_site)
     if not model.in_register:
-        by_light = np.einsum("ls,sthw,mt->lmhw", to_lights, by_site, to_lights)
-        apart = np.einsum("sl,lmhw,tm->sthw", model.sites, by_light, model.sites)
+        by_light = _transformed(to_lights, by_site)
+        apart = _transformed(model.sites, by_light)
         if model.displacement.any():
             registered = np.empty_like(lights)
-            kernels.register_planes(lights, model.displacement / 2, registered)
+            kernels.register_planes(lights, model.displacement / 2, lanczos_weights(), registered)
             lights, by_light = registered, _second_moments(registered, (height, width))
             if texture is not None:
                 by_light /= model.registered_energy(texture)
         rows = model.matrix[list(CHANNEL)]
-        moments += _channel_moments(np.einsum("sl,lmhw,tm->sthw", rows, by_light, rows) - apart)
+        moments += _channel_moments(_transformed(rows, by_light) - apart)
     level = [cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in channel_means(mean)]
     variance = np.zeros((3, height, width))
     if noise is not None:
@@ -163,6 +171,12 @@ def gather_moments(
         red=red,
         lights=lights,
     )
+
+
+def _transformed(matrix: FloatArray, moments: FloatArray) -> FloatArray:
+    """Return the moments (m, m, h, w) of what a matrix (m, n) makes of planes of moments (n, n, h, w)."""
+    rows, shape = len(matrix), moments.shape[2:]
+    return np.asarray((np.kron(matrix, matrix) @ moments.reshape(matrix.shape[1] ** 2, -1)).reshape(rows, rows, *shape))
 
 
 def _second_moments(planes: FloatImage, grid: tuple[int, int]) -> FloatArray:

@@ -109,6 +109,8 @@ class Reconstruction:
         Local mean of each channel on a grid of 4 px.
     displacement : LightDisplacement
         Of the lights' textures against each other, on a grid of 8 px.
+    model : MosaicModel
+        The lights that the factors are of: on a coloured specimen those are the channels.
     """
 
     channels: LinearChannels
@@ -116,6 +118,7 @@ class Reconstruction:
     factors: ColourFactors
     mean: FloatImage
     displacement: LightDisplacement
+    model: MosaicModel
 
 
 def reconstruct(
@@ -169,14 +172,13 @@ def reconstruct(
     assert learnt is not None, "of the mosaic, where none is given"
     factors = colour_factors(moments, learnt, model)
     displacement = light_displacement(moments, factors, learnt)
+    glints = displacement.significant
     if learnt.specific >= COLOURED:
         # a coloured specimen has no texture in common that could tell how the channels see the lights
         model = MosaicModel.of(None, None, values.shape)
         factors = colour_factors(moments, learnt, model)
-        displacement = replace(displacement, values=np.zeros_like(displacement.values))
-    frame = _Frame(
-        mosaic=mosaic, model=model, moments=moments, factors=factors, glints=_per_tile(displacement.significant)
-    )
+        displacement, glints = displacement.without_glints, np.zeros_like(glints)
+    frame = _Frame(mosaic=mosaic, model=model, moments=moments, factors=factors, glints=_per_tile(glints))
     if texture is None and learnt.specific < COLOURED:
         learnt = replace(learnt, common=frame.shows_common_texture(learnt))
     mixing = np.eye(3) if mixing is None else mixing
@@ -188,7 +190,12 @@ def reconstruct(
         valid = np.stack([by_channel.valid[matters].all(axis=0) for matters in needed(mixing)])
         channels = LinearChannels(values=out, valid=valid, full_scale=mosaic.full_scale)
     return Reconstruction(
-        channels=channels, texture=learnt, factors=factors, mean=moments.channel_mean, displacement=displacement
+        channels=channels,
+        texture=learnt,
+        factors=factors,
+        mean=moments.channel_mean,
+        displacement=displacement,
+        model=model,
     )
 
 

@@ -3,7 +3,8 @@
 Where paint reflects, glints sit on the flanks of raised droplets: the light that is reflected shows the common texture
 displaced by some tenths of a pixel, and the displacement slides as the surface turns. Its variance hardly shows that.
 The difference of each light's low-passed plane from the mean of the others, all read where the registration says that
-they show the texture, is regressed on the gradient of that mean.
+they show the texture, is regressed on the gradient of that mean. What is smooth over the whole field is not glints but
+lateral colour beyond the registration (`LightDisplacement.lateral`).
 
 Which of several lights shows the texture where it is, is a question of agreement (`agreement`): a light counts by its
 precision and by the precision of the others that show it at the same place.
@@ -17,12 +18,15 @@ import numpy as np
 
 from rgbmidic._kernels.texture import CELLS, displacement_scores
 from rgbmidic.illumination.colour_factors import ColourFactors, Moments, blurred, widened
+from rgbmidic.illumination.images import frame_geometry, registration_basis
 from rgbmidic.illumination.mosaic_model import BLOCK, FAINTEST
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import BoolArray, FloatArray
 
 SIZE, REACH = 5, 8
 """Side of the square of samples of a prediction, px; rows and columns over which predictions are correlated."""
+WINDOW = 20.0
+"""Standard deviation (px) of the window in which a displacement is taken: glints change their place over some 50 px."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +51,45 @@ class LightDisplacement:
         chance = 2 * most**2 * (self.std**2).sum(axis=0)
         gain = 1 - chance / np.maximum((self.values**2).sum(axis=(0, 1)), 1e-12)
         return np.asarray(self.values * np.maximum(gain, 0))
+
+    @property
+    def without_glints(self) -> LightDisplacement:
+        """The part alone that lateral colour explains: lights whose textures differ show nothing else."""
+        lateral = self.lateral(np.ones(self.std.shape[1:], dtype=bool))
+        values = np.moveaxis(lateral - lateral.mean(axis=0), 2, 1).reshape(self.values.shape)
+        return LightDisplacement(values=values, std=self.std)
+
+    def lateral(self, inside: BoolArray) -> FloatArray:
+        """Displacement from the first light that varies over the field as lateral colour does (`registration_basis`).
+
+        Parameters
+        ----------
+        inside : ndarray, shape (h, w)
+            The blocks that count.
+
+        Returns
+        -------
+        ndarray, shape (k, M, 2)
+            In px at the M blocks inside; 0 for a light where chance explains a third of it.
+        """
+        rows, columns = np.nonzero(inside)
+        blocks = np.stack([columns, rows], axis=1)
+        basis = registration_basis(blocks, *frame_geometry((inside.shape[0], inside.shape[1])))
+        fields = np.zeros((len(self.std), len(blocks), 2))
+        chance = np.zeros(len(self.std))
+        for light, std in enumerate(self.std[:, inside]):
+            target, weight = self.values[light][:, inside].T, 1 / std[:, None]
+            system = (basis * weight[..., None]).reshape(-1, basis.shape[2])
+            covariance = np.linalg.pinv(system.T @ system)
+            fields[light] = basis @ (covariance @ (system.T @ (target * weight).ravel()))
+            scatter = max(float((((target - fields[light]) * weight) ** 2).mean()), 1.0)
+            # a displacement has an error in common with those in the window of its estimate
+            common = 4 * np.pi * (WINDOW / BLOCK) ** 2
+            chance[light] = common * scatter * np.einsum("mdp,pq,mdq->m", basis, covariance, basis).mean()
+        fields -= fields[0].copy()
+        square = (fields**2).sum(axis=2).mean(axis=1)
+        fields[square <= 9 * (chance + chance[0])] = 0
+        return fields
 
 
 def agreement(
@@ -96,7 +139,7 @@ def agreement(
 
 
 def light_displacement(
-    moments: Moments, factors: ColourFactors, texture: TextureModel, *, window: float = 20.0
+    moments: Moments, factors: ColourFactors, texture: TextureModel, *, window: float = WINDOW
 ) -> LightDisplacement:
     """Displacement of the lights' textures against each other, beyond their registration.
 
@@ -105,8 +148,7 @@ def light_displacement(
     moments, factors, texture
         Of the mosaic.
     window
-        Standard deviation (px) of the window in which a displacement is taken: glints change their place over some
-        50 px.
+        Standard deviation (px) of the window in which a displacement is taken.
 
     Returns
     -------

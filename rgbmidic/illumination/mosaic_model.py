@@ -123,14 +123,15 @@ class MosaicModel:
         coarse = [[cv2.resize(d, size, interpolation=cv2.INTER_AREA) for d in one] for one in self.displacement]
         entry = np.round(np.mod(coarse, 2) / DISPLACEMENTS[1]).astype(np.intp)
         lines, weights = registered_lines(texture.widths), np.asarray(texture.weights)
+        # whether two sites lie in different columns, and rows, of the cell
+        kinds = [[(int(s % 2 != t % 2), int(s // 2 != t // 2)) for t in range(4)] for s in range(4)]
         energy = np.empty((count, count, rows, columns))
-        for a, b in np.ndindex(count, count):
-            met, rest = np.zeros(size[::-1]), np.zeros(())
-            for s, t in np.ndindex(4, 4):
-                along_x, along_y = lines[int(s % 2 != t % 2)], lines[int(s // 2 != t // 2)]
-                fraction = fractions[a, s] * fractions[b, t]
-                parts = along_x[:, entry[a, 0], entry[b, 0]] * along_y[:, entry[a, 1], entry[b, 1]]
-                met += fraction * (np.tensordot(weights, parts, axes=1) + texture.offset)
-                rest = rest + fraction * (weights @ (along_x[:, 0, 0] * along_y[:, 0, 0]) + texture.offset)
-            energy[a, b] = cv2.resize(met / rest, (columns, rows), interpolation=cv2.INTER_LINEAR)
+        for a, b in zip(*np.triu_indices(count), strict=True):
+            fraction, met, rest = np.zeros((2, 2)), np.zeros(size[::-1]), 0.0
+            np.add.at(fraction, tuple(np.moveaxis(np.array(kinds), 2, 0)), np.outer(fractions[a], fractions[b]))
+            for (x, y), part in np.ndenumerate(fraction):
+                parts = lines[x][:, entry[a, 0], entry[b, 0]] * lines[y][:, entry[a, 1], entry[b, 1]]
+                met += part * (np.tensordot(weights, parts, axes=1) + texture.offset)
+                rest += part * float(weights @ (lines[x][:, 0, 0] * lines[y][:, 0, 0]) + texture.offset)
+            energy[a, b] = energy[b, a] = cv2.resize(met / rest, (columns, rows), interpolation=cv2.INTER_LINEAR)
         return energy

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError
-from rgbmidic.typing import FloatArray
+from rgbmidic.typing import FloatArray, FloatImage
 
 LAGS = np.array(
     [(i, j) for i in range(5) for j in range(-4, 5) if (i, j) > (0, 0) and np.hypot(i, j) <= 4.3], dtype=np.int64
@@ -159,6 +159,19 @@ DISPLACEMENTS = np.linspace(0, 2, 41)
 """Of a plane (px, modulo its lattice) at which `registered_lines` is tabulated."""
 
 
+def _lanczos(fraction: FloatArray) -> FloatArray:
+    """Return the weights (8, F) of the neighbours of places between the middle two (Duchon 1979), of unit sum."""
+    cells = np.arange(-3, 5)[:, None] - fraction
+    weights = np.sinc(cells) * np.sinc(cells / 4)
+    return np.asarray(weights / weights.sum(axis=0))
+
+
+@lru_cache(maxsize=1)
+def lanczos_weights(steps: int = 256) -> FloatImage:
+    """Return the weights (8, F) of `register_planes` of the kernels, at the middle of each of the steps."""
+    return _lanczos((np.arange(steps) + 0.5) / steps).astype(np.float32)
+
+
 @lru_cache(maxsize=8)
 def registered_lines(widths: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
     """Second moments of two low-passed planes along one axis, each read where it shows the texture displaced.
@@ -176,12 +189,9 @@ def registered_lines(widths: tuple[float, ...]) -> tuple[FloatArray, FloatArray]
 
     def samples(parity: int) -> tuple[FloatArray, FloatArray]:
         """Weights and places (D, S) of the samples that Lanczos interpolation and the binomial take."""
-        cells = np.arange(-3, 5) - DISPLACEMENTS[:, None] / 2
-        weights = np.sinc(cells) * np.sinc(cells / 4)
-        weights /= weights.sum(axis=1, keepdims=True)
-        shape = len(cells), -1
-        places = 2 * cells[:, :, None] + _OFFSETS[parity::2]
-        return (weights[:, :, None] * _BINOMIAL[parity::2]).reshape(shape), places.reshape(shape)
+        cells, shape = np.arange(-3, 5) - DISPLACEMENTS[:, None] / 2, (len(DISPLACEMENTS), -1)
+        weights = _lanczos(DISPLACEMENTS / 2).T[:, :, None] * _BINOMIAL[parity::2]
+        return weights.reshape(shape), (2 * cells[:, :, None] + _OFFSETS[parity::2]).reshape(shape)
 
     def line(p: int, q: int) -> FloatArray:
         (first, x), (second, y) = samples(p), samples(q)

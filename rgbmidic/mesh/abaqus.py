@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.content import CORNERS, MeshContent, text_of
+from rgbmidic.mesh.content import CORNERS, MeshContent, real, text_of
 
 logger = logging.getLogger(__name__)
 
@@ -30,8 +30,8 @@ _Rows = list[list[str]]
 def read_abaqus(path: Path) -> MeshContent:
     """Read nodes, elements and element sets of an input file, of its one part that has elements, or without parts."""
     parts = dict[str, tuple[list[tuple[int, list[float]]], list[tuple[str, int, list[int]]]]]()
-    sets, unread, part = dict[str, set[int]](), set[str](), ""
-    stated = list[tuple[dict[str, str], _Rows]]()
+    unread, part, instances = set[str](), "", dict[str, str]()
+    stated = list[tuple[str, dict[str, str], _Rows]]()
     for keyword, options, rows in _cards(path, set()):
         nodes, elements = parts.setdefault(part, ([], []))
         if keyword in _GENERATED or (keyword == "NODE" and options.get("SYSTEM", "R").upper() != "R"):
@@ -39,11 +39,15 @@ def read_abaqus(path: Path) -> MeshContent:
                 f"{path}: *{keyword} is not read: write nodes and elements out, in rectangular coordinates"
             )
         if keyword in ("PART", "END PART"):
-            part = options.get("NAME", "")
-        elif keyword == "INSTANCE" and any(float(x or 0) for row in rows for x in row):
-            logger.warning("%s: the translation of an *INSTANCE is not applied: nodes lie as in their part", path)
+            part = options.get("NAME", "").upper()
+        elif keyword == "INSTANCE":
+            instances[options.get("NAME", "").upper()] = options.get("PART", "").upper()
+            if any(real(x) for row in rows for x in row):
+                logger.warning(
+                    "%s: rotation and translation of an *INSTANCE is not applied: nodes lie as in their part", path
+                )
         elif keyword == "NODE":
-            nodes += [(int(n), [float(x or 0) for x in (*place[:3], "", "", "")[:3]]) for n, *place in rows]
+            nodes += [(int(n), [real(x) for x in (*coordinates[:3], "", "", "")[:3]]) for n, *coordinates in rows]
         elif keyword == "ELEMENT":
             shape, cells = _elements(options["TYPE"], rows)
             if shape is None:
@@ -51,36 +55,60 @@ def read_abaqus(path: Path) -> MeshContent:
             else:
                 elements += [(shape, label, corners) for label, *corners in cells]
             if "ELSET" in options:
-                _set(sets, options["ELSET"]).update(label for label, *_ in cells)
+                stated.append((part, {"ELSET": options["ELSET"]}, [[str(label)] for label, *_ in cells]))
         elif keyword == "ELSET":
-            stated.append((options, rows))
-    meshed = {name: found for name, found in parts.items() if found[1]}
+            stated.append((part, options, rows))
+    meshed = {name: content for name, content in parts.items() if content[1]}
     if len(meshed) > 1:
         raise InputError(f"{path} has parts that number their nodes alike ({', '.join(meshed)}): write one of them")
     if not meshed:
         raise InputError(f"{path} has no elements that are read: plane ones, shells, membranes or solids")
-    nodes, elements = next(iter(meshed.values()))
+    ((part, (nodes, elements)),) = meshed.items()
+    if len(names := [name for name, whole in instances.items() if whole == part]) > 1:
+        raise InputError(f"{path} has the part {part} {len(names)} times ({', '.join(names)}): write one of them")
     labels = {label for _, label, _ in elements}
-    for options, rows in stated:
-        members = _set(sets, options["ELSET"])
+    sets = _Sets(labels)
+    for scope, options, rows in stated:
+        if scope in (part, "") and instances.get(options.get("INSTANCE", "").upper(), part) == part:
+            sets.add(scope, options, rows)
+    return MeshContent.labelled(nodes, elements, sets.by_name(), unread)
+
+
+class _Sets:
+    """Element sets of a part and of the assembly, whose names may be written in upper or lower case."""
+
+    def __init__(self, labels: set[int]) -> None:
+        self._labels, self._members = labels, dict[tuple[str, str], set[int]]()
+        self._spelling = dict[str, str]()
+
+    def add(self, scope: str, options: dict[str, str], rows: _Rows) -> None:
+        """Add the rows of an ``*ELSET`` of a part, or of the assembly ("")."""
+        name = self._spelling.setdefault(options["ELSET"].upper(), options["ELSET"])
+        members = self._members.setdefault((scope, name.upper()), set())
         for row in rows:
             if "GENERATE" in options:
                 first, last, *step = map(int, filter(None, row))
                 span = range(first, last + 1, *step[:1])
                 members.update(
-                    labels.intersection(span) if len(span) < len(labels) else filter(span.__contains__, labels)
+                    self._labels.intersection(span)
+                    if len(span) < len(self._labels)
+                    else filter(span.__contains__, self._labels)
                 )
                 continue
-            for name in filter(None, row):
-                if not name.isdigit() and name.lower() not in map(str.lower, sets):
-                    raise InputError(f"the set {options['ELSET']} has {name}, a set that is not stated before")
-                members.update([int(name)] if name.isdigit() else _set(sets, name))
-    return MeshContent.labelled(nodes, elements, {name: list(has) for name, has in sets.items()}, unread)
+            for member in filter(None, row):
+                if not member.isdigit() and (scope, member.upper()) not in self._members:
+                    raise InputError(f"the set {name} has {member}, a set that is not stated before")
+                members.update([int(member)] if member.isdigit() else self._members[scope, member.upper()])
 
-
-def _set(sets: dict[str, set[int]], name: str) -> set[int]:
-    """Return the set of a name, which may be written in upper or lower case."""
-    return sets.setdefault(next((known for known in sets if known.lower() == name.lower()), name), set())
+    def by_name(self) -> dict[str, list[int]]:
+        """Labels by the name of their set, with that of the part where part and assembly have sets of one name."""
+        names = [name for _, name in self._members]
+        return {
+            f"{scope or 'ASSEMBLY'}.{self._spelling[name]}" if names.count(name) > 1 else self._spelling[name]: [
+                *members
+            ]
+            for (scope, name), members in self._members.items()
+        }
 
 
 def _elements(name: str, rows: _Rows) -> tuple[str | None, list[list[int]]]:
@@ -111,12 +139,21 @@ def _cards(path: Path, read: set[str]) -> Iterator[tuple[str, dict[str, str], _R
             raise InputError(f'{path} begins with "{rows[0][0][:40]}", which is no keyword')
         keyword = entries[0][1:].upper()
         options = {key.strip().upper(): value.strip() for key, _, value in (x.partition("=") for x in entries[1:])}
+        if odd := [key for key in options if key and not key[0].isalpha()]:
+            raise InputError(f'the line of *{keyword} ends with a comma and goes on with "{odd[0][:40]}", no option')
         rows = []
         if keyword in ("NODE", "ELEMENT") and "INPUT" in options:
             rows = [[x.strip() for x in row.split(",")] for row in _lines(path.parent / options["INPUT"], read)]
 
 
 def _lines(path: Path, read: set[str]) -> list[str]:
-    """Lines of a file without blank ones and comments."""
-    lines = map(str.strip, text_of(path, read).splitlines())
-    return [line for line in lines if line and not line.startswith("**")]
+    """Lines of a file without blank ones and comments; a keyword's goes on after a comma at its end."""
+    lines = list[str]()
+    for line in map(str.strip, text_of(path, read).splitlines()):
+        if not line or line.startswith("**"):
+            continue
+        if lines and lines[-1].startswith("*") and lines[-1].endswith(",") and not line.startswith("*"):
+            lines[-1] += line
+        else:
+            lines.append(line)
+    return lines

@@ -7,6 +7,7 @@ what is read.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -102,6 +103,11 @@ def unique(what: str, labels: IntArray) -> None:
     known, count = np.unique(labels, return_counts=True)
     if (count > 1).any():
         raise InputError(f"{what} {known[count > 1][0]} is stated {count[count > 1][0]} times")
+
+
+def real(text: str) -> float:
+    """Value of a real number as Fortran writes it, with the exponent D or a sign alone; 0 of an empty field."""
+    return float(re.sub(r"(?<=[\d.])(?=[+-])", "E", text.upper().replace("D", "E"))) if text else 0.0
 
 
 def sized(path: Path) -> Path:

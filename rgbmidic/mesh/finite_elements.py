@@ -34,7 +34,7 @@ class FiniteElementMesh:
     element_numbers : ndarray, shape (E,), int64
         Labels, in the file, of the elements that the triangles come from.
     fields : mapping of str to ndarray, shape (N, ...)
-        Nodal data of the file (none of Abaqus and of gmsh in text), in its own unit and components: a vector's
+        Nodal data of the file (none of Abaqus and Nastran), in its own unit and components: a vector's
         component along x is ``[:, axes[0]]``.
     axes : tuple of int
         Which coordinates (0, 1, 2) of the file are x and y.

@@ -1,90 +1,261 @@
-"""gmsh's files in text, versions 2 and 4.1, with their tags (meshio keeps none)."""
+"""gmsh's files of versions 2 and 4.1, in text and binary, with their tags and nodal data (meshio keeps no tags)."""
 
 from __future__ import annotations
 
+import logging
+import re
+import struct
 from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.content import MeshContent, text_of
-from rgbmidic.mesh.meshio_formats import read_with_meshio
+from rgbmidic.mesh.content import MeshContent, sized
 
-_SHAPES = {
-    **dict.fromkeys((2, 9, 20, 21), "triangle"),
-    **dict.fromkeys((3, 10, 16, 36), "quad"),
-    **dict.fromkeys((4, 11), "tetra"),
-    **dict.fromkeys((5, 12, 17), "hexahedron"),
-    **dict.fromkeys((6, 13, 18), "wedge"),
-    **dict.fromkeys((7, 14, 19), "pyramid"),
+logger = logging.getLogger(__name__)
+
+_NODES = {
+    **{"triangle": {2: 3, 9: 6, 20: 9, 21: 10, 22: 12, 23: 15, 24: 15, 25: 21}},
+    **{"quad": {3: 4, 10: 9, 16: 8, 36: 16, 37: 25, 38: 36, 39: 12, 40: 16, 41: 20}},
+    **{"tetra": {4: 4, 11: 10, 29: 20, 30: 35, 31: 56, 32: 22, 33: 28}},
+    **{"hexahedron": {5: 8, 12: 27, 17: 20, 92: 64, 93: 125}},
+    **{"wedge": {6: 6, 13: 18, 18: 15, 90: 40, 91: 75}},
+    **{"pyramid": {7: 5, 14: 14, 19: 13}},
+    **{"": {1: 2, 8: 3, 26: 4, 27: 5, 28: 6, 15: 1}},
 }
-"""Shapes of gmsh's numbers of element types, of first to third order (its manual, "Node ordering")."""
-_THIN = {1, 8, 15, 26, 27, 28}
-"""Lines and points, which files have on every edge and corner."""
+"""Number of nodes of gmsh's numbers of element types, by shape; "" are lines and points (its GmshDefines.h)."""
+_TYPES = {kind: (shape, count) for shape, kinds in _NODES.items() for kind, count in kinds.items()}
+_WORD = re.compile(rb'\s*("[^"\n]*"|\S+)[ \t]*\r?\n?')
+_HEADER = re.compile(rb"\$MeshFormat\s+(\S+)\s+([01])\s+8[ \t]*\r?\n")
+_NUMBERS = {"i": int, "q": int, "d": float}
 
 
 def read_gmsh(path: Path) -> MeshContent:
-    """Read such a file, and by meshio one in binary."""
-    with path.open("rb") as file:
-        if not file.read(200).lstrip().startswith(b"$"):
-            raise InputError(f"{path} is not a gmsh file: it does not begin with a section such as $MeshFormat")
-    lines = iter([line for line in text_of(path, set()).splitlines() if line.strip()])
-    version, names = "", dict[tuple[int, int], str]()
-    groups = dict[tuple[int, int], list[int]]()  # physical groups of the entities of version 4
-    nodes, elements = list[tuple[int, list[float]]](), list[tuple[str, int, list[int]]]()
-    sets, unread = dict[str, list[int]](), set[str]()
-
-    def rows(count: str | int) -> list[list[str]]:
-        return [next(lines).split() for _ in range(int(count))]
-
-    def add(kind: int, tag: int, corners: list[int], members: Sequence[int]) -> None:
-        if (shape := _SHAPES.get(kind)) is not None:
-            elements.append((shape, tag, corners))
-            for group in members:
-                dimension = 2 if shape in ("triangle", "quad") else 3
-                sets.setdefault(names.get((dimension, group), str(group)), []).append(tag)
-        elif kind not in _THIN:
-            unread.add(f"type {kind}")
-
-    for line in lines:
-        section = line.strip()
+    """Read nodes, elements, physical groups and nodal data of such a file."""
+    content = sized(path).read_bytes().removeprefix(b"\xef\xbb\xbf")
+    if not content.lstrip().startswith(b"$"):
+        raise InputError(f"{path} is not a gmsh file: it does not begin with a section such as $MeshFormat")
+    if (header := _HEADER.search(content)) is None:
+        raise InputError(f"{path} has no $MeshFormat with a version, 0 or 1, and 8 as size of its numbers")
+    if (version := header[1].decode(errors="replace")) != "4.1" and not version.startswith("2"):
+        raise InputError(f"it is of version {version}; of gmsh's 2 and 4.1 are read")
+    source: _Source = (_Binary if header[2] == b"1" else _Text)(content[header.end() :])
+    mesh = _Mesh(is_old=version != "4.1")
+    section: str | None = "$MeshFormat"
+    while section is not None:
         if section == "$MeshFormat":
-            version, is_binary, *_ = next(lines).split()
-            if int(is_binary):
-                return read_with_meshio(path, "gmsh")
-            if version != "4.1" and not version.startswith("2"):
-                raise InputError(f"it is of version {version}; of gmsh's text 2 and 4.1 are read")
-        elif section == "$PhysicalNames":
-            for axis, number, *title in rows(next(lines)):
-                names[int(axis), int(number)] = " ".join(title).strip('"')
-        elif section == "$Entities":
-            for dimension, count in enumerate(next(lines).split()):
-                for entity, *about in rows(count):
-                    at = 3 if dimension == 0 else 6
-                    groups[dimension, int(entity)] = [abs(int(n)) for n in about[at + 1 : at + 1 + int(about[at])]]
-        elif section == "$Nodes" and version != "4.1":
-            nodes += [(int(label), [float(x) for x in place]) for label, *place in rows(next(lines))]
-        elif section == "$Nodes":
-            for _ in range(int(next(lines).split()[0])):
-                count = next(lines).split()[3]
-                labels = [int(label) for (label,) in rows(count)]
-                nodes += [(label, [float(x) for x in y[:3]]) for label, y in zip(labels, rows(count), strict=True)]
-        elif section == "$Elements" and version != "4.1":
-            for row in rows(next(lines)):
-                tag, kind, width, *rest = map(int, row)
-                add(kind, tag, rest[width:], rest[: min(width, 1)])
-        elif section == "$Elements":
-            for _ in range(int(next(lines).split()[0])):
-                level, tag, kind, many = map(int, next(lines).split())
-                members = groups.get((level, tag), ())
-                for row in rows(many):
-                    tag, *corners = map(int, row)
-                    add(kind, tag, corners, members)
+            pass
+        elif (read := _SECTIONS.get(section)) is not None:
+            read(mesh, source)
         elif section.startswith("$"):  # of no use here
-            while not (section := next(lines).strip()).startswith("$End"):
-                pass
-            continue
+            source.skip(f"$End{section[1:]}")
         else:
             raise InputError(f'"{section[:40]}" stands in no section')
-        if (end := next(lines).strip()) != f"$End{section[1:]}":
+        if (end := _word(source)) != f"$End{section[1:]}":
             raise InputError(f'after its stated number of rows {section} goes on with "{end[:40]}"')
-    return MeshContent.labelled(nodes, elements, sets, unread)
+        section = source.word()
+    return mesh.content()
+
+
+class _Source(Protocol):
+    """The words and rows of numbers of a file."""
+
+    is_binary: bool
+
+    def word(self) -> str | None:
+        """Return the next word or quoted name, None at the end."""
+
+    def rows(self, layout: str, count: int = 1) -> Sequence[Sequence[Any]]:
+        """Return rows of numbers, whose kinds are i (int), q (size_t) and d (double)."""
+
+    def skip(self, end: str) -> None:
+        """Go to the next word that ends a section."""
+
+
+class _Text:
+    is_binary = False
+
+    def __init__(self, content: bytes) -> None:
+        text = content.decode("utf-8", errors="replace")
+        self._words, self._at = re.findall(r'"[^"\n]*"|\S+', text), 0
+
+    def word(self) -> str | None:
+        self._at += 1
+        return self._words[self._at - 1] if self._at <= len(self._words) else None
+
+    def rows(self, layout: str, count: int = 1) -> list[list[Any]]:
+        kinds, begin, width = [_NUMBERS[kind] for kind in layout], self._at, len(layout)
+        self._at += _positive(count) * width
+        if self._at > len(self._words):
+            raise EOFError
+        numbers = range(begin, self._at, width)
+        return [[kind(x) for kind, x in zip(kinds, self._words[i : i + width], strict=True)] for i in numbers]
+
+    def skip(self, end: str) -> None:
+        self._at = self._words.index(end, self._at) if end in self._words[self._at :] else len(self._words)
+
+
+class _Binary:
+    is_binary = True
+
+    def __init__(self, content: bytes) -> None:
+        """Begin with the number one, which shows the order of bytes."""
+        self._content, self._at, self._order = content, 4, "<" if content[:1] == b"\1" else ">"
+
+    def word(self) -> str | None:
+        if (found := _WORD.match(self._content, self._at)) is None:
+            return None
+        self._at = found.end()
+        return found[1].decode("utf-8", errors="replace")
+
+    def rows(self, layout: str, count: int = 1) -> list[tuple[Any, ...]]:
+        row = struct.Struct(self._order + layout)
+        begin, self._at = self._at, self._at + _positive(count) * row.size
+        if self._at > len(self._content):
+            raise EOFError
+        return [*row.iter_unpack(self._content[begin : self._at])]
+
+    def skip(self, end: str) -> None:
+        self._at = max(self._content.find(end.encode(), self._at), 0) or len(self._content)
+
+
+@dataclass(slots=True)
+class _Mesh:
+    """What the sections of a file have stated."""
+
+    is_old: bool = False
+    names: dict[tuple[int, int], str] = field(default_factory=dict)
+    groups: dict[tuple[int, int], list[int]] = field(default_factory=dict)
+    nodes: list[tuple[int, Sequence[float]]] = field(default_factory=list)
+    elements: list[tuple[str, int, Sequence[int]]] = field(default_factory=list)
+    sets: dict[str, list[int]] = field(default_factory=dict)
+    data: dict[str, dict[int, Sequence[float]]] = field(default_factory=dict)
+
+    def content(self) -> MeshContent:
+        """Return it with checks; a node without data has NaN."""
+        content = MeshContent.labelled(self.nodes, self.elements, self.sets, ())
+        fields = {}
+        for name, values in self.data.items():
+            empty = [np.nan] * len(next(iter(values.values()), [0.0]))
+            table = np.array([values.get(node, empty) for node, _ in self.nodes], dtype=np.float64)
+            fields[name] = table[:, 0] if len(empty) == 1 else table
+        return replace(content, fields=fields)
+
+    def add(self, shape: str, tag: int, corners: Sequence[int], groups: Sequence[int]) -> None:
+        """Add an element and its physical groups."""
+        if shape:
+            self.elements.append((shape, tag, corners))
+            dimension = 2 if shape in ("triangle", "quad") else 3
+            for group in groups:
+                self.sets.setdefault(self.names.get((dimension, group), str(group)), []).append(tag)
+
+    def read_names(self, source: _Source) -> None:
+        """Read ``$PhysicalNames``, which are text in every file."""
+        for _ in range(_whole(source)):
+            dimension, number = _whole(source), _whole(source)
+            self.names[dimension, number] = _word(source).strip('"')
+
+    def read_entities(self, source: _Source) -> None:
+        """Read the physical groups of the entities of version 4."""
+        for dimension, count in enumerate(source.rows("qqqq")[0]):
+            for _ in range(count):
+                entity = source.rows("i" + "d" * (3 if dimension == 0 else 6))[0][0]
+                self.groups[dimension, entity] = [abs(group) for (group,) in source.rows("i", _size(source))]
+                if dimension:
+                    source.rows("i", _size(source))
+
+    def read_nodes(self, source: _Source) -> None:
+        """Read ``$Nodes``; those of curves and surfaces may have parameters."""
+        if self.is_old:
+            self.nodes += [(label, place) for label, *place in source.rows("iddd", _whole(source))]
+            return
+        for _ in range(source.rows("qqqq")[0][0]):
+            dimension, _, is_parametric = source.rows("iii")[0]
+            if not (0 <= is_parametric * dimension <= 3):
+                raise InputError(f"nodes on an entity of {dimension} dimensions: 0 to 3 are possible")
+            labels = [label for (label,) in source.rows("q", _size(source))]
+            places = source.rows("ddd" + "d" * (is_parametric * dimension), len(labels))
+            self.nodes += [(label, place[:3]) for label, place in zip(labels, places, strict=True)]
+
+    def read_parametric_nodes(self, source: _Source) -> None:
+        """Read ``$ParametricNodes`` of version 2: each with dimension and number of its entity, and parameters."""
+        for _ in range(_whole(source)):
+            ((label, *place, dimension, _),) = source.rows("idddii")
+            source.rows("d", dimension % 3)  # in a volume none are written
+            self.nodes.append((label, place))
+
+    def read_elements(self, source: _Source) -> None:
+        """Read ``$Elements``: rows of text or blocks of version 2, blocks of entities of version 4."""
+        if not self.is_old:
+            for _ in range(source.rows("qqqq")[0][0]):
+                level, entity, kind = source.rows("iii")[0]
+                shape, width = _type(kind)
+                for tag, *corners in source.rows("q" * (1 + width), _size(source)):
+                    self.add(shape, tag, corners, self.groups.get((level, entity), ()))
+            return
+        missing = _whole(source)
+        while missing > 0:
+            tag, kind, n_tags = source.rows("iii")[0]
+            kind, many = (tag, kind) if source.is_binary else (kind, 1)
+            shape, width = _type(kind)
+            step = source.is_binary + n_tags + width
+            numbers = [x for (x,) in source.rows("i", many * step)]
+            for row in (numbers[i : i + step] for i in range(0, len(numbers), step)):
+                self.add(shape, row.pop(0) if source.is_binary else tag, row[n_tags:], row[: min(n_tags, 1)])
+            missing -= many
+
+    def read_nodal_data(self, source: _Source) -> None:
+        """Read ``$NodeData``, whose head is text in every file."""
+        name, *_ = [_word(source).strip('"') for _ in range(_whole(source))]
+        for _ in range(_whole(source)):
+            _word(source)
+        _, width, count, *_ = [_whole(source) for _ in range(_whole(source))]
+        if width not in (1, 3, 9):
+            raise InputError(f"nodal data have 1, 3 or 9 components, not {width}")
+        if name in self.data:
+            logger.warning('of the nodal data "%s", stated more than once, the last are read', name)
+        self.data[name] = {label: values for label, *values in source.rows("i" + "d" * width, count)}
+
+
+_SECTIONS = {
+    "$PhysicalNames": _Mesh.read_names,
+    "$Entities": _Mesh.read_entities,
+    "$Nodes": _Mesh.read_nodes,
+    "$ParametricNodes": _Mesh.read_parametric_nodes,
+    "$Elements": _Mesh.read_elements,
+    "$NodeData": _Mesh.read_nodal_data,
+}
+
+
+def _word(source: _Source) -> str:
+    """Return the next word of a section."""
+    if (word := source.word()) is None:
+        raise EOFError
+    return word
+
+
+def _whole(source: _Source) -> int:
+    """Return the next word, a whole number."""
+    return int(_word(source))
+
+
+def _size(source: _Source) -> int:
+    """Return the next size."""
+    return int(source.rows("q")[0][0])
+
+
+def _positive(count: int) -> int:
+    """Refuse a count that is none."""
+    if count < 0:
+        raise InputError(f"it states {count} rows")
+    return count
+
+
+def _type(kind: int) -> tuple[str, int]:
+    """Shape and number of nodes of an element type."""
+    if kind not in _TYPES:
+        raise InputError(f"its elements of type {kind} are not read; those of types {', '.join(map(str, _TYPES))} are")
+    return _TYPES[kind]

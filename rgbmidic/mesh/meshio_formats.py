@@ -46,11 +46,10 @@ def read_with_meshio(path: Path, kind: str) -> MeshContent:
     for name, members in mesh.cell_sets.items():
         given = [part[np.isin(np.arange(len(part)), m)] for part, m in zip(by_block, members, strict=False)]
         sets[name] = np.concatenate(given)
-    tags = {int(tag): name for name, (tag, dimension) in mesh.field_data.items() if int(dimension) == 2}
-    for key in {"gmsh:physical", "medit:ref", "cell_tags"} & set(mesh.cell_data):
+    for key in {"medit:ref", "cell_tags"} & set(mesh.cell_data):
         values = np.concatenate(mesh.cell_data[key])
         for tag in np.unique(values):
-            sets.setdefault(tags.get(int(tag), str(int(tag))), labels[values == tag])
+            sets.setdefault(str(int(tag)), labels[values == tag])
     if wrong := [nodes.dtype for _, nodes in cells if nodes.dtype.kind not in "iu"]:
         raise InputError(f"{path}: elements name their nodes by whole numbers, not by {wrong[0]}")
     return MeshContent(

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.content import CORNERS, MeshContent, text_of
+from rgbmidic.mesh.content import CORNERS, MeshContent, real, text_of
 
 _SHAPES = {
     **dict.fromkeys(("CTRIA3", "CTRIAR", "CTRIA6", "CPLSTN3", "CPLSTN6", "CPLSTS3", "CPLSTS6"), "triangle"),
@@ -31,7 +31,7 @@ def read_nastran(path: Path) -> MeshContent:
             if system not in ("", "0"):
                 raise InputError(f"{name} {label} has the coordinate system {system}: write nodes in the basic one")
             if name == "GRID":
-                nodes.append((int(label), [_real(x) for x in place]))
+                nodes.append((int(label), [real(x) for x in place]))
         elif (shape := _SHAPES.get(name)) is not None:
             label, property_, *corners = fields
             elements.append((shape, int(label), [int(node) for node in corners[: CORNERS[shape]]]))
@@ -41,25 +41,19 @@ def read_nastran(path: Path) -> MeshContent:
     return MeshContent.labelled(nodes, elements, sets, unread)
 
 
-def _real(text: str) -> float:
-    """Value of a real number, whose exponent may be a sign and digits alone."""
-    return float(re.sub(r"(?<=[\d.])(?=[+-])", "E", text.upper().replace("D", "E"))) if text else 0.0
-
-
 def _cards(path: Path) -> Iterator[tuple[str, list[str]]]:
     """Name and fields of every entry of the bulk data, without marks of continuation."""
     name, fields = "", list[str]()
-    lines = _lines(path, set())
-    if not any(re.match(r"\s*BEGIN\s+BULK", line, re.IGNORECASE) for line in lines):
-        raise ValueError("it has no BEGIN BULK")
-    for line in lines:
+    lines = [*_lines(path, set())]
+    begin = next((i for i, line in enumerate(lines, 1) if re.match(r"\s*BEGIN\s+BULK", line, re.IGNORECASE)), 0)
+    for line in lines[begin:]:  # gmsh and others write the entries alone
         first, given = _fields(line)
         if not first:
             fields += given
             continue
         if name:
             yield name, fields
-        if first == "ENDDATA":
+        if first in ("ENDDATA", "END BULK"):
             return
         name, fields = first, given
     raise EOFError("it ends without ENDDATA")

@@ -402,6 +402,8 @@ def _check_reference(plan: Plan, state: RawState, noise: NoiseModel | None) -> N
         logger.warning("the reference (%s): %s", name, clipping[1])
     if repeated := suitability.repetition(images, region, plan.speckle):
         logger.warning("the reference (%s): %s", name, repeated)
+    for doubt in suitability.separation_doubts(images, region):
+        logger.warning("the reference (%s): %s", name, doubt.text)
     dark = suitability.background_fraction(images, region, plan.speckle, noise)
     if dark > CONTRAST.hidden:
         logger.warning(f"the region holds dark background ({dark:.1%}) in the reference: draw it inside the specimen")

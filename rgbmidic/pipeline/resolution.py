@@ -300,8 +300,21 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
         missed, noise = (  # the squares at the corners of each element; NaN takes no part
             np.nan_to_num(part[mesh.elements] ** 2).sum(axis=(1, 2)) for part in (known.strain_error, known.strain_std)
         )
-        finer = refined(mesh, missed > CONSTANTS.worth**2 * noise, least)
+        unresolved = missed > CONSTANTS.worth**2 * noise
+        finer = refined(mesh, unresolved, least)
         if finer is mesh:
+            if unresolved.any():
+                worst = int(np.argmax(np.where(unresolved, missed, 0)))
+                logger.warning(
+                    "mesh.refine: strain is not resolved in %.2g %% of the region, least around (%.0f, %.0f): its "
+                    "discretisation error is %.2g there, its noise %.2g, and its parts would have legs under %.3g px",
+                    *(
+                        100 * mesh.areas[unresolved].sum() / mesh.areas.sum(),
+                        *mesh.nodes[mesh.elements[worst]].mean(axis=0),
+                    ),
+                    *(np.sqrt(part[worst] / 9) for part in (missed, noise)),  # three strains at three corners
+                    least,
+                )
             break
         nodes = np.round(finer.nodes / CONSTANTS.exact) * CONSTANTS.exact
         plan = plan.on_mesh(Tri3Mesh(nodes=nodes, elements=finer.elements))

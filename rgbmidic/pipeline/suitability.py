@@ -14,10 +14,13 @@ from scipy.ndimage import label, maximum, maximum_position
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
+from rgbmidic.illumination.checks import Check
 from rgbmidic.illumination.contrast import LocalContrast
+from rgbmidic.illumination.displacement import LightDisplacement
 from rgbmidic.illumination.frame_check import saturation_pile
 from rgbmidic.illumination.images import DARK, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
+from rgbmidic.illumination.mosaic_model import BLOCK
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.illumination.texture import speckle_diameter
 from rgbmidic.mesh import FiniteElementMesh, Region, Tri3Mesh
@@ -63,6 +66,10 @@ class SuitabilityConstants:
     shake
         Motion (px) from which the difference of two reference frames is more than noise: that of speckle of 300 DN/px
         is 3 DN, a third of usual camera noise.
+    lateral, unregistered
+        Displacement (px, rms over the region) of a light's texture from the first light's, smooth over the field, from
+        which a warning is given: beyond a calibrated registration, and without one. On eight rendered scenes that lie
+        in register, or are registered, it is .04 px at most, raised droplets and glare included.
     blur
         Motion (px) during the exposure from which a warning is given: the speckle's gradient is resolved to 1 px.
     """
@@ -77,6 +84,8 @@ class SuitabilityConstants:
     enough_speckles: float = 50.0
     motion: float = 0.05
     shake: float = 0.01
+    lateral: float = 0.1
+    unregistered: float = 0.15
     blur: float = 1.0
 
 
@@ -179,6 +188,65 @@ def repetition(images: IlluminationImages, region: Region, speckle: float | None
         f"the texture repeats itself: displaced by ({abs(column)}, {abs(row)}) px it agrees with itself to "
         f"{agreement:.2f}, so that displacements may be wrong by this distance; use a random speckle, or steps of less "
         "than half of it from frame to frame"
+    )
+
+
+def separation_doubts(images: IlluminationImages, region: Region) -> list[Check]:
+    """Return what a separated frame contradicts: the registration of the lights, or that they show one texture.
+
+    Parameters
+    ----------
+    images
+        One image a light, each where the lens put it, with what its separation found.
+    region
+        What is measured.
+
+    Returns
+    -------
+    list of Check
+        None for lights that were not separated by the reflection-aware method.
+    """
+    doubts = []
+    if images.displacement is not None and (text := _lights_apart(images, images.displacement, region)):
+        doubts.append(Check("lights apart", text))
+    if images.texture is not None and not images.texture.common:
+        doubts.append(
+            Check(
+                "no common texture",
+                "the samples contradict one texture common to the lights, as prints of dots with sharp edges do, or a "
+                "lens that blurs one light more than another: each channel is demosaiced by itself (malvar), without "
+                "what the others see, and inspect expects too little uncertainty (a half to a quarter on printed "
+                "disks); the same focus for all lights, or a softer print",
+            )
+        )
+    return doubts
+
+
+def _lights_apart(images: IlluminationImages, displacement: LightDisplacement, region: Region) -> str:
+    """Which lights show the texture apart from the first one, how far, and what to do; else nothing."""
+    shape = displacement.std.shape[1:]
+    cells = np.zeros((shape[0] * BLOCK, shape[1] * BLOCK), dtype=np.float32)
+    cells[: images.shape[0], : images.shape[1]] = region.mask
+    inside = cells.reshape(shape[0], BLOCK, shape[1], BLOCK).mean(axis=(1, 3)) > 0.5
+    if not inside.any():
+        return ""
+    away = np.sqrt((displacement.lateral(inside) ** 2).sum(axis=2))
+    registered = images.registration is not None
+    least = SUITABILITY.lateral if registered else SUITABILITY.unregistered
+    rms = np.sqrt((away**2).mean(axis=1))
+    lights = [
+        f"{name} lies {mean:.2f} px (up to {most:.2f} px)"
+        for name, mean, most in zip(images.names, rms, away.max(axis=1), strict=True)
+        if mean > least
+    ]
+    if not lights:
+        return ""
+    where = f"{' and '.join(lights)} from {images.names[0]}"
+    if registered:
+        return f"beyond the calibrated registration {where}: it is not of this set-up; rgbmidic-calibrate registration"
+    return (
+        f"no registration is calibrated, but {where}: at half a pixel errors are 1.2 to 1.8 times as large, most under "
+        "strain; rgbmidic-calibrate registration"
     )
 
 

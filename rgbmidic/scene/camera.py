@@ -402,8 +402,15 @@ def reference_camera(shape: tuple[int, int], **changes: object) -> Camera:
 
 
 def mosaic_samples(channels: npt.NDArray[Floating], cfa: str) -> npt.NDArray[Floating]:
-    """Return the samples (H, W) that a colour filter array takes of channels (3, H, W)."""
-    return np.asarray(np.take_along_axis(channels, sampled_channels(cfa, channels.shape[1:])[None], axis=0)[0])
+    """Return the samples (H, W) that a colour filter array takes of channels (3, H, W), or of sites (4, H, W).
+
+    The sites are red, green in rows with red, green in rows with blue, and blue.
+    """
+    shape = channels.shape[1], channels.shape[2]
+    index = sampled_channels(cfa, shape)
+    if len(channels) == 4:
+        index = index + (index == 2) + (green_signs(cfa, shape) < 0)
+    return np.asarray(np.take_along_axis(channels, index[None], axis=0)[0])
 
 
 def green_signs(cfa: str, shape: tuple[int, int]) -> npt.NDArray[np.float32]:

@@ -118,8 +118,8 @@ def separated_phases(
 
     Parameters
     ----------
-    channels : ndarray, shape (3, H, W)
-        The state with all its channels at every pixel.
+    channels : ndarray, shape (3, H, W) or (4, H, W)
+        The state with all its channels, or kinds of sites, at every pixel.
     cfa
         Pattern of the first phase.
     lights

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from textures import Texture
 
-from rgbmidic import Solution, Tri3Mesh, correlate
+from rgbmidic import Region, Solution, Tri3Mesh, correlate
 from rgbmidic.typing import FloatArray
 
 SIZE, ELEMENT = 320, 20
 REGION = (15, 15, 304, 304)
+MIDDLE, RADIUS = 160, 50  # of the hole: elements are a fifth of its diameter
 TOGETHER = (0.75, 1.25)  # measured: .79 to 1.19
 AT_EDGE = (0.6, 1.6)  # measured: .69 to 1.44
+AT_RIM = 1.8  # measured: 1.43 and 1.55
 INFLATED = 1.15  # measured: 1.04 and 1.14
 Field = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
@@ -35,7 +37,27 @@ def still(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.zeros_like(x), np.zeros_like(y)
 
 
-def measured(field: Field, seed: int = 0, lights: int = 1, mesh_error: bool = True) -> Solution:
+def hole(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A free hole in a sheet under tension along x, strain .01 far from it (Kirsch 1898; plane stress)."""
+    r, angle = np.hypot(x - MIDDLE, y - MIDDLE), np.arctan2(y - MIDDLE, x - MIDDLE)
+    r, poisson, double = np.maximum(r, 0.8 * RADIUS), 0.3, 2 * angle
+    kappa = (3 - poisson) / (1 + poisson)
+    radial = r * ((kappa - 1) / 2 + np.cos(double)) + RADIUS**2 / r * (1 + (kappa + 1) * np.cos(double))
+    radial -= RADIUS**4 / r**3 * np.cos(double)
+    hoop = -np.sin(double) * (r + RADIUS**2 / r * (kappa - 1) + RADIUS**4 / r**3)
+    scale = 0.01 * (1 + poisson) / 2
+    c, s = np.cos(angle), np.sin(angle)
+    return scale * (radial * c - hoop * s), scale * (radial * s + hoop * c)
+
+
+def measured(
+    field: Field,
+    seed: int = 0,
+    lights: int = 1,
+    mesh_error: bool = True,
+    region: Region | tuple[int, ...] = REGION,
+    noise: float = 4,
+) -> Solution:
     y, x = np.mgrid[:SIZE, :SIZE].astype(float)
     there = x.copy(), y.copy()
     for _ in range(30):
@@ -43,13 +65,13 @@ def measured(field: Field, seed: int = 0, lights: int = 1, mesh_error: bool = Tr
         there = x - u, y - v
     random, texture = np.random.default_rng(seed), Texture.random(seed)
     pair = [
-        np.stack([texture.at(*place)] * lights) + random.normal(scale=4, size=(lights, SIZE, SIZE))
+        np.stack([texture.at(*place)] * lights) + random.normal(scale=noise, size=(lights, SIZE, SIZE))
         for place in ((x, y), there)
     ]
     if lights > 1:  # a reflection that stays where it is, in one light
         glare = 80 * np.exp(-((x - 160) ** 2 + (y - 120) ** 2) / 1800)
         pair = [images + glare * (np.arange(lights) == 0)[:, None, None] for images in pair]
-    return correlate(*pair, region=REGION, element_size=ELEMENT, initial=(0, 0), mesh_error=mesh_error)
+    return correlate(*pair, region=region, element_size=ELEMENT, initial=(0, 0), mesh_error=mesh_error)
 
 
 def ratios(found: Solution, field: Field) -> dict[str, float]:
@@ -78,6 +100,26 @@ def test_noise_and_discretisation_error_are_the_true_error(elements: float, ligh
     for name, ratio in found.items():
         low, high = TOGETHER if name.endswith("inside") else AT_EDGE
         assert low < ratio < high, (name, found)
+
+
+def test_the_error_at_the_rim_of_a_hole_and_of_the_peak_strain_is_stated() -> None:
+    y, x = np.mgrid[:SIZE, :SIZE]
+    mask = (np.abs(x - MIDDLE) < 145) & (np.abs(y - MIDDLE) < 145) & (np.hypot(x - MIDDLE, y - MIDDLE) > RADIUS + 1)
+    found = measured(hole, region=Region.from_mask(mask), noise=1)
+    x, y = found.nodes.T
+    rim = np.hypot(x - MIDDLE, y - MIDDLE) < RADIUS + 3
+    peak = rim & (np.abs(x - MIDDLE) < RADIUS / 4)
+    step = 1e-3
+    true = (hole(x + step, y)[0] - hole(x - step, y)[0]) / (2 * step), np.stack(hole(x, y), 1)
+    assert peak.sum() > 2
+    for name, index, truth in (("strain", 0, true[0]), ("displacement", slice(None), true[1])):
+        error = getattr(found, name)[:, index] - truth
+        noise, missed = (getattr(found, f"{name}_{kind}")[:, index] for kind in ("std", "error"))
+        ratio = [np.sqrt(np.mean(error[here] ** 2) / np.mean((noise**2 + missed**2)[here])) for here in (rim, peak)]
+        assert ratio[0] < AT_RIM, name
+        assert np.mean(error[rim] ** 2) > 2 * np.mean(noise[rim] ** 2), name  # there is something to state
+        if name == "strain":
+            assert ratio[1] < 1, name
 
 
 def test_an_affine_field_is_hardly_inflated() -> None:

@@ -19,7 +19,7 @@ from rgbmidic.illumination.demosaicing import SMALLEST_FRAME
 from rgbmidic.illumination.frame_check import Frame, check_state
 from rgbmidic.illumination.images import REFLECTING, IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
-from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.channels import (
     Channel,
     channels_of,
@@ -27,13 +27,14 @@ from rgbmidic.lab.inspection.channels import (
     speckle_texture,
     surroundings,
 )
+from rgbmidic.lab.inspection.lamps import LampBalance
 from rgbmidic.lab.inspection.prediction import Prediction, predict, separated
 from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import finite_elements_of, read_region
-from rgbmidic.pipeline.suitability import clipping, repetition
+from rgbmidic.pipeline.suitability import clipping, repetition, separation_doubts
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
-from rgbmidic.typing import BoolArray, FloatImage, Progress
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage, Progress
 
 
 def inspect_files(
@@ -176,8 +177,9 @@ def inspect_frame(
     channels = channels_of(linear)
     summaries, noise, speckle = _summarised(channels, region.mask, known.noise, linear[0].full_scale)
     report(1, 3, "lights, and the errors of their separation")
-    state, errors = separated(linear, known, demosaic, noise, np.random.default_rng(seed))
-    images = align(replace(state, registration=known.registration))
+    state, draw = separated(linear, known, demosaic, noise)
+    state = replace(state, registration=known.registration)
+    images = align(state)
     report(2, 3, "uncertainty to expect")
     shown = LocalContrast.of(images, [channel.speckle_px for channel in summaries], region.mask, noise)
     index = state.reflection_index()
@@ -185,7 +187,19 @@ def inspect_frame(
         best = np.maximum(shown.contrast.max(axis=0), 1e-6)
         index = np.asarray(1 - shown.contrast / best, dtype=np.float32)
     texture, local = state.texture or speckle, replace(mesh, nodes=mesh.nodes - window.origin)
-    prediction = predict(local, region, shown, errors, texture=texture, prefilter=prefilter)
+
+    def expected(strength: FloatArray) -> Prediction:
+        """With the lights so many times as strong."""
+        lights = replace(shown, level=shown.level * strength[:, None, None].astype(np.float32))
+        errors = draw(np.random.default_rng(seed), strength)
+        return predict(local, region, lights, errors, texture=texture, prefilter=prefilter)
+
+    prediction = expected(np.ones(len(images.names)))
+    doubts = separation_doubts(state, region)
+    coloured = texture is not None and texture.specific >= COLOURED  # of one light more than of another
+    if known.crosstalk is not None and len(known.crosstalk.matrix) == len(channels) and not coloured:
+        balance = LampBalance.of(shown, channels, known.crosstalk.matrix, region.mask)
+        doubts += balance.advice(images.names, prediction, expected, noise_calibrated=known.noise is not None)
     report(3, 3, "done")
     first, greens = linear[0], 0.0
     single = not isinstance(first, LinearMosaic) and len(first.values) == 1
@@ -214,6 +228,7 @@ def inspect_frame(
         prediction=prediction,
         greens=greens,
         clipping="" if clipped is None else clipped[1],
+        doubts=tuple(doubts),
         repetition=repetition(images, region, None if speckle is None else speckle.diameter) or "",
     )
 

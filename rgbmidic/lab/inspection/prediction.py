@@ -1,7 +1,7 @@
 """Displacement uncertainty expected from one frame: `rgbmidic.scene.forecast` with images of the frame's errors.
 
 Contrast and energy of the speckle's gradient follow from the frame; the errors are drawn (`separated`). The
-reflection-aware model of the frame (local means, slope of each channel on the common texture, channel-specific
+reflection-aware model of the frame (local means, slope of each light on the common texture, light-specific
 component, autocorrelation of the speckle) describes a random frame with the statistics of the one given. Such a frame
 is drawn with all its channels at every pixel and separated as the test does, behind the four phases of the colour
 filter array: what is the same in all of them moves with the specimen, the rest stays with the sensor.
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ import numpy.typing as npt
 from scipy.fft import fftfreq, irfft2, next_fast_len, rfft2, rfftfreq
 from scipy.ndimage import median_filter
 
+from rgbmidic._kernels.splines import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.colour_factors import LEAST, MEAN_BLOCK, enlarged
@@ -28,10 +30,10 @@ from rgbmidic.illumination.crosstalk import Crosstalk, unmix
 from rgbmidic.illumination.demosaicing import Reconstruction, reconstruct
 from rgbmidic.illumination.images import IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel
-from rgbmidic.illumination.mosaic_model import BLOCK
+from rgbmidic.illumination.mosaic_model import BLOCK, CHANNEL
 from rgbmidic.illumination.prediction_filters import SPARKLE_VARIANCE
 from rgbmidic.illumination.separation import DEFAULT_METHOD, reconstructed_lights, separate
-from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.channels import CONSTANTS
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.scene.camera import mosaic_samples
@@ -40,14 +42,35 @@ from rgbmidic.scene.speckle import SpeckleSpectrum, separated_phases
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
+class ErrorDraw(Protocol):
+    """Draws errors of the separation of a state whose lights are so many times as strong."""
+
+    def __call__(self, random: np.random.Generator, strength: FloatArray, /) -> tuple[FloatImage, FloatImage]:
+        """Draw the errors.
+
+        Parameters
+        ----------
+        random
+            Source of random numbers.
+        strength : ndarray, shape (k,)
+            Of each light, relative to the frame's; those of a coloured specimen are not changed.
+
+        Returns
+        -------
+        tuple of ndarray, shapes (1, k, H, W) and (4, k, H, W), float32
+            Draw of the lights' change by the camera noise, DN; difference of the lights behind each phase of the colour
+            filter array from the mean of the four, none for a camera that has all channels at every pixel.
+        """
+        ...
+
+
 def separated(
     frames: Sequence[LinearMosaic | LinearChannels],
     known: Calibration,
     method: str,
     noise: NoiseModel,
-    random: np.random.Generator,
-) -> tuple[IlluminationImages, tuple[FloatImage, FloatImage]]:
-    """Separate a state as the test would, and draw the errors of that.
+) -> tuple[IlluminationImages, ErrorDraw]:
+    """Separate a state as the test would, and return what draws the errors of that.
 
     Reflection index and speckle of a mosaic are those of the default method.
 
@@ -59,33 +82,36 @@ def separated(
         The calibration; without crosstalk the channels are used as lights.
     method
         How the test separates its mosaics (`rgbmidic.illumination.separation`).
-    noise, random
-        Camera noise to draw; source of random numbers.
+    noise
+        Camera noise to draw.
 
     Returns
     -------
     images
         The lights.
-    errors : tuple of ndarray, shapes (1, k, H, W) and (4, k, H, W), float32
-        Draws of the lights' change by the camera noise, DN; difference of the lights behind each phase of the colour
-        filter array from the mean of the four, none for a camera that has all channels at every pixel.
+    draw
+        See `ErrorDraw`.
     """
     first, crosstalk = frames[0], known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
     if isinstance(first, LinearMosaic):
-        model = reconstruct(first, crosstalk)
+        calibration = replace(known, crosstalk=crosstalk)
+        model = reconstruct(first, crosstalk, registration=known.registration)
         images = reconstructed_lights(model, crosstalk)
         if method not in ("auto", DEFAULT_METHOD):
             other = separate(first, crosstalk, method)
-            images = replace(other, reflection=images.reflection, texture=images.texture)
-        channels = _drawn_channels(model, first.values.shape, random)
+            images = replace(images, values=other.values, valid=other.valid)
 
         def lights_of(values: FloatImage, cfa: str) -> FloatImage:
             drawn = replace(first, values=values, cfa=cfa, saturated=np.zeros(values.shape, dtype=bool))
-            return np.nan_to_num(separate(drawn, crosstalk, method, texture=model.texture).values)
+            return np.nan_to_num(separate(drawn, calibration, method, texture=model.texture).values)
 
-        phases = separated_phases(channels, first.cfa, lights_of)
-        noisy = lights_of(_noisy(mosaic_samples(channels, first.cfa), noise, random), first.cfa)
-        return images, ((noisy - phases[0])[None], phases - phases.mean(axis=0))
+        def drawn_mosaic(random: np.random.Generator, strength: FloatArray) -> tuple[FloatImage, FloatImage]:
+            sites = _drawn_sites(model, strength if model.texture.specific < COLOURED else np.ones(3), random)
+            phases = separated_phases(sites, first.cfa, lights_of)
+            noisy = lights_of(_noisy(mosaic_samples(sites, first.cfa), noise, random), first.cfa)
+            return (noisy - phases[0])[None], phases - phases.mean(axis=0)
+
+        return images, drawn_mosaic
     full = [frame for frame in frames if isinstance(frame, LinearChannels)]
     names = known.registration.lights if known.registration else ()
 
@@ -94,9 +120,17 @@ def separated(
         return IlluminationImages.in_succession(state, names) if single else unmix(state[0], crosstalk)
 
     images = lights(full)
-    noisy = lights([replace(frame, values=_noisy(frame.values, noise, random)) for frame in full]).values
-    change = np.nan_to_num(noisy - images.values)[None]
-    return images, (change, change[:0])
+
+    def drawn(random: np.random.Generator, strength: FloatArray) -> tuple[FloatImage, FloatImage]:
+        more = (strength[:, None, None] - 1) * np.nan_to_num(images.values)
+        if len(full) == 1 and len(images.names) > 1:
+            more = np.tensordot(crosstalk.matrix, more, axes=1)[None]
+        state = [replace(frame, values=frame.values + part) for frame, part in zip(full, more, strict=True)]
+        noisy = lights([replace(frame, values=_noisy(frame.values, noise, random)) for frame in state]).values
+        change = np.nan_to_num(noisy - lights(state).values)[None]
+        return change, change[:0]
+
+    return images, drawn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,21 +234,48 @@ def gaussian_field(texture: TextureModel, shape: tuple[int, ...], random: np.ran
     return np.asarray(irfft2(spectrum, s=(rows, columns))[: shape[0], : shape[1]], dtype=np.float32)
 
 
-def _drawn_channels(model: Reconstruction, shape: tuple[int, ...], random: np.random.Generator) -> FloatImage:
-    """Channels (3, H, W) of a random state with the frame's statistics, DN."""
-    factors, texture = model.factors, model.texture
+def _drawn_sites(model: Reconstruction, strength: FloatArray, random: np.random.Generator) -> FloatImage:
+    """Samples (4, H, W) that each kind of site would take everywhere of a random state with the frame's statistics.
+
+    Every light shows the texture where the registration says that it does, and a component of its own.
+    """
+    factors, texture, sites = model.factors, model.texture, model.model
+    shape = model.channels.values.shape[1:]
+    place = enlarged(sites.displacement.reshape(-1, *sites.displacement.shape[2:]), BLOCK, shape)
+    margin = int(np.ceil(np.abs(place).max())) + 2
+    common = gaussian_field(texture, (shape[0] + 2 * margin, shape[1] + 2 * margin), random)
     sparkle = TextureModel(weights=(1.0,), widths=(float(np.sqrt(2 * SPARKLE_VARIANCE)),))
-    channels = np.repeat(gaussian_field(texture, shape, random)[None], 3, axis=0)
     # by the median around: variances are cut off at zero, so that a mean would be too large
-    typical = median_filter(factors.specific - LEAST, size=(1, CONSTANTS.typical, CONSTANTS.typical), mode="reflect")
+    size = 1, CONSTANTS.typical, CONSTANTS.typical
+    typical = median_filter(factors.light_specific - LEAST, size=size, mode="reflect")
     deviation = np.sqrt(enlarged(np.maximum(typical, 0), BLOCK, shape))
-    for channel in range(3):
-        if deviation[channel].any():
+    slope = enlarged(_settled(factors.light_slope, BLOCK), BLOCK, shape)
+    mean = enlarged(_settled(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
+    response = sites.sites * strength
+    # each green sees the lights' means in its own proportion
+    beyond = (response - sites.matrix[list(CHANNEL)]) @ np.linalg.pinv(sites.matrix)
+    samples = mean[list(CHANNEL)] + np.tensordot(beyond.astype(np.float32), mean, axes=1)
+    for light, (x, y) in enumerate(place.reshape(-1, 2, *shape)):
+        contrast = _displaced(common, x, y, margin)
+        if deviation[light].any():
             coarse, fine = (gaussian_field(kind, shape, random) for kind in (texture, sparkle))
             specific = np.sqrt(texture.specific) * coarse + np.sqrt(1 - texture.specific) * fine
-            channels[channel] += deviation[channel] * specific
-    mean = enlarged(_settled(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
-    return np.asarray(mean + enlarged(_settled(factors.slope, BLOCK), BLOCK, shape) * channels, dtype=np.float32)
+            contrast += deviation[light] * specific
+        samples += response[:, light, None, None].astype(np.float32) * (slope[light] * contrast)
+    return np.asarray(samples, dtype=np.float32)
+
+
+def _displaced(image: FloatImage, x: FloatImage, y: FloatImage, margin: int) -> FloatImage:
+    """Return the image less a margin, displaced by fields x and y (H, W)."""
+    rows, columns = x.shape
+    if not (x.any() or y.any()):
+        return image[margin : margin + rows, margin : margin + columns].copy()
+    spline = np.empty((image.shape[0] + 2 * PAD, image.shape[1] + 2 * PAD), dtype=np.float32)
+    bspline_coefficients(image, spline)
+    row, column = np.mgrid[margin : margin + rows, margin : margin + columns].astype(np.float64)
+    sampled = np.empty((3, x.size), dtype=np.float32)
+    sample_with_gradient(spline, (column - x).ravel(), (row - y).ravel(), *sampled)
+    return np.asarray(sampled[0].reshape(x.shape))
 
 
 def _settled(grid: npt.NDArray[np.floating], block: int) -> FloatArray:

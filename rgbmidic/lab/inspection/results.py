@@ -150,6 +150,9 @@ class Inspection:
         Where samples pile up below the stated white level, which then counts as the white level; empty: nowhere.
     repetition : str
         How the texture repeats itself; empty: it does not.
+    doubts : tuple of Check
+        Lights that lie apart or show no common texture (`rgbmidic.pipeline.suitability.separation_doubts`), lamps of
+        unequal strength.
     """
 
     name: str
@@ -175,6 +178,7 @@ class Inspection:
     greens: float
     clipping: str
     repetition: str
+    doubts: tuple[Check, ...]
 
     @property
     def unmeasured(self) -> float:
@@ -206,6 +210,7 @@ def _of_set_up(inspection: Inspection) -> Iterator[Check]:
         yield Check(
             "noise unknown", f"no noise calibration: {why} under 4 px and in reflections; rgbmidic-calibrate noise"
         )
+    yield from inspection.doubts
     for light in inspection.lights:
         negative = f"light {light.name} is negative on {light.negative:.0%} of the region"
         text = f"{negative}: crosstalk, pattern or black level are not those of this frame"
@@ -228,7 +233,9 @@ def _of_exposure(inspection: Inspection) -> Iterator[Check]:
 def _of_speckle(inspection: Inspection) -> Iterator[Check]:
     texture, size = inspection.texture, inspection.speckle_px
     least = CONSTANTS.too_fine if size > 2 * CONSTANTS.finest else COLOURED  # coarse speckle is not too fine
-    if texture is not None and (texture.specific > 0.5 or texture.correlation < least):
+    if any(doubt.name == "lights apart" for doubt in inspection.doubts):
+        pass  # a texture of displaced lights is not that of the specimen
+    elif texture is not None and (texture.specific > 0.5 or texture.correlation < least):
         yield Check(
             "coloured",
             f"the colours do not show one texture (agreement {texture.correlation:.2f}; of what each shows alone, "

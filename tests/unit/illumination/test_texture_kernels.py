@@ -8,6 +8,7 @@ from rgbmidic._kernels import demosaicing as kriging
 from rgbmidic._kernels import texture
 from rgbmidic.illumination.colour_factors import _channel_moments, _planes, of_mosaic, widened
 from rgbmidic.illumination.demosaicing import red_position
+from rgbmidic.illumination.texture import lanczos_weights
 from rgbmidic.settings import BAYER_PATTERNS
 
 SHAPES = [(16, 24), (19, 21), (33, 18), (9, 531)]
@@ -56,7 +57,9 @@ def test_division_by_the_local_mean(shape, block):
 def test_moments_of_the_planes(cfa, shape):
     values, grid = make_contrast(shape, unknown=0.005), tuple(-(-n // 8) for n in shape)
     planes = np.empty((4, shape[0] // 2, shape[1] // 2), dtype=np.float32)
-    texture.low_passed_planes(values, np.argsort(_planes(red_position(cfa))), planes)
+    unmixing, lights = np.random.default_rng(5).normal(size=(2, 4)).astype(np.float32), np.empty_like(planes[:2])
+    texture.low_passed_planes(values, np.argsort(_planes(red_position(cfa))), unmixing, planes, lights)
+    np.testing.assert_allclose(lights, np.tensordot(unmixing, planes, axes=1), rtol=1e-4, atol=1)
     sums = np.empty((11, *grid), dtype=np.float32)
     texture.plane_products(planes, texture.CELLS, sums)
     pairs = np.zeros((4, 4), dtype=int)
@@ -73,6 +76,7 @@ def test_planes_are_read_where_they_show_the_texture(width):
     y, x = np.mgrid[:30, :width].astype(float)
     displacement = np.zeros((2, 2, 8, -(-width // 4)))
     displacement[1] = np.linspace(-2.6, 1.9, displacement[1].size).reshape(displacement[1].shape)
+    displacement[1, :, 2, 1] = -1e-17  # rounded to the next sample
     blocks = (np.arange(30) // 4)[:, None], np.arange(width) // 4
     at_x, at_y = (displacement[:, axis][:, *blocks] for axis in (0, 1))
 
@@ -82,7 +86,7 @@ def test_planes_are_read_where_they_show_the_texture(width):
     planes = np.stack([wave(x, y), wave(x, y)]).astype(np.float32)
     planes[0, 3, 9] = np.nan
     out = np.empty_like(planes)
-    texture.register_planes(planes, displacement, out)
+    texture.register_planes(planes, displacement, lanczos_weights(), out)
     expected = wave(x + at_x, y + at_y)
     known = np.isfinite(out)
     assert known[1, 8:-8, 8:-8].all()

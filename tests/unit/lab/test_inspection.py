@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 from colour_scenes import CROSSTALK, FULL_SCALE, NOISE, A, mosaic_of, sparkle, speckle
 from real_files import CROPS
+from scipy.ndimage import shift
 from small_tests import REGION, colour_test, grey_frame
 
 import rgbmidic
@@ -255,6 +257,49 @@ def test_the_same_frame_gives_the_same_figures():
     assert inspection_document(again) == inspection_document(mat())
 
 
+def test_the_expected_uncertainty_knows_where_the_lights_lie():
+    shifts = np.array([[0, 0], [0.6, 0.2], [-0.4, 0.5]])
+    apart = np.stack(
+        [shift(light, by[::-1], order=5, mode="mirror") for light, by in zip(mat_lights(), shifts, strict=False)]
+    )
+    parameters = np.pad(shifts, ((0, 0), (0, 3)))
+    centre, radius = frame_geometry(SHAPE)
+    right, wrong = (
+        replace(
+            CALIBRATION,
+            registration=Registration(lights=CROSSTALK.lights, parameters=p, centre=centre, radius=radius),
+        )
+        for p in (parameters, -parameters)
+    )
+    with_it, without, misled = (inspect_frame(raw(apart), calibration=one) for one in (right, CALIBRATION, wrong))
+    expected, plain, worse = (np.nanmedian(seen.prediction.std) for seen in (with_it, mat(), without))
+    assert codes(with_it) == set()
+    assert expected == pytest.approx(plain, rel=0.15)  # lights that lie apart show as much as lights in register
+    assert worse > 1.3 * expected
+    for seen, words in ((without, "no registration is calibrated"), (misled, "beyond the calibrated registration")):
+        (text,) = [finding.text for finding in seen.findings if finding.name == "lights apart"]
+        assert words in text
+        assert "coloured" not in codes(seen)
+
+
+def test_what_dimming_a_lamp_gains_is_what_the_dimmed_frame_shows():
+    strength = np.array([1.0, 1.0, 5.0])
+    lights = mat_lights(level=400.0) * strength[:, None, None].astype(np.float32)
+    seen = inspect_frame(raw(lights), calibration=CALIBRATION)
+    (text,) = [finding.text for finding in seen.findings if finding.name == "unequal lamps"]
+    assert "blue dimmed to 20%" in text
+    exposure = float(re.search(r"([\d.]+) times the exposure", text)[1])
+    after, before = map(float, re.search(r"([\d.]+) px instead of ([\d.]+) px", text).groups())
+    dimmed = inspect_frame(raw(mat_lights(level=400.0 * exposure)), calibration=CALIBRATION)
+    assert max(channel.high for channel in dimmed.channels) < 1.05 * max(channel.high for channel in seen.channels)
+    assert codes(dimmed) == set()
+    assert before == pytest.approx(np.nanmedian(seen.prediction.std), rel=0.02)
+    assert after == pytest.approx(np.nanmedian(dimmed.prediction.std), rel=0.05)
+    assert before > 1.2 * after
+    rough = inspect_frame(raw(lights), calibration=replace(CALIBRATION, noise=None))
+    assert any("noise estimated" in finding.text for finding in rough.findings if finding.name == "unequal lamps")
+
+
 def _coloured():
     return np.stack([1500 * speckle(SHAPE, seed=20 + n) for n in range(3)]).astype(np.float32)
 
@@ -283,13 +328,14 @@ def _blind():
 def test_troubles_are_told(lights, code):
     seen = inspect_frame(raw(lights()), calibration=CALIBRATION)
     assert code in codes(seen)
+    assert "lights apart" not in codes(seen)
     assert all(finding.text for finding in seen.findings)
 
 
 @pytest.mark.parametrize(("size", "code"), [(2.0, "fine speckle"), (26.0, "coloured")])
 def test_coarse_speckle_whose_colours_hardly_agree_is_not_called_too_fine(size, code):
     texture = SimpleNamespace(specific=0.2, correlation=0.74)
-    seen = SimpleNamespace(texture=texture, speckle_px=size, element_size=100.0, repetition="")
+    seen = SimpleNamespace(texture=texture, speckle_px=size, element_size=100.0, repetition="", doubts=())
     assert [check.name for check in _of_speckle(seen) if not check.passed] == [code]
 
 

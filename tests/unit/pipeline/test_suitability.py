@@ -1,8 +1,9 @@
-"""What run says of a reference: texture that repeats itself, clipped samples, dark background, frames that move."""
+"""What run says of a reference: its texture, clipped samples, dark background, lights that lie apart, motion."""
 
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,13 +11,22 @@ from scipy.ndimage import gaussian_filter, shift
 from small_tests import colour_test
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording
+from rgbmidic.illumination.displacement import LightDisplacement
 from rgbmidic.illumination.frame_check import saturation_pile
-from rgbmidic.illumination.images import IlluminationImages
+from rgbmidic.illumination.images import IlluminationImages, Registration
+from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection import inspect_frame
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan, measure
 from rgbmidic.pipeline.source import SourceSeries
-from rgbmidic.pipeline.suitability import ReferenceMotion, background_fraction, clipping, repetition, speckle_size
+from rgbmidic.pipeline.suitability import (
+    ReferenceMotion,
+    background_fraction,
+    clipping,
+    repetition,
+    separation_doubts,
+    speckle_size,
+)
 from rgbmidic.settings import TestSettings
 
 SHAPE = (120, 140)
@@ -203,3 +213,69 @@ def test_a_lamp_that_goes_out_is_one_line_of_the_run_and_is_kept_with_it(tmp_pat
     (line,) = told()
     assert line == "frames 2 to 3 (frame 2, ...): light 2 gives less than 30% of its light in the reference"
     assert result.warnings == (line,)
+
+
+def found_apart(std: float, *displacements: np.ndarray) -> IlluminationImages:
+    """Lights that a separation found displaced, (2, h, w) each, with an uncertainty."""
+    values = np.stack(displacements)
+    values = values + std * np.random.default_rng(1).normal(size=values.shape)
+    blocks = values.shape[2:]
+    pictures = images(*[speckle(shape=(8 * blocks[0], 8 * blocks[1]))] * len(values))
+    found = LightDisplacement(values=values - values.mean(axis=0), std=np.full((len(values), *blocks), std))
+    return replace(pictures, displacement=found)
+
+
+def magnified(by: float) -> np.ndarray:
+    """Of a lens that magnifies a light more: 0 in the middle, `by` px at the left and right end."""
+    y, x = np.mgrid[-1:1:40j, -1:1:40j]
+    return by * np.stack([x, y])
+
+
+def glints(rms: float, seed: int) -> np.ndarray:
+    """Of glints on raised droplets: they slide over the surface over some 50 px."""
+    field = gaussian_filter(np.random.default_rng(seed).normal(size=(2, 40, 40)), (0, 5, 5))
+    return rms * field / field.std()
+
+
+@pytest.mark.parametrize(
+    ("displacements", "std", "text"),
+    [
+        ((magnified(0), magnified(0.1), magnified(0.5)), 0.02, "no registration is calibrated, but c lies 0.42 px (up"),
+        ((magnified(0), magnified(0.3), magnified(0.5)), 0.02, "b lies 0.25 px (up to 0.4"),
+        ((magnified(0), magnified(0.05), magnified(0.1)), 0.02, ""),
+        ((magnified(0), magnified(0.1), magnified(0.5)), 0.5, ""),  # it may be chance
+        *[((glints(0.3, 3 * n), glints(0.3, 3 * n + 1), glints(0.3, 3 * n + 2)), 0.02, "") for n in range(4)],
+    ],
+)
+def test_lights_that_lie_apart_are_told_and_glints_are_not(displacements, std, text):
+    found = found_apart(std, *displacements)
+    said = [check.text for check in separation_doubts(found, Region.from_mask(np.ones(found.shape, bool)))]
+    assert [text in one for one in said] == [True] * bool(text)
+
+
+def test_a_registration_of_another_set_up_is_told():
+    found = found_apart(0.02, magnified(0), magnified(0.14), magnified(0))
+    region = Region.from_mask(np.ones(found.shape, bool))
+    assert separation_doubts(found, region) == []  # without one .15 px are not told
+    registered = replace(found, registration=Registration.identity(found.names, found.shape))
+    assert "beyond the calibrated registration b lies 0.1" in separation_doubts(registered, region)[0].text
+
+
+def test_the_run_says_what_its_separation_has_found(tmp_path, told):
+    def separation(frames):
+        found = found_apart(0.02, magnified(0), magnified(0.8))
+        cut = found.values[:, : SHAPE[0], : SHAPE[1]] + frames[0].values.mean()
+        texture = TextureModel(weights=(1.0,), widths=(1.5,), common=False)
+        return replace(found, values=cut, valid=np.ones(cut.shape, bool), texture=texture)
+
+    settings = TestSettings.from_mapping(
+        {
+            "frames": {"path": [], "kind": "monochrome", "white_level": 4095},
+            "region": {"rectangle": [10, 10, 129, 109]},
+            "mesh": {"element_size": 25},
+        }
+    )
+    measure(settings, tmp_path / "out", source=[raw(speckle()), raw(speckle() + 1)], separation=separation)
+    said = "\n".join(told())
+    assert "the reference (frame 0): no registration is calibrated, but b lies" in said
+    assert "the samples contradict one texture common to the lights" in said

@@ -10,6 +10,7 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.illumination.crosstalk import HALF_MAXIMUM, spectral_response
 from rgbmidic.lab.virtual import Camera, Led, Light, Sensitivities, expose, paper_scene, record, render, sphere_scene
 from rgbmidic.lab.virtual.dataset import dark_frames, single_light_frames
+from rgbmidic.scene.camera import mosaic_samples
 from rgbmidic.settings import BAYER_PATTERNS
 
 LIGHTS = tuple(Light(name=name, position=(0.0, 0.0, 0.0)) for name in ("red", "green", "blue"))
@@ -191,3 +192,12 @@ def test_scene_checks_lights_and_crosstalk():
         replace(scene, lights=(scene.lights[0],) * 3)
     with pytest.raises(InputError, match="violet"):
         scene.light("violet")
+
+
+@pytest.mark.parametrize("cfa", BAYER_PATTERNS)
+def test_each_site_of_a_mosaic_takes_its_own_plane(cfa):
+    planes = np.broadcast_to(np.arange(4.0)[:, None, None], (4, 5, 6))
+    samples, colours = mosaic_samples(planes, cfa), mosaic_samples(planes[:3], cfa)
+    for row in range(5):
+        greens = 1 if 0 in samples[row] else 2  # in a row with red, or with blue
+        np.testing.assert_array_equal(samples[row], np.choose(colours[row].astype(int), [0, greens, 3]))
