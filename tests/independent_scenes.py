@@ -42,7 +42,7 @@ CROPS = ("sphere_crop", "plate_in_green_glare_crop")
 COLUMNS = ("scene", "quantity", "frame", "rms [px]", "rms of commit", "error/stated", "ratio of commit")
 QUANTITIES = ("pixels", "nodes", "centres", "means", "gauges")
 LIGHTS = ("red", "green", "blue")
-MARGIN, SPACING, LENGTH, STEP = 25.0, 50.0, 100.0, 5.0
+MARGIN, SPACING, LENGTH, STEP = 25.0, 25.0, 100.0, 10.0
 """px: border that is left out; from one gauge or square to the next; their length; between points of a square."""
 STATED = {"kind": "bayer", "cfa": "RGGB", "black_level": 64.0, "white_level": 4095.0}
 
