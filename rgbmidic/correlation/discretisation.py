@@ -126,9 +126,11 @@ def discretisation_error(
         return solution
     halves, draws = _halves(reference)
     with one_blas_thread():
-        values, variance = _finer_field(halves, deformed, solution, options, method)
+        values, variance, rotation = _finer_field(halves, deformed, solution, options, method)
         std = np.concatenate([solution.displacement_std, solution.strain_std], axis=1)
         noise = np.sqrt(draws.own_variance * np.column_stack([variance, variance, variance.mean(axis=1)]))
+        turned = np.sqrt(np.einsum("nij,nj->ni", rotation**2, noise[:, :2] ** 2))
+        noise[:, :4] *= np.tile(turned / np.maximum(noise[:, :2], 1e-300), 2)  # slopes of u have its direction
         less = noise < _CONSTANTS.chance * std
         own = np.concatenate([solution.displacement, solution.strain], axis=1)
         used = np.asarray(measured[mesh.elements].all(axis=1))
@@ -147,14 +149,15 @@ def discretisation_error(
 
 def _finer_field(
     halves: _Halves, deformed: Deformed, solution: Solution, options: SolverSettings, method: PrecisionMethod | None
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Take Gauss-Newton steps on the halved mesh from the recovered field.
 
     Returns
     -------
     tuple
-        u, v, exx, eyy, exy (N, 5) at the nodes of the solution, NaN where the finer mesh sees too little; and the
-        variance of the scores in x and y that it leaves, (N, 2), as `_score_variance`.
+        u, v, exx, eyy, exy (N, 5) at the nodes of the solution, NaN where the finer mesh sees too little; the variance
+        of the scores in x and y of the reference that it leaves, (N, 2), as `_score_variance`; and the rotation
+        (N, 2, 2) of these axes.
     """
     mesh, fine, count = halves.mesh, halves.fine, len(halves.mesh.nodes)
     used = np.asarray(solution.measured[mesh.elements].all(axis=1))
@@ -175,11 +178,12 @@ def _finer_field(
     # a robust loss bends less than the weights of one residual state: with these alone noise is followed too little
     rest = loss[:, None] * equations.solve(_right_side(fine, equations.weights, last.difference)).reshape(-1, 2)
     last = replace(last, difference=_left(fine, last.difference, rest).difference)
-    found = estimate.displacement + np.einsum("nij,nj->ni", equations.rotation, rest)
+    found = estimate.displacement + equations.turned(rest)
     recovery = halves.recovery(children & equations.textured[fine.mesh.elements].all(axis=1), equations)
-    variance = _score_variance(halves.straightened(last, recovery, found), equations.weights) * (loss[:, None] ** 2)
+    straight = halves.straightened(last, equations, recovery, found)
+    variance = _score_variance(straight, equations.weights) * (loss[:, None] ** 2)
     known = (equations.textured & ~fine.mesh.beside(~equations.textured))[:count]
-    return np.where(known[:, None], recovery.field(*found.T), np.nan), variance[:count]
+    return np.where(known[:, None], recovery.field(*found.T), np.nan), variance[:count], equations.rotation[:count]
 
 
 def _right_side(reference: Reference, weights: FloatImage, difference: FloatImage) -> FloatArray:
@@ -282,10 +286,9 @@ class _Halves:
         """Recover the field on the finer mesh, at the nodes of the coarse one."""
         return Recovery.over(self.fine.material, used, equations.information(self.fine), len(self.mesh.nodes))
 
-    def straightened(self, residual: Residual, recovery: Recovery, found: FloatArray) -> Residual:
+    def straightened(self, residual: Residual, equations: Equations, recovery: Recovery, found: FloatArray) -> Residual:
         """Take out what the recovered field (its fit on the finer mesh is `found`) has over that fit."""
-        carried, second = recovery.bend(found)
-        return residual.without(self.prolonged(carried), self.prolonged(second))
+        return residual.without(*(equations.turned_back(self.prolonged(part)) for part in recovery.bend(found)))
 
     def averaged(self, values: FloatArray) -> FloatArray:
         """Mean (N, C) over a window of some 1.5 elements; NaN takes no part."""
@@ -416,7 +419,7 @@ def _drawn(halves: _Halves, reference: Reference) -> _Draws:
         noise = fine.pixels.gather(np.stack([apply_prefilter(image, fine.prefilter) for image in white]))
         side = _right_side(fine, fine.pixel_weights, noise)
         found = finer.solve(side).reshape(-1, 2)
-        residual = halves.straightened(_left(fine, noise, found), fine_recovery, found)
+        residual = halves.straightened(_left(fine, noise, found), finer, fine_recovery, found)
         left += _score_variance(residual, fine.pixel_weights)[:count] / _CONSTANTS.noises
         energy += float(side @ side) / float((right**2).sum()) * _CONSTANTS.draws / _CONSTANTS.noises
     if not mesh.is_graded:

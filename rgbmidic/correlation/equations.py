@@ -97,7 +97,9 @@ class Equations:
         per_light = reference.hessians(weights)
         blocks = np.sum(per_light, axis=0)
         rotation = _rotation(reference.mesh, displacement, blocks)
-        functions = _turned_back(rotation, functions)
+        functions = _turned_back(rotation, functions.reshape(len(rotation), 2, functions.shape[1])).reshape(
+            *functions.shape
+        )
         own = assembly.node_blocks(blocks)
         least = constants.seen if given is None else constants.informed
         observability = _observability(own, assembly.nodal_area, least, constants)
@@ -161,7 +163,15 @@ class Equations:
         if self.rigid is not None:
             rigid = self.rigid.increment(motion, held_side, rigid_side)
             motion = motion - self.rigid.follows @ rigid
-        return np.einsum("nij,nj->ni", self.rotation, motion.reshape(-1, 2)), rigid
+        return self.turned(motion.reshape(-1, 2)), rigid
+
+    def turned(self, vectors: FloatArray) -> FloatArray:
+        """Turn nodal vectors (N, 2, ...) from the axes of the reference to where they are now."""
+        return np.asarray(np.einsum("nij,nj...->ni...", self.rotation, vectors))
+
+    def turned_back(self, vectors: FloatArray) -> FloatArray:
+        """Turn nodal vectors (N, 2, ...) into the axes of the reference."""
+        return _turned_back(self.rotation, vectors)
 
 
 def _rotation(mesh: Tri3Mesh, displacement: FloatArray, blocks: FloatArray) -> FloatArray:
@@ -178,10 +188,8 @@ def _rotation(mesh: Tri3Mesh, displacement: FloatArray, blocks: FloatArray) -> F
     return np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
 
 
-def _turned_back(rotation: FloatArray, columns: FloatArray) -> FloatArray:
-    """Turn nodal vectors (2 N, m) into the axes of the reference."""
-    turned = np.einsum("nji,njm->nim", rotation, columns.reshape(len(rotation), 2, -1))
-    return np.asarray(turned.reshape(columns.shape))
+def _turned_back(rotation: FloatArray, vectors: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("nji,nj...->ni...", rotation, vectors))
 
 
 def _observability(own: FloatArray, area: FloatArray, least: float, constants: SolverConstants) -> FloatArray:
@@ -330,7 +338,7 @@ def _right_sides(
     """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
     reference, assembly = problem.reference, problem.reference.assembly
     bend = assembly.smoothness @ estimate.displacement.ravel()
-    held = -equations.smoothness * _turned_back(equations.rotation, bend[:, None]).ravel()
+    held = -equations.smoothness * equations.turned_back(bend.reshape(-1, 2)).ravel()
     total, rigid, difference = held.copy(), [], np.empty_like(values[0])
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
         if known is not None:

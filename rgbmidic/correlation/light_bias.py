@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.illumination.displacement import agreement
@@ -90,8 +91,8 @@ def settled_gradient(residual: Residual, weights: FloatImage) -> Reference:
     return replace(reference, gradient=texture.matched(reference.pixels, consistency, constants.block))
 
 
-def light_bias(residual: Residual, weights: FloatImage) -> tuple[FloatArray, FloatArray]:
-    """Bias at the nodes, from the residual at a solution with these pixel weights (k, P); none with one light.
+def light_bias(residual: Residual, equations: Equations) -> tuple[FloatArray, FloatArray]:
+    """Bias at the nodes, from the residual at a solution and the equations it was found with; none with one light.
 
     Where a light's displacement changes within the window by more than chance, it is taken in a window of a third.
 
@@ -103,7 +104,7 @@ def light_bias(residual: Residual, weights: FloatImage) -> tuple[FloatArray, Flo
         Standard uncertainty that is left of u, v, exx, eyy and exy: a bias that is alike over the reach of the window
         changes by so much over it.
     """
-    reference = residual.reference
+    reference, weights = residual.reference, equations.weights
     mesh, pixels, count, constants = reference.mesh, reference.pixels, len(weights), reference.constants
     reach = constants.bias_range
     if count == 1:
@@ -126,5 +127,5 @@ def light_bias(residual: Residual, weights: FloatImage) -> tuple[FloatArray, Flo
     place = (mesh.nodes[:, ::-1] - (top, left_edge)).T / scores.side - 0.5
     at_nodes = [map_coordinates(one, place, order=1, mode="nearest") for one in (*off, *left)]
     bias, square = np.stack(at_nodes, axis=1).reshape(-1, 2, 2).swapaxes(0, 1)
-    x, y = np.sqrt(square).T
-    return bias, np.stack([x, y, x / reach, y / reach, np.hypot(x, y) / (2 * reach)], axis=1)
+    x, y = np.sqrt(np.einsum("nij,nj->ni", equations.rotation**2, square)).T
+    return equations.turned(bias), np.stack([x, y, x / reach, y / reach, np.hypot(x, y) / (2 * reach)], axis=1)

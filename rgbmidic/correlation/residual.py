@@ -140,9 +140,9 @@ class Residual:
         Parameters
         ----------
         carried : ndarray, shape (N, 2)
-            What the fit has at the nodes beyond the field, px.
+            What the fit has at the nodes beyond the field, px, in the axes of the reference.
         curvature : ndarray, shape (N, 2, 3)
-            Second derivatives xx, xy, yy of the field at the nodes, 1/px.
+            Second derivatives xx, xy, yy of the field at the nodes, 1/px, in the axes of the reference.
 
         Returns
         -------

@@ -312,11 +312,11 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     used = weighting.matched & equations.textured[mesh.elements].all(axis=1)
     recovery = Recovery.over(reference.material, used, equations.information(reference))
     fitted = estimate.displacement
-    residual = weighting.residual.without(*recovery.bend(fitted))
+    residual = weighting.residual.without(*map(equations.turned_back, recovery.bend(fitted)))
     std = standard_uncertainty(residual, equations, weighting.precision, recovery)
     bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
     if weighting.precision is not None:
-        bias, bias_std = light_bias(weighting.residual, equations.weights)
+        bias, bias_std = light_bias(weighting.residual, equations)
     sensitivity = observed_sensitivity(problem, equations, weighting.values, weighting.residual, estimate)
     scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
     fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale

@@ -27,8 +27,9 @@ OFFSET_VARIANCE = 10.0
 """Variance of an unknown constant under the texture: makes the filter's coefficients sum to one."""
 SPARKLE_VARIANCE = 0.29
 """Variance (px²) of the aperture through which sparkle is seen: a square pixel, 1/12, and a lens blur of 0.45 px."""
-STEP = 0.02
-"""Fineness (px) in which a light's displacement is rounded."""
+STEP = 0.01
+"""Fineness (px) in which a light's displacement is rounded: with .02 and .05 the error behind a lens with lateral
+colour is 1 and 9 % larger."""
 LEAST_NOISE = 1e-8
 """Least variance of the noise, relative to the texture's: keeps the system of equations regular."""
 DISSIMILAR = 1.0

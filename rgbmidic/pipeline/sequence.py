@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.threads import aside
-from rgbmidic.correlation import Deformed, Reference, Solution, Start, discretisation_error, fill, solve, track
+from rgbmidic.correlation import Deformed, Reference, Solution, Start, discretisation_error, fill, track
 from rgbmidic.correlation.images import as_light_stack, unmasked
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import PrecisionMethod
@@ -67,7 +67,8 @@ def correlate(
     weights : array_like, shape (H, W) or (k, H, W), optional
         Weight of each light at each pixel of the reference, finite and not negative; 0 excludes the pixel.
     initial : array_like, shape (2,) or (N, 2), optional
-        Initial guess of the displacement (u, v) in px; None: it is found by a search.
+        Initial guess of the displacement (u, v) in px. Where the solve fails from it or loses nodes, or None is given,
+        initial guesses are found by a search, and the best solution is returned.
     deformed_weights
         Like `weights`, on the deformed images.
     normalise
@@ -124,11 +125,8 @@ def correlate(
     first = Reference.prepare(f, region, given[0], mesh=mesh, prefilter=solver.prefilter)
     method = (Statistics() if statistics else None) if isinstance(statistics, bool) else statistics
     check_object("statistics", method, "precision")
-    start = initial_displacement(initial, len(mesh.nodes))
-    if start is None:
-        solution = track(first, second.result(), Start(displacement=None), solver, method)
-    else:
-        solution = solve(first, second.result(), start, solver, method)
+    start = Start(displacement=initial_displacement(initial, len(mesh.nodes)))
+    solution = track(first, second.result(), start, solver, method)
     if solution.disagreement:
         logger.warning("%s", solution.disagreement)
     if mesh_error:

@@ -73,6 +73,15 @@ def test_a_start_may_be_one_motion_or_one_per_node(pair, initial):
     np.testing.assert_allclose(found.displacement, blank.displacement, atol=2e-3)
 
 
+@pytest.mark.parametrize("initial", [(20, -15), "turned"])
+def test_a_wrong_start_is_one_candidate_beside_the_search(pair, initial):
+    found = correlate(*pair, region=(12, 12, 85, 75))
+    start = 0.5 * (found.nodes - found.nodes.mean(axis=0))[:, ::-1] if initial == "turned" else initial
+    other = correlate(*pair, region=(12, 12, 85, 75), initial=start)
+    assert other.measured.all()
+    np.testing.assert_allclose(other.displacement, found.displacement, atol=2e-3)
+
+
 def test_the_largest_number_of_iterations_is_kept_and_told():
     texture = Texture.random(0)
     pair = texture.image(SHAPE), texture.image(SHAPE, Affine(shift=(0.8, 0)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from textures import Affine, Texture
@@ -12,6 +13,7 @@ from rgbmidic import Region, Tri3Mesh, correlate
 from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.correlation.equations import Equations
+from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.recovery import Recovery, functional_std
 from rgbmidic.correlation.residual import Residual
 
@@ -23,13 +25,14 @@ def noisy(image, seed):
     return image + np.random.default_rng(seed).normal(0, NOISE, image.shape)
 
 
+@pytest.mark.parametrize("prefilter", ["none", "binomial"])
 @pytest.mark.parametrize("size", [6, 13, 20])
-def test_the_unfitted_share_is_that_of_the_projection(size):
+def test_the_unfitted_share_is_that_of_the_projection(size, prefilter):
     shape = (60, 60)
     region = Region.from_rectangle((4, 4, 55, 55), shape)
     mesh = Tri3Mesh.from_region(region, size)
     image = Texture.random(1).image(shape)[None].astype(np.float32)
-    reference = Reference.prepare(image, region, mesh=mesh, prefilter="none")
+    reference = Reference.prepare(image, region, mesh=mesh, prefilter=prefilter)
     pixels, slopes = reference.pixels, (reference.gradient[0][0], reference.gradient[1][0])
     columns = np.zeros((pixels.rows.size, len(mesh.nodes), 2))
     for element, corners in enumerate(mesh.elements):
@@ -43,8 +46,15 @@ def test_the_unfitted_share_is_that_of_the_projection(size):
     inside = (index[:, None] == np.arange(grid[0] * grid[1])) & used[:, None]
     scores = np.concatenate([slope[:, None] * inside for slope in slopes], axis=1).astype(float)
     system = columns.reshape(len(columns), -1) * used[:, None]
-    fitted = system @ np.linalg.lstsq(system, scores, rcond=1e-6)[0]
-    left = 1 - (fitted**2).sum() / (scores**2).sum()
+    unfitted = scores - system @ np.linalg.lstsq(system, scores, rcond=1e-6)[0]
+    inner = np.repeat(~mesh.on_boundary, 2)
+    moved = system @ np.linalg.pinv(system.T @ system, rcond=1e-9)[:, inner]
+
+    def passed(columns):
+        images = (pixels.scatter(column) for column in columns.T.astype(np.float32))
+        return sum((apply_prefilter(image, prefilter) ** 2).sum() for image in images) / (columns**2).sum()
+
+    left = (unfitted**2).sum() / (scores**2).sum() * passed(unfitted) / passed(moved)
     assert reference.unfitted == pytest.approx(left, rel=0.1)
 
 
@@ -80,6 +90,27 @@ def test_elements_of_any_size_state_their_error(size):
         found = correlate(noisy(image, seed), noisy(image, 100 + seed), element_size=size, initial=(0, 0))
         ratios.append((found.displacement / found.displacement_std)[found.measured].ravel())
     assert 0.85 < np.sqrt(np.mean(np.concatenate(ratios) ** 2)) < 1.25
+
+
+@pytest.mark.parametrize(("wave", "apart", "mesh_error"), [(0, 0, True), (0.5, 0, False), (0, 0.1, False)])
+def test_the_uncertainty_turns_with_the_surface(wave, apart, mesh_error):
+    random, (y, x), options = np.random.default_rng(0), np.mgrid[:121, :121].astype(float), {"element_size": 16}
+    streaks = np.stack([gaussian_filter(random.normal(size=x.shape), (1.5, 4.0)) for _ in range(2)])
+    streaks *= 40 / streaks.std()
+    # what elements cannot follow, and two lights that disagree, along the streaks
+    moved = ((y, x - wave * np.sin(y / 9) + shift) for shift in (apart, -apart))
+    deformed = [map_coordinates(light, at, order=5, mode="mirror") for light, at in zip(streaks, moved, strict=True)]
+    first, second = (stack + random.normal(0, 1, streaks.shape) for stack in (streaks, np.stack(deformed)))
+    options |= {"region": (15, 15, 105, 105), "mesh_error": mesh_error}
+    rest = correlate(first, second, initial=(0, 0), **options)
+    x, y = rest.nodes.T
+    turned = correlate(first, np.rot90(second, -1, axes=(1, 2)), initial=np.c_[120 - y - x, x - y], **options)
+    least = 6e-4 * np.array([0, 1, 0])  # px: the bias of lights that agree is 0 or by chance
+    for name, order, atol in zip(
+        ("displacement_std", "bias_std", "strain_std"), ([1, 0], [1, 0], [1, 0, 2]), least, strict=True
+    ):
+        expected, stated = (np.nanmedian(getattr(one, name), axis=0) for one in (rest, turned))
+        np.testing.assert_allclose(stated[order], expected, rtol=0.3, atol=atol, err_msg=name)
 
 
 def test_the_smallest_element_beside_a_hole_is_told_by_the_common_way(monkeypatch):
