@@ -168,6 +168,7 @@ def keep_better(found: Figures, commit: str) -> None:
     for (scene, frame, quantity), (rms, ratio) in found.items():
         row = best.setdefault((scene, frame, quantity), {})
         row |= {"scene": scene, "quantity": quantity, "frame": str(frame)}
+        rms, ratio = round(rms, 5), round(ratio, 3)
         if not row.get("rms [px]") or rms < float(row["rms [px]"]):
             row |= {"rms [px]": f"{rms:.5f}", "rms of commit": commit}
         if np.isfinite(ratio) and (not row.get("error/stated") or off(ratio) < off(float(row["error/stated"]))):
