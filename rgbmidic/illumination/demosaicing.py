@@ -20,6 +20,7 @@ that the samples of all colours say how much of it to take off which.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -89,8 +90,6 @@ def normalised_demosaic(mosaic: LinearMosaic) -> LinearChannels:
 
 SMALLEST_FRAME = 64
 """Rows and columns under which a frame holds too few speckles for statistics."""
-_PASSES = 2
-"""Times that a texture is learnt: what the lattices cannot see of displaced lights follows from the first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,10 +165,13 @@ def reconstruct(
     if mosaic.saturated.any():
         values = np.where(mosaic.saturated, np.float32(np.nan), values)
     model, learnt = MosaicModel.of(crosstalk, registration, values.shape), texture
-    for _ in range(_PASSES if texture is None else 0):
-        learnt = learn_texture(gather_moments(values, red_position(mosaic.cfa), mosaic.noise, model, learnt), model)
-    moments = gather_moments(values, red_position(mosaic.cfa), mosaic.noise, model, learnt)
-    assert learnt is not None, "of the mosaic, where none is given"
+    gather = partial(gather_moments, values, red_position(mosaic.cfa), mosaic.noise, model)
+    moments = gather(texture)
+    if learnt is None:
+        learnt = learn_texture(moments, model)
+        if model.displacement.any():  # what the lattices cannot see of displaced lights follows from a first texture
+            learnt = learn_texture(gather(learnt), model)
+            moments = gather(learnt)
     factors = colour_factors(moments, learnt, model)
     displacement = light_displacement(moments, factors, learnt)
     glints = displacement.significant
