@@ -210,12 +210,10 @@ def saturation_pile(samples: npt.NDArray[np.integer[Any]], white: float) -> floa
     -------
     float or None
         Their largest value, where it occurs more than twice as often as the four levels below it, which noise would
-        make as frequent; None: it does not.
+        make as frequent; None: it does not. A constant piles up: a plane that is saturated as a whole.
     """
     top = int(samples.max(initial=0))
     if top >= white or top < 8 or (count := np.count_nonzero(samples == top)) <= 20:
-        return None
-    if count == samples.size:  # a constant
         return None
     bits = int(np.bitwise_or.reduce(samples, axis=None))
     step = bits & -bits  # all samples are multiples of it

@@ -404,7 +404,8 @@ def clipping(state: RawState) -> tuple[float, str] | None:
     """Level at which samples of raw frames pile up below their white level, and what it means; None: they do not."""
     frames = () if isinstance(state, IlluminationImages) else state
     for frame in frames:
-        if (level := saturation_pile(frame.values, frame.white_level)) is not None:
+        level = saturation_pile(frame.values, frame.white_level)
+        if level is not None and np.ptp(frame.values) > 0:  # a constant has no texture to be clipped
             return level, (
                 f"samples pile up at {level:.0f} DN, below white_level {frame.white_level:g}, as where a camera "
                 f"saturates: clipped samples count as measured; state white_level = {level:.0f}"

@@ -13,6 +13,9 @@ SHIFT_ERROR = 0.25
 """px; .18 and .08 found, with a residual of .07 and .26 px at the nodes."""
 IMAGES = 0.1
 """Rms error of red and blue where they are not sampled, over their level: .060 to .072 found."""
+UNEQUAL_IMAGES = 0.15
+"""The same with one band ten times as strong: .101, Malvar's, whose errors do not stay with the sensor's phase as those
+of a prediction from the other bands do (.060, and displacements ten times as wrong)."""
 DISPLACEMENT = 0.011
 """px, at even strengths: .0067 to .0073 found with each offset."""
 RATIO = 1.3
@@ -50,10 +53,10 @@ def test_lateral_colour_of_the_lens_is_found_on_printed_disks(calibration):
         assert np.abs(found - shift).max() < SHIFT_ERROR
 
 
-@pytest.mark.parametrize("strengths", [EVEN, (1.0, 1.0, 10.0)])
-def test_a_single_shot_is_separated_into_the_bands_that_it_is_the_sum_of(bands, calibration, strengths):
+@pytest.mark.parametrize(("strengths", "limit"), [(EVEN, IMAGES), ((1.0, 1.0, 10.0), UNEQUAL_IMAGES)])
+def test_a_single_shot_is_separated_into_the_bands_that_it_is_the_sum_of(bands, calibration, strengths, limit):
     ours, malvar = (disks.image_error(bands, calibration, strengths, method) for method in ("auto", "malvar"))
-    assert ours < IMAGES
+    assert ours < limit
     assert ours < 1.05 * malvar
 
 

@@ -107,9 +107,12 @@ def test_samples_pile_up_where_a_camera_saturates_below_its_white_level(step):
     assert saturation_pile(clipped, 65535) == 2000 * step
     assert saturation_pile(clipped, 2000 * step) is None
     assert saturation_pile(bright.astype(np.uint16), 65535) is None
-    assert saturation_pile(np.full(99, 700, dtype=np.uint16), 65535) is None
     mosaic = Mosaic(values=clipped, cfa="RGGB", black_level=0, white_level=65535)
     assert clipping((mosaic,))[0] == 2000 * step
+    # a plane that is saturated as a whole; a frame without any texture
+    constant = np.full((10, 10), 700, dtype=np.uint16)
+    assert saturation_pile(constant, 65535) == 700
+    assert clipping((replace(mosaic, values=constant),)) is None
 
 
 def test_clipped_samples_are_told_by_inspect_and_run_whatever_frame_has_them(tmp_path, told):
