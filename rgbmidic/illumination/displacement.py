@@ -25,6 +25,8 @@ from rgbmidic.typing import BoolArray, FloatArray
 
 SIZE, REACH = 5, 8
 """Side of the square of samples of a prediction, px; rows and columns over which predictions are correlated."""
+LEAST_STD = 1e-6
+"""Least standard uncertainty of a displacement, px: far below what filters round it to."""
 WINDOW = 20.0
 """Standard deviation (px) of the window in which a displacement is taken: glints change their place over some 50 px."""
 
@@ -169,6 +171,6 @@ def light_displacement(
     chance = np.array([blurred(grid, blocks / np.sqrt(2)) for grid in scatter]) / (4 * np.pi * blocks**2)
     # cells of 2 px; a light against the mean of all, not of the others
     unit = 2 / texture.gradient_gain * (count - 1) / count
-    return LightDisplacement(
-        values=unit * (found - found.mean(axis=0)), std=unit * np.sqrt(np.maximum(chance, 1e-12)) / information[:, 0]
-    )
+    std = unit * np.sqrt(np.maximum(chance, 1e-12)) / information[:, 0]
+    # a single light lies at the mean of all, exactly
+    return LightDisplacement(values=unit * (found - found.mean(axis=0)), std=np.maximum(std, LEAST_STD))

@@ -7,6 +7,7 @@ from scipy.ndimage import shift
 
 from rgbmidic._kernels.texture import displacement_scores
 from rgbmidic.illumination.colour_factors import enlarged, widened
+from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.displacement import agreement
 from rgbmidic.illumination.separation import separate
 
@@ -62,6 +63,14 @@ def test_a_light_counts_by_its_precision_and_by_those_that_agree():
     weights, agree = agreement(place[:2], chance[:2], np.array([3.0, 1.0])[:, None, None])
     np.testing.assert_allclose(weights.ravel(), [0.75, 0.25])
     assert agree.item() < 0.05
+
+
+def test_a_single_light_is_displaced_against_nothing():
+    one = Crosstalk(matrix=scenes.A[:, [1]], lights=("green",))
+    light = np.array([0, 2000, 0])[:, None, None] * scenes.speckle(SHAPE)
+    found = separate(scenes.mosaic_of(light), one).displacement
+    assert not found.values.any()
+    assert not found.lateral(np.ones(found.std.shape[1:], dtype=bool)).any()
 
 
 def test_scores_are_those_written_out():
