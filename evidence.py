@@ -13,7 +13,7 @@ import importlib  # noqa: E402
 
 from benchmarks.tables import TABLES, Table  # noqa: E402
 
-for module in ("grey_levels", "public_pairs"):
+for module in ("grey_levels", "public_pairs", "challenge"):
     importlib.import_module(f"benchmarks.{module}")
 for name in sys.argv[1:] or ["public_pairs", "grey_levels", "frame_border", "background_at_rest", "turned"]:
     begin = time.perf_counter()

@@ -20,6 +20,7 @@ from rgbmidic.fields import at_pixels
 from rgbmidic.typing import BoolArray, FloatArray
 
 from . import ROOT
+from .contenders import Placing, displacements, peers_python
 from .peers import speckle
 from .tables import MissingDataError, Row, table
 
@@ -90,6 +91,11 @@ def read_pair(folder: Path) -> Pair:
     return Pair(reference=first, deformed=second, still=first + added)
 
 
+def shared_wave() -> Path:
+    """Folder of the full files."""
+    return Path(os.environ.get("RGBMIDIC_SHARED_DATA", ROOT.parent / "shared" / "data")) / "dic_challenge2_wave"
+
+
 def own_fields(pair: Pair, size: float) -> dict[str, Field]:
     """What the solve measures at the nodes and at the pixels."""
     moved, rest = (
@@ -143,8 +149,7 @@ def star(quick: bool) -> Iterator[Row]:
     of 3, 4 and 6 elements; SR, the longest period with an error of 10 %; scatter at rest; their product MEI; stated
     uncertainty over true error at the nodes (root mean squares) for waves of 2 to 3, 3 to 5 and over 5 elements.
     """
-    shared = os.environ.get("RGBMIDIC_SHARED_DATA", ROOT.parent / "shared" / "data")
-    pair = own_pair((141, 1001)) if quick else read_pair(Path(shared) / "dic_challenge2_wave")
+    pair = own_pair((141, 1001)) if quick else read_pair(shared_wave())
     for size in (16,) if quick else (8, 16, 25, 40):
         for place, field in own_fields(pair, size).items():
             scatter, longest = float(np.sqrt(np.nanmean(field.rest**2))), resolution(pair, field)
@@ -159,6 +164,47 @@ def star(quick: bool) -> Iterator[Row]:
             }
 
 
+SPACING = 10
+"""px between the subsets of other programs."""
+SUBSETS = {"pyvale": (11, 17, 25, 41), "pyvale quadratic": (17, 25, 41, 57)}
+"""Sides (px); smaller ones lose points."""
+
+
+@table("star_peers", page="explanation/uncertainty", cost=150, keys=3, own_quick=True)
+def star_peers(quick: bool) -> Iterator[Row]:
+    """The same star beside subsets of pyvale, affine and quadratic, with its default prefilter: SR, the longest period
+    with an error of 10 %; scatter at rest; and their product, which says what resolution costs in noise."""
+    python, peers = ("", []) if quick else peers_python(list(SUBSETS))
+    pair = own_pair((141, 1001)) if quick else read_pair(shared_wave())
+    fields: dict[tuple[str, str, int], Field] = {}
+    for size in (16,) if quick else (8, 12, 16, 25, 40):
+        for place, field in own_fields(pair, size).items():
+            fields["rgbmidic", place, size] = field
+    for name in peers:
+        both = {
+            f"{size} {kind}": (pair.reference, image, Placing(pair.region, size, SPACING))
+            for size in SUBSETS[name]
+            for kind, image in (("moved", pair.deformed), ("still", pair.still))
+        }
+        found = displacements(python, name, both)
+        for size in SUBSETS[name]:
+            moved, still = found[f"{size} moved"], found[f"{size} still"]
+            if moved is not None and still is not None:
+                fields[name, "subsets", size] = Field(
+                    x=moved[0][:, 0], y=moved[0][:, 1], v=moved[1][:, 1], rest=still[1].T
+                )
+    for (name, place, size), field in fields.items():
+        scatter, longest = float(np.sqrt(np.nanmean(field.rest**2))), resolution(pair, field)
+        yield {
+            "program": name,
+            "at": place,
+            "elements or subsets [px]": size,
+            "SR [px]": longest,
+            "noise [px]": scatter,
+            "product [px^2]": scatter * longest,
+        }
+
+
 BINS = ((3.0, 3.5), (3.5, 4.5), (4.5, 6.0), (6.0, 9.0), (9.0, 15.0))
 """Periods, in elements, at which noise and discretisation error are compared with the true error."""
 
@@ -169,8 +215,7 @@ def mesh_error(quick: bool) -> Iterator[Row]:
     noise that is stated without `mesh.error`, of the noise with it, and of noise and discretisation error together,
     by the period of the waves in elements; at the edge over all waves from 3 elements on.
     """
-    shared = os.environ.get("RGBMIDIC_SHARED_DATA", ROOT.parent / "shared" / "data")
-    pair = own_pair((181, 1001)) if quick else read_pair(Path(shared) / "dic_challenge2_wave")
+    pair = own_pair((181, 1001)) if quick else read_pair(shared_wave())
     for size in (16,) if quick else (16, 25, 40):
         options = {"region": pair.region, "element_size": size, "initial": (0, 0)}
         plain = correlate(pair.reference, pair.deformed, **options)

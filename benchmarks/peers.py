@@ -21,8 +21,6 @@ Accuracy is over the points away from the edge.
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import os
 import resource
@@ -39,15 +37,13 @@ import numpy as np
 
 from rgbmidic.typing import AnyArray, FloatArray
 
-from . import ROOT
+from .contenders import CONTENDERS, MARGIN, Points, environment, peers_python
 from .tables import table
 
-MARGIN, STEP = 30, 25
 SIZE, ROUNDS = 1024, 6
 """Side of the images (px), and timed rounds."""
-CONTENDERS = {"rgbmidic": "rgbmidic", "pyvale": "pyvale", "pyxel-dic": "pyxel", "al-dic": "al_dic"}
-CONTENDERS["al-dic local"] = "al_dic"
-"""Contenders, and the modules that they need."""
+TIMED = ("rgbmidic", "pyvale", "pyxel-dic", "al-dic", "al-dic local")
+"""Contenders whose time is compared."""
 PAIRS = {"star": "grey pair – waves of half a pixel", "affine, 1 % noise": "grey pair – 1 % and 2 deg – 1 % noise"}
 FRAMES = {
     "raw": "raw frame – noise and crosstalk",
@@ -55,9 +51,6 @@ FRAMES = {
     "small": "raw frame of 256 x 128 px",
 }
 _STRAIN, _TURN = 0.01, np.radians(2.0)
-
-Points = tuple[FloatArray, FloatArray]
-"""Positions and displacements (n, 2) in px."""
 
 
 def star(x: FloatArray, y: FloatArray, size: int) -> FloatArray:
@@ -161,61 +154,6 @@ def write_raw_test(folder: Path, frames: int, states: FloatArray, registration: 
     )
 
 
-def with_rgbmidic(f: AnyArray, g: AnyArray, threads: int) -> Points:
-    from rgbmidic import correlate
-
-    edge = f.shape[-1] - 1 - MARGIN
-    found = correlate(f, g, region=(MARGIN, MARGIN, edge, edge), element_size=STEP)
-    return found.nodes, found.displacement
-
-
-def with_pyvale(f: AnyArray, g: AnyArray, threads: int) -> Points:
-    from pyvale import dic  # type: ignore[import-untyped]
-
-    size = len(f)
-    mask = np.zeros(f.shape, dtype=bool)
-    mask[MARGIN:-MARGIN, MARGIN:-MARGIN] = True
-    with tempfile.TemporaryDirectory() as folder:
-        dic.calculate_2d(
-            *(image.round().astype(np.uint8) for image in (f, g)), mask, [size // 2, size // 2], subset_size=25,
-            subset_step=STEP, max_displacement=32, num_threads=threads, output_basepath=folder, print_level=0,
-        )  # fmt: skip
-        found = dic.import_2d(str(next(Path(folder).glob("*.csv"))), layout="column", binary=False, delimiter=",")
-    x, y, u, v = (np.asarray(p, dtype=float).ravel() for p in (found.ss_x, found.ss_y, found.u_px, found.v_px))
-    return np.stack([x, y], axis=1), np.stack([u, v], axis=1)
-
-
-def with_pyxel(f: AnyArray, g: AnyArray, threads: int) -> Points:
-    import pyxel  # type: ignore[import-untyped]
-
-    def image(pixels: AnyArray) -> Any:
-        made = pyxel.Image("array")
-        made.pix = pixels.copy()
-        return made
-
-    edge = len(f) - 1 - MARGIN
-    with contextlib.redirect_stdout(io.StringIO()):
-        mesh, camera = pyxel.MeshFromROI(np.array([[MARGIN, MARGIN], [edge, edge]]), [STEP, STEP], typel=2)
-        mesh.Connectivity()
-        found = np.asarray(pyxel.Correlate(image(f), image(g), mesh, camera, disp=False)[0])
-    u, v = (found[mesh.conn[:, axis]] for axis in (0, 1))
-    return np.stack([mesh.n[:, 0], -mesh.n[:, 1]], axis=1), np.stack([u, -v], axis=1)
-
-
-def with_aldic(f: AnyArray, g: AnyArray, threads: int, *, whole: bool = True) -> Points:
-    import al_dic  # type: ignore[import-untyped]
-    from al_dic.core.data_structures import GridxyROIRange
-
-    # as pyvale's: subsets of 25 px; its step is a power of two
-    region = (MARGIN, len(f) - 1 - MARGIN)
-    settings = al_dic.dicpara_default(
-        winsize=24, winstepsize=32, img_size=f.shape, gridxy_roi_range=GridxyROIRange(region, region),
-        reference_mode="accumulative", use_global_step=whole, size_of_fft_search_region=32, show_plots=False,
-    )  # fmt: skip
-    found = al_dic.run_aldic(settings, [f / 255, g / 255], [np.ones(f.shape)] * 2, compute_strain=False)
-    return found.dic_mesh.coordinates_fem, found.result_disp[0].U.reshape(-1, 2)
-
-
 def raw_frame(folder: Path) -> Callable[[], Points]:
     """Measures the second frame of a raw series, whose reference is prepared, as a run does."""
     from rgbmidic import read_test
@@ -277,13 +215,7 @@ def serve(name: str, folder: Path, threads: int) -> None:
 
 def _measures(name: str, folder: Path, threads: int) -> Callable[[str], dict[str, Any]]:
     """What a contender measures of a case."""
-    run = {
-        "rgbmidic": with_rgbmidic,
-        "pyvale": with_pyvale,
-        "pyxel-dic": with_pyxel,
-        "al-dic": with_aldic,
-        "al-dic local": partial(with_aldic, whole=False),
-    }[name]
+    run = CONTENDERS[name]
     frame = cache(lambda case: raw_frame(folder / case))
 
     def measure(case: str) -> dict[str, Any]:
@@ -308,12 +240,10 @@ class Contender:
     """A process that measures what it is told."""
 
     def __init__(self, python: str, name: str, folder: Path) -> None:
-        variables = ("RGBMIDIC_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-        path = os.pathsep.join(map(str, (ROOT, ROOT / "calibration")))
         # in the temporary folder: some contenders leave files where they run
         self._process = subprocess.Popen(
             [python, "-m", "benchmarks.peers", name, str(folder)],
-            env={**os.environ, **dict.fromkeys(variables, "1"), "PYTHONPATH": path}, cwd=folder, text=True,
+            env=environment(), cwd=folder, text=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
         )  # fmt: skip
 
@@ -355,24 +285,11 @@ def compare(python: str, folder: Path, case: str, names: list[str], rounds: int)
     return found
 
 
-def peers_python() -> tuple[str, list[str]]:
-    """The Python of the peers and those of them that it has."""
-    python = os.environ.get("PEERS_PYTHON", sys.executable)
-    code = "import importlib.util as u, sys; print(*(n for n in sys.argv[1:] if u.find_spec(n)))"
-    modules = set(CONTENDERS.values()) - {"rgbmidic"}
-    done = subprocess.run([python, "-c", code, *modules], capture_output=True, text=True, check=True)
-    return python, ["rgbmidic", *(name for name, module in CONTENDERS.items() if module in done.stdout.split())]
-
-
 @table("speed_peers", page="explanation/speed", cost=130, timing=True)
 def speed_peers(quick: bool) -> Iterator[dict[str, object]]:
     """Comparison with other programs in one run: processor seconds on one thread, best of three alternating runs, 1024
     x 1024 px."""
-    python, names = peers_python()
-    if not quick and len(names) < len(CONTENDERS):
-        raise RuntimeError(
-            f"PEERS_PYTHON names a Python with all of {', '.join(CONTENDERS)}; there are {', '.join(names)}"
-        )
+    python, names = (sys.executable, ["rgbmidic"]) if quick else peers_python(TIMED)
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
         write_cases(folder, 160 if quick else SIZE)

@@ -16,7 +16,7 @@ from rgbmidic.pipeline import correlated
 from rgbmidic.typing import AnyArray, FloatArray
 from run import run_scene
 
-from . import peers
+from .contenders import CONTENDERS, MODULES
 from .tables import MissingDataError, Row, table
 from .uncertainty import rms
 
@@ -31,7 +31,7 @@ CROSSED = slice(3, 5)
 """Areas A3 and A4: the reflection covers A4 at rest and has come to A3 at 8 degrees."""
 TREND = 1.3
 """An area is as good as A0 up to this multiple of its P (examples/paper/claims.py)."""
-PEERS = {"pyvale": peers.with_pyvale, "al-dic": peers.with_aldic, "pyxel-dic": peers.with_pyxel}
+PEERS = ("pyvale", "al-dic", "pyxel-dic")
 LOST = 2.0
 """Error (px) beyond which a point of another program is counted as not found instead."""
 
@@ -99,8 +99,8 @@ def with_peers(quick: bool) -> Iterator[Row]:
     """The same sphere in one Bayer shot: error in A3 and A4 of other programs, which get our light images, divided by
     their local mean, of the lamp that is best for them in hindsight or the mean of the three, and of rgbmidic, which
     gets all three. Points that are over 2 px wrong count as not found. They have subsets or elements of 25 px."""
-    for name, module in peers.CONTENDERS.items():
-        if name in PEERS and importlib.util.find_spec(module) is None:
+    for name in PEERS:
+        if importlib.util.find_spec(MODULES.get(name, name)) is None:
             raise MissingDataError(f"{name} is not installed here: pip install '.[bench]' in an environment of its own")
     found: dict[tuple[str, str], dict[float, list[FloatArray]]] = {}
     for seed in SEEDS[:1] if quick else SEEDS:
@@ -114,8 +114,8 @@ def with_peers(quick: bool) -> Iterator[Row]:
             for what, f, g in zip(
                 ("red", "green", "blue", "mean of three"), pictures[0.0], pictures[angle], strict=True
             ):
-                for name, measure in PEERS.items():
-                    points, displacement = measure(f, g, 2)
+                for name in PEERS:
+                    points, displacement = CONTENDERS[name](f, g, 2)
                     errors = in_reflection(bench, exact, points, displacement)
                     found.setdefault((f"{name} {version(name)}", what), {}).setdefault(angle, []).append(errors)
             study = run_scene(bench, (angle,), methods=("default",), set_up=())
