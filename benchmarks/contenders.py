@@ -90,9 +90,7 @@ def with_pyxel(f: AnyArray, g: AnyArray, threads: int, placing: Placing | None =
     return np.stack([mesh.n[:, 0], -mesh.n[:, 1]], axis=1), np.stack([u, -v], axis=1)
 
 
-def with_aldic(
-    f: AnyArray, g: AnyArray, threads: int, placing: Placing | None = None, *, whole: bool = True
-) -> Points:
+def with_aldic(f: AnyArray, g: AnyArray, threads: int, placing: Placing | None = None, *, whole: bool = True) -> Points:
     import al_dic  # type: ignore[import-untyped]
     from al_dic.core.data_structures import GridxyROIRange
 

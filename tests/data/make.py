@@ -13,6 +13,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import tifffile
 
@@ -29,6 +30,11 @@ WANTED = {
         "Sample14 L3 Amp0.1b.tif",
         "Sample14 L5 Amp0.1b.tif",
     ),
+    "public_pairs": (
+        *("s5_ref.tif", "s5_000_c75_r10.tif", "s5_001_c100_r20.tif"),
+        *("pattern_7x.bmp", "pattern_7x_translation.bmp", "pattern_7x_tension.bmp", "pattern_7x_shear.bmp"),
+        *("rigid_cam0_frame00.tiff", "rigid_cam0_frame04.tiff"),
+    ),
     "real_disks_three_bands": (
         "disks_650nm_250ms.tif",
         "disks_550nm_25ms.tif",
@@ -39,6 +45,8 @@ WANTED = {
 """Files of a folder, where not all are used or may be given on."""
 COPYRIGHT = {
     "dicengine/dice": "BSD-3-Clause, Copyright 2015 National Technology & Engineering Solutions of Sandia, LLC (NTESS)",
+    "vincentjzy/OpenCorr": "MPL-2.0, Copyright Zhenyu Jiang and contributors",
+    "pyvale": "MIT, Copyright (C) 2025 The Computer Aided Validation Team at UKAEA",
     "PolymerGuy/muDIC": "MIT, Copyright (c) 2019 PolymerGuy",
     "AcademySoftwareFoundation/rawtoaces": "Apache-2.0, Copyright Contributors to the rawtoaces Project",
     "mushfiqulalam/isp": "MIT, Copyright (c) 2017 Mushfiqul Alam",
@@ -153,7 +161,9 @@ def write_source(folder: Path, out: Path, cut: dict) -> None:
     text = (folder / "SOURCE.txt").read_text()
     head, *files = re.split(r"\n(?=\S[^\n]*\n    from: )", text)
     kept = [one for one in files if (out / one.split("\n")[0]).exists() or folder.name == "mosaic16_nikon"]
-    holders = NAMED.get(folder.name) or sorted({COPYRIGHT[re.search(r"from: github (\S+)", one)[1]] for one in kept})
+    holders = NAMED.get(folder.name) or sorted(
+        {COPYRIGHT[re.search(r"from: (?:github|PyPI wheel) (\S+)", one)[1]] for one in kept}
+    )
     here = f"Here: {cut}, cut by tests/data/make.py." if cut else "Here: whole files."
     lines = [*holders, "Texts of the licences: ../LICENCES.txt.", here, "Of the full files:", head.strip(), *kept]
     out.joinpath("SOURCE.txt").write_text("\n".join(lines).rstrip() + "\n")
@@ -180,6 +190,9 @@ def main(full: Path) -> None:
                 cut_photron(file, target, cut["frames"])
             elif file.suffix in (".tif", ".tiff"):
                 crop_tiff(file, target, cut["window"])
+            elif file.suffix == ".bmp":
+                left, top, right, bottom = cut["window"]
+                cv2.imwrite(str(target), cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[top:bottom, left:right])
             elif file.suffix == ".raw":
                 crop_raw(file, target, cut["window"])
             elif name == "raw_colorchart_dng":
