@@ -63,8 +63,8 @@ def with_pyvale(
     with tempfile.TemporaryDirectory() as folder:
         dic.calculate_2d(
             *(image.round().astype(np.uint8) for image in (f, g)), mask, [(left + right) // 2, (top + bottom) // 2],
-            subset_size=placing.size | 1, subset_step=placing.step or placing.size, max_displacement=32, num_threads=threads,
-            shape_function=shape_function, output_basepath=folder, print_level=0,
+            subset_size=placing.size | 1, subset_step=placing.step or placing.size, max_displacement=32,
+            num_threads=threads, shape_function=shape_function, output_basepath=folder, print_level=0,
         )  # fmt: skip
         found = dic.import_2d(str(next(Path(folder).glob("*.csv"))), layout="column", binary=False, delimiter=",")
     x, y, u, v = (np.asarray(p, dtype=float).ravel() for p in (found.ss_x, found.ss_y, found.u_px, found.v_px))

@@ -90,9 +90,9 @@ def beside(found: dict[str, Row]) -> Row:
 
 @table("grey_levels", page="explanation/uncertainty", cost=40)
 def grey_levels(quick: bool) -> Iterator[Row]:
-    """Brightness that changes between the states (8 bit: contrast 40, noise 2; shift of .2 and .3 px, elements of 25 px):
-    error of the defaults of `correlate` and `measure`, as a multiple of that without a change times the noise that the
-    gain adds, error over stated uncertainty, nodes lost, iterations; and coarse speckle under strain without a change.
+    """Brightness that changes between the states (contrast 40, noise 2; shift of .2 and .3 px, elements of 25 px):
+    error of the defaults of `correlate` and `measure`, as a multiple of that without a change times the noise that the gain
+    adds; error over stated uncertainty; nodes lost; iterations. And coarse speckle under strain without a change.
     """
     texture, without = speckle(), dict[str, float]()
     f, g = texture.image(SHAPE), texture.image(SHAPE, Affine(shift=SHIFT))
@@ -128,7 +128,7 @@ def grey_levels(quick: bool) -> Iterator[Row]:
         yield {"case": f"blobs of {width:g} px under 2 % strain and noise {noise:g}"} | beside(found)
 
 
-BANDS = {"beyond": (-99, 0), "on it (< 1 px)": (0, 1), "1 to 5 px": (1, 5), "5 to 25 px": (5, 25), "deeper": (25, 999)}
+BANDS = {"beyond": (-99, 0), "on it (< 1 px)": (0, 1), "1 to 25 px": (1, 25), "deeper": (25, 999)}
 
 
 @table("frame_border", page="explanation/uncertainty", cost=30, keys=2)
@@ -161,15 +161,18 @@ def frame_border(quick: bool) -> Iterator[Row]:
             row: Row = {"motion": name, "distance": band}
             for default in DEFAULTS:
                 error, std = (np.concatenate(part) for part in zip(*parts[band, default], strict=True))
+                if not len(error):
+                    break
                 some = np.isfinite(error).any()
                 row |= {
-                    f"{default}: nodes": len(error),
-                    f"{default}: measured [%]": 100 * float(np.isfinite(error[:, 0]).mean()) if len(error) else np.nan,
+                    "nodes": len(error),
+                    f"{default}: measured [%]": 100 * float(np.isfinite(error[:, 0]).mean()),
                     f"{default}: rms error [px]": rms(error) if some else float("nan"),
                     f"{default}: largest [px]": float(np.nanmax(np.abs(error))) if some else float("nan"),
                     f"{default}: error/stated": rms(error / std) if some else float("nan"),
                 }
-            yield row
+            else:
+                yield row
 
 
 @table("background_at_rest", page="explanation/uncertainty", cost=15, keys=1)
@@ -201,8 +204,9 @@ def background_at_rest(quick: bool) -> Iterator[Row]:
 
 @table("turned", page="explanation/uncertainty", cost=20, keys=3)
 def turned(quick: bool) -> Iterator[Row]:
-    """Turns: a directional speckle (4 times as long along x as along y, elements of 20 px) with noise, by the angle; and
-    an exact copy of a plain one turned by 180 degrees, by the size of the elements."""
+    """Turns: a directional speckle (4 times as long along x as along y) with noise, by the angle; and an exact copy of
+    a plain one turned by 180 degrees, by the size of the elements.
+    """
     shape = (300, 300)
     plain = speckle()
     waves = Texture.random(0, 2.0).waves * (0.25, 1.0)
