@@ -1,9 +1,9 @@
 """Public image pairs with a known displacement: the defaults of `correlate` and `measure` beside other programs.
 
-The files, with source and licence, are described by SOURCE.txt of their folders. Crops of those whose licence allows it
-are in tests/data. Not shipped: pattern_11 (a lattice of 10 px: every program is a period off where the motion is beyond
-half of it), the plate's 25 px (as the whole pixels), sample 14's L1 (as L3 and L5), for their size. OpenCorr is not
-among the programs: it is C++ that must be built with OpenCV, FFTW and Eigen.
+The files, with source and licence, are described by SOURCE.txt of their folders. Crops of some are in tests/data, whose
+size is limited: sample 5 and the tension of pattern 7x. Not there: pattern 7x's other motions, pattern 11 (a lattice of
+10 px: every program is a period off where the motion is beyond half of it), the rendered plate, sample 14's L1.
+OpenCorr is not among the programs: it is C++ that must be built with OpenCV, FFTW and Eigen.
 """
 
 from __future__ import annotations

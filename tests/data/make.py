@@ -32,8 +32,7 @@ WANTED = {
     ),
     "public_pairs": (
         *("s5_ref.tif", "s5_000_c75_r10.tif", "s5_001_c100_r20.tif"),
-        *("pattern_7x.bmp", "pattern_7x_translation.bmp", "pattern_7x_tension.bmp", "pattern_7x_shear.bmp"),
-        *("rigid_cam0_frame00.tiff", "rigid_cam0_frame04.tiff"),
+        *("pattern_7x.bmp", "pattern_7x_tension.bmp"),
     ),
     "real_disks_three_bands": (
         "disks_650nm_250ms.tif",
@@ -46,7 +45,6 @@ WANTED = {
 COPYRIGHT = {
     "dicengine/dice": "BSD-3-Clause, Copyright 2015 National Technology & Engineering Solutions of Sandia, LLC (NTESS)",
     "vincentjzy/OpenCorr": "MPL-2.0, Copyright Zhenyu Jiang and contributors",
-    "pyvale": "MIT, Copyright (C) 2025 The Computer Aided Validation Team at UKAEA",
     "PolymerGuy/muDIC": "MIT, Copyright (c) 2019 PolymerGuy",
     "AcademySoftwareFoundation/rawtoaces": "Apache-2.0, Copyright Contributors to the rawtoaces Project",
     "mushfiqulalam/isp": "MIT, Copyright (c) 2017 Mushfiqul Alam",
@@ -161,9 +159,7 @@ def write_source(folder: Path, out: Path, cut: dict) -> None:
     text = (folder / "SOURCE.txt").read_text()
     head, *files = re.split(r"\n(?=\S[^\n]*\n    from: )", text)
     kept = [one for one in files if (out / one.split("\n")[0]).exists() or folder.name == "mosaic16_nikon"]
-    holders = NAMED.get(folder.name) or sorted(
-        {COPYRIGHT[re.search(r"from: (?:github|PyPI wheel) (\S+)", one)[1]] for one in kept}
-    )
+    holders = NAMED.get(folder.name) or sorted({COPYRIGHT[re.search(r"from: github (\S+)", one)[1]] for one in kept})
     here = f"Here: {cut}, cut by tests/data/make.py." if cut else "Here: whole files."
     lines = [*holders, "Texts of the licences: ../LICENCES.txt.", here, "Of the full files:", head.strip(), *kept]
     out.joinpath("SOURCE.txt").write_text("\n".join(lines).rstrip() + "\n")
