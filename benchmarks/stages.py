@@ -19,6 +19,7 @@ from rgbmidic import timing
 from rgbmidic._kernels import threads
 
 from . import peers
+from .contenders import with_rgbmidic
 from .tables import table
 
 
@@ -56,7 +57,7 @@ def speed_stages(quick: bool) -> Iterator[dict[str, object]]:
         for case in ("star",) if quick else cases:
             pair = peers.images(folder, "star")
             work: Callable[[], object] = (
-                partial(peers.with_rgbmidic, *pair, 1) if case == "star" else peers.raw_frame(folder / case)
+                partial(with_rgbmidic, *pair, 1) if case == "star" else peers.raw_frame(folder / case)
             )
             taken, inside = stages(work, 1 if quick else 3)
             total, shared = sum(taken.values()), sum(inside.values())
