@@ -175,7 +175,7 @@ def star_peers(quick: bool) -> Iterator[Row]:
     """The same star beside subsets of pyvale, affine and quadratic, with its default prefilter: SR, the longest period
     with an error of 10 %; scatter at rest; and their product, which says what resolution costs in noise."""
     python, peers = ("", []) if quick else peers_python(list(SUBSETS))
-    pair = own_pair((141, 1001)) if quick else read_pair(shared_wave())
+    pair = own_pair((101, 601)) if quick else read_pair(shared_wave())
     fields: dict[tuple[str, str, int], Field] = {}
     for size in (16,) if quick else (8, 12, 16, 25, 40):
         for place, field in own_fields(pair, size).items():

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from textures import Affine, Texture
@@ -24,7 +25,7 @@ DRAWS = 2
 DEFAULTS = ("correlate", "measure")
 
 
-def measured_by(default: str, f: FloatArray, g: FloatArray, **options: object) -> Solution:
+def measured_by(default: str, f: FloatArray, g: FloatArray, **options: Any) -> Solution:
     """One pair by the default of `correlate` or of `measure`."""
     if default == "correlate":
         return correlate(f, g, **options)
