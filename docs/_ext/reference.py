@@ -148,7 +148,7 @@ def _several(hint: Any) -> str:
 
 def test_keys() -> dict[str, dict[str, tuple[str, str]]]:
     """Type and default of every key of TEST.toml, by section and key."""
-    from rgbmidic.settings.schema import section_kinds
+    from rgbmidic.settings.schema import section_types
 
     return {
         name: {
@@ -158,7 +158,7 @@ def test_keys() -> dict[str, dict[str, tuple[str, str]]]:
             )
             for entry in fields(kind)
         }
-        for name, kind in section_kinds().items()
+        for name, kind in section_types().items()
     }
 
 

@@ -19,7 +19,7 @@ from rgbmidic.errors import FrameError
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stored import BROKEN_JPEG, StoredFrame, check_size, complaints, damaged
 from rgbmidic.frames.tiff_pages import Tag, is_stored_as_is, missing_data, tag, tiff_pages
-from rgbmidic.settings import BAYER_PATTERNS, FrameKind, regular
+from rgbmidic.settings import BAYER_PATTERNS, FrameKind, require_regular_file
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
@@ -213,7 +213,7 @@ def has_camera_header(path: Path) -> bool:
     LibRaw takes a file without a header for some camera's by its length alone, and so gives a wrong picture.
     """
     try:
-        with regular(path).open("rb") as file:
+        with require_regular_file(path).open("rb") as file:
             head = file.read(12)
     except OSError:  # reported by whoever reads the file
         return False

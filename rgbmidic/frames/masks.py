@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rgbmidic.errors import FrameError, disk_reason
-from rgbmidic.settings import regular
+from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import AnyArray, FloatImage
 
 SOFTWARE = 305
@@ -36,7 +36,7 @@ def read_mask(path: Path) -> FloatImage:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        stored = np.load if regular(path).suffix.lower() == ".npy" else _grey
+        stored = np.load if require_regular_file(path).suffix.lower() == ".npy" else _grey
         values = stored(path)
     except UnidentifiedImageError:
         raise FrameError(f"{path} is no mask: allowed are pictures (PNG, TIFF, BMP, JPEG) and .npy arrays") from None

@@ -14,7 +14,7 @@ from typing import ClassVar, TypeVar
 from rgbmidic.errors import FrameError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.stored import Camera, MovieHeader, StoredFrame, damaged, raw_frame
-from rgbmidic.settings import FrameSettings, regular
+from rgbmidic.settings import FrameSettings, require_regular_file
 
 _T = TypeVar("_T")
 
@@ -212,7 +212,7 @@ def _on_disk(path: Path) -> Iterator[None]:
     with disk_faults(FrameError, f"{path} cannot be read"):
         if path.is_symlink() and not path.exists():
             raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
-        if not regular(path).is_file():
+        if not require_regular_file(path).is_file():
             raise FrameError(f"not a file but a folder: {path}" if path.exists() else f"frame file not found: {path}")
         if path.stat().st_size == 0:
             raise damaged(path, "it is empty")
@@ -254,7 +254,7 @@ def file_hash(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
-    with regular(Path(path)).open("rb") as file:
+    with require_regular_file(Path(path)).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -280,7 +280,7 @@ def file_fingerprint(path: Path | str) -> str:
     # 256 KiB, in pages of memory, are read in a millisecond; a movie that was exchanged differs in all of them, and one
     # that was cut in its size
     pieces, page = 64, 4096
-    with regular(Path(path)).open("rb") as file:
+    with require_regular_file(Path(path)).open("rb") as file:
         size = file.seek(0, 2)
         digest = hashlib.sha256(str(size).encode())
         for number in range(pieces):

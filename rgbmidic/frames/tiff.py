@@ -41,7 +41,7 @@ from rgbmidic.frames.tiff_pages import (
     tag,
     tiff_pages,
 )
-from rgbmidic.settings import regular
+from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
@@ -248,7 +248,7 @@ class _Pages(MovieHeader):
 
 @remembered
 def _stack(path: Path) -> _Pages:
-    with regular(path).open("rb") as file:
+    with require_regular_file(path).open("rb") as file:
         pages = PageList(file, path)
         offsets, ends_early = pages.offsets(path)
         entries, _ = pages.page(offsets[0]) or ({}, 0)

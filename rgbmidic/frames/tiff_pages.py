@@ -20,7 +20,7 @@ from rgbmidic.frames.stored import (
     damaged,
     faults_of,
 )
-from rgbmidic.settings import regular
+from rgbmidic.settings import require_regular_file
 
 if TYPE_CHECKING:
     import tifffile
@@ -86,7 +86,7 @@ def opened_tiff(path: Path) -> Iterator[tifffile.TiffFile]:
     """Open a TIFF file; what is done inside and fails over a damaged header becomes a FrameError."""
     import tifffile
 
-    with regular(path).open("rb") as file:
+    with require_regular_file(path).open("rb") as file:
         PageList(file, path)  # tifffile tries some camera raws that begin as a TIFF file does
     with faults_of(path, OSError), tifffile.TiffFile(path) as tiff:
         yield tiff
@@ -95,7 +95,7 @@ def opened_tiff(path: Path) -> Iterator[tifffile.TiffFile]:
 def is_dng(path: Path) -> bool:
     """Return whether the first image has the tag of DNG, whatever the file's name; False for what cannot be read."""
     try:
-        with regular(path).open("rb") as file:
+        with require_regular_file(path).open("rb") as file:
             pages = PageList(file, path)
             first = pages.page(pages.first) if pages.offset == 4 else None  # LibRaw reads no BigTIFF
             return first is not None and Tag.DNG_VERSION in first[0]

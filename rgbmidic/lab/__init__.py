@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rgbmidic._version import __version__
 from rgbmidic.errors import ResultError
 from rgbmidic.results.files import write_json, write_text, writing
-from rgbmidic.settings.conversion import plain
+from rgbmidic.settings.conversion import to_plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,7 +51,7 @@ def number(value: float, form: str = ".3g") -> str:
 
 def document(kind: str, figures: Mapping[str, Any]) -> dict[str, Any]:
     """Return figures as plain values under the name of their schema, for JSON; a number that is not known is null."""
-    stated: dict[str, Any] = plain({"schema": f"rgbmidic-{kind}", "rgbmidic": __version__, **figures})
+    stated: dict[str, Any] = to_plain({"schema": f"rgbmidic-{kind}", "rgbmidic": __version__, **figures})
     return stated
 
 

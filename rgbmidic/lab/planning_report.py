@@ -16,7 +16,7 @@ from rgbmidic.pipeline.resolution import rms
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, finish_picture, literal
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS
-from rgbmidic.settings.conversion import plain
+from rgbmidic.settings.conversion import to_plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -139,7 +139,7 @@ def out_of_plane(plan: Plan, distance: float | None = None) -> dict[str, Any]:
     x, y = plan.scene.camera.centre
     edge = math.hypot(max(x - x0, x1 - x), max(y - y0, y1 - y)) / distance
     figures = {"stand_off_mm": distance, "strain_per_mm": 1 / distance, "edge_px_per_mm": edge}
-    return plain(figures | {"unseen_mm": plan.std / edge})  # type: ignore[no-any-return]
+    return to_plain(figures | {"unseen_mm": plan.std / edge})  # type: ignore[no-any-return]
 
 
 def plan_document(plan: Plan, proposals: dict[str, Plan], distance: float | None = None) -> dict[str, Any]:

@@ -271,7 +271,7 @@ def next_reference(plan: Plan, before: ReferenceUpdate, index: int, solution: So
     RgbmidicError
         The frame cannot be read, or no element of it is measured.
     """
-    window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
+    window = plan.window_of(solution.displacement[plan.reference.mesh.nearest_nodes(solution.measured)[1]])
     return before.updated(solution, *prepared_frame(plan, index, window), window.origin)
 
 

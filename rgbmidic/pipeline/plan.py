@@ -42,7 +42,7 @@ from rgbmidic.illumination.separation import (
     reference_images,
 )
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
-from rgbmidic.mesh.placement import on_image
+from rgbmidic.mesh.placement import place_on_image
 from rgbmidic.pipeline import suitability
 from rgbmidic.pipeline.objects import check_given
 from rgbmidic.pipeline.source import FrameSequence, Series, open_frames
@@ -212,7 +212,7 @@ class Plan:
         region, window = region or read_region(settings.region, frame), Window.whole(frame)
         if not given and isinstance(separate, WindowedSeparation):
             window = window_of_reference(region, settings, frame)
-            region = region.part(*window.part_of(Window.whole(frame)))
+            region = region.crop(*window.part_of(Window.whole(frame)))
         state, images, separate, motion = _read_reference(settings, series, separate, window, region, calibration)
         if separation is not None and isinstance(state, IlluminationImages):
             raise ConfigurationError("the source gives images of the lights, which need no separation: give only one")
@@ -425,7 +425,7 @@ def finite_elements_of(
     placement = Placement.fit(settings.mesh.points or (), camera)
     logger.info("mesh.points: %s", placement.summary())
     every = read_mesh(settings.mesh.file, unit=settings.mesh.unit or "mm", part=settings.mesh.part)
-    part, mesh, region = on_image(every, placement, frame, read_region(settings.region, frame))
+    part, mesh, region = place_on_image(every, placement, frame, read_region(settings.region, frame))
     return part, placement, mesh, region
 
 

@@ -1,10 +1,10 @@
 """The checks of what a scene consists of."""
 
 from rgbmidic.errors import ConfigurationError, InputError
-from rgbmidic.settings.conversion import Checked
+from rgbmidic.settings.conversion import CheckedSettings
 
 
-class PartOfScene(Checked):
+class PartOfScene(CheckedSettings):
     """A part of a scene, checked as the settings of a test are: an `InputError` where a value is impossible."""
 
     __slots__ = ()

@@ -16,7 +16,7 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.scene.forecast import Instrument
 from rgbmidic.scene.scene import Scene, State, read_scene
 from rgbmidic.scene.zones import Zones, material_points, predict_zones, unit, zones_on_surface
-from rgbmidic.settings import TestSettings, regular
+from rgbmidic.settings import TestSettings, require_regular_file
 from rgbmidic.typing import FloatArray, FloatImage
 
 _STEP = 4
@@ -167,7 +167,7 @@ def _read_surface(path: Path, scene: Scene) -> tuple[FloatArray, FloatArray]:
     """Points and normals on the grid, from a height map on disk."""
     camera = scene.camera
     try:
-        heights = np.load(regular(path), allow_pickle=False)
+        heights = np.load(require_regular_file(path), allow_pickle=False)
     except FileNotFoundError:
         raise ConfigurationError(f"weights.height_map not found: {path}") from None
     except (OSError, ValueError) as error:

@@ -18,7 +18,15 @@ from rgbmidic.illumination.crosstalk import Led, Sensitivities
 from rgbmidic.scene.camera import PIXEL, REFERENCE_CROSSTALK, Camera, Light, Polarisers, Vector, rotation, three_lights
 from rgbmidic.scene.checked import PartOfScene
 from rgbmidic.scene.surface import AffineField, InPlaneField, MeshField, Surface
-from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value, read_section, read_table, read_toml, regular
+from rgbmidic.settings import (
+    ELEMENT_SIZE,
+    check_names,
+    convert_value,
+    read_section,
+    read_table,
+    read_toml,
+    require_regular_file,
+)
 from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
@@ -465,7 +473,7 @@ def _field(given: Mapping[str, Any], body: Body, base: Path) -> InPlaneField | N
         raise ConfigurationError("states.displacement_file excludes displacement_gradient and displacement_offset")
     path = convert_value(given["displacement_file"], Path, "states.displacement_file", base)
     try:
-        with np.load(regular(path)) as file:
+        with np.load(require_regular_file(path)) as file:
             arrays = {name: file[name] for name in ("nodes", "elements", "displacement")}
     except (OSError, KeyError, ValueError) as error:
         raise ConfigurationError(f"{path} is not an npz with nodes, elements and displacement: {error}") from None

@@ -168,7 +168,7 @@ def inspect_frame(
     contradictions = check_state(frames, known, region.mask, name, accept=accept)
     mesh, window = Tri3Mesh.from_region(region, element_size), surroundings(region)
     part = window.part_of(Window.whole(shape))
-    region, known = region.part(*part), known.cropped(window.origin, window.shape)
+    region, known = region.crop(*part), known.cropped(window.origin, window.shape)
     cut = [replace(shot, values=np.ascontiguousarray(shot.values[..., *part])) for shot in frames]
     if clipped := clipping(frames):
         cut = [replace(shot, white_level=clipped[0]) for shot in cut]

@@ -14,7 +14,7 @@ import pytest
 from rgbmidic import CameraCalibration, FiniteElementMesh, Placement, Tri3Mesh, read_mesh
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh import Region
-from rgbmidic.mesh.placement import on_image
+from rgbmidic.mesh.placement import place_on_image
 
 meshio = pytest.importorskip("meshio")
 
@@ -388,18 +388,18 @@ def plate() -> FiniteElementMesh:
 
 def test_what_lies_outside_the_image_or_the_region_is_left_out_and_counted(caplog: pytest.LogCaptureFixture) -> None:
     mesh, placement = pickle.loads(pickle.dumps((plate(), Placement.fit([[0, 0, 10, 50], [10, 0, 20, 50]]))))
-    kept, placed, region = on_image(mesh, placement, (80, 80))
+    kept, placed, region = place_on_image(mesh, placement, (80, 80))
     assert len(kept.elements) == len(mesh.elements)
     assert np.abs(region.mask.sum() - placed.areas.sum()) < 0.05 * placed.areas.sum()
-    kept, placed, region = on_image(mesh, placement, (80, 45))
+    kept, placed, region = place_on_image(mesh, placement, (80, 45))
     assert f"{24} of {48} triangles lie outside the image" in caplog.text
     assert (kept.points[:, 0] <= 30).all()
     assert set(kept.node_numbers) <= set(mesh.node_numbers)
     assert placed.nodes == pytest.approx(kept.points * [1, -1] + [10, 50])
     half = np.zeros((80, 80), dtype=bool)
     half[:, :40] = True
-    kept, _, _ = on_image(mesh, placement, (80, 80), Region.from_mask(half))
+    kept, _, _ = place_on_image(mesh, placement, (80, 80), Region.from_mask(half))
     assert "lie outside the region" in caplog.text
     assert set(kept.element_numbers) < set(mesh.element_numbers)
     with pytest.raises(RegionError, match="place it at x 10 to 70, y 10 to 50 px of an image of 8 x 8"):
-        on_image(mesh, placement, (8, 8))
+        place_on_image(mesh, placement, (8, 8))
