@@ -158,12 +158,12 @@ def frames(
     """List the properties of raw frames as read: number, size, levels, times, missing frames."""
     from json import dumps
 
-    from rgbmidic.frames import known_formats
+    from rgbmidic.frames import frame_formats
     from rgbmidic.frames.series import describe, description_text, save_frame
     from rgbmidic.settings import FrameSettings
 
     if formats:
-        for format_ in known_formats():
+        for format_ in frame_formats():
             print(f"{format_.name}: {' '.join((*format_.endings, *format_.movies)) or 'by content'}")
         return
     if not path:

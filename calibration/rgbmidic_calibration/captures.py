@@ -23,7 +23,7 @@ import numpy.typing as npt
 import rgbmidic
 from rgbmidic.errors import CalibrationError, ConfigurationError, FrameError
 from rgbmidic.frames import ChannelFrame, FrameSeries, FrameSource, Mosaic, open_series
-from rgbmidic.frames.data import cfa_channels, planes_of
+from rgbmidic.frames.data import cfa_channels, colour_planes
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import saturation_pile, unevenness
 from rgbmidic.settings import FrameSettings
@@ -213,7 +213,7 @@ class Sampling:
     @classmethod
     def of(cls, frame: Mosaic | ChannelFrame) -> Sampling:
         """How the camera of a frame samples."""
-        names, _, black = planes_of(frame)
+        names, _, black = colour_planes(frame)
         origins, step = ((0, 0),) * len(names), 1
         if isinstance(frame, Mosaic):
             order = np.argsort(cfa_channels(frame.cfa).ravel(), kind="stable")
@@ -305,7 +305,7 @@ def stack_frames(
     strength: list[FloatArray] = []
     zeros, piled_at = 0.0, None
     for frame in frames:
-        _, samples, black = planes_of(frame)
+        _, samples, black = colour_planes(frame)
         planes, sampling = np.stack(samples), Sampling.of(frame)
         if camera is None:
             camera, clipped, uneven = sampling, np.zeros(planes.shape, dtype=bool), unevenness_of(frame)
@@ -458,7 +458,7 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16, name: str = ""
     CalibrationError
         The frame is monochrome, or too small for 3 x 3 blocks.
     """
-    _, planes, black = planes_of(frame)
+    _, planes, black = colour_planes(frame)
     camera = Sampling.of(frame)
     shape, step = camera.shape, camera.step
     if camera.names == ("M",):
@@ -515,7 +515,7 @@ def unevenness_of(frame: Mosaic | ChannelFrame, lit: float = 0.1) -> float:
     to smooth it. Some cameras apply gains of their own to red and blue, so all planes are looked at.
     """
     white, found = frame.white_level, [np.nan]
-    for plane, black in zip(*planes_of(frame)[1:], strict=True):
+    for plane, black in zip(*colour_planes(frame)[1:], strict=True):
         if plane.mean() > black + lit * (white - black):
             found.append(unevenness(plane[plane < white]))
     return float(np.fmax.reduce(found))

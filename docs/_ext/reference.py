@@ -289,10 +289,10 @@ def quantities() -> str:
 
 def formats() -> str:
     """Formats of frame files, as ``rgbmidic frames --formats`` lists them."""
-    from rgbmidic.frames import known_formats
+    from rgbmidic.frames import frame_formats
 
     rows = []
-    for entry in known_formats():
+    for entry in frame_formats():
         endings = [" ".join(f"`{ending}`" for ending in group) for group in (entry.endings, entry.movies)]
         rows.append((entry.name, *(endings if any(endings) else ("by content", ""))))
     return table(("format", "one frame a file", "several frames a file"), rows)

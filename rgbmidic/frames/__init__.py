@@ -1,7 +1,7 @@
 """Raw frames and where they come from: readers, the series of a test's frames, writers."""
 
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window, cfa_channels
-from rgbmidic.frames.formats import FrameFormat, known_formats, open_source, read_frame
+from rgbmidic.frames.formats import FrameFormat, frame_formats, open_source, read_frame
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.frames.masks import read_mask
 from rgbmidic.frames.names import list_frames
@@ -22,7 +22,7 @@ __all__ = [
     "cfa_channels",
     "file_fingerprint",
     "file_hash",
-    "known_formats",
+    "frame_formats",
     "list_frames",
     "open_series",
     "open_source",

@@ -13,7 +13,7 @@ from typing import ClassVar, TypeVar
 
 from rgbmidic.errors import FrameError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.stored import Camera, MovieHeader, StoredFrame, damaged, raw_frame
+from rgbmidic.frames.stored import CameraMetadata, MovieHeader, StoredFrame, damaged_file, raw_frame
 from rgbmidic.settings import FrameSettings, require_regular_file
 
 _T = TypeVar("_T")
@@ -30,7 +30,7 @@ class FrameSource(ABC):
     ----------
     path
         The file; it need not exist before it is read.
-    stated
+    user_metadata
         What the user states of it.
     camera
         What a calibration states of it.
@@ -40,13 +40,13 @@ class FrameSource(ABC):
     """Packages, beside numpy and OpenCV, whose version decides on what is read."""
 
     path: Path
-    stated: FrameSettings
-    camera: Camera | None = field(default=None, compare=False, repr=False)
+    user_metadata: FrameSettings
+    camera: CameraMetadata | None = field(default=None, compare=False, repr=False)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of every frame, from the header alone."""
-        with _on_disk(self.path):
+        with _require_file(self.path):
             return self._shape()
 
     @property
@@ -56,12 +56,12 @@ class FrameSource(ABC):
 
     @property
     def recording(self) -> Recording:
-        """How the frames were recorded, from the header alone; a file of one frame states nothing and is not read."""
+        """Recording of the frames, from the header alone; a file of one frame states nothing and is not read."""
         return Recording()
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What else the header states that a user should know."""
+        """Remarks of the header for the user."""
         return self.recording.remarks
 
     def __len__(self) -> int:
@@ -109,7 +109,7 @@ class FrameSource(ABC):
             There is no such frame.
         """
         shape = None if window is None or window.is_whole else window.frame
-        return raw_frame(self.stored(index, window), self.stated, self.path, self.camera, shape)
+        return raw_frame(self.stored(index, window), self.user_metadata, self.path, self.camera, shape)
 
     def stored(self, index: int, window: Window | None = None) -> StoredFrame:
         """Return the samples of frame `index`, or of a part of it, with what the file alone states.
@@ -134,13 +134,13 @@ class FrameSource(ABC):
         """
         if not 0 <= index < len(self):
             raise IndexError(f"there is no frame {index} in {self.path}, which holds {len(self)}")
-        with _on_disk(self.path):
+        with _require_file(self.path):
             if window is None or window.is_whole:
                 return self._rows(index, slice(None))
             if (shape := self._shape()) != window.frame:
                 sizes = "{} rows of {} pixels, the frames of the test {} of {}".format(*shape, *window.frame)
                 raise FrameError(f"{self.path} has {sizes}")
-            rows, columns = window.part_of(Window.whole(shape))
+            rows, columns = window.slices_in(Window.of_frame(shape))
             stored = self._rows(index, rows)
         return replace(stored, values=stored.values[:, columns])
 
@@ -161,19 +161,20 @@ class FrameSource(ABC):
 class Movie(FrameSource):
     """A file of several frames, whose header is read when the number of its frames is asked for, and reads the frames.
 
-    Of a frame only its own samples are read, whatever the size of the file; a header that is `remembered` is read once.
+    Of a frame only its own samples are read, whatever the size of the file; a header behind `cache_by_file` is read
+    once.
     """
 
     @property
     def recording(self) -> Recording:
-        """How the frames were recorded, from the header alone.
+        """Recording of the frames, from the header alone.
 
         Raises
         ------
         FrameError
             The file is missing, or its header is damaged.
         """
-        with _on_disk(self.path):
+        with _require_file(self.path):
             return self._header().recording
 
     @property
@@ -207,7 +208,7 @@ class Movie(FrameSource):
 
 
 @contextmanager
-def _on_disk(path: Path) -> Iterator[None]:
+def _require_file(path: Path) -> Iterator[None]:
     """Check that there is something to read; what the disk refuses becomes a FrameError."""
     with disk_faults(FrameError, f"{path} cannot be read"):
         if path.is_symlink() and not path.exists():
@@ -215,27 +216,27 @@ def _on_disk(path: Path) -> Iterator[None]:
         if not require_regular_file(path).is_file():
             raise FrameError(f"not a file but a folder: {path}" if path.exists() else f"frame file not found: {path}")
         if path.stat().st_size == 0:
-            raise damaged(path, "it is empty")
+            raise damaged_file(path, "it is empty")
         yield
 
 
-def remembered(parse: Callable[[Path], _T]) -> Callable[[Path | str], _T]:
+def cache_by_file(parse: Callable[[Path], _T]) -> Callable[[Path | str], _T]:
     """Decorate `parse` so that a file that does not change is parsed once; what the disk refuses is a FrameError."""
 
     @lru_cache(maxsize=1024)
-    def found(path: Path, size: int, modified: int) -> _T:
+    def parse_cached(path: Path, size: int, modified: int) -> _T:
         return parse(path)
 
     @wraps(parse)
-    def look(path: Path | str) -> _T:
+    def parse_current(path: Path | str) -> _T:
         with disk_faults(FrameError, f"{path} cannot be read"):
             status = Path(path).stat()
-            return found(Path(path), status.st_size, status.st_mtime_ns)
+            return parse_cached(Path(path), status.st_size, status.st_mtime_ns)
 
-    return look
+    return parse_current
 
 
-@remembered
+@cache_by_file
 def file_hash(path: Path | str) -> str:
     """Return the SHA-256 of a file, in hexadecimal digits; it is computed once for a file that does not change.
 
@@ -258,7 +259,7 @@ def file_hash(path: Path | str) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-@remembered
+@cache_by_file
 def file_fingerprint(path: Path | str) -> str:
     """Return the SHA-256 of a file's size and of 64 pieces of 4 KiB spread evenly over it: of all of it up to 256 KiB.
 

@@ -329,9 +329,9 @@ class Tri3Mesh:
         """Offset (N, 3), square px, of the best linear fit at the nodes from a field of unit curvature xx, xy or yy.
 
         Curvature is the second derivative. The texture counts alike in all places and directions on average, so the fit
-        is that of the mass matrix M. A field with the second derivative H has ``-1/2 sum phi_a phi_b d^T H d`` over its linear interpolant,
-        d being the edges of an element of area A. The offset solves ``M x = b``, where b sums over the elements around
-        a node ``-A/120 (2 sum d^T H d - d^T H d of the opposite edge)``.
+        is that of the mass matrix M. A field with the second derivative H has ``-1/2 sum phi_a phi_b d^T H d`` over its
+        linear interpolant, d being the edges of an element of area A. The offset solves ``M x = b``, where b sums over
+        the elements around a node ``-A/120 (2 sum d^T H d - d^T H d of the opposite edge)``.
         """
         corners = self.nodes[self.elements]
         edge = np.roll(corners, -1, axis=1) - corners

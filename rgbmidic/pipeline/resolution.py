@@ -342,7 +342,7 @@ class _KeyFrame:
     @classmethod
     def find(cls, plan: Plan, frames: Sequence[int]) -> _KeyFrame:
         """Measure some frames, and keep the one whose displacement departs most from an affine one."""
-        chosen, reference = plan.series.chosen, plan.settings.frames.reference
+        chosen, reference = plan.series.selected, plan.settings.frames.reference
         for index in frames:
             if index not in chosen or index in reference:
                 what = "of the reference" if index in reference else f"not among {chosen[0]} to {chosen[-1]}"

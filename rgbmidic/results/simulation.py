@@ -158,7 +158,7 @@ def _listed(path: Path, interval: float | None) -> list[tuple[float | None, Path
 
 def _numbered(path: Path, interval: float | None) -> list[tuple[float | None, Path]]:
     """Return the files of a folder by the last number in their names, times the `interval`."""
-    files = NamedFiles.ordered([file for file in path.iterdir() if file.suffix.lower() in (".vtu", ".vtk")])
+    files = NamedFiles.from_files([file for file in path.iterdir() if file.suffix.lower() in (".vtu", ".vtk")])
     if not files.paths or not all(files.numbers):
         raise InputError(f"{path} must hold one .pvd file, or .vtu or .vtk files with a number in their names")
     if interval is None or not interval > 0:

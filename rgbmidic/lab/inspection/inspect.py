@@ -167,7 +167,7 @@ def inspect_frame(
     report = progress or (lambda done, total, line: None)
     contradictions = check_state(frames, known, region.mask, name, accept=accept)
     mesh, window = Tri3Mesh.from_region(region, element_size), surroundings(region)
-    part = window.part_of(Window.whole(shape))
+    part = window.slices_in(Window.of_frame(shape))
     region, known = region.crop(*part), known.cropped(window.origin, window.shape)
     cut = [replace(shot, values=np.ascontiguousarray(shot.values[..., *part])) for shot in frames]
     if clipped := clipping(frames):

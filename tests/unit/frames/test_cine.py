@@ -95,10 +95,10 @@ def test_when_frames_were_taken_and_which_are_lost(tmp_path: Path, version: int)
     assert recording.times_ns is not None
     assert recording.times_ns.dtype == np.int64
     np.testing.assert_allclose(recording.times_ns, times, atol=1)
-    assert (recording.trigger, recording.frame_rate, recording.exposure_ns, recording.lost) == (7, 1e6, 300, 3)
+    assert (recording.trigger, recording.frame_rate, recording.exposure_ns, recording.n_lost) == (7, 1e6, 300, 3)
     series = open_series(FrameSettings(path=("f.cine",)), tmp_path)
     assert list(series.numbers[2:5]) == [2, 5, 6]
-    assert series.lost == 3
+    assert series.n_lost == 3
 
 
 @pytest.mark.parametrize("length", [BEFORE_COLOURS, 900, BEFORE_NS, BEFORE_LEVELS, 10392, SETUP_LENGTH, 11000])
@@ -273,7 +273,7 @@ def test_real_grey_movies(real_data: RealData, name: str, pixels: str, numbers: 
     source = open_source(path, ANY)
     frames = [source.read(index) for index in range(len(source))]
     recording = source.recording
-    assert (len(source), source.shape, recording.lost) == (count(path.parent, 6), (128, 256), 0)
+    assert (len(source), source.shape, recording.n_lost) == (count(path.parent, 6), (128, 256), 0)
     depth, black, white, rate, exposure_ns, trigger, first_ns = numbers
     assert (recording.bit_depth, frames[0].black_level[0], frames[0].white_level) == (depth, black, white)
     assert (recording.frame_rate, recording.trigger) == (rate, trigger)

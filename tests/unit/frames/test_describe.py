@@ -155,7 +155,7 @@ def test_times_that_cannot_be_are_left_out_with_a_word(times: list[int], remark:
     recording = Recording(count=4, frame_rate=100.0, times_ns=stamps)
     assert recording.remarks == ((remark,) if remark else ())
     assert (recording.times_ns is None) == ("not used" in remark)
-    assert recording.numbered.tolist() == [0, 1, 2, 3]
+    assert recording.relative_numbers.tolist() == [0, 1, 2, 3]
 
 
 def test_movies_whose_times_do_not_rise_say_so_once(tmp_path: Path) -> None:

@@ -223,7 +223,7 @@ def test_absurd_pages_are_refused_before_anything_is_allocated(tmp_path: Path) -
 def _check(path: Path) -> None:
     from rgbmidic.frames.tiff import TiffStack
 
-    len(TiffStack(path=path, stated=STATED))
+    len(TiffStack(path=path, user_metadata=STATED))
 
 
 def _write_pages(path: Path, count: int) -> None:
