@@ -125,7 +125,7 @@ def plan(
 
     check_folder(out, planning.FILES, overwrite=overwrite)
     made = make_plan(read_scene(scene))
-    motion = planning.out_of_plane(made, distance)
+    motion = planning.out_of_plane_error(made, distance)
     proposals = {"colours exchanged": propose_colours(made), "lamps moved": propose_lamps(made)}
     planning.write_plan(made, proposals, out, distance=distance, overwrite=overwrite)
     title = "fraction of the field where lights reflect, all of them do, and only one or none is clean"

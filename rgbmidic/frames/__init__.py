@@ -6,7 +6,7 @@ from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.frames.masks import read_mask
 from rgbmidic.frames.names import list_frames
 from rgbmidic.frames.series import FrameSeries, open_series
-from rgbmidic.frames.source import FrameSource, Movie, file_fingerprint, file_hash
+from rgbmidic.frames.source import FrameSource, MovieSource, file_fingerprint, file_hash
 from rgbmidic.frames.stored import StoredFrame
 
 __all__ = [
@@ -15,7 +15,7 @@ __all__ = [
     "FrameSeries",
     "FrameSource",
     "Mosaic",
-    "Movie",
+    "MovieSource",
     "Recording",
     "StoredFrame",
     "Window",

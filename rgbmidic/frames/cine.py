@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import SECOND, Recording
-from rgbmidic.frames.source import Movie, cache_by_file
+from rgbmidic.frames.source import MovieSource, cache_by_file
 from rgbmidic.frames.stored import MovieHeader, StoredFrame, check_size, damaged_file, truncated_file, unpack_bits
 from rgbmidic.settings import FrameKind
 from rgbmidic.typing import AnyArray
@@ -79,7 +79,7 @@ Stored as the steps from one code to the next; the codes above 1014, white, are 
 """
 
 
-class CineFile(Movie):
+class CineFile(MovieSource):
     """A Phantom .cine file. Flips and rotation are settings of the camera's viewer and left to it."""
 
     def _header(self) -> _Header:

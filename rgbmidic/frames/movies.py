@@ -26,7 +26,7 @@ import numpy as np
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import SECOND, Integers, Recording, even_times, parse_fraction
-from rgbmidic.frames.source import Movie, cache_by_file
+from rgbmidic.frames.source import MovieSource, cache_by_file
 from rgbmidic.frames.stored import EvenFrames, StoredFrame, damaged_file
 
 logger = logging.getLogger(__name__)
@@ -54,7 +54,7 @@ _NAMES = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MrawFile(Movie):
+class MrawFile(MovieSource):
     """A movie of a Photron camera, named by its samples or by its header, of monochrome or raw samples.
 
     The header does not state the Bayer pattern: its colour type "Raw" occurs on monochrome cameras, too.
@@ -182,7 +182,7 @@ _PATTERNS = {1: "GRBG", 2: "BGGR", 3: "RGGB"}
 """By NorPix's `eHBayerPatternOrigin`; 0, green beside blue, is also what a header holds that states no pattern."""
 
 
-class SeqFile(Movie):
+class SeqFile(MovieSource):
     """An uncompressed sequence of StreamPix, of monochrome or raw samples with a time stamp behind each frame."""
 
     def _header(self) -> EvenFrames:

@@ -23,8 +23,8 @@ _T = TypeVar("_T")
 class FrameSource(ABC):
     """A file of one frame or several, read in any order; frames count from 0.
 
-    A format says how header and samples are read; one of several frames is a `Movie`. It is a dataclass only where it
-    has fields of its own.
+    A format defines how header and samples are read; one of several frames is a `MovieSource`. It is a dataclass only
+    where it has fields of its own.
 
     Attributes
     ----------
@@ -158,7 +158,7 @@ class FrameSource(ABC):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Movie(FrameSource):
+class MovieSource(FrameSource):
     """A file of several frames, whose header is read when the number of its frames is asked for, and reads the frames.
 
     Of a frame only its own samples are read, whatever the size of the file; a header behind `cache_by_file` is read

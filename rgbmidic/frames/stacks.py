@@ -18,7 +18,7 @@ import numpy as np
 
 from rgbmidic.errors import FrameError, first_line, legible
 from rgbmidic.frames.data import Integers, Recording, even_times
-from rgbmidic.frames.source import Movie, cache_by_file
+from rgbmidic.frames.source import MovieSource, cache_by_file
 from rgbmidic.frames.stored import (
     MAX_BYTES,
     MAX_FRAMES,
@@ -54,7 +54,7 @@ def _split_shape(shape: tuple[int, ...], dtype: np.dtype[Any], name: object) -> 
     return count, shape[-axes:]
 
 
-class NpyFile(Movie):
+class NpyFile(MovieSource):
     """A numpy array of frames, of which one is read at a time."""
 
     def _header(self) -> EvenFrames:
@@ -101,7 +101,7 @@ def split_dataset(path: Path | str) -> tuple[str, str]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Hdf5File(Movie):
+class Hdf5File(MovieSource):
     """A dataset of frames, (T, H, W) or (T, H, W, 3), of which the chunks of one frame are read at a time.
 
     Attributes

@@ -20,7 +20,7 @@ from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import Integers, Recording
 from rgbmidic.frames.hyperstacks import Hyperstack
 from rgbmidic.frames.images import decode
-from rgbmidic.frames.source import FrameSource, Movie, cache_by_file
+from rgbmidic.frames.source import FrameSource, MovieSource, cache_by_file
 from rgbmidic.frames.stored import (
     CHECKED_BYTES,
     EvenFrames,
@@ -207,7 +207,7 @@ def _check_unpacked(page: tifffile.TiffPage, path: Path) -> None:
         raise damaged_file(path, f"its image data unpack to {total} bytes, too few for its size")
 
 
-class TiffStack(Movie):
+class TiffStack(MovieSource):
     """A TIFF file of several frames of one size, in the order of the file."""
 
     packages = ("tifffile",)

@@ -47,18 +47,20 @@ class SpecklePatch:
         """Return a piece of `size` x `size` px of a scene's paint, faced at the distance of the body's front point."""
         camera, surface = scene.camera, scene.surface
         white, black = (replace(paint, slope_deg=0.0) for paint in (surface.white, surface.black))
-        place = (np.arange(size * subsamples) + 0.5) / subsamples * scene.pixel
-        cover, height = replace(surface, white=white, black=black).on_plate(place, place)
+        coordinates = (np.arange(size * subsamples) + 0.5) / subsamples * scene.pixel
+        cover, height = replace(surface, white=white, black=black).on_plate(coordinates, coordinates)
         albedo = surface.white.albedo + cover * (surface.black.albedo - surface.white.albedo)
-        texture = _seen(albedo, size, camera.lens_blur)
-        return cls(texture=texture / texture.mean(), domes=_seen(height / scene.pixel, size, camera.lens_blur))
+        texture = _image_fine_samples(albedo, size, camera.lens_blur)
+        return cls(
+            texture=texture / texture.mean(), domes=_image_fine_samples(height / scene.pixel, size, camera.lens_blur)
+        )
 
 
-def _seen(fine: FloatArray, size: int, blur: float) -> FloatArray:
+def _image_fine_samples(fine: FloatArray, size: int, blur: float) -> FloatArray:
     """Fine samples averaged over the pixels and blurred by the lens."""
-    whole = fine.reshape(size, len(fine) // size, size, -1).mean(axis=(1, 3))
+    pixel_means = fine.reshape(size, len(fine) // size, size, -1).mean(axis=(1, 3))
     line = np.exp(-2 * (np.pi * blur * np.fft.fftfreq(size)) ** 2)
-    return np.asarray(np.fft.ifft2(np.fft.fft2(whole) * np.outer(line, line)).real)
+    return np.asarray(np.fft.ifft2(np.fft.fft2(pixel_means) * np.outer(line, line)).real)
 
 
 def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tuple[FloatArray, FloatArray]:
@@ -95,7 +97,7 @@ def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tupl
         )
         return separate(mosaic, crosstalk, demosaic).values.astype(np.float64)
 
-    phases = separated_phases(channels, camera.cfa, lights)
+    phases = separate_phases(channels, camera.cfa, lights)
     samples, colours = mosaic_samples(channels, camera.cfa), sampled_channels(camera.cfa, texture.shape)
     random, noise = np.random.default_rng(0), []
     for colour in range(3):
@@ -107,7 +109,7 @@ def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tupl
     return np.stack(noise), np.stack([cross_spectra(carrier) for carrier in carriers])
 
 
-def separated_phases(
+def separate_phases(
     channels: npt.NDArray[Floating],
     cfa: str,
     lights: Callable[[npt.NDArray[Floating], str], npt.NDArray[Floating]],
@@ -242,7 +244,7 @@ class SpeckleSpectrum:
         """Variance at a pixel, after the prefilter, of errors with power spectra (..., n, n)."""
         return np.asarray((self.prefilter * errors).mean(axis=(-2, -1)))
 
-    def pull(self, cross: FloatArray) -> float:
+    def gradient_product(self, cross: FloatArray) -> float:
         """Mean product of the gradients along x, after the prefilter, of the texture and of another field.
 
         `cross` (n, n) is their cross spectrum.
@@ -254,9 +256,9 @@ class SpeckleSpectrum:
 
         The mean square of the filtered image is `score` of the spectrum of the errors.
         """
-        whole = np.fft.fftshift(np.fft.ifft2(np.sqrt(self.slope * self.texture) * self.prefilter).real)
-        near = slice(len(whole) // 2 - reach, len(whole) // 2 + reach + 1)
-        return whole[near, near].astype(np.float32)
+        kernel = np.fft.fftshift(np.fft.ifft2(np.sqrt(self.slope * self.texture) * self.prefilter).real)
+        central = slice(len(kernel) // 2 - reach, len(kernel) // 2 + reach + 1)
+        return kernel[central, central].astype(np.float32)
 
     @property
     def slope(self) -> FloatArray:
@@ -270,14 +272,14 @@ class SpeckleSpectrum:
 
 
 def _optics(frequency: FloatArray, blur: float) -> FloatArray:
-    return _outer(np.sinc(frequency) ** 2 * np.exp(-4 * (np.pi * blur * frequency) ** 2))
+    return _outer_square(np.sinc(frequency) ** 2 * np.exp(-4 * (np.pi * blur * frequency) ** 2))
 
 
 def _prefilter_transfer(name: str, frequency: FloatArray) -> FloatArray:
     taps = PREFILTERS[name]
-    place = np.arange(len(taps)) - len(taps) // 2
-    return _outer((taps @ np.cos(2 * np.pi * place[:, None] * frequency)) ** 2)
+    tap_offset = np.arange(len(taps)) - len(taps) // 2
+    return _outer_square((taps @ np.cos(2 * np.pi * tap_offset[:, None] * frequency)) ** 2)
 
 
-def _outer(line: FloatArray) -> FloatArray:
+def _outer_square(line: FloatArray) -> FloatArray:
     return np.outer(line, line)

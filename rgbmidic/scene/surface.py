@@ -16,7 +16,7 @@ from scipy.special import pdtr
 from rgbmidic._kernels.mesh import interpolate_at_points
 from rgbmidic._kernels.render import PLATE, sample_paint
 from rgbmidic.errors import InputError
-from rgbmidic.scene.checked import PartOfScene
+from rgbmidic.scene import SceneSection
 from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
@@ -29,8 +29,8 @@ BOUND = math.sqrt(6.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finish(PartOfScene):
-    """How one paint reflects.
+class Finish(SceneSection):
+    """Reflectance of one paint.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Finish(PartOfScene):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Surface(PartOfScene):
+class Surface(SceneSection):
     """White paint under a spray of black droplets, thrown at random (Boolean model).
 
     Attributes
@@ -297,10 +297,11 @@ class MeshField:
             raise InputError("the elements of a mesh field must name existing nodes, and there must be one")
         if not (np.isfinite(nodes).all() and np.isfinite(values).all()):
             raise InputError("nodes and displacement of a mesh field must be finite")
-        before, after = _areas(nodes, elements), _areas(nodes + values, elements)
-        if not (before * after > 0).all():
+        reference_areas, deformed_areas = _areas(nodes, elements), _areas(nodes + values, elements)
+        if not (reference_areas * deformed_areas > 0).all():
             raise InputError(
-                f"element {int(np.argmin(before * after))} of the mesh field has no area or is turned over"
+                f"element {int(np.argmin(reference_areas * deformed_areas))} of the mesh field has no area or is "
+                "turned over"
             )
         object.__setattr__(self, "nodes", nodes)
         object.__setattr__(self, "displacement", values)
@@ -380,9 +381,11 @@ def _bins(
     start = ((low - origin) / side).astype(np.int64)
     count = ((high - origin) / side).astype(np.int64) - start + 1
     pairs = np.repeat(np.arange(len(elements)), count.prod(axis=1))
-    place = np.arange(pairs.size) - np.repeat(np.cumsum(count.prod(axis=1)) - count.prod(axis=1), count.prod(axis=1))
-    i = np.minimum(start[pairs, 0] + place % count[pairs, 0], columns - 1)
-    j = np.minimum(start[pairs, 1] + place // count[pairs, 0], rows - 1)
+    index_in_element = np.arange(pairs.size) - np.repeat(
+        np.cumsum(count.prod(axis=1)) - count.prod(axis=1), count.prod(axis=1)
+    )
+    i = np.minimum(start[pairs, 0] + index_in_element % count[pairs, 0], columns - 1)
+    j = np.minimum(start[pairs, 1] + index_in_element // count[pairs, 0], rows - 1)
     bins = j * columns + i
     first = np.searchsorted(np.sort(bins), np.arange(columns * rows + 1))
     return np.array([*origin, side, columns, rows]), first, pairs[np.argsort(bins, kind="stable")]

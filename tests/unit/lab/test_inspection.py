@@ -31,13 +31,13 @@ from rgbmidic.illumination.linear import NoiseModel, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection import Inspection, inspect_files, inspect_frame
-from rgbmidic.lab.inspection.channels import Channel, channels_of, noise_estimate, speckle_texture
+from rgbmidic.lab.inspection.channels import Channel, estimate_noise, frame_channels, speckle_texture
 from rgbmidic.lab.inspection.prediction import gaussian_field
 from rgbmidic.lab.inspection.report import inspection_document, write_inspection
-from rgbmidic.lab.inspection.results import _of_speckle
+from rgbmidic.lab.inspection.results import _speckle_checks
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import correlate
-from rgbmidic.scene.forecast import expected_std, node_constant
+from rgbmidic.scene.forecast import expected_std, nodal_variance_factor
 from rgbmidic.settings import FrameSettings
 
 Run = Callable[..., tuple[int, str, str]]
@@ -96,7 +96,7 @@ def test_a_good_frame_has_no_warnings_and_its_figures_are_those_it_was_made_with
     assert codes(seen) == set()
     assert (seen.kind, [one.name for one in seen.channels]) == ("bayer", ["R", "G", "B"])
     sampled = mosaic_of(mat_lights(), noise=None)
-    for one, channel in zip(seen.channels, channels_of([sampled]), strict=True):
+    for one, channel in zip(seen.channels, frame_channels([sampled]), strict=True):
         mean = np.nanmean(channel.values)
         assert one.mean == pytest.approx(mean / FULL_SCALE, rel=0.01)
         assert one.low < one.mean < one.high
@@ -122,7 +122,7 @@ def test_speckle_size_of_a_coarse_lattice_is_that_of_the_full_image(diameter):
     nowhere, inside = np.zeros(SHAPE, bool), np.ones(SHAPE, bool)
     whole = Channel(name="M", values=full, saturated=nowhere, step=1)
     true = speckle_texture(whole, inside, NoiseModel(gain=np.inf, read_noise=0.0)).diameter
-    for channel in channels_of([mosaic_of(mat_lights(diameter, seed=2))]):
+    for channel in frame_channels([mosaic_of(mat_lights(diameter, seed=2))]):
         assert speckle_texture(channel, inside, NOISE).diameter == pytest.approx(true, rel=0.06)
         assert speckle_texture(channel, inside, None).diameter == pytest.approx(true, rel=0.2)
 
@@ -152,7 +152,7 @@ def test_inner_nodes_of_an_even_field_follow_the_closed_form_of_plan():
     everywhere = np.ones(len(mesh.elements))
     (std,) = expected_std(mesh, information * everywhere, score * everywhere)
     inner = ((mesh.nodes > 60) & (mesh.nodes < 180)).all(axis=1)
-    closed = np.sqrt(node_constant() * score) / (side * information)
+    closed = np.sqrt(nodal_variance_factor() * score) / (side * information)
     assert np.sqrt(np.mean(std[inner] ** 2)) == pytest.approx(closed, rel=0.01)
     assert std[~inner].max() > 1.4 * closed
     blind = np.where((mesh.nodes[mesh.elements].mean(axis=1)[:, 0] < 100), 0.0, information)
@@ -163,8 +163,8 @@ def test_noise_is_estimated_from_a_flat_or_coarsely_painted_frame():
     inside = np.ones(SHAPE, bool)
     flat = np.full((3, *SHAPE), 800.0, dtype=np.float32)
     for lights, limits in ((flat, (0.8, 1.2)), (mat_lights(6.0), (0.8, 1.8))):
-        channels = channels_of([mosaic_of(lights)])
-        for channel, found in zip(channels, noise_estimate(channels, inside), strict=True):
+        channels = frame_channels([mosaic_of(lights)])
+        for channel, found in zip(channels, estimate_noise(channels, inside), strict=True):
             true = np.sqrt(NOISE.variance(np.nanmean(channel.values)))
             assert limits[0] < found / true < limits[1]
 
@@ -187,7 +187,7 @@ def test_predicted_uncertainty_is_the_scatter_of_repeated_frames(glare, size):
     predicted = np.sqrt(np.nanmean(seen.prediction.std[inner] ** 2))
     assert 0.75 < predicted / observed < 1.25
     assert 0 < np.nanmedian(seen.prediction.noise) <= 1.1 * np.nanmedian(seen.prediction.std)
-    assert min(light.alone.median for light in seen.lights) > np.nanmedian(seen.prediction.std)
+    assert min(light.std_alone.median for light in seen.lights) > np.nanmedian(seen.prediction.std)
 
 
 def _moved_lights(glare):
@@ -336,7 +336,7 @@ def test_troubles_are_told(lights, code):
 def test_coarse_speckle_whose_colours_hardly_agree_is_not_called_too_fine(size, code):
     texture = SimpleNamespace(specific=0.2, correlation=0.74)
     seen = SimpleNamespace(texture=texture, speckle_px=size, element_size=100.0, repetition="", doubts=())
-    assert [check.name for check in _of_speckle(seen) if not check.passed] == [code]
+    assert [check.name for check in _speckle_checks(seen) if not check.passed] == [code]
 
 
 @pytest.mark.parametrize("region", [(26, 250, 285, 800), (60, 450, 280, 640), (100, 250, 280, 450)])
@@ -350,8 +350,8 @@ def test_edges_of_a_specimen_before_a_dark_background_hide_no_texture(real_data,
     x, y = x + left, y + top
     empty = (np.hypot(x - 192, y - 541) < 52) | (x < 38) | (x > 354)
     inside = seen.region
-    assert (seen.hidden != empty)[inside].mean() < 0.01
-    np.testing.assert_array_equal(seen.background[inside], seen.hidden[inside])
+    assert (seen.lacks_contrast != empty)[inside].mean() < 0.01
+    np.testing.assert_array_equal(seen.background[inside], seen.lacks_contrast[inside])
     text = next((finding.text for finding in seen.findings if finding.name == "hidden"), None)
     if empty[inside].any():
         assert "draw it inside the specimen" in text
@@ -381,8 +381,8 @@ def test_three_lights_before_a_dark_background_and_with_a_dim_part():
     seen = inspect_frame(raw(lights), calibration=CALIBRATION)
     assert seen.background[:, :46].mean() > 0.98
     assert seen.background[:, 50:].mean() < 0.01
-    assert seen.hidden[120:, 120:].mean() < 0.02
-    assert seen.hidden[55:65, 115:125].all()
+    assert seen.lacks_contrast[120:, 120:].mean() < 0.02
+    assert seen.lacks_contrast[55:65, 115:125].all()
     text = next(finding.text for finding in seen.findings if finding.name == "hidden")
     assert "draw it inside the specimen" in text
     assert "reflect" in text

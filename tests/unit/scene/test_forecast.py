@@ -21,7 +21,7 @@ from rgbmidic.illumination.separation import separate
 from rgbmidic.lab.virtual import Scene, State, record, render, strained_plate, truth, turned
 from rgbmidic.lab.virtual.rendering import paint, plate_scene, sphere_scene
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.scene.forecast import Instrument, node_constant, trace_change
+from rgbmidic.scene.forecast import Instrument, nodal_variance_factor, trace_change
 from rgbmidic.scene.speckle import SpecklePatch, SpeckleSpectrum, cover_covariance
 from rgbmidic.scene.zones import material_points, predict_zones
 
@@ -53,7 +53,7 @@ def test_the_node_constant_is_the_scatter_of_nodes_recovered_from_fits_to_noise(
         loads += [np.bincount(mesh.elements.ravel(), weights=parts[..., c].ravel()) for c in (0, 1)]
     found = recovery.value @ np.linalg.solve(mesh.mass_matrix.toarray(), np.transpose(loads))
     inner = (abs(mesh.nodes - 75) < 40).all(axis=1)  # as many nodes with eight triangles as with four
-    assert found[inner].var() * size**2 == pytest.approx(node_constant(), rel=0.05)
+    assert found[inner].var() * size**2 == pytest.approx(nodal_variance_factor(), rel=0.05)
 
 
 def test_the_cover_s_covariance_is_that_of_the_paint():
@@ -170,8 +170,8 @@ def test_where_no_light_sees_there_is_no_number_and_saturation_is_told():
     zones = still(made.scene)
     bright = replace(zones, irradiance=zones.irradiance * np.array([1.0, 5.0, 1.0]).reshape(3, 1, 1))
     # green's glare saturates green's channel, through which red and blue are hardly seen
-    np.testing.assert_array_equal(made.saturated(bright).all(axis=(1, 2)), [False, True, False])
-    assert not made.saturated(zones).any()
+    np.testing.assert_array_equal(made.is_saturated(bright).all(axis=(1, 2)), [False, True, False])
+    assert not made.is_saturated(zones).any()
     weights = made.weights(zones, bright)
     np.testing.assert_array_equal(weights[1], 0)
     assert (weights[[0, 2]] > 0).all()
@@ -185,7 +185,7 @@ def observed(scene: Scene, state: State, start: tuple[float, float], inset: int 
 
     def shot(image, seed):
         if grey:
-            frames = [record(image, scene.camera, scene.lights, seed=seed * 9 + i, on=(light.name,))
+            frames = [record(image, scene.camera, scene.lights, seed=seed * 9 + i, shining=(light.name,))
                       for i, light in enumerate(scene.lights)]  # fmt: skip
             return np.concatenate([linearise(frame).values for frame in frames])
         frame = linearise(record(image, scene.camera, scene.lights, seed=seed))

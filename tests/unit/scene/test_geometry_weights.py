@@ -14,7 +14,7 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.virtual import State
 from rgbmidic.scene.geometry_weights import GeometryWeights
 from rgbmidic.scene.scene import read_scene
-from rgbmidic.scene.zones import material_points, placed, predict_zones
+from rgbmidic.scene.zones import material_points, points_and_normals, predict_zones
 from rgbmidic.settings import TestSettings
 
 SCENE = """
@@ -140,7 +140,7 @@ def test_a_height_map_takes_the_place_of_the_body(prepare, tmp_path):
     scene = SCENE.replace('kind = "sphere"', 'kind = "plate"\nwidth = 300.0\nheight = 300.0')
     (tmp_path / "scene.toml").write_text(SCENE)
     sphere = read_scene(tmp_path / "scene.toml").scene
-    points, _ = placed(sphere, material_points(sphere))
+    points, _ = points_and_normals(sphere, material_points(sphere))
     np.save(tmp_path / "heights.npy", sphere.body.front[2] - points[2])
     mapped = prepare(scene, height_map="heights.npy", limit_deg=15.0).deformed(IMAGES, 1)
     modelled = prepare(SCENE, limit_deg=15.0).deformed(IMAGES, 1)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import InputError
-from rgbmidic.lab.planning import CONSTANTS, Plan, make_plan, propose_colours, propose_lamps
+from rgbmidic.lab.planning import CONSTANTS, LampPlan, make_plan, propose_colours, propose_lamps
 from rgbmidic.lab.virtual import Cylinder, Light, Plate, Scene, State, turned
 from rgbmidic.lab.virtual.rendering import paint, sphere_scene
 from rgbmidic.scene.camera import reference_camera, three_lights
@@ -16,7 +16,7 @@ from rgbmidic.scene.scene import DatasetSettings, Experiment
 from rgbmidic.scene.zones import REFLECTS, predict_zones
 
 
-def plan(scene: Scene, *states: State, **output: object) -> Plan:
+def plan(scene: Scene, *states: State, **output: object) -> LampPlan:
     return make_plan(Experiment(scene=scene, states=states, output=DatasetSettings(**output)))
 
 
@@ -39,7 +39,7 @@ def with_lamps(scene: Scene, *directions: tuple[float, float]) -> Scene:
     return replace(scene, lights=lights)
 
 
-def overlap(made: Plan) -> float:
+def overlap(made: LampPlan) -> float:
     return max(made.fraction(outlook.reflects.sum(axis=0) > 1) for outlook in made.outlooks)
 
 
@@ -105,7 +105,7 @@ def test_moved_lamps_overlap_less_keep_their_distance_and_stay_apart():
     np.testing.assert_allclose([np.linalg.norm(t) for t in towards], 550.0)
     unit = np.array([t / np.linalg.norm(t) for t in towards])
     cosines = (unit @ unit.T)[np.triu_indices(3, 1)]
-    assert cosines.max() <= np.cos(np.radians(CONSTANTS.apart)) + 1e-9
+    assert cosines.max() <= np.cos(np.radians(CONSTANTS.min_angle)) + 1e-9
     # the proposal's figures are those of a plan made for it
     again = plan(replace(scene, lights=proposal.scene.lights), turned(1.0), turned(4.0))
     assert again.std == pytest.approx(proposal.std)
