@@ -114,7 +114,7 @@ ENTRY_POINTS = "rgbmidic.frame_formats"
 
 @cache
 def _plugin_formats() -> tuple[FrameFormat, ...]:
-    """Formats of other packages; one that cannot be loaded is left out with a warning."""
+    """Return the formats of other packages; one that cannot be loaded is left out with a warning."""
     formats = list[FrameFormat]()
     for point in entry_points(group=ENTRY_POINTS):
         try:
@@ -128,7 +128,7 @@ def _plugin_formats() -> tuple[FrameFormat, ...]:
 
 
 def frame_formats() -> tuple[FrameFormat, ...]:
-    """All formats, the package's own first: the first that recognises a file reads it.
+    """Return all formats, the package's own first: the first that recognises a file reads it.
 
     Returns
     -------

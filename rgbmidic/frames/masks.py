@@ -55,7 +55,7 @@ def read_mask(path: Path) -> FloatImage:
 
 
 def _strongest_channel(path: Path) -> AnyArray:
-    """Strongest channel of each pixel of a picture, times its opacity."""
+    """Return the strongest channel of each pixel of a picture, times its opacity."""
     from PIL import Image
 
     with warnings.catch_warnings():

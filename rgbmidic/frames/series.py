@@ -73,7 +73,7 @@ class FrameSeries:
         return len(self.first_frames)
 
     def __getitem__(self, index: int) -> tuple[Mosaic | ChannelFrame, ...]:
-        """State `index`, as `read` gives it: a series of files is a frame source as any other."""
+        """Return the state `index`, as `read` gives it: a series of files is a frame source as any other."""
         return self.read(index)
 
     @property
@@ -118,7 +118,7 @@ class FrameSeries:
         return max((numbers[-1] - numbers[0]) // step + 1 - len(numbers), 0) if numbers else 0
 
     def shapes(self) -> Iterator[tuple[FrameSource, tuple[int, int]]]:
-        """Every source whose header can be read, with its rows and columns.
+        """Yield every source whose header can be read, with its rows and columns.
 
         Yields
         ------
@@ -364,7 +364,7 @@ def _complete_states(numbers: Sequence[int], lights: int) -> tuple[tuple[int, ..
 
 
 def selected_frames(settings: FrameSettings, count: int) -> range:
-    """The states that the settings choose.
+    """Return the states that the settings choose.
 
     Raises
     ------
@@ -475,7 +475,7 @@ def describe(settings: FrameSettings) -> dict[str, Any]:
 
 
 def description_text(description: Mapping[str, Any]) -> str:
-    """One line for each thing that is known of frames (`describe`)."""
+    """Return one line for each known property of frames (`describe`)."""
 
     def text(value: object) -> str:
         if isinstance(value, tuple):

@@ -69,7 +69,7 @@ class FrameSource(ABC):
         return self.recording.count
 
     def __getitem__(self, index: int) -> Mosaic | ChannelFrame:
-        """Frame `index`, as `read` gives it."""
+        """Return the frame `index`, as `read` gives it."""
         return self.read(index)
 
     def name(self, index: int) -> str:

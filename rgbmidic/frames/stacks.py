@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 def _split_shape(shape: tuple[int, ...], dtype: np.dtype[Any], name: object) -> tuple[int, tuple[int, ...]]:
-    """Number of frames in an array, and the shape of one, (H, W) or (H, W, 3).
+    """Return the number of frames in an array, and the shape of one, (H, W) or (H, W, 3).
 
     Raises
     ------

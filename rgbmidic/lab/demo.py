@@ -243,7 +243,7 @@ def write_plate(test: Path) -> CameraCalibration:
     straight = undistorted(np.array(_LENS), np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64))
 
     def photograph(name: str, values: FloatArray) -> None:
-        """Values of 0 to 1 as grey levels, with noise of .25 % of the full scale."""
+        """Write values of 0 to 1 as grey levels, with noise of .25 % of the full scale."""
         (test / name).parent.mkdir(exist_ok=True)
         levels = 65535 * (0.05 + 0.8 * values + random.normal(0, 0.0025, values.shape))
         _, content = cv2.imencode(".png", np.round(levels).clip(0, 65535).astype(np.uint16).reshape(_PLATE_SHAPE))
@@ -355,7 +355,7 @@ def _separate() -> None:
 
 
 def _images(index: int) -> FloatImage:
-    """Blobs under three lights, a fraction of a pixel further from frame to frame."""
+    """Return the blobs under three lights, a fraction of a pixel further from frame to frame."""
     from scipy.ndimage import gaussian_filter, shift
 
     blobs = gaussian_filter(np.random.default_rng(0).normal(size=(3, _SIZE, _SIZE)), (0, 1.5, 1.5))

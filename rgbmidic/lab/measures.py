@@ -76,7 +76,7 @@ class MeasureArea:
 def areas_along_x(
     first: tuple[float, float], *, pitch: float = 100.0, count: int = 5, size: tuple[float, float] = AREA_SIZE
 ) -> tuple[MeasureArea, ...]:
-    """Areas A0, A1, ... in a row along x, as on the paper's Fig. 4.
+    """Return the areas A0, A1, ... in a row along x, as on the paper's Fig. 4.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def perturbation(field: npt.ArrayLike, areas: Sequence[MeasureArea], *, sigma: f
 
 
 def residual_percent(reference: npt.ArrayLike, deformed: npt.ArrayLike, displacement: FloatArray) -> float:
-    """Residual of a measurement in % of the effective dynamic range (paper, section 2.2).
+    """Return the residual of a measurement in % of the effective dynamic range (paper, section 2.2).
 
     Standard deviation of the difference between the reference image and the deformed image warped by the
     displacement (cubic spline interpolation), over the largest minus the smallest grey level of the two images.
@@ -187,7 +187,7 @@ def area_stds(high_passed: FloatArray, areas: Sequence[MeasureArea]) -> FloatArr
 
 
 def area_means(field: FloatArray, areas: Sequence[MeasureArea]) -> FloatArray:
-    """Mean of an image in each area.
+    """Return the mean of an image in each area.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ class Lobe:
     std: tuple[float, float, float, float]
 
     def __call__(self, angles_deg: npt.ArrayLike) -> FloatArray:
-        """Grey level at light angles in degrees from the surface's normal."""
+        """Return the grey level at light angles in degrees from the surface's normal."""
         return _lobe(np.asarray(angles_deg, dtype=np.float64), *astuple(self)[:4])
 
 
@@ -258,7 +258,7 @@ class Goniometry:
 
 
 def pixel_levels(frames: Sequence[npt.ArrayLike], pixels: npt.ArrayLike) -> FloatArray:
-    """Grey levels (n, m) of chosen pixels in n frames.
+    """Return the grey levels (n, m) of chosen pixels in n frames.
 
     Parameters
     ----------
@@ -328,7 +328,7 @@ def fit_lobe(angles_deg: npt.ArrayLike, levels: npt.ArrayLike) -> Lobe:
 
 
 def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, min_spread: float = 0.05) -> Goniometry:
-    """Diffuse light, specular lobe and erratic band of a series of grey levels.
+    """Return the diffuse light, specular lobe and erratic band of a series of grey levels.
 
     Every pixel has its own diffuse level, found where the light is far from the reflection; the excess over it is
     reflection. A smooth reflection would be the same at every pixel of one paint: the spread between the pixels is the
@@ -381,7 +381,7 @@ def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, min_spread: 
 
 
 def _lobe_of_pixels(angles: FloatArray, levels: FloatArray, max_groups: int = 10) -> Lobe:
-    """Lobe of the mean of m pixels; its uncertainty from leaving out groups of them in turn (jackknife).
+    """Return the lobe of the mean of m pixels; its uncertainty from leaving out groups of them in turn (jackknife).
 
     The residual of the fit does not show it: a pixel's deviation is the same at neighbouring angles.
     """
@@ -439,7 +439,7 @@ def detrend(height: npt.ArrayLike, order: int = 4) -> FloatArray:
 
 
 def local_slope(height: npt.ArrayLike, pitch: float) -> FloatArray:
-    """Local slope arctan|grad h| by central differences.
+    """Return the local slope arctan|grad h| by central differences.
 
     Parameters
     ----------
@@ -482,7 +482,7 @@ def slope_uncertainty(height_std: float, pitch: float) -> float:
 
 
 def paint_classes(intensity: npt.ArrayLike) -> BoolArray:
-    """White and black paint of an intensity map, by Otsu's threshold.
+    """Classify white and black paint of an intensity map, by Otsu's threshold.
 
     Parameters
     ----------
@@ -510,7 +510,7 @@ def paint_classes(intensity: npt.ArrayLike) -> BoolArray:
 
 
 def rms_slope(height: npt.ArrayLike, on_paint: BoolArray, pitch: float, *, height_std: float = 0.0) -> float:
-    """Root mean square local slope of one paint in degrees, measurement noise taken off.
+    """Return the root mean square local slope of one paint in degrees, measurement noise taken off.
 
     Parameters
     ----------
@@ -544,7 +544,7 @@ def rms_slope(height: npt.ArrayLike, on_paint: BoolArray, pitch: float, *, heigh
 
 
 def wrinkle_spacing(height: npt.ArrayLike, pitch: float, *, longest: float = 0.06) -> tuple[float, float]:
-    """Distance between wrinkles: where the spectrum of the height, summed over all directions, has its peak.
+    """Return the distance between wrinkles: where the spectrum of the height, summed over all directions, has its peak.
 
     Parameters
     ----------
@@ -586,7 +586,7 @@ def _as_map(values: npt.ArrayLike) -> FloatArray:
 
 
 def _ring_spectrum(values: FloatArray, pitch: float, longest: float) -> tuple[FloatArray, FloatArray]:
-    """Frequencies and the power summed over the rings of these frequencies (Hann window)."""
+    """Return the frequencies and the power summed over the rings of these frequencies (Hann window)."""
     is_measured = np.isfinite(values)
     centred = np.where(is_measured, values - values[is_measured].mean(), 0.0)
     window = np.hanning(values.shape[0])[:, None] * np.hanning(values.shape[1])
@@ -601,7 +601,7 @@ def _ring_spectrum(values: FloatArray, pitch: float, longest: float) -> tuple[Fl
 
 
 def _peak(frequency: FloatArray, power: FloatArray, width: float = 0.1) -> float:
-    """Peak of a noisy spectrum: vertex of the parabola through its logarithm.
+    """Return the peak of a noisy spectrum: vertex of the parabola through its logarithm.
 
     It is smoothed over `width`, a standard deviation in the logarithm of the frequency.
     """

@@ -99,7 +99,7 @@ class _Search:
 
     @classmethod
     def of(cls, plan: LampPlan, directions: FloatArray) -> _Search:
-        """Inverse variance of each light's pull, times the fourth power of its diffuse fraction."""
+        """Return the search by the inverse variance of each light, times the fourth power of its diffuse fraction."""
         scene = plan.scene
         rows, columns = np.nonzero(plan.inside)
         sample = slice(None, None, max(1, rows.size // CONSTANTS.n_points))
@@ -132,12 +132,12 @@ class _Search:
         return cls(directions=directions, information=np.stack(information))
 
     def cost(self, choice: Iterable[int]) -> float:
-        """Root mean square uncertainty, in units of its own, of one direction per light."""
+        """Return the root mean square uncertainty, in units of its own, of one direction per light."""
         total = sum(self.information[light, direction] for light, direction in enumerate(choice))
         return float(np.sqrt(np.mean(1 / np.maximum(total, 1e-9))))
 
     def best(self, light: int, fixed: Mapping[int, int]) -> int:
-        """Direction in which a light adds most to `fixed` (light to direction), at an angle from all of them."""
+        """Return direction in which a light adds most to `fixed` (light to direction), at an angle from all of them."""
         total = self.information[light] + sum(
             self.information[fixed_light, direction] for fixed_light, direction in fixed.items()
         )
@@ -146,7 +146,7 @@ class _Search:
         return int(np.where(near.any(axis=1), np.inf, costs).argmin())
 
     def greedy(self, order: tuple[int, ...]) -> tuple[int, ...]:
-        """One light after the other where it adds most."""
+        """Return one light after the other where it adds most."""
         choice: dict[int, int] = {}
         for light in order:
             choice[light] = self.best(light, choice)
@@ -267,7 +267,7 @@ class LampPlan:
     gain: float = 1.0
 
     def fraction(self, mask: BoolArray) -> float:
-        """Fraction of the field on which a mask (h, w) holds."""
+        """Return the fraction of the field on which a mask (h, w) holds."""
         return float(mask[self.inside].mean())
 
     @property
@@ -316,7 +316,7 @@ def make_plan(experiment: Experiment) -> LampPlan:
 def _predict(
     scene: Scene, instrument: Instrument, x: FloatArray, y: FloatArray, states: list[State]
 ) -> tuple[Zones, tuple[Outlook, ...]]:
-    """Zones at rest, and the outlook of every state, at points x, y (h, w) of a square grid (px)."""
+    """Return the zones at rest, and the outlook of every state, at points x, y (h, w) of a square grid (px)."""
     material = material_points(scene, None, (x, y))
     reference = predict_zones(scene, material=material)
     radius = instrument.element_size / float(x[0, 1] - x[0, 0])
@@ -343,7 +343,7 @@ def _predict(
 
 
 def _nodal_mean(values: FloatArray, radius: float) -> FloatArray:
-    """Mean (n, h, w) of the known values within about `radius` points: over the elements of a node."""
+    """Return the mean (n, h, w) of the known values within about `radius` points: over the elements of a node."""
     is_finite = np.isfinite(values)
     total, weight = (
         np.stack([cv2.GaussianBlur(layer, (0, 0), 0.5 * radius) for layer in stack])

@@ -65,7 +65,7 @@ def zone_rows(plan: LampPlan) -> tuple[list[str], list[list[str]]]:
 
 
 def uncertainty_rows(plan: LampPlan) -> tuple[list[str], list[list[str]]]:
-    """Headings and one row per state: standard uncertainty over the field in px, and its parts."""
+    """Return the headings and one row per state: standard uncertainty over the field in px, and its parts."""
     rows = []
     for label, state in _labelled_states(plan):
         std = state["std_px"]
@@ -105,7 +105,7 @@ def lamp_rows(plan: LampPlan) -> tuple[list[str], list[list[str]]]:
 
 
 def summary(plan: LampPlan) -> str:
-    """One line: the largest overlap of reflections, and the uncertainty over field and states."""
+    """Return one line: the largest overlap of reflections, and the uncertainty over field and states."""
     overlap = max(plan.fraction(np.asarray(outlook.reflects.sum(axis=0) > 1)) for outlook in plan.outlooks)
     std = f"{plan.std:.4f} px" if math.isfinite(plan.std) else "unbounded: somewhere no light sees"
     return f"reflections overlap on up to {overlap:.1%} of the field; u_std {std}"
@@ -161,7 +161,7 @@ def _arrangement(plan: LampPlan) -> dict[str, Any]:
 
 
 def _lamps(plan: LampPlan) -> list[dict[str, Any]]:
-    """The lamps; azimuth about the optical axis (0 to the right, 90 down) and inclination from it, from the body."""
+    """Return lamps; azimuth about the optical axis (0 to the right, 90 down) and inclination from it, from the body."""
     lamps = []
     for light in plan.scene.lights:
         x, y, z = (a - b for a, b in zip(light.position, plan.scene.body.front, strict=True))
@@ -243,7 +243,7 @@ def _extent(plan: LampPlan) -> tuple[float, float, float, float]:
 
 
 def _draw_zones(axis: Axes, plan: LampPlan, outlook: Outlook) -> None:
-    """Specular fractions as colours, zones as lines: broken in the reference state, whole in this one."""
+    """Draw the specular fractions as colours, zones as lines: broken in the reference state, whole in this one."""
     from matplotlib.colors import to_rgb
 
     body = np.isfinite(outlook.displacement[0])

@@ -72,7 +72,7 @@ def cut_offs(gauges: Sequence[float]) -> tuple[float, float, FloatArray]:
 
 
 def _integrals(mesh: Tri3Mesh, number: FloatArray, n_parts: int = 6) -> FloatArray:
-    """Integrals (N, 2 P) of each shape function times cosine and sine of wave numbers (P,) along x.
+    """Return the integrals (N, 2 P) of each shape function times cosine and sine of wave numbers (P,) along x.
 
     They are summed over so many `n_parts` of an element's side: 1e-3 of the amplitude at a period of two elements.
     """
@@ -137,7 +137,7 @@ GAUGE_WORDS = {
 
 
 def size_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
-    """Headings and one row per element size."""
+    """Return the headings and one row per element size."""
     rows = []
     for size_figures in _documents(study):
         micro = [1e6 * size_figures[f"strain_{key}"] for key in ("noise", "discretisation", "total")]
@@ -154,7 +154,7 @@ def size_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
 
 
 def gauge_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
-    """Headings and one row per element size and virtual strain gauge."""
+    """Return the headings and one row per element size and virtual strain gauge."""
     rows = []
     for size_figures in _documents(study):
         for gauge in size_figures["gauges"]:
@@ -199,7 +199,7 @@ _NO_GAUGE = dict.fromkeys(("length_px", "noise", "largest", "cut_off_px"), float
 
 @lru_cache(maxsize=1)
 def _documents(study: ResolutionStudy) -> list[dict[str, Any]]:
-    """Figures of every size with their units in their names, cut-offs and gauges included."""
+    """Return the figures of every size with their units in their names, cut-offs and gauges included."""
     lengths_in_elements = sorted({gauge.length / size.element_size for size in study.sizes for gauge in size.gauges})
     displacement_cut_off, strain_cut_off, gauge_cut_offs = cut_offs(lengths_in_elements)
     cut_off_of = dict(zip(lengths_in_elements, gauge_cut_offs.tolist(), strict=True))

@@ -89,7 +89,7 @@ class Sample:
 
 
 def cache_folder() -> Path:
-    """Folder in which fetched files are kept: RGBMIDIC_SAMPLES, else the user's cache folder.
+    """Return the folder in which fetched files are kept: RGBMIDIC_SAMPLES, else the user's cache folder.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def write_sample(name: str, folder: Path, report: Callable[[str], None] = lambda
 
 
 def _fetch(sample: Sample, file: SampleFile, report: Callable[[str], None]) -> Path:
-    """The file in the cache, fetched where it is not there or not what was published."""
+    """Return the file in the cache, fetched where it is not there or not what was published."""
     pooch = optional("pooch", "sample")
     url = f"{ADDRESS}/{sample.repository}/{sample.commit}/{quote(file.path)}"
     cache_path = cache_folder() / sample.name

@@ -114,7 +114,7 @@ class _Sets:
 
 
 def _elements(name: str, rows: _Rows) -> tuple[str | None, list[list[int]]]:
-    """Shape of a type of elements, None of one that is not read, and the label and corners of each."""
+    """Return the shape of a type of elements, None of one that is not read, and the label and corners of each."""
     planar, size = match.groups() if (match := _ELEMENT.match(name)) else (None, "")
     if (shape := (_PLANAR if planar else _SOLIDS).get(size)) is None:
         return None, []
@@ -126,7 +126,7 @@ def _elements(name: str, rows: _Rows) -> tuple[str | None, list[list[int]]]:
 
 
 def _cards(path: Path, read_files: set[str]) -> Iterator[tuple[str, dict[str, str], _Rows]]:
-    """Keyword, options and rows of data of every card, in their order, with files that are included."""
+    """Yield the keyword, options and rows of data of every card, in their order, with files that are included."""
     keyword, options, rows = "", dict[str, str](), _Rows()
     for line in (*_lines(path, read_files), "*"):
         entries = [entry.strip() for entry in line.split(",")]
@@ -151,7 +151,7 @@ def _cards(path: Path, read_files: set[str]) -> Iterator[tuple[str, dict[str, st
 
 
 def _lines(path: Path, read_files: set[str]) -> list[str]:
-    """Lines of a file without blank ones and comments; a keyword's goes on after a comma at its end."""
+    """Return the lines of a file without blank ones and comments; a keyword's goes on after a comma at its end."""
     lines = list[str]()
     for line in map(str.strip, read_text(path, read_files).splitlines()):
         if not line or line.startswith("**"):

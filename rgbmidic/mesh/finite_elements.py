@@ -98,7 +98,7 @@ class FiniteElementMesh:
         return cross(self.points, self.elements) / 2
 
     def overlap(self) -> tuple[int, int] | None:
-        """Numbers of two elements whose triangles overlap by more than rounding; None: no two do.
+        """Return the numbers of two elements whose triangles overlap by more than rounding; None: no two do.
 
         The triangles are sorted into strips along x, and those within a strip by their left ends. Two of them overlap
         by the least depth along the normals of their sides (separating axis theorem).
@@ -161,6 +161,6 @@ def _depth(triangle: FloatArray, other_triangle: FloatArray) -> FloatArray:
 
 
 def cross(points: FloatArray, elements: npt.NDArray[np.integer]) -> FloatArray:
-    """Twice the signed area (...) of triangles (..., 3)."""
+    """Return twice the signed area (...) of triangles (..., 3)."""
     first, second = (points[elements[..., corner]] - points[elements[..., 0]] for corner in (1, 2))
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])

@@ -255,7 +255,7 @@ def _require_count(count: int) -> int:
 
 
 def _element_type(kind: int) -> tuple[str, int]:
-    """Shape and number of nodes of an element type."""
+    """Return the shape and number of nodes of an element type."""
     if kind not in _TYPES:
         raise InputError(f"its elements of type {kind} are not read; those of types {', '.join(map(str, _TYPES))} are")
     return _TYPES[kind]

@@ -108,12 +108,12 @@ def require_unique(noun: str, labels: IntArray) -> None:
 
 
 def parse_real(text: str) -> float:
-    """Value of a real number as Fortran writes it, with the exponent D or a sign alone; 0 of an empty field."""
+    """Return value of a real number as Fortran writes it, with the exponent D or a sign alone; 0 of an empty field."""
     return float(re.sub(r"(?<=[\d.])(?=[+-])", "E", text.upper().replace("D", "E"))) if text else 0.0
 
 
 def limit_size(path: Path) -> Path:
-    """The path itself, of a regular file that is not larger than what is read."""
+    """Return the path itself, of a regular file that is not larger than what is read."""
     if (size := require_regular_file(path).stat().st_size) > MAX_BYTES:
         raise InputError(f"{path} has {size} bytes; meshes of up to {MAX_BYTES} are read")
     return path

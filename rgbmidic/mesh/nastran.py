@@ -42,7 +42,7 @@ def read_nastran(path: Path) -> MeshContent:
 
 
 def _cards(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Name and fields of every entry of the bulk data, without marks of continuation."""
+    """Yield the name and fields of every entry of the bulk data, without marks of continuation."""
     name, fields = "", list[str]()
     lines = [*_lines(path, set())]
     begin = next((i for i, line in enumerate(lines, 1) if re.match(r"\s*BEGIN\s+BULK", line, re.IGNORECASE)), 0)
@@ -60,7 +60,7 @@ def _cards(path: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def _fields(line: str) -> tuple[str, list[str]]:
-    """Name of an entry, empty of one that goes on, and its eight fields, or four large ones."""
+    """Return the name of an entry, empty of one that goes on, and its eight fields, or four large ones."""
     card_name = (line.split(",")[0] if "," in line else line[:8]).strip().upper()
     number, width = (4, 16) if "*" in card_name else (8, 8)
     entries = line.split(",")[1:] if "," in line else [line[i : i + width] for i in range(8, 72, width)]
@@ -69,7 +69,7 @@ def _fields(line: str) -> tuple[str, list[str]]:
 
 
 def _lines(path: Path, read_files: set[str]) -> Iterator[str]:
-    """Lines without blank ones and comments, with those of files that are included."""
+    """Yield the lines without blank ones and comments, with those of files that are included."""
     for line in read_text(path, read_files).splitlines():
         line = line.partition("$")[0].expandtabs(8).rstrip()
         if line.lstrip()[:7].upper() == "INCLUDE":

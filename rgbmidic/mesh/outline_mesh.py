@@ -80,7 +80,7 @@ def outline_mesh(
     origin: tuple[int, int] = (0, 0),
     constants: OutlineConstants = OutlineConstants(),
 ) -> tuple[FloatArray, npt.NDArray[np.int32]]:
-    """Nodes (N, 2) and elements (E, 3) of about `size` px for the region `mask` (H, W), split along `cracks`.
+    """Return nodes (N, 2) and elements (E, 3) of about `size` px for the region `mask` (H, W), split along `cracks`.
 
     The mask may be a part of a frame that begins at column and row `origin`: the nodes then lie as in all of it.
 
@@ -166,7 +166,7 @@ def _lattice_points(shape: tuple[int, int], size: float, origin: tuple[int, int]
 
 
 def _outline_points(outlines: list[FloatArray], size: float) -> FloatArray:
-    """Points about `size` px apart along polygons; corners are kept."""
+    """Return the points about `size` px apart along polygons; corners are kept."""
     points = [np.empty((0, 2))]
     for corners in outlines:
         for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -183,7 +183,7 @@ def _crack_paths(
     size: float,
     constants: OutlineConstants,
 ) -> list[FloatArray]:
-    """Nodes (n, 2) of every crack (M, 2) within the region, at most `size` px apart.
+    """Return the nodes (n, 2) of every crack (M, 2) within the region, at most `size` px apart.
 
     A path that leaves the region or nearly reaches its edge ends on points of the `edge`, or on a `sharp` corner.
 
@@ -232,7 +232,7 @@ def _segments_within(corners: FloatArray, mask: BoolArray, size: float, number: 
 def _path_nodes(
     segment: FloatArray, targets: Sequence[tuple[FloatArray, float]], size: float, constants: OutlineConstants
 ) -> FloatArray:
-    """Nodes (n, 2) along a part of a path, at most `size` px apart.
+    """Return the nodes (n, 2) along a part of a path, at most `size` px apart.
 
     Each end moves to the nearest of the first `targets` (points, reach in px) that is within reach.
     """
@@ -251,7 +251,7 @@ def _path_nodes(
 
 
 def _sharp_corners(polygons: Sequence[FloatArray], turn_deg: float) -> FloatArray:
-    """Corners (n, 2) at which polygons (M, 2) turn by more than `turn_deg`."""
+    """Return the corners (n, 2) at which polygons (M, 2) turn by more than `turn_deg`."""
     sharp = [np.empty((0, 2))]
     for corners in polygons:
         side = np.roll(corners, -1, axis=0) - corners
@@ -292,12 +292,12 @@ def split_along(
 
 
 def edge_keys(edges: npt.NDArray[np.integer], nodes: int) -> npt.NDArray[np.int64]:
-    """One number for each edge (n, 2) of a mesh of so many nodes, whichever way it runs."""
+    """Return one number for each edge (n, 2) of a mesh of so many nodes, whichever way it runs."""
     return np.asarray(edges.min(axis=1).astype(np.int64) * nodes + edges.max(axis=1))
 
 
 def spacing_mask(points: FloatArray, distance: float) -> BoolArray:
-    """Points (N,) to keep: without those that lie closer than `distance` to a kept one before them."""
+    """Return the points (N,) to keep as a mask: without those closer than `distance` to a kept one before them."""
     keep = np.ones(len(points), dtype=bool)
     for i, j in sorted(cKDTree(points).query_pairs(distance)):
         if keep[i]:

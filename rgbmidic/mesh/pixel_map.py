@@ -126,7 +126,7 @@ class PixelMap:
     def element_pixels(
         self, selected: BoolArray
     ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Slots, columns and rows (n,) of the pixels of the chosen elements (E,).
+        """Return the slots, columns and rows (n,) of the pixels of the chosen elements (E,).
 
         Parameters
         ----------
@@ -143,7 +143,7 @@ class PixelMap:
         return slots, self.local_x[slots].astype(np.int64) + x, self.local_y[slots].astype(np.int64) + y
 
     def gather(self, image: FloatImage) -> FloatImage:
-        """Values of an image (..., H, W) at the owned pixels, shape (..., P).
+        """Return the values of an image (..., H, W) at the owned pixels, shape (..., P).
 
         Parameters
         ----------
@@ -160,7 +160,7 @@ class PixelMap:
         return out
 
     def grid(self, side: int) -> tuple[int, int]:
-        """Rows and columns of the blocks of `side` px that cover `bounds`.
+        """Return the rows and columns of the blocks of `side` px that cover `bounds`.
 
         Parameters
         ----------
@@ -214,7 +214,7 @@ class PixelMap:
         return out
 
     def scatter(self, values: FloatImage, fill: float = 0.0) -> FloatImage:
-        """Image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere.
+        """Return the image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere.
 
         Parameters
         ----------

@@ -195,7 +195,7 @@ class Placement:
         return np.asarray((positions - self.shift) @ np.linalg.inv(self.matrix).T)
 
     def jacobian(self, points: FloatArray) -> FloatArray:
-        """Derivative (N, 2, 2) of `to_mm` at points (N, 2) in px: ``[n, mesh axis, px axis]``, mm per px.
+        """Return the derivative (N, 2, 2) of `to_mm` at points (N, 2) in px: ``[n, mesh axis, px axis]``, mm per px.
 
         Parameters
         ----------
@@ -213,7 +213,7 @@ class Placement:
         return np.asarray(inverse @ self.camera.jacobian(points))
 
     def vectors_to_mm(self, points: FloatArray, vectors: FloatArray) -> FloatArray:
-        """Displacements (N, 2) in mm in the mesh's axes, of `vectors` (N, 2) in px from `points` (N, 2) in px.
+        """Return displacements (N, 2) in mm in the mesh's axes, of `vectors` (N, 2) in px from `points` (N, 2) in px.
 
         Parameters
         ----------
@@ -228,7 +228,7 @@ class Placement:
         return self.to_mm(points + vectors) - self.to_mm(points)
 
     def vectors_to_px(self, points: FloatArray, vectors: FloatArray) -> FloatArray:
-        """Displacements (N, 2) in px, of `vectors` (N, 2) in mm from `points` (N, 2) in mm, in the mesh's axes.
+        """Return displacements (N, 2) in px, of `vectors` (N, 2) in mm from `points` (N, 2) in mm, in the mesh's axes.
 
         Parameters
         ----------

@@ -58,7 +58,7 @@ class Region:
 
     @classmethod
     def from_rectangle(cls, rectangle: Sequence[float], shape: tuple[int, int]) -> Region:
-        """Rectangle (x0, y0, x1, y1) in px, clipped to the image of `shape` (H, W).
+        """Return the rectangle (x0, y0, x1, y1) in px, clipped to the image of `shape` (H, W).
 
         Parameters
         ----------
@@ -95,7 +95,7 @@ class Region:
 
     @classmethod
     def from_polygon(cls, corners: npt.ArrayLike, shape: tuple[int, int]) -> Region:
-        """Polygon with corners (x, y) in px, shape (M, 2), on an image of `shape` (H, W).
+        """Return the polygon with corners (x, y) in px, shape (M, 2), on an image of `shape` (H, W).
 
         Parameters
         ----------
@@ -165,7 +165,7 @@ class Region:
 
     @classmethod
     def from_mask(cls, mask: npt.ArrayLike, shape: tuple[int, int] | None = None) -> Region:
-        """Non-zero pixels of a mask image (H, W); `shape`, where given, is the size it must have.
+        """Return the non-zero pixels of a mask image (H, W); `shape`, where given, is the size it must have.
 
         Parameters
         ----------

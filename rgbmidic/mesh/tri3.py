@@ -197,7 +197,7 @@ class Tri3Mesh:
         return distance, index.astype(np.int64)
 
     def to_nodes(self, per_element: FloatArray) -> FloatArray:
-        """Sum of a value per element (E,) over the elements around each node, shape (N,).
+        """Return the sum of a value per element (E,) over the elements around each node, shape (N,).
 
         Parameters
         ----------
@@ -212,7 +212,7 @@ class Tri3Mesh:
         return np.asarray(sums, dtype=np.float64)
 
     def adjacent_nodes(self, nodes: BoolArray) -> BoolArray:
-        """Nodes (N,) that share an element with one of `nodes` (N,), these included.
+        """Return the nodes (N,) that share an element with one of `nodes` (N,), these included.
 
         Parameters
         ----------
@@ -228,7 +228,7 @@ class Tri3Mesh:
         return is_adjacent
 
     def element_gradient(self, values: FloatArray) -> FloatArray:
-        """Gradient of the linear interpolant of nodal values (N, C) in every element, shape (E, C, 2).
+        """Return the gradient of the linear interpolant of nodal values (N, C) in every element, shape (E, C, 2).
 
         Parameters
         ----------
@@ -246,7 +246,7 @@ class Tri3Mesh:
         return slopes.swapaxes(0, 1)
 
     def shape_gradients(self) -> FloatArray:
-        """Gradient of the three shape functions of every element, shape (E, 3, 2), per px.
+        """Return the gradient of the three shape functions of every element, shape (E, 3, 2), per px.
 
         Returns
         -------
@@ -284,7 +284,7 @@ class Tri3Mesh:
         return boundary
 
     def _boundary_edges(self) -> npt.NDArray[np.int32]:
-        """Edges (B, 2) that belong to one element only."""
+        """Return the edges (B, 2) that belong to one element only."""
         edges, count = self._edges
         return np.asarray(edges[count == 1])
 

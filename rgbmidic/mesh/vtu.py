@@ -98,7 +98,7 @@ def entity_labels(
 
 
 def _as_labels(name: str, values: Any, count: int) -> IntArray:
-    """Labels, of which some converters make real numbers."""
+    """Return the labels, of which some converters make real numbers."""
     numbers = np.asarray(values, dtype=np.float64).ravel()
     if len(numbers) != count or not (np.abs(numbers) < 2**53).all() or (numbers % 1 != 0).any():
         raise InputError(f'the numbers "{name}" are not {count} whole ones')

@@ -132,7 +132,7 @@ class Polarisers(SceneSection):
 
 
 def rotation(angle_deg: float, axis: Vector) -> FloatArray:
-    """Rotation matrix by an angle about an axis (Rodrigues)."""
+    """Return the rotation matrix by an angle about an axis (Rodrigues)."""
     length = math.hypot(*axis)
     if length == 0:
         raise InputError("a rotation axis must not be the null vector")
@@ -144,7 +144,7 @@ def rotation(angle_deg: float, axis: Vector) -> FloatArray:
 
 
 def three_lights(target: Vector = (0.0, 0.0, NOMINAL_DISTANCE)) -> tuple[Light, ...]:
-    """Red, green and blue lamps left, right and above the camera, all equally bright at the target."""
+    """Return the red, green and blue lamps left, right and above the camera, all equally bright at the target."""
     positions = {"red": (-190.0, -12.0, 90.0), "green": (200.0, 15.0, 90.0), "blue": (10.0, -220.0, 60.0)}
     return tuple(Light(name=name, position=position).aimed(target) for name, position in positions.items())
 
@@ -261,7 +261,7 @@ class Camera(SceneSection):
         return NoiseModel(gain=self.gain, read_noise=self.read_noise / self.gain)
 
     def response(self, lights: tuple[Light, ...]) -> FloatArray:
-        """Response (C, k) of each channel to each light; its largest entry is 1.
+        """Return the response (C, k) of each channel to each light; its largest entry is 1.
 
         Parameters
         ----------
@@ -381,7 +381,7 @@ class Camera(SceneSection):
 
 
 def reference_camera(shape: tuple[int, int], **changes: object) -> Camera:
-    """RGGB, 12 bit, 4 e-/DN, read noise 12 e-, lens blur 0.45 px, 0.055 mm per px; `changes` to any setting.
+    """Return RGGB, 12 bit, 4 e-/DN, read noise 12 e-, lens blur 0.45 px, 0.055 mm per px; `changes` to any setting.
 
     Its lens has no lateral colour unless `changes` state it, so that a scene shows one cause at a time; a camera of a
     SCENE.toml has. A monochrome camera has no crosstalk of its own.

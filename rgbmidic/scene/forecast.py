@@ -45,7 +45,7 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 @cache
 def nodal_variance_factor() -> float:
-    """Variance of an inner node's value per unit of white noise density and element area: about 1.1.
+    """Return the variance of an inner node's value per unit of white noise density and element area: about 1.1.
 
     `expected_std` of a regular mesh: the linear fit has the inverse of the consistent mass matrix (2.6 on its
     diagonal); the recovery of the nodal values reduces it.
@@ -231,7 +231,7 @@ class Instrument:
         )
 
     def forecast(self, reference: Zones, deformed: Zones, change: FloatArray) -> Forecast:
-        """Uncertainty between two states, at the points at which their zones were predicted.
+        """Return the uncertainty between two states, at the points at which their zones were predicted.
 
         Parameters
         ----------
@@ -318,7 +318,7 @@ class Instrument:
     def _covariance(
         self, energies: Energies, reference: Zones, deformed: Zones, change: FloatArray, common: float = 1.0
     ) -> FloatArray:
-        """Covariance (k, k, ...) of the changes of the lights' images, in units of their local means.
+        """Return the covariance (k, k, ...) of the changes of the lights' images, in units of their local means.
 
         `common` is 1 where the two states share their reflections as predicted, 0 where they have nothing in common.
         """
@@ -354,7 +354,7 @@ class Instrument:
         return np.asarray(area * np.maximum(covariances[0] + covariances[1] - 2 * common * covariances[2], 0))
 
     def _dome_factor(self, zones: Zones) -> FloatArray:
-        """Effect (k, 3, ...) of a unit slope of a droplet's dome on the light's image, in units of its mean.
+        """Return the effect (k, 3, ...) of a unit slope of a droplet's dome on the light's image, in units of its mean.
 
         A slope s changes the reflection at the half-way slope h by the factor exp(h.s/(a^2 + b^2)); its linear part is
         taken.
@@ -381,12 +381,12 @@ class Instrument:
         return np.asarray(np.einsum("jc,c...->j...", is_needed.astype(float), is_full.astype(float)) > 0)
 
     def white_level(self, zones: Zones) -> FloatArray:
-        """Grey level (k, ...) of the white paint under each light, DN above black."""
+        """Return the grey level (k, ...) of the white paint under each light, DN above black."""
         return zones.irradiance * (self.scene.surface.white.albedo * zones.lambert + zones.specular)
 
 
 def trace_change(displacement: FloatArray) -> FloatArray:
-    """Mean square change (3, ...) of the three carriers of the mosaic under a displacement (2, ...) in px.
+    """Return the mean square change (3, ...) of the three carriers of the mosaic under a displacement (2, ...) in px.
 
     The trace stays with the sensor: it differs most where the texture has moved by an odd number of pixels.
     """
@@ -395,14 +395,14 @@ def trace_change(displacement: FloatArray) -> FloatArray:
 
 
 def _channel_mixing(scene: Scene) -> FloatArray:
-    """Camera samples from lights, (C, k); before a monochrome camera every light has a frame of its own."""
+    """Return the camera samples from lights, (C, k); before a monochrome camera every light has a frame of its own."""
     if scene.camera.kind == "monochrome":
         return np.eye(len(scene.lights))
     return scene.camera.mixing(scene.lights)
 
 
 def _channel_levels(mixing: FloatArray, levels: FloatArray) -> FloatArray:
-    """Levels (C, ...) of the channels; a light that does not reach a point adds nothing."""
+    """Return the levels (C, ...) of the channels; a light that does not reach a point adds nothing."""
     return np.asarray(np.einsum("cj,j...->c...", mixing, np.nan_to_num(levels)))
 
 

@@ -104,7 +104,7 @@ class GeometryWeights:
         )
 
     def reference(self, images: IlluminationImages) -> FloatImage:
-        """Weights (k, H, W) of the reference: binary ones, or 1 where an image is valid.
+        """Return the weights (k, H, W) of the reference: binary ones, or 1 where an image is valid.
 
         Soft weights belong to a pair of states and are given to the deformed one.
         """
@@ -115,7 +115,7 @@ class GeometryWeights:
         return np.asarray(valid * np.min(frame_weights, axis=0))
 
     def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
-        """Weights (k, H, W) of frame `index` compared with the first reference frame."""
+        """Return the weights (k, H, W) of frame `index` compared with the first reference frame."""
         state = self._state(index)
         if self.limit_deg is not None:
             return np.asarray(images.valid * self._binary(state, images, self.limit_deg))
@@ -136,14 +136,14 @@ class GeometryWeights:
         return self.states[index] if self.states else State()
 
     def _zones(self, state: State, viewed_state: State) -> Zones:
-        """Zones in a state at the material points that the grid's pixels see in another one."""
+        """Return the zones in a state at the material points that the grid's pixels see in another one."""
         if self.surface is not None:
             return zones_on_surface(self.scene, *self.surface)
         material = material_points(self.scene, viewed_state, _grid(self.scene.camera.shape))
         return predict_zones(self.scene, state, material=material)
 
     def _at_pixels(self, coarse: FloatImage, images: IlluminationImages) -> FloatImage:
-        """Values (k, h, w) on the grid at the pixels of images (k, H, W), in the order of the test's lights."""
+        """Return values (k, h, w) on the grid at the pixels of images (k, H, W), in the order of the test's lights."""
         (x_origin, y_origin), (height, width) = images.origin, images.shape
         x, y = np.meshgrid(*(np.arange(a, a + n, dtype=np.float32) for a, n in ((x_origin, width), (y_origin, height))))
         grid_coordinates = x / _STEP, y / _STEP
@@ -151,7 +151,7 @@ class GeometryWeights:
 
 
 def _grid(shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Image points (x, y) of the prediction, up to beyond the last pixel."""
+    """Return the image points (x, y) of the prediction, up to beyond the last pixel."""
     rows, columns = (np.arange(0, size + _STEP, _STEP, dtype=np.float64) for size in shape)
     x, y = np.meshgrid(columns, rows)
     return x, y
@@ -167,7 +167,7 @@ def _order(scene: Scene, lights: Sequence[str], file: Path) -> tuple[int, ...]:
 
 
 def _read_surface(path: Path, scene: Scene) -> tuple[FloatArray, FloatArray]:
-    """Points and normals on the grid, from a height map on disk."""
+    """Return the points and normals on the grid, from a height map on disk."""
     camera = scene.camera
     try:
         heights = np.load(require_regular_file(path), allow_pickle=False)
@@ -193,7 +193,7 @@ def _read_surface(path: Path, scene: Scene) -> tuple[FloatArray, FloatArray]:
 
 
 def angle_weights(deviation_deg: FloatArray, limit_deg: float = 15.0) -> FloatImage:
-    """Binary weights: 0 within `limit_deg` of the mirror direction and where the deviation is NaN, 1 elsewhere.
+    """Return binary weights: 0 within `limit_deg` of the mirror direction and where the deviation is NaN, 1 elsewhere.
 
     By default the limit is that within which the reflection corrupts the image (paper, Fig. 9).
 
@@ -208,7 +208,7 @@ def angle_weights(deviation_deg: FloatArray, limit_deg: float = 15.0) -> FloatIm
 
 
 def surface_from_heights(heights: npt.ArrayLike, scene: Scene) -> tuple[FloatArray, FloatArray]:
-    """Points and normals of a surface given as a height map over the pixels of the reference image.
+    """Return the points and normals of a surface given as a height map over the pixels of the reference image.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ class _Body(SceneSection):
         return x, y, z - float(self.parameters()[1])
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels.
+        """Return [kind, radius, half width, half height] for the kernels.
 
         Returns
         -------
@@ -78,7 +78,7 @@ class Sphere(_Body):
         return np.eye(3)
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels.
+        """Return [kind, radius, half width, half height] for the kernels.
 
         Returns
         -------
@@ -112,7 +112,7 @@ class Cylinder(_Body):
         return rotation(self.tilt_deg, (0.0, 0.0, 1.0))
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels.
+        """Return [kind, radius, half width, half height] for the kernels.
 
         Returns
         -------
@@ -146,7 +146,7 @@ class Plate(_Body):
         return rotation(self.tilt_deg[1], (1.0, 0.0, 0.0)) @ rotation(self.tilt_deg[0], (0.0, 1.0, 0.0))
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels.
+        """Return [kind, radius, half width, half height] for the kernels.
 
         Returns
         -------
@@ -205,7 +205,7 @@ class State:
         return replace(self, angle_deg=angle, translation=(x, y, z), velocity=(0.0, 0.0, 0.0), spin_deg=0.0)
 
     def pose(self, body: Body) -> tuple[FloatArray, FloatArray]:
-        """Rotation R (3, 3) and origin t (3,): camera point = R . body point + t.
+        """Return the rotation R (3, 3) and origin t (3,): camera point = R . body point + t.
 
         Parameters
         ----------

@@ -57,14 +57,14 @@ class SpecklePatch:
 
 
 def _image_fine_samples(fine: FloatArray, size: int, blur: float) -> FloatArray:
-    """Fine samples averaged over the pixels and blurred by the lens."""
+    """Return the fine samples averaged over the pixels and blurred by the lens."""
     pixel_means = fine.reshape(size, len(fine) // size, size, -1).mean(axis=(1, 3))
     line = np.exp(-2 * (np.pi * blur * np.fft.fftfreq(size)) ** 2)
     return np.asarray(np.fft.ifft2(np.fft.fft2(pixel_means) * np.outer(line, line)).real)
 
 
 def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tuple[FloatArray, FloatArray]:
-    """Cross spectra of the errors that demosaicing and unmixing leave in the lights' images.
+    """Return the cross spectra of the errors that demosaicing and unmixing leave in the lights' images.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def separate_phases(
     cfa: str,
     lights: Callable[[npt.NDArray[Floating], str], npt.NDArray[Floating]],
 ) -> npt.NDArray[Floating]:
-    """Lights separated from a state behind the four phases of a colour filter array.
+    """Return the lights separated from a state behind the four phases of a colour filter array.
 
     What is the same in all four moves with the specimen; the rest stays with the sensor.
 
@@ -148,7 +148,7 @@ def cross_spectra(fields: FloatArray, rim: int = 8) -> FloatArray:
 
 
 def cover_covariance(surface: Surface, distance: FloatArray) -> FloatArray:
-    """Covariance of the black cover (0 or 1) at two points, by their distance (mm).
+    """Return the covariance of the black cover (0 or 1) at two points, by their distance (mm).
 
     Boolean model of discs of random radius R and number density n: ``(1 - coverage)^2 (exp(n E[overlap]) - 1)``, with
     the overlap of two equal discs at that distance.
@@ -186,7 +186,7 @@ class SpeckleSpectrum:
 
     @classmethod
     def of(cls, surface: Surface, *, pixel: float, blur: float, prefilter: str, samples: int = 4) -> SpeckleSpectrum:
-        """Spectrum of a painted surface; `pixel` in mm, `blur` the lens blur in px.
+        """Return the spectrum of a painted surface; `pixel` in mm, `blur` the lens blur in px.
 
         The droplets' covariance is tabulated on so many `samples` per pixel.
         """
@@ -229,7 +229,7 @@ class SpeckleSpectrum:
         return float((self.texture * self.prefilter).mean())
 
     def contrast_score(self, element_size: float) -> float:
-        """Variance density of the right-hand side under a unit change of the texture's contrast.
+        """Return the variance density of the right-hand side under a unit change of the texture's contrast.
 
         The integral of ``phi t dt/dx = phi/2 d(t^2)/dx`` is ``-1/2 integral t^2 dphi/dx``: with the spectrum of t^2 at
         zero frequency, ``2 integral C^2`` for a Gaussian texture, and ``integral (dphi/dx)^2 = 4/h^2 integral phi^2``.
@@ -241,18 +241,18 @@ class SpeckleSpectrum:
         return np.asarray((self._gradient * self.prefilter**2 * errors).mean(axis=(-2, -1)))
 
     def residual(self, errors: FloatArray) -> FloatArray:
-        """Variance at a pixel, after the prefilter, of errors with power spectra (..., n, n)."""
+        """Return the variance at a pixel, after the prefilter, of errors with power spectra (..., n, n)."""
         return np.asarray((self.prefilter * errors).mean(axis=(-2, -1)))
 
     def gradient_product(self, cross: FloatArray) -> float:
-        """Mean product of the gradients along x, after the prefilter, of the texture and of another field.
+        """Return the mean product of the gradients along x, after the prefilter, of the texture and of another field.
 
         `cross` (n, n) is their cross spectrum.
         """
         return float(((2 * np.pi * self.frequency) ** 2 * self.prefilter * cross).mean())
 
     def score_kernel(self, reach: int) -> FloatImage:
-        """Kernel (2 reach + 1, 2 reach + 1) that filters errors, before the prefilter, into the right-hand side.
+        """Return kernel (2 reach + 1, 2 reach + 1) that filters errors, before the prefilter, into the right-hand side.
 
         The mean square of the filtered image is `score` of the spectrum of the errors.
         """

@@ -33,7 +33,7 @@ REFLECTS = 0.2
 def material_points(
     scene: Scene, state: State | None = None, pixels: tuple[FloatArray, FloatArray] | None = None
 ) -> FloatArray:
-    """Material point (mm, body axes) seen at every pixel centre of the first light's image; NaN off the body.
+    """Return material point (mm, body axes) seen at every pixel centre of the first light's image; NaN off the body.
 
     `pixels`: image points (x, y) in px, two arrays of one shape, instead of the pixel centres.
 
@@ -215,13 +215,13 @@ class Reflectance(SceneSection):
 
 
 def unit_vectors(vectors: FloatArray, axis: int = 0) -> FloatArray:
-    """Vectors of length 1 in the same directions; the components are along an axis."""
+    """Return the vectors of length 1 in the same directions; the components are along an axis."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(vectors / np.linalg.norm(vectors, axis=axis, keepdims=True))
 
 
 def macroscopic_reflectance(surface: Surface) -> Reflectance:
-    """Reflectance of a painted surface at the scale of the speckle, averaged over white and black paint.
+    """Return the reflectance of a painted surface at the scale of the speckle, averaged over white and black paint.
 
     A facet's Gaussian lobe of variance b^2 convolved with slopes of variance a^2 per axis is a Gaussian of variance
     ``a^2 + b^2`` whose peak is lower by ``b^2/(a^2 + b^2)``. Where the paints differ the lobe keeps peak and volume.
@@ -238,12 +238,12 @@ def macroscopic_reflectance(surface: Surface) -> Reflectance:
 
 
 def facet_variance(paint: Finish) -> float:
-    """Variance (rad^2, per axis) of the specular lobe of one facet."""
+    """Return the variance (rad^2, per axis) of the specular lobe of one facet."""
     return math.radians(paint.lobe_deg) ** 2
 
 
 def slope_variance(paint: Finish) -> float:
-    """Variance per axis of the slopes of the wrinkles."""
+    """Return the variance per axis of the slopes of the wrinkles."""
     return math.tan(math.radians(paint.slope_deg)) ** 2 / 2
 
 

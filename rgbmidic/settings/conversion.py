@@ -20,7 +20,7 @@ _Section = TypeVar("_Section")
 
 
 def read_table(document: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Keys and values of a section of a file; empty where the section is not there.
+    """Return the keys and values of a section of a file; empty where the section is not there.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def read_table(document: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def require_regular_file(path: Path) -> Path:
-    """The path itself, unless a pipe, a socket or a device is there: to open one may wait, and to read it never end.
+    """Return path itself, unless a pipe, a socket or a device is there: to open one may wait, and to read it never end.
 
     Every file that is read is opened as this gives it. One that is missing is left for the opening to report.
 
@@ -71,7 +71,7 @@ def require_regular_file(path: Path) -> Path:
 
 
 def read_toml(path: Path, description: str) -> dict[str, Any]:
-    """The sections of a TOML file.
+    """Return the sections of a TOML file.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ _TYPE_NAMES = {
 
 
 def convert_value(value: Any, hint: Any, key: str, base: Path | str = "") -> Any:
-    """A value converted to the type of a field.
+    """Return a value converted to the type of a field.
 
     Parameters
     ----------
@@ -185,14 +185,14 @@ def convert_value(value: Any, hint: Any, key: str, base: Path | str = "") -> Any
 
 
 def _to_python(value: Any) -> Any:
-    """Scalars and arrays of numpy as Python's, at any depth."""
+    """Return the scalars and arrays of numpy as Python's, at any depth."""
     if type(value).__module__ == "numpy":
         value = value.tolist()
     return tuple(map(_to_python, value)) if isinstance(value, list | tuple) else value
 
 
 def read_range(text: str, key: str) -> range:
-    """The whole numbers that ``"a:b"`` stands for: a and all up to b, without b.
+    """Return the whole numbers that ``"a:b"`` stands for: a and all up to b, without b.
 
     Parameters
     ----------
@@ -273,12 +273,12 @@ def to_plain(value: Any) -> Any:
 
 @cache
 def type_hints(settings: Any) -> dict[str, Any]:
-    """Types of the fields of a class of settings, which take a while to resolve."""
+    """Return the types of the fields of a class of settings, which take a while to resolve."""
     return get_type_hints(settings)
 
 
 def bounded(default: Any = MISSING, **bounds: float) -> Any:
-    """A field whose number, or every number of it, keeps the bounds `above`, `at_least`, `at_most`, `below`.
+    """Return a field whose number, or every number of it, keeps the bounds `above`, `at_least`, `at_most`, `below`.
 
     Parameters
     ----------
@@ -298,7 +298,7 @@ _BOUNDS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le
 
 
 def convert_field(entry: Field[Any], value: Any, hint: Any, key: str, base: Path | str = "") -> Any:
-    """A value in the type of a field, every number of it finite and within the field's bounds."""
+    """Return a value in the type of a field, every number of it finite and within the field's bounds."""
     value = convert_value(value, hint, key, base)
     for number in _numbers(value):
         if not math.isfinite(number):

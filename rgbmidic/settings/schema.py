@@ -328,7 +328,7 @@ class TestSettings(CheckedSettings):
         return cls(base=base, **sections)
 
     def to_mapping(self) -> dict[str, dict[str, Any]]:
-        """The settings as sections of plain values, defaults included, without `base` and what is not known.
+        """Return the settings as sections of plain values, defaults included, without `base` and what is not known.
 
         ``TestSettings.from_mapping(settings.to_mapping(), settings.base)`` gives the settings back.
 
@@ -343,7 +343,7 @@ class TestSettings(CheckedSettings):
 
 
 def section_types() -> dict[str, Any]:
-    """Names of the sections of a TEST.toml, and the classes that hold their keys."""
+    """Return the names of the sections of a TEST.toml, and the classes that hold their keys."""
     return {name: kind for name, kind in type_hints(TestSettings).items() if is_dataclass(kind)}
 
 

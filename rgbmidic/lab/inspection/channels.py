@@ -146,7 +146,7 @@ def speckle_texture(channel: Channel, inside: BoolArray, noise: NoiseModel | Non
 
 
 def _autocorrelation(contrast: FloatImage, usable: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Distances (px) up to the farthest, the mean product of samples so far apart, and how many there are."""
+    """Return distances (px) up to the farthest, the mean product of samples so far apart, and how many there are."""
     farthest = CONSTANTS.max_lag
     size = [next_fast_len(side + farthest + 1, real=True) for side in contrast.shape]
     sums, pairs = (
@@ -167,7 +167,7 @@ def _autocorrelation(contrast: FloatImage, usable: BoolArray) -> tuple[FloatArra
 
 
 def _fit_gaussians(distance: FloatArray, product: FloatArray, widths: FloatArray) -> TextureModel | None:
-    """``sum w exp(-r^2/2s^2) - c`` with w, c >= 0, fitted to the products."""
+    """Return ``sum w exp(-r^2/2s^2) - c`` with w, c >= 0, fitted to the products."""
     importance = 1 / (1 + distance)
     system = np.column_stack([np.exp(-0.5 * (distance[:, None] / widths) ** 2), -np.ones(distance.size)])
     scale = float(np.abs(product).max()) or 1.0
@@ -213,7 +213,7 @@ def _mean(channel: Channel) -> FloatImage:
 
 
 def _regression_residual(image: FloatImage, lattice: BoolArray, phase: tuple[int, int], step: int) -> FloatImage:
-    """Residual (flat) of the samples of one phase after a regression on the 5 x 5 samples around each."""
+    """Return the residual (flat) of the samples of one phase after a regression on the 5 x 5 samples around each."""
     rows, columns = np.nonzero(lattice[2:-2, 2:-2])
     in_phase = ((rows + 2) % step == phase[0]) & ((columns + 2) % step == phase[1])
     rows, columns = rows[in_phase], columns[in_phase]

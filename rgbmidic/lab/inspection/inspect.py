@@ -189,7 +189,7 @@ def inspect_frame(
     texture, local = state.texture or speckle, replace(mesh, nodes=mesh.nodes - window.origin)
 
     def expected(strength: FloatArray) -> Prediction:
-        """With the lights so many times as strong."""
+        """Predict the uncertainty with the lights so many times as strong."""
         lights = replace(contrasts, level=contrasts.level * strength[:, None, None].astype(np.float32))
         errors = draw(np.random.default_rng(seed), strength)
         return predict(local, region, lights, errors, texture=texture, prefilter=prefilter)
@@ -242,7 +242,7 @@ def inspect_frame(
 def _unexpected_green_difference(
     mosaic: LinearMosaic, lights: IlluminationImages, crosstalk: Crosstalk | None
 ) -> float:
-    """Difference of the means of the greens beyond the calibrated one, over their mean."""
+    """Return the difference of the means of the greens beyond the calibrated one, over their mean."""
     channel = sampled_channels(mosaic.cfa, mosaic.values.shape)
     with_red = int((channel[1] == 0).any())  # row
     red, blue = (float(mosaic.values[row::2][channel[row::2] == 1].mean()) for row in (with_red, 1 - with_red))
@@ -286,7 +286,7 @@ def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) ->
 
 
 def _require_shape(frames: Sequence[Frame]) -> tuple[int, int]:
-    """Rows and columns of frames that can be inspected."""
+    """Return the rows and columns of frames that can be inspected."""
     first, shapes = frames[0], {frame.values.shape for frame in frames}
     if len(shapes) > 1:
         raise InputError(f"frames of lights in succession must have one shape; given are {sorted(shapes)}")
@@ -342,7 +342,7 @@ def _light_summaries(
     prediction: Prediction,
     inside: BoolArray,
 ) -> tuple[LightSummary, ...]:
-    """Figures of each light in the region, from its contrast, its reflection index and its uncertainty alone."""
+    """Return figures of each light in the region, from its contrast, its reflection index and its uncertainty alone."""
     summaries = []
     for j, light in enumerate(images.names):
         values, valid = images.values[j][inside], images.valid[j][inside]

@@ -198,7 +198,7 @@ def predict(
             yield np.stack([change(image) for image in relative])
 
     def variance(change: Callable[[FloatImage], FloatImage]) -> FloatImage:
-        """Local mean square (k, H, W) of all errors of one state."""
+        """Return the local mean square (k, H, W) of all errors of one state."""
         total = np.zeros_like(contrast)
         for draws in errors:
             for images in filtered(draws, change):
@@ -211,7 +211,7 @@ def predict(
     pixels = PixelMap.from_mesh(mesh, region)
 
     def scores(draws: FloatImage) -> FloatArray:
-        """Score (1 + k, E) of all lights together and of each alone, between two states."""
+        """Return the score (1 + k, E) of all lights together and of each alone, between two states."""
         total = np.zeros((1 + len(precision), *precision.shape[1:]), dtype=np.float32)
         for images in filtered(draws, lambda image: np.asarray(cv2.filter2D(image, -1, kernel), dtype=np.float32)):
             images *= precision
@@ -299,12 +299,12 @@ def _add_noise(values: FloatImage, noise: NoiseModel, random: np.random.Generato
 
 
 def _smooth(images: FloatImage, inside: BoolArray, width: float) -> FloatImage:
-    """Local means of images (n, H, W) inside the region, over about an element and its neighbours."""
+    """Return the local means of images (n, H, W) inside the region, over about an element and its neighbours."""
     return np.stack([np.nan_to_num(local_mean(np.where(inside, image, np.float32(np.nan)), width)) for image in images])
 
 
 def _element_means(images: FloatImage, pixels: PixelMap) -> FloatArray:
-    """Means (n, E) of images (n, H, W) over the pixels of each element; 0 for one without pixels."""
+    """Return the means (n, E) of images (n, H, W) over the pixels of each element; 0 for one without pixels."""
     total = np.cumsum(pixels.gather(images), axis=1, dtype=np.float64)
     ends = np.pad(total, ((0, 0), (1, 0)))[:, pixels.offsets]
     return np.asarray(np.diff(ends, axis=1) / np.maximum(np.diff(pixels.offsets), 1))

@@ -37,7 +37,7 @@ def write_inspection(inspection: Inspection, out: Path, *, overwrite: bool = Fal
 
 
 def channel_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
-    """Headings and one row per camera channel."""
+    """Return the headings and one row per camera channel."""
     rows = []
     for channel in inspection.channels:
         noise = f"{channel.noise_dn:.1f}" if inspection.noise_known else f"~ {channel.noise_dn:.0f}"
@@ -47,7 +47,7 @@ def channel_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
 
 
 def light_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
-    """Headings and one row per light."""
+    """Return the headings and one row per light."""
     rows = []
     for light in inspection.lights:
         reflecting = "-" if light.reflecting is None else f"{light.reflecting:.1%}"
@@ -56,7 +56,7 @@ def light_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
 
 
 def uncertainty_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
-    """Headings and rows: all lights together, its parts, each light alone."""
+    """Return the headings and rows: all lights together, its parts, each light alone."""
     expected = inspection.prediction
     spreads = {"all lights": Spread.of(expected.std)}
     if inspection.kind == "bayer":
@@ -135,7 +135,7 @@ def _inspection_figure(inspection: Inspection) -> Figure:
 
 
 def _draw_trouble(axis: Axes, inspection: Inspection) -> None:
-    """Saturated samples, and where no light shows the texture, over the mean of the lights."""
+    """Draw the saturated samples, and where no light shows the texture, over the mean of the lights."""
     from scipy.ndimage import maximum_filter
 
     show_image(axis, np.nan_to_num(inspection.images.values).mean(axis=0), inspection.origin)
@@ -155,7 +155,7 @@ def _draw_trouble(axis: Axes, inspection: Inspection) -> None:
 
 
 def _draw_std(figure: Figure, axis: Axes, bar: Axes, inspection: Inspection) -> None:
-    """Predicted uncertainty of u and v, linear inside each element."""
+    """Draw the predicted uncertainty of u and v, linear inside each element."""
     from matplotlib.tri import Triangulation
 
     std, mesh = inspection.prediction.std, inspection.mesh
@@ -203,7 +203,7 @@ def _extent(inspection: Inspection) -> tuple[float, float, float, float]:
 
 
 def _finish(axis: Axes, inspection: Inspection, title: str) -> None:
-    """Title, pixel axes, and the outline of the region where it is not the whole frame."""
+    """Draw title, pixel axes, and the outline of the region where it is not the whole frame."""
     axis.set_title(title)
     x_low, x_high, y_high, y_low = _extent(inspection)
     if not inspection.region.all():

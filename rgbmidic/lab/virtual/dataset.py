@@ -96,7 +96,7 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: Progress | 
 
 
 def _check_output(scene: Scene, out: Path) -> None:
-    """Names of lights that can be names of folders, and an empty folder, which is made."""
+    """Require names of lights that can be names of folders, and make an empty folder."""
     for light in scene.lights:
         if not re.fullmatch(r"[A-Za-z0-9_-]+", light.name):
             raise InputError(f"a light's name becomes a folder's: letters, digits, - and _ only, not {light.name!r}")
@@ -184,7 +184,7 @@ def target_scene(scene: Scene, target: Target = "white") -> Scene:
 
 
 def single_light_frames(scene: Scene, *, count: int = 3, seed: int, target: Target = "white") -> dict[str, list[Frame]]:
-    """Frames with one light on at a time, dimmed from frame to frame.
+    """Return the frames with one light on at a time, dimmed from frame to frame.
 
     Parameters
     ----------
@@ -213,13 +213,13 @@ def single_light_frames(scene: Scene, *, count: int = 3, seed: int, target: Targ
 
 
 def dark_frames(scene: Scene, *, count: int = 3, seed: int) -> list[Frame]:
-    """Frames with all lights off."""
+    """Return the frames with all lights off."""
     darkness = np.zeros((len(scene.lights), *scene.camera.shape), dtype=np.float32)
     return _record_frames(scene, darkness, np.random.SeedSequence(seed).generate_state(count), ())
 
 
 def flat_frames(scene: Scene, *, count: int = 2, seed: int) -> list[list[Frame]]:
-    """Frames of a white card under all lights together: `count` at each of the `EXPOSURES`."""
+    """Return the frames of a white card under all lights together: `count` at each of the `EXPOSURES`."""
     images = render(target_scene(scene, "white"))
     brightest = float(np.einsum("cl,lyx->cyx", scene.camera.mixing(scene.lights), images).max())
     levels = [np.float32(fraction * scene.camera.full_scale / brightest) for fraction in EXPOSURES]
@@ -230,7 +230,7 @@ def flat_frames(scene: Scene, *, count: int = 2, seed: int) -> list[list[Frame]]
 
 
 def _check_frames(scene: Scene, images: FloatImage, *, count: int = 2, seed: int) -> dict[str, list[Frame]]:
-    """Frames of the specimen at rest, `images` (k, H, W): each light alone, all together ("all"), and "dark"."""
+    """Return frames of the specimen at rest, `images` (k, H, W): each light alone, all together ("all"), and "dark"."""
     shining_lights = {light.name: (light.name,) for light in scene.lights} | {"all": None}
     *steps, last = np.random.SeedSequence(seed).spawn(len(shining_lights) + 1)
     frames = {

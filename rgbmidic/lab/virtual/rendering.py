@@ -22,7 +22,7 @@ from rgbmidic.typing import FloatArray, FloatImage
 
 
 def rays_per_pixel(scene: Scene) -> int:
-    """Rays per pixel and direction: the camera's, or so many that the sampling pattern leaves no trace.
+    """Return how many rays per pixel and direction: the camera's, or so many that the sampling pattern leaves no trace.
 
     On a mat plate six rays per pixel of 2.2 wrinkles err by 1 DN rms of 2000. A reflection follows details finer than
     the wrinkles by the ratio of lobe to slope: twice as many rays at 6 and 4 degrees (measured; see the tests).
@@ -38,7 +38,7 @@ def rays_per_pixel(scene: Scene) -> int:
 
 
 def render(scene: Scene, state: State | None = None) -> FloatImage:
-    """Images of each light alone, without noise.
+    """Return the images of each light alone, without noise.
 
     Parameters
     ----------
@@ -63,19 +63,19 @@ def render(scene: Scene, state: State | None = None) -> FloatImage:
 
 
 def _trace(scene: Scene, state: State) -> FloatImage:
-    """One pose: lights that the lens images alike are traced together."""
+    """Trace one pose: lights that the lens images alike are traced together."""
     out = np.empty((len(scene.lights), *scene.camera.shape), dtype=np.float32)
     lenses, kinds = np.unique(scene.camera.lenses(scene.lights), axis=0, return_inverse=True)
     for number, lens in enumerate(lenses):
         indices = np.flatnonzero(kinds.ravel() == number)
-        out[indices] = _trace_together(scene, state, tuple(scene.lights[index] for index in indices), lens)
+        out[indices] = _trace_lens(scene, state, tuple(scene.lights[index] for index in indices), lens)
     camera = scene.camera
     levels = camera.full_scale * camera.exposure * camera.response(scene.lights).max(axis=0)
     out *= levels.astype(np.float32)[:, None, None]
     return out
 
 
-def _trace_together(scene: Scene, state: State, lights: tuple[Light, ...], lens: FloatArray) -> FloatImage:
+def _trace_lens(scene: Scene, state: State, lights: tuple[Light, ...], lens: FloatArray) -> FloatImage:
     camera, n = scene.camera, rays_per_pixel(scene)
     turn, origin = state.pose(scene.body)
     frame = np.concatenate([-turn.T @ origin, turn.T.ravel()])
@@ -120,7 +120,7 @@ def _aperture(blur: float, samples: int) -> tuple[int, FloatArray]:
 def _subpixel_material(
     scene: Scene, state: State, lens: FloatArray, sample_rows: tuple[int, int], pad: int
 ) -> FloatArray:
-    """Material point (count, columns, 2) of the samples in so many rows from the first; NaN off the plate."""
+    """Return material point (count, columns, 2) of the samples in so many rows from the first; NaN off the plate."""
     n, (first, count) = rays_per_pixel(scene), sample_rows
     x = (np.arange(n * (scene.camera.shape[1] + 2 * pad)) + 0.5) / n - 0.5 - pad
     y = (np.arange(first, first + count) + 0.5) / n - 0.5
@@ -132,7 +132,7 @@ def _subpixel_material(
 
 
 def paint(*, gloss: float = 1.5, lobe_deg: float = 4.0, **settings: Any) -> Surface:
-    """Black droplets (albedo 0.10) on white paint (0.80), wrinkles 25 um apart with 6 degrees rms slope.
+    """Return black droplets (albedo 0.10) on white paint (0.80), wrinkles 25 um apart with 6 degrees rms slope.
 
     `settings` are those of `Surface`.
     """

@@ -26,7 +26,7 @@ from rgbmidic.text import uncertain
 from rgbmidic_calibration.camera import estimate_lens, estimate_plane
 from rgbmidic_calibration.cli import app
 from rgbmidic_calibration.jobs import calibrate_camera
-from rgbmidic_calibration.target import Target, View, find_view, photograph, refined_corners
+from rgbmidic_calibration.target import Target, View, find_view, photograph, refine_corners
 
 
 def frame_of(image):
@@ -91,7 +91,7 @@ def test_corners_that_opencv_finds_a_pixel_off_are_mended() -> None:
     """As in OpenCV's own pictures, in which some are (benchmarks/camera.py)."""
     where = pose(8, -5, 3)
     true = imaged(TARGET.points - TARGET.points.mean(axis=0), where)
-    found = refined_corners(photo(where).astype(np.float32), TARGET.points, true + np.array([1.1, -1.3]), 4.0)
+    found = refine_corners(photo(where).astype(np.float32), TARGET.points, true + np.array([1.1, -1.3]), 4.0)
     assert np.abs(found - true).max() < 0.02
 
 

@@ -19,7 +19,14 @@ from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic_calibration.camera import estimate_lens, estimate_plane
 from rgbmidic_calibration.captures import block_means, stack_frames
 from rgbmidic_calibration.cli import app, read_limits
-from rgbmidic_calibration.verify import Limits, additivity, check_distances, leakage, noise_ratio, registration_left
+from rgbmidic_calibration.verify import (
+    Limits,
+    additivity,
+    check_distances,
+    leakage,
+    noise_ratio,
+    remaining_registration,
+)
 
 MATRIX = MATRICES[1.5]
 LIGHTS = ("red", "green", "blue")
@@ -151,10 +158,10 @@ def test_registration_left():
         name: stack_frames([expose(3000 * picture, MATRIX[:, i], rng) for _ in range(2)])
         for i, (name, picture) in enumerate(zip(LIGHTS, registered_pictures(truth, shape, 3), strict=True))
     }
-    assert all(check.value < 0.02 + 3 * check.std for check in registration_left(truth, stacks))
+    assert all(check.value < 0.02 + 3 * check.std for check in remaining_registration(truth, stacks))
     none = Registration.identity(LIGHTS, shape)
-    assert [check.value > 0.1 for check in registration_left(none, stacks)] == [True, True]
-    two = registration_left(truth, {"green": stacks["green"], "blue": stacks["blue"]})
+    assert [check.value > 0.1 for check in remaining_registration(none, stacks)] == [True, True]
+    two = remaining_registration(truth, {"green": stacks["green"], "blue": stacks["blue"]})
     assert [check.name for check in two] == ["registration of blue"]
     assert two[0].value < 0.05
 
