@@ -243,6 +243,17 @@ def read_frame(path: Path | str, **metadata: Unpack[FrameMetadata]) -> Mosaic | 
         The file is missing, damaged, truncated, already demosaiced, or contradicts a statement (both are named).
     InputError
         A stated property is not allowed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rgbmidic import read_frame
+    >>> from rgbmidic.frames import Mosaic, write_tiff
+    >>> values = np.full((4, 6), 100, dtype=np.uint16)
+    >>> write_tiff("frame.tif", Mosaic(values=values, cfa="RGGB", black_level=np.array(16.0), white_level=1023.0))
+    >>> frame = read_frame("frame.tif", cfa="RGGB", black_level=16, white_level=1023)
+    >>> frame.values.shape, frame.cfa, frame.white_level
+    ((4, 6), 'RGGB', 1023.0)
     """
     if unknown := metadata.keys() - FrameMetadata.__annotations__:
         raise TypeError(f"read_frame takes {', '.join(FrameMetadata.__annotations__)}, not {', '.join(unknown)}")

@@ -38,7 +38,7 @@ _READERS: Mapping[str, Callable[[Path], MeshContent]] = {
 
 
 def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) -> FiniteElementMesh:
-    """Read the planar part of a finite-element mesh.
+    r"""Read the planar part of a finite-element mesh.
 
     Shells and plane elements are used; if there are none, the free faces of solids. Of several planes normal to an axis
     of the file, the one with the largest area is measured; of equal ones, that with the largest coordinate. The log
@@ -63,6 +63,16 @@ def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) ->
     InputError
         The file is missing, not readable, larger than what is read or at odds with itself (a number that is stated
         twice or not at all, elements that overlap); meshio is missing; or there is no plane.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from rgbmidic import read_mesh
+    >>> text = "*NODE\n1, 0, 0\n2, 10, 0\n3, 0, 10\n*ELEMENT, TYPE=CPS3\n7, 1, 2, 3\n"
+    >>> _ = Path("plate.inp").write_text(text)
+    >>> mesh = read_mesh("plate.inp")
+    >>> mesh.element_numbers.tolist(), mesh.areas.tolist()
+    ([7], [50.0])
     """
     path = Path(path)
     if unit not in LENGTH_UNITS:

@@ -42,6 +42,19 @@ class FiniteElementMesh:
         Millimetres per unit of length of the file; multiply a displacement in `fields` by it.
     numbering : str
         Origin of the numbers, in words.
+
+    Examples
+    --------
+    >>> from rgbmidic import FiniteElementMesh
+    >>> mesh = FiniteElementMesh(
+    ...     name="plate",
+    ...     points=np.array([[0, 0], [10, 0], [10, 5], [0, 5]]),
+    ...     node_numbers=np.array([1, 2, 3, 4]),
+    ...     elements=np.array([[0, 1, 2], [0, 2, 3]]),
+    ...     element_numbers=np.array([11, 12]),
+    ... )
+    >>> mesh.areas.tolist(), mesh.overlap()
+    ([25.0, 25.0], None)
     """
 
     name: str

@@ -52,6 +52,15 @@ class Placement:
         Lens and plane; None: the image is similar to the mesh (rotated, shifted and scaled).
     pairs : ndarray, shape (n, 4)
         The pairs (x_mm, y_mm, x_px, y_px) that it was fitted to.
+
+    Examples
+    --------
+    >>> from rgbmidic import Placement
+    >>> placement = Placement.fit([(0, 0, 100, 300), (10, 0, 200, 300), (0, 20, 100, 100)])
+    >>> placement.to_px(np.array([[5.0, 5.0]])).round(6).tolist()
+    [[150.0, 250.0]]
+    >>> round(placement.mm_per_pixel, 6)
+    0.1
     """
 
     matrix: FloatArray
@@ -135,7 +144,7 @@ class Placement:
 
     @property
     def reflected(self) -> bool:
-        """Whether a counter-clockwise turn of the mesh (x right, y up) is one on the screen, where y points down."""
+        """True if a counter-clockwise turn of the mesh (x right, y up) is one on the screen, where y points down."""
         return bool(np.linalg.det(self.matrix) < 0)
 
     @property

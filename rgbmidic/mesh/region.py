@@ -32,6 +32,15 @@ class Region:
         Stated if the region is a rectangle with sides along the axes; it includes the pixels whose centres lie on it.
     origin : tuple of int
         Column and row of the first pixel of the mask in the frame.
+
+    Examples
+    --------
+    >>> from rgbmidic import Region
+    >>> region = Region.from_rectangle((10, 10, 90, 70), shape=(80, 120))
+    >>> region.width, int(region.mask.sum())
+    (61, 4941)
+    >>> int(region.without([[(20, 20), (40, 20), (40, 40)]]).mask.sum())
+    4710
     """
 
     mask: BoolArray

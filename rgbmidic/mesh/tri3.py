@@ -45,6 +45,14 @@ class Tri3Mesh:
         graded.
     is_graded : bool
         Whether the elements around one node in ten are more than twice as large as those around another one in ten.
+
+    Examples
+    --------
+    >>> from rgbmidic import Region, Tri3Mesh
+    >>> region = Region.from_rectangle((10, 10, 90, 70), shape=(80, 120))
+    >>> mesh = Tri3Mesh.from_region(region, element_size=20)
+    >>> mesh.nodes.shape, mesh.elements.shape, float(mesh.areas.sum())
+    ((20, 2), (24, 3), 4800.0)
     """
 
     nodes: FloatArray

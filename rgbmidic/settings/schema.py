@@ -275,6 +275,14 @@ class TestSettings(CheckedSettings):
         The sections of the same name.
     base
         Folder that relative paths start from.
+
+    Examples
+    --------
+    >>> from rgbmidic import TestSettings
+    >>> frames = {"path": "frames/*.tif", "kind": "monochrome"}
+    >>> settings = TestSettings.from_mapping({"frames": frames, "region": {"rectangle": [10, 10, 90, 70]}})
+    >>> settings.mesh.element_size, settings.frames.reference
+    (25.0, (0,))
     """
 
     __test__ = False
@@ -348,7 +356,7 @@ def section_types() -> dict[str, Any]:
 
 
 def read_test(path: Path | str) -> TestSettings:
-    """Read the settings of a test from a TOML file; paths in it are relative to it.
+    r"""Read the settings of a test from a TOML file; paths in it are relative to it.
 
     Parameters
     ----------
@@ -363,6 +371,16 @@ def read_test(path: Path | str) -> TestSettings:
     ------
     ConfigurationError
         The file is missing, not TOML, or has an entry that `TestSettings.from_mapping` refuses; the file is named.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from rgbmidic import read_test
+    >>> text = "[frames]\npath = 'frames/*.dng'\n[region]\nrectangle = [10, 10, 90, 70]\n[mesh]\nelement_size = 20\n"
+    >>> _ = Path("test.toml").write_text(text)
+    >>> settings = read_test("test.toml")
+    >>> settings.mesh.element_size, settings.region.rectangle
+    (20.0, (10.0, 10.0, 90.0, 70.0))
     """
     path = Path(path)
     document = read_toml(path, "settings file")

@@ -256,7 +256,7 @@ class RegionSettings(CheckedSettings):
 
     @property
     def is_stated(self) -> bool:
-        """Whether there is a rectangle, polygon or mask."""
+        """True if there is a rectangle, polygon or mask."""
         return any(getattr(self, kind) is not None for kind in ("rectangle", "polygon", "mask"))
 
 
@@ -333,6 +333,16 @@ class SolverSettings(CheckedSettings):
         The iteration stops when no node moves by more than this (px).
     max_iterations
         Iterations before the frame counts as not converged.
+
+    Examples
+    --------
+    >>> from rgbmidic import SolverSettings
+    >>> SolverSettings(fill=3).fill
+    3.0
+    >>> SolverSettings(tolerance=0)
+    Traceback (most recent call last):
+        ...
+    rgbmidic.errors.ConfigurationError: solver.tolerance must be above 0, not 0
     """
 
     section = "solver"

@@ -158,6 +158,18 @@ def inspect_frame(
         The calibration varies over frames of another size.
     RegionError
         The region is empty, outside the frame or too small for one element.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic import inspect_frame
+    >>> from rgbmidic.frames import ChannelFrame
+    >>> speckle = gaussian_filter(np.random.default_rng(0).normal(size=(1, 64, 64)), (0, 2, 2))
+    >>> frame = ChannelFrame(values=1500 + 4000 * speckle, black_level=np.zeros(1), white_level=4095.0)
+    >>> inspection = inspect_frame(frame)
+    >>> inspection.kind, inspection.channels[0].mean > 0.3, inspection.unmeasured_fraction
+    ('monochrome', True, 0.0)
     """
     frames = (frame,) if isinstance(frame, Mosaic | ChannelFrame) else tuple(frame)
     shape = _require_shape(frames)

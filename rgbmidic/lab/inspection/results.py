@@ -153,6 +153,20 @@ class Inspection:
     doubts : tuple of Check
         Lights that lie apart or show no common texture (`rgbmidic.pipeline.suitability.separation_doubts`), lamps of
         unequal strength.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic import inspect_frame
+    >>> from rgbmidic.frames import ChannelFrame
+    >>> speckle = gaussian_filter(np.random.default_rng(0).normal(size=(1, 64, 64)), (0, 2, 2))
+    >>> frame = ChannelFrame(values=1500 + 4000 * speckle, black_level=np.zeros(1), white_level=4095.0)
+    >>> inspection = inspect_frame(frame, element_size=20)
+    >>> [finding.name for finding in inspection.findings]
+    ['noise unknown']
+    >>> 5 < inspection.speckle_px < 7
+    True
     """
 
     name: str
