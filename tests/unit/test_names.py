@@ -18,7 +18,8 @@ import rgbmidic
 import rgbmidic_calibration
 
 POINTERS = """there here again now why what where who how this that it such each every both one ones other others own
-    some many few most least even alone apart together alike away beyond around under elsewhere after worse whole rest"""
+    some many few most least even alone apart together alike away beyond around under elsewhere after
+    worse whole rest"""
 """They point at something that stands elsewhere."""
 PARTICIPLES = """found known kept told asked shown seen stated used made left wanted given taken chosen tried believed
     returned learnt settled lit named drawn followed follows carried moved straightened written swinging wandering
