@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import InputError
+from rgbmidic.errors import InputError, renamed_attributes
 from rgbmidic.typing import BoolArray, FloatArray, IntArray, as_numbers
 
 ROUNDING = 1e-4
@@ -66,6 +66,9 @@ class FiniteElementMesh:
     axes: tuple[int, int] = (0, 1)
     unit_mm: float = 1.0
     numbering: str = "labels of the file"
+
+    if not TYPE_CHECKING:  # mypy would accept any name
+        __getattr__ = renamed_attributes("FiniteElementMesh", part="subset")
 
     def __post_init__(self) -> None:
         """Check the arrays, convert them to their types and order the corners."""

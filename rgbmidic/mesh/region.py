@@ -6,13 +6,13 @@ import logging
 import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import RegionError
+from rgbmidic.errors import RegionError, renamed_attributes
 from rgbmidic.typing import BoolArray, FloatArray, as_numbers
 
 logger = logging.getLogger(__name__)
@@ -46,6 +46,9 @@ class Region:
     mask: BoolArray
     rectangle: tuple[float, float, float, float] | None = None
     origin: tuple[int, int] = (0, 0)
+
+    if not TYPE_CHECKING:  # mypy would accept any name
+        __getattr__ = renamed_attributes("Region", part="crop")
 
     def __post_init__(self) -> None:
         """Check the mask."""

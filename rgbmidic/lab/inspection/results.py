@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rgbmidic.errors import renamed_attributes
 from rgbmidic.illumination.checks import Check, reported
 from rgbmidic.illumination.contrast import CONTRAST
 from rgbmidic.illumination.images import IlluminationImages
@@ -193,6 +195,9 @@ class Inspection:
     clipping: str
     repetition: str
     doubts: tuple[Check, ...]
+
+    if not TYPE_CHECKING:  # mypy would accept any name
+        __getattr__ = renamed_attributes("Inspection", hidden="lacks_contrast", unmeasured="unmeasured_fraction")
 
     @property
     def unmeasured_fraction(self) -> float:
