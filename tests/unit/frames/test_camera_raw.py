@@ -290,8 +290,8 @@ def test_damaged_header_never_gives_another_error(dng: Path, seed: int) -> None:
     try:
         read_frame(bad)
     except FrameError as error:
-        named = str(error)
-        assert "bad.dng" in named
+        message = str(error)
+        assert "bad.dng" in message
 
 
 @pytest.mark.parametrize(("black", "fill"), [(0, 0), (64, 0), (64, 64), (64, 128)])

@@ -177,9 +177,9 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path: Path, place: int, val
     tracemalloc.start()
     with pytest.raises(FrameError, match=reason) as raised:
         open_source(path, ANY).read(0)
-    most = tracemalloc.get_traced_memory()[1]
+    peak_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert most < 2**20
+    assert peak_bytes < 2**20
     assert "\n" not in str(raised.value)
     assert "f.cine" in str(raised.value)
 
@@ -189,8 +189,8 @@ def test_a_truncated_movie_is_read_up_to_its_last_whole_frame(tmp_path: Path, an
     path = tmp_path / "f.cine"
     frames = _frames(16, depth=12, count=9)
     _movie(path, frames, annotation=annotation)
-    whole, size = path.read_bytes(), 12 * 16 * 2
-    path.write_bytes(whole[: -3 * (size + 8 + len(annotation)) - 100])
+    content, size = path.read_bytes(), 12 * 16 * 2
+    path.write_bytes(content[: -3 * (size + 8 + len(annotation)) - 100])
     source = open_source(path, ANY)
     assert len(source) == 9
     for index in range(5):
@@ -200,7 +200,7 @@ def test_a_truncated_movie_is_read_up_to_its_last_whole_frame(tmp_path: Path, an
             FrameError, match=r"f\.cine: the file ends after frame 4 of 9 \(0 to 8\): truncated or still being"
         ):
             source.read(index)
-    path.write_bytes(whole)  # the rest is written: nothing of the shorter file is remembered
+    path.write_bytes(content)  # the rest is written: nothing of the shorter file is remembered
     np.testing.assert_array_equal(source.read(8).values[0], frames[8])
 
 
@@ -223,9 +223,9 @@ def test_one_frame_of_a_large_movie_is_read_at_a_time(tmp_path: Path) -> None:
     source.read(0)
     tracemalloc.start()
     assert [int(source.read(index).values[0, 0, 0]) for index in range(0, frames, 37)] == list(range(0, frames, 37))
-    most = tracemalloc.get_traced_memory()[1]
+    peak_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert most < 20 * 64 * 64 * 2
+    assert peak_bytes < 20 * 64 * 64 * 2
 
 
 def _by_ffmpeg(path: Path, pixels: str) -> Any:

@@ -185,8 +185,8 @@ def test_brackets_in_the_name_of_a_folder_are_no_pattern(tmp_path: Path, absolut
     _write(tmp_path / "run1" / "cam", ["other.tif"])
     start = str(tmp_path) + "/" if absolute else ""
     for pattern in ("run[1]/cam*/*.tif", "run[1]/cam*/a[12].tif", "run[1]/**/*.tif", "run[1]/cam*"):
-        found = list_frames(start + pattern, "elsewhere" if absolute else tmp_path)
-        assert found == (tmp_path / "run[1]/cam*/a1.tif", tmp_path / "run[1]/cam*/a2.tif")
+        files = list_frames(start + pattern, "elsewhere" if absolute else tmp_path)
+        assert files == (tmp_path / "run[1]/cam*/a1.tif", tmp_path / "run[1]/cam*/a2.tif")
 
 
 @pytest.mark.parametrize("pattern", ["*.tif", "."])
@@ -441,9 +441,9 @@ def test_the_frames_of_all_files_are_counted_once(tmp_path: Path) -> None:
 def test_a_series_goes_to_another_process_and_reads_the_same(tmp_path: Path) -> None:
     _write(tmp_path, ["f1.tif", "f2.tif"])
     series = open_series(FrameSettings(path=("*.tif",), cfa="RGGB"), tmp_path)
-    other = pickle.loads(pickle.dumps(series))
-    assert other == series
-    np.testing.assert_array_equal(other.read(1)[0].values, series.read(1)[0].values)
+    unpickled = pickle.loads(pickle.dumps(series))
+    assert unpickled == series
+    np.testing.assert_array_equal(unpickled.read(1)[0].values, series.read(1)[0].values)
 
 
 def test_a_file_is_hashed_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

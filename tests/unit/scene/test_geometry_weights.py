@@ -60,8 +60,8 @@ def test_soft_weights_are_low_where_a_light_reflects_and_the_motion_changes_it(p
     assert weights.max() <= 1
     np.testing.assert_array_equal(found.reference(IMAGES), 1)
     scene = read_scene(tmp_path / "scene.toml").scene
-    seen = material_points(scene, State(angle_deg=6.0))
-    before, after = (predict_zones(scene, State(angle_deg=angle), material=seen).fraction for angle in (0.0, 6.0))
+    material = material_points(scene, State(angle_deg=6.0))
+    before, after = (predict_zones(scene, State(angle_deg=angle), material=material).fraction for angle in (0.0, 6.0))
     for light in (0, 1):
         changed, calm = abs(after - before)[light] > 0.2, np.maximum(after, before)[light] < 0.02
         assert changed.mean() > 0.05
@@ -80,9 +80,9 @@ def test_binary_weights_are_those_of_the_angle_at_every_pixel(prepare, tmp_path)
 
 
 def test_the_reference_excludes_what_any_of_its_frames_excludes(prepare):
-    found = prepare(limit_deg=15.0, reference=[0, 2])
-    both = found.reference(IMAGES)
-    np.testing.assert_array_equal(both, np.minimum(found.deformed(IMAGES, 0), found.deformed(IMAGES, 2)))
+    weights = prepare(limit_deg=15.0, reference=[0, 2])
+    both = weights.reference(IMAGES)
+    np.testing.assert_array_equal(both, np.minimum(weights.deformed(IMAGES, 0), weights.deformed(IMAGES, 2)))
 
 
 @pytest.mark.parametrize("limit_deg", [None, 15.0])
@@ -125,8 +125,8 @@ def test_without_states_every_frame_is_the_body_at_rest_and_the_reflections_coun
 
 def test_weights_by_geometry_can_be_pickled(prepare):
     weights = prepare()
-    again = pickle.loads(pickle.dumps(weights))
-    np.testing.assert_array_equal(again.deformed(IMAGES, 1), weights.deformed(IMAGES, 1))
+    unpickled = pickle.loads(pickle.dumps(weights))
+    np.testing.assert_array_equal(unpickled.deformed(IMAGES, 1), weights.deformed(IMAGES, 1))
 
 
 def test_beside_the_body_nothing_is_seen(prepare):

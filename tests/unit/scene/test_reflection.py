@@ -35,16 +35,16 @@ def reflection(points, normals, lamps, paint: Finish = PAINT) -> Zones:
 def test_a_lamp_in_the_mirror_direction_does_not_deviate():
     scene = plate_scene(tilt_deg=(8.0, -3.0))
     points, normals = points_and_normals(scene, np.zeros((3, 1)))
-    found = reflection(points, normals, [scene.mirror_position(450.0)])
-    np.testing.assert_allclose(found.deviation_deg, 0, atol=1e-5)
-    np.testing.assert_allclose(found.slopes, 0, atol=1e-7)
+    result = reflection(points, normals, [scene.mirror_position(450.0)])
+    np.testing.assert_allclose(result.deviation_deg, 0, atol=1e-5)
+    np.testing.assert_allclose(result.slopes, 0, atol=1e-7)
 
 
 def test_the_light_turns_twice_as_far_as_the_half_way_vector():
     angles = np.array([4.0, 15.0, 40.0])
-    found = reflection(POINT[:, None], NORMAL[:, None], [lamp_at(angle) for angle in angles])
-    np.testing.assert_allclose(found.deviation_deg[:, 0], angles, atol=1e-9)
-    half = np.degrees(np.arctan(np.linalg.norm(found.slopes[:, :, 0], axis=1)))
+    result = reflection(POINT[:, None], NORMAL[:, None], [lamp_at(angle) for angle in angles])
+    np.testing.assert_allclose(result.deviation_deg[:, 0], angles, atol=1e-9)
+    half = np.degrees(np.arctan(np.linalg.norm(result.slopes[:, :, 0], axis=1)))
     np.testing.assert_allclose(half, angles / 2, atol=1e-9)
 
 
