@@ -4,10 +4,10 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window, cfa_ch
 from rgbmidic.frames.formats import FrameFormat, frame_formats, open_source, read_frame
 from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.frames.masks import read_mask
+from rgbmidic.frames.metadata import StoredFrame
 from rgbmidic.frames.names import list_frames
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.frames.source import FrameSource, MovieSource, file_fingerprint, file_hash
-from rgbmidic.frames.stored import StoredFrame
 
 __all__ = [
     "ChannelFrame",

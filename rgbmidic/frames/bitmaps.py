@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic.errors import FrameError
+from rgbmidic.frames.metadata import EvenFrames, StoredFrame, check_size, damaged_file
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import EvenFrames, StoredFrame, check_size, damaged_file
 
 _PGM = re.compile(rb"P5(?:\s|#[^\n]*\n)+([0-9]{1,9})(?:\s|#[^\n]*\n)+([0-9]{1,9})(?:\s|#[^\n]*\n)+([0-9]{1,5})\s")
 _BMP = struct.Struct("<2s8x2I2i2HI12xI4x")

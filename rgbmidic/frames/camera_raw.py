@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
+from rgbmidic.frames.metadata import BROKEN_JPEG, StoredFrame, captured_stderr, check_size, damaged_file
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import BROKEN_JPEG, StoredFrame, captured_stderr, check_size, damaged_file
 from rgbmidic.frames.tiff_pages import Tag, has_uncompressed_data, missing_data, tag, tiff_pages
 from rgbmidic.settings import BAYER_PATTERNS, FrameKind, require_regular_file
 from rgbmidic.typing import AnyArray, FloatArray
@@ -39,7 +39,7 @@ _CAMERA_HEADERS = (
 )
 _CR3_HEADER = b"ftypcrx "
 _HARMLESS_JPEG = ("Invalid SOS parameters", "Unknown Adobe color transform code", "Warning: unknown JFIF revision")
-"""How libjpeg's warnings begin of headers that it can read all the same."""
+"""Beginnings of libjpeg's warnings of headers that it can read all the same."""
 
 _MALLOPT = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
 """Sets what allocated memory is filled with; only glibc has it."""

@@ -21,8 +21,8 @@ import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import SECOND, Recording
+from rgbmidic.frames.metadata import MovieHeader, StoredFrame, check_size, damaged_file, truncated_file, unpack_bits
 from rgbmidic.frames.source import MovieSource, cache_by_file
-from rgbmidic.frames.stored import MovieHeader, StoredFrame, check_size, damaged_file, truncated_file, unpack_bits
 from rgbmidic.settings import FrameKind
 from rgbmidic.typing import AnyArray
 
@@ -49,7 +49,7 @@ _MARK, _LENGTH = 140, 142
 _TIMES, _EXPOSURES = 1002, 1003
 _STAMPS = {_TIMES: "<u8", _EXPOSURES: "<u4"}
 _MAX_BLOCKS, _MAX_FRAMES = 100, 2**25
-"""What no file of a camera has: Phantom's own have five blocks, and the largest memories hold some million frames."""
+"""Limits beyond any file of a camera: Phantom's own have five blocks, the largest memories some million frames."""
 
 _LEAD, _UNINTERPOLATED = 1, 2
 _PACKED_BITS = {256: 10, 1024: 12}

@@ -16,10 +16,10 @@ from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera
 from rgbmidic.frames.cine import CINE_ENDINGS, CineFile
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import HeaderlessFile, PngFile, is_headerless
+from rgbmidic.frames.metadata import CameraMetadata
 from rgbmidic.frames.movies import MRAW_ENDINGS, MrawFile, SeqFile
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile, split_dataset
-from rgbmidic.frames.stored import CameraMetadata
 from rgbmidic.frames.tiff import TIFF_ENDINGS, TiffFile, TiffStack, is_tiff_stack
 from rgbmidic.frames.tiff_pages import is_dng
 from rgbmidic.settings import FrameKind, FrameSettings
@@ -43,7 +43,7 @@ class FrameFormat:
         Whether a file, with what the user states of it, is read as this format; it raises nothing for any file. None:
         by its ending.
     source
-        Its reader; built with `path` and `stated`, it reads nothing yet.
+        Its reader; built with `path` and `user_metadata`, it reads nothing yet.
     """
 
     name: str

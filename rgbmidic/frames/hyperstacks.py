@@ -22,7 +22,7 @@ from rgbmidic.frames.data import SECOND, Integers, even_times, parse_fraction
 
 _UNITS = {"s": 1, "sec": 1, "seconds": 1}
 _UNITS |= {"ms": 10**3, "msec": 10**3, "µs": 10**6, "us": 10**6, "usec": 10**6, "ns": SECOND}
-"""Of time, by how many make a second."""
+"""Units of time, by their number in a second."""
 _Plane = tuple[int, int, int]
 
 

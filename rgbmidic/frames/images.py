@@ -18,13 +18,13 @@ import numpy as np
 
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
+from rgbmidic.frames.metadata import BROKEN_JPEG, EvenFrames, StoredFrame, captured_stderr, check_size, damaged_file
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import BROKEN_JPEG, EvenFrames, StoredFrame, captured_stderr, check_size, damaged_file
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import AnyArray
 
 _LOG_PREFIX = re.compile(r"^\[ *(ERROR|WARN)\S*\] global \S+ \S+ ")
-"""Where in OpenCV a line of its log comes from."""
+"""Origin of a line in OpenCV's log."""
 
 
 def decode(content: bytes, path: Path) -> AnyArray:

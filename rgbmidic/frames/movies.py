@@ -26,8 +26,8 @@ import numpy as np
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import SECOND, Integers, Recording, even_times, parse_fraction
+from rgbmidic.frames.metadata import EvenFrames, StoredFrame, damaged_file
 from rgbmidic.frames.source import MovieSource, cache_by_file
-from rgbmidic.frames.stored import EvenFrames, StoredFrame, damaged_file
 
 logger = logging.getLogger(__name__)
 

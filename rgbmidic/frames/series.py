@@ -22,9 +22,9 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.formats import frame_formats, open_source
 from rgbmidic.frames.images import write_tiff
+from rgbmidic.frames.metadata import CameraMetadata
 from rgbmidic.frames.names import NamedFiles, list_frames
 from rgbmidic.frames.source import FrameSource, file_fingerprint
-from rgbmidic.frames.stored import CameraMetadata
 from rgbmidic.frames.tiff import TIFF_ENDINGS
 from rgbmidic.settings import FrameSettings
 

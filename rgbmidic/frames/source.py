@@ -13,7 +13,7 @@ from typing import ClassVar, TypeVar
 
 from rgbmidic.errors import FrameError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.stored import CameraMetadata, MovieHeader, StoredFrame, damaged_file, raw_frame
+from rgbmidic.frames.metadata import CameraMetadata, MovieHeader, StoredFrame, damaged_file, raw_frame
 from rgbmidic.settings import FrameSettings, require_regular_file
 
 _T = TypeVar("_T")

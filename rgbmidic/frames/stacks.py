@@ -18,8 +18,7 @@ import numpy as np
 
 from rgbmidic.errors import FrameError, first_line, legible
 from rgbmidic.frames.data import Integers, Recording, even_times
-from rgbmidic.frames.source import MovieSource, cache_by_file
-from rgbmidic.frames.stored import (
+from rgbmidic.frames.metadata import (
     MAX_BYTES,
     MAX_FRAMES,
     EvenFrames,
@@ -31,6 +30,7 @@ from rgbmidic.frames.stored import (
     library_faults,
     truncated_file,
 )
+from rgbmidic.frames.source import MovieSource, cache_by_file
 
 if TYPE_CHECKING:
     import h5py

@@ -20,8 +20,7 @@ from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import Integers, Recording
 from rgbmidic.frames.hyperstacks import Hyperstack
 from rgbmidic.frames.images import decode
-from rgbmidic.frames.source import FrameSource, MovieSource, cache_by_file
-from rgbmidic.frames.stored import (
+from rgbmidic.frames.metadata import (
     CHECKED_BYTES,
     EvenFrames,
     MovieHeader,
@@ -31,6 +30,7 @@ from rgbmidic.frames.stored import (
     damaged_file,
     unpack_bits,
 )
+from rgbmidic.frames.source import FrameSource, MovieSource, cache_by_file
 from rgbmidic.frames.tiff_pages import (
     UNCOMPRESSED,
     PageList,

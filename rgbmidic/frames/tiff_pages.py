@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.stored import (
+from rgbmidic.frames.metadata import (
     damaged_file,
     library_faults,
 )
@@ -30,7 +30,7 @@ logging.getLogger("tifffile").propagate = False
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 _HEADERS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-"""Of TIFF and BigTIFF; several cameras' raws begin with II or MM, too, and are none."""
+"""First bytes of TIFF and BigTIFF; several cameras' raws begin with II or MM, too, and are none."""
 _FIRST_OFFSET = 8
 """Bytes of the header of a TIFF file, the shortest."""
 UNCOMPRESSED = 1

@@ -69,7 +69,7 @@ _VIEWS = (
 )
 """Turns of the chessboard about x, y and z, degrees, and its place beside the axis, mm."""
 _WAVES = 36
-"""Of the speckle: a sum of cosines whose contrast is then cut off."""
+"""Waves of the speckle: a sum of cosines whose contrast is then cut off."""
 _PLATE_SETTINGS = """\
 # A flat specimen tilted by 5 degrees behind a lens that distorts by 2 % in the corners.
 [frames]

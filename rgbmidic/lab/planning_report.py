@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FILES = ("plan.json", "plan.png")
-"""What `write_plan` writes."""
+"""Files that `write_plan` writes."""
 
 
 def write_plan(
@@ -79,12 +79,12 @@ ZONE_WORDS = {
     "one, none": "a single light is clean, no light is",
     "clipped": "white paint saturates a channel",
 }
-"""What the headings of `zone_rows` mean."""
+"""Meaning of the headings of `zone_rows`."""
 UNCERTAINTY_WORDS = {
     "random": "camera noise, what demosaicing leaves of the mosaic, reflections that change",
     "feigned": "droplets whose lit sides change look as if they moved",
 }
-"""What the headings of `uncertainty_rows` mean."""
+"""Meaning of the headings of `uncertainty_rows`."""
 
 
 def _labelled_states(plan: LampPlan) -> Iterator[tuple[str, dict[str, Any]]]:

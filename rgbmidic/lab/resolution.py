@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FILES = ("resolution.csv", "resolution.json", "resolution.png")
-"""What `write_study` writes."""
+"""Files that `write_study` writes."""
 
 
 def cut_offs(gauges: Sequence[float]) -> tuple[float, float, FloatArray]:
@@ -127,13 +127,13 @@ SIZE_WORDS = {
     "cut-off": "period of a wave of which a tenth is lost, displacement / strain at the nodes, px",
     "CPU s": "of the solve of a frame",
 }
-"""What the headings of `size_rows` mean."""
+"""Meaning of the headings of `size_rows`."""
 GAUGE_WORDS = {
     "resolution": "noise of the strain, 1e-6",
     "largest": "99 % of the strains in the key frame are smaller, 1e-6: longer gauges level peaks",
     "cut-off": "period of a wave of which a tenth of the strain is lost, px",
 }
-"""What the headings of `gauge_rows` mean."""
+"""Meaning of the headings of `gauge_rows`."""
 
 
 def size_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:

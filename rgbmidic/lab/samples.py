@@ -19,7 +19,7 @@ from rgbmidic.errors import InputError, optional
 from rgbmidic.results.files import writing
 
 ADDRESS = "https://raw.githubusercontent.com"
-"""Where GitHub gives a file of a repository at a commit."""
+"""Address at which GitHub gives a file of a repository at a commit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

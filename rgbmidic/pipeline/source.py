@@ -20,8 +20,8 @@ import numpy as np
 from rgbmidic.correlation.images import unmasked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RgbmidicError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
+from rgbmidic.frames.metadata import CameraMetadata, StoredFrame, raw_frame
 from rgbmidic.frames.series import FrameSeries, open_series, selected_frames
-from rgbmidic.frames.stored import CameraMetadata, StoredFrame, raw_frame
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.pipeline.objects import class_name, describe

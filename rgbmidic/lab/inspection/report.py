@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FILES = ("inspection.json", "inspection.png")
-"""What `write_inspection` writes."""
+"""Files that `write_inspection` writes."""
 _UNKNOWN_COLOUR = "#e8590c"
 """Colour of what is not known of a light's image."""
 

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from rgbmidic.frames.stored import captured_stderr
+from rgbmidic.frames.metadata import captured_stderr
 
 
 def test_lines_are_caught_by_their_start_and_the_others_pass(capfd: pytest.CaptureFixture[str]) -> None:

@@ -17,8 +17,8 @@ from real_files import RealData, count
 from rgbmidic.errors import FrameError
 from rgbmidic.frames import FrameSeries, Mosaic, open_series, open_source
 from rgbmidic.frames import movies as mraw
+from rgbmidic.frames.metadata import unpack_bits
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import unpack_bits
 from rgbmidic.settings import FrameSettings
 
 SHAPE = (12, 16)

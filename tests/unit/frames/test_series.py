@@ -24,7 +24,7 @@ from rgbmidic.frames import FrameSeries, FrameSource, file_hash, formats, list_f
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.frames.formats import FrameFormat
 from rgbmidic.frames.images import write_dng, write_tiff
-from rgbmidic.frames.stored import StoredFrame
+from rgbmidic.frames.metadata import StoredFrame
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.settings import FrameSettings, TestSettings
 

@@ -133,7 +133,7 @@ def unpack_bits(packed: bytes | AnyArray, bits: int) -> AnyArray:
 
 
 BROKEN_JPEG = ("Corrupt JPEG data", "Premature end of JPEG file", "Inconsistent progression sequence")
-"""How libjpeg's warnings begin (JWRN in its jerror.h) after which it goes on with invented samples."""
+"""Beginnings of libjpeg's warnings (JWRN in its jerror.h) after which it goes on with invented samples."""
 
 _LOCK = threading.Lock()
 
