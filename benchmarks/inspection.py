@@ -58,7 +58,9 @@ def shot(images: FloatImage, case: Case, kind: str, seed: int) -> tuple[list[Fra
     """Raw frames of a state and its illumination images."""
     camera, lights = camera_of(case, kind), case.scene.lights
     if kind == "monochrome":
-        frames = [record(images, camera, lights, seed=seed * 9 + n, on=(one.name,)) for n, one in enumerate(lights)]
+        frames = [
+            record(images, camera, lights, seed=seed * 9 + n, shining=(one.name,)) for n, one in enumerate(lights)
+        ]
         return frames, IlluminationImages.in_succession([linearise(f, camera.noise) for f in frames])
     frame = record(images, camera, lights, seed=seed)
     linear, crosstalk = linearise(frame, camera.noise), camera.true_crosstalk(lights)

@@ -20,7 +20,7 @@ from rgbmidic import correlate
 from rgbmidic.fields import at_nodes, at_pixels
 from rgbmidic.lab.virtual import Polarisers, Scene, record, render, sphere_scene, truth, turned
 from rgbmidic.lab.virtual.dataset import true_calibration
-from rgbmidic.lab.virtual.rendering import samples_needed
+from rgbmidic.lab.virtual.rendering import rays_per_pixel
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import Separation
 from rgbmidic.scene.camera import PIXEL
@@ -92,7 +92,7 @@ def shots(paint: str, angle: float, seed: int) -> Shots:
     scene, changes = sphere_scene(size=SIZE, seed=seed, droplet=4.2 * PIXEL), dict(PAINTS[paint])
     scene = replace(scene, surface=replace(scene.surface, dome=changes.pop("dome", 0.0)))
     scene = with_finish(scene, **changes)
-    scene = replace(scene, camera=replace(scene.camera, samples=samples_needed(scene)))
+    scene = replace(scene, camera=replace(scene.camera, samples=rays_per_pixel(scene)))
     states, mat = (None, turned(angle)), with_finish(scene, gloss=0.0)
     seen, diffuse = ([render(one, state) for state in states] for one in (scene, mat))
     return Shots(scene, (seen[0], seen[1]), (diffuse[0], diffuse[1]), truth(scene, states[1]))

@@ -178,7 +178,7 @@ def _measured(plate: HoledPlate, moving: int | None) -> Row:
     renderer, region = _Renderer(plate), plate.region()
     frames = [(renderer.mosaic(number),) for number in range(plate.rest + (moving or plate.moving))]
     images, separation = reference_images(
-        Separation(calibration=calibration), frames[: plate.rest], Window.whole(frames[0][0].values.shape[-2:])
+        Separation(calibration=calibration), frames[: plate.rest], Window.of_frame(frames[0][0].values.shape[-2:])
     )
     mesh = Tri3Mesh.from_region(region, ELEMENT_SIZE)
     reference = Reference.prepare(correlated(images), region, mesh=mesh, prefilter=solver.prefilter)

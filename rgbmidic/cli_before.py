@@ -125,7 +125,7 @@ def plan(
 
     check_folder(out, planning.FILES, overwrite=overwrite)
     made = make_plan(read_scene(scene))
-    motion = planning.out_of_plane(made, distance)
+    motion = planning.out_of_plane_error(made, distance)
     proposals = {"colours exchanged": propose_colours(made), "lamps moved": propose_lamps(made)}
     planning.write_plan(made, proposals, out, distance=distance, overwrite=overwrite)
     title = "fraction of the field where lights reflect, all of them do, and only one or none is clean"
@@ -158,12 +158,12 @@ def frames(
     """List the properties of raw frames as read: number, size, levels, times, missing frames."""
     from json import dumps
 
-    from rgbmidic.frames import known_formats
+    from rgbmidic.frames import frame_formats
     from rgbmidic.frames.series import describe, description_text, save_frame
     from rgbmidic.settings import FrameSettings
 
     if formats:
-        for format_ in known_formats():
+        for format_ in frame_formats():
             print(f"{format_.name}: {' '.join((*format_.endings, *format_.movies)) or 'by content'}")
         return
     if not path:

@@ -6,10 +6,10 @@ Every message says what is wrong, what is allowed and what was given, and names 
 import errno
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from typing import Any
+from typing import Any, NoReturn
 
 _LONG_WORD, _LONGEST = re.compile(r"\S{1000,}"), 4000
 """Characters that no name of a file or key has (Linux allows 255 for a name), and a screenful of them."""
@@ -103,3 +103,13 @@ def optional(module: str, extra: str) -> Any:
         if (error.name or "").startswith("rgbmidic"):
             raise
         raise InputError(f'this needs the package {error.name}: pip install "rgbmidic[{extra}]"') from None
+
+
+def renamed_attributes(owner: str, **new_names: str) -> Callable[[Any, str], NoReturn]:
+    """Return a `__getattr__` for the class `owner` whose error answers an old name with the new one."""
+
+    def report_new_name(_: Any, name: str) -> NoReturn:
+        reason = f"is now {owner}.{new_names[name]}" if name in new_names else "does not exist"
+        raise AttributeError(f"{owner}.{name} {reason}")
+
+    return report_new_name

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from renders import kept_renders, new_renders
 
 from rgbmidic import report
-from rgbmidic.lab.demo import kernels_compiled_meanwhile
+from rgbmidic.lab.demo import compile_kernels_in_background
 
 THREADS = ("RGBMIDIC_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
@@ -32,7 +32,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Let the processes of the run share cores, kernels and renders; exchange the noise where an option asks for it."""
     if getattr(config.option, "numprocesses", None):
         os.environ |= {name: os.environ.get(name, "1") for name in THREADS}
-        with nullcontext() if config.option.collectonly else kernels_compiled_meanwhile():
+        with nullcontext() if config.option.collectonly else compile_kernels_in_background():
             pass
     stack = ExitStack()
     stack.enter_context(kept_renders())

@@ -163,10 +163,10 @@ def read_all(path: Path, stated: FrameSettings) -> tuple[int, list[str]]:
     read, told = 0, []
     try:
         series = open_series(replace(stated, path=(str(path),)))
-        (rows, columns), _ = series.shape, (series.recording.lost, series.fingerprint())
+        (rows, columns), _ = series.shape, (series.recording.n_lost, series.fingerprint())
     except RgbmidicError as error:
         return 0, [str(error)]
-    window = Window.around(np.array([[columns // 2, rows // 2]]), min(rows, columns) // 8, (rows, columns))
+    window = Window.around_points(np.array([[columns // 2, rows // 2]]), min(rows, columns) // 8, (rows, columns))
     for index in range(min(len(series), MOST_FRAMES)):
         whole, part = _read(series, index), _read(series, index, window)
         if isinstance(whole, str):
@@ -174,7 +174,7 @@ def read_all(path: Path, stated: FrameSettings) -> tuple[int, list[str]]:
             continue
         assert not isinstance(part, str), f"of a frame that can be read no part can: {part}"
         assert whole.values.shape[-2:] == (rows, columns), f"{whole.values.shape} for {rows} x {columns}"
-        inside = window.part_of(Window.whole((rows, columns)))
+        inside = window.slices_in(Window.of_frame((rows, columns)))
         np.testing.assert_array_equal(part.values, whole.values[(..., *inside)])
         assert series.name(index)
         assert series.inputs(index, window)

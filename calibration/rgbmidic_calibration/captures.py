@@ -23,7 +23,7 @@ import numpy.typing as npt
 import rgbmidic
 from rgbmidic.errors import CalibrationError, ConfigurationError, FrameError
 from rgbmidic.frames import ChannelFrame, FrameSeries, FrameSource, Mosaic, open_series
-from rgbmidic.frames.data import cfa_channels, planes_of
+from rgbmidic.frames.data import cfa_channels, colour_planes
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import saturation_pile, unevenness
 from rgbmidic.settings import FrameSettings
@@ -40,7 +40,7 @@ class CaptureFiles:
         ``"dark"``, ``"light red"`` ...: for messages and the provenance.
     series
         Their frames.
-    stated
+    user_metadata
         What the user stated about them.
     exposure
         Exposure time of all of them, any unit; None: not stated.
@@ -48,12 +48,14 @@ class CaptureFiles:
 
     role: str
     series: FrameSeries
-    stated: FrameSettings
+    user_metadata: FrameSettings
     exposure: float | None = None
 
     @classmethod
-    def find(cls, role: str, pattern: str, stated: FrameSettings, calibration: Calibration | None = None) -> Self:
-        """Files that a pattern or folder names; `stated` is what the user states of them (its path is not used).
+    def find(
+        cls, role: str, pattern: str, user_metadata: FrameSettings, calibration: Calibration | None = None
+    ) -> Self:
+        """Files that a pattern or folder names; `user_metadata` is what the user states of them (its path is not used).
 
         What neither the files nor the user state comes from the `calibration`, which must agree with both.
 
@@ -62,14 +64,16 @@ class CaptureFiles:
         CalibrationError
             No file matches, or the files have different sizes.
         """
-        settings = replace(stated, path=(pattern,))
+        settings = replace(user_metadata, path=(pattern,))
         try:
-            return cls(role=role, series=open_series(settings, camera=calibration, in_order=False), stated=settings)
+            return cls(
+                role=role, series=open_series(settings, camera=calibration, in_order=False), user_metadata=settings
+            )
         except FrameError as error:
             raise CalibrationError(f"{role}: {error}") from None
 
     def by_folder(self) -> list[CaptureFiles]:
-        """The same flat frames in one group per folder."""
+        """Return the same flat frames in one group per folder."""
         groups: dict[Path, list[FrameSource]] = {}
         for source in self.series.lights[0]:
             groups.setdefault(source.path.parent, []).append(source)
@@ -79,17 +83,17 @@ class CaptureFiles:
         ]
 
     def frames(self) -> Iterator[tuple[str, Mosaic | ChannelFrame]]:
-        """Name and frame, one after the other."""
+        """Return the name and frame, one after the other."""
         return ((self.series.name(index), self.series.read(index)[0]) for index in range(len(self.series)))
 
     def stack(self) -> TemporalStack:
-        """Mean and variance of the frames of one exposure; dark frames do not drift."""
+        """Return the mean and variance of the frames of one exposure; dark frames do not drift."""
         dark, frames = self.role == "dark", (frame for _, frame in self.frames())
         name = "the dark frames" if dark else self.role
         return stack_frames(frames, exposure=self.exposure, drifts=not dark, name=name)
 
     def means(self, block: int = 16) -> list[BlockMeans]:
-        """Block averages of every frame."""
+        """Return the block averages of every frame."""
         return [block_means(frame, block=block, name=name) for name, frame in self.frames()]
 
     @property
@@ -99,14 +103,14 @@ class CaptureFiles:
 
 
 def provenance(command: str, groups: Sequence[CaptureFiles], details: Mapping[str, Any]) -> dict[str, Any]:
-    """Where a calibration comes from: command, date, version, what was stated, input files, and `details`."""
+    """Return the origin of a calibration: command, date, version, stated metadata, input files, and `details`."""
     names = ("kind", "cfa", "black_level", "white_level", "shape", "dtype")
-    stated = {name: getattr(group.stated, name) for group in groups[:1] for name in names}
+    metadata_values = {name: getattr(group.user_metadata, name) for group in groups[:1] for name in names}
     return {
         "command": f"rgbmidic-calibrate {command}",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "version": rgbmidic.__version__,
-        "stated": {name: value for name, value in stated.items() if value is not None},
+        "stated": {name: value for name, value in metadata_values.items() if value is not None},
         "inputs": [
             {"role": group.role, "file": path, "sha256": fingerprint}
             for group in groups
@@ -126,23 +130,23 @@ class Captures:
         With one light on, by its name.
     dark
         With every lamp off; None: there are none.
-    together
+    simultaneous
         With several lights on, by their names joined by ``+``.
     """
 
     lights: Mapping[str, CaptureFiles]
     dark: CaptureFiles | None
-    together: Mapping[str, CaptureFiles]
+    simultaneous: Mapping[str, CaptureFiles]
 
     @classmethod
     def find(
         cls,
         lights: Mapping[str, str],
         dark: str | None,
-        stated: FrameSettings,
+        user_metadata: FrameSettings,
         *,
         calibration: Calibration | None = None,
-        together: Mapping[str, str] | None = None,
+        simultaneous: Mapping[str, str] | None = None,
     ) -> Captures:
         """Find the files of patterns, given by the names of the lights.
 
@@ -153,7 +157,7 @@ class Captures:
         CalibrationError
             As in `CaptureFiles.find`.
         """
-        for names in together or ():
+        for names in simultaneous or ():
             if missing := [name for name in names.split("+") if name not in lights]:
                 raise ConfigurationError(
                     f"--together {names} needs the single captures of {', '.join(missing)} too (--light)"
@@ -161,28 +165,30 @@ class Captures:
             if "+" not in names:
                 raise ConfigurationError(f"--together takes NAME+NAME=FILES, at least two lights, not {names}")
 
-        def found(role: str, pattern: str) -> CaptureFiles:
-            return CaptureFiles.find(role, pattern, stated, calibration)
+        def find_files(role: str, pattern: str) -> CaptureFiles:
+            return CaptureFiles.find(role, pattern, user_metadata, calibration)
 
         return cls(
-            lights={name: found(f"light {name}", pattern) for name, pattern in lights.items()},
-            dark=found("dark", dark) if dark else None,
-            together={names: found(f"lights {names}", pattern) for names, pattern in (together or {}).items()},
+            lights={name: find_files(f"light {name}", pattern) for name, pattern in lights.items()},
+            dark=find_files("dark", dark) if dark else None,
+            simultaneous={
+                names: find_files(f"lights {names}", pattern) for names, pattern in (simultaneous or {}).items()
+            },
         )
 
     @property
     def groups(self) -> tuple[CaptureFiles, ...]:
         """The captures of each light, of lights together, and the dark frames."""
-        return *self.lights.values(), *self.together.values(), *([self.dark] if self.dark else [])
+        return *self.lights.values(), *self.simultaneous.values(), *([self.dark] if self.dark else [])
 
     def stacks(self) -> tuple[dict[str, TemporalStack], TemporalStack | None]:
-        """Mean and variance of the captures of every light by its name, and of the dark frames."""
+        """Return the mean and variance of the captures of every light by its name, and of the dark frames."""
         return {name: files.stack() for name, files in self.lights.items()}, self.dark.stack() if self.dark else None
 
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """How a camera samples its frames.
+    """Sampling of a camera's frames.
 
     Attributes
     ----------
@@ -212,8 +218,8 @@ class Sampling:
 
     @classmethod
     def of(cls, frame: Mosaic | ChannelFrame) -> Sampling:
-        """How the camera of a frame samples."""
-        names, _, black = planes_of(frame)
+        """Return the sampling of a frame's camera."""
+        names, _, black = colour_planes(frame)
         origins, step = ((0, 0),) * len(names), 1
         if isinstance(frame, Mosaic):
             order = np.argsort(cfa_channels(frame.cfa).ravel(), kind="stable")
@@ -251,9 +257,9 @@ class TemporalStack:
         Mean of every frame and plane above the stated black level (DN).
     zeros : float
         Largest fraction of a plane's samples that are 0 (cut off at the bottom).
-    piled_at : float or None
+    pile_level : float or None
         Level below white where samples pile up as at saturation.
-    uneven : float
+    unevenness : float
         Unevenness of the histogram of the first frame (`unevenness_of`).
     exposure : float or None
         Exposure time, any unit.
@@ -265,8 +271,8 @@ class TemporalStack:
     clipped: BoolArray
     strength: FloatArray
     zeros: float
-    piled_at: float | None
-    uneven: float
+    pile_level: float | None
+    unevenness: float
     exposure: float | None = None
 
     @property
@@ -283,7 +289,7 @@ class TemporalStack:
 def stack_frames(
     frames: Iterable[Mosaic | ChannelFrame], *, exposure: float | None = None, drifts: bool = True, name: str = "frames"
 ) -> TemporalStack:
-    """Mean and variance over the frames of one exposure, frame by frame (Welford), so that memory does not grow.
+    """Return mean and variance over the frames of one exposure, frame by frame (Welford), so that memory does not grow.
 
     Parameters
     ----------
@@ -303,12 +309,12 @@ def stack_frames(
     """
     camera: Sampling | None = None
     strength: list[FloatArray] = []
-    zeros, piled_at = 0.0, None
+    zeros, pile_level = 0.0, None
     for frame in frames:
-        _, samples, black = planes_of(frame)
+        _, samples, black = colour_planes(frame)
         planes, sampling = np.stack(samples), Sampling.of(frame)
         if camera is None:
-            camera, clipped, uneven = sampling, np.zeros(planes.shape, dtype=bool), unevenness_of(frame)
+            camera, clipped, unevenness_first = sampling, np.zeros(planes.shape, dtype=bool), unevenness_of(frame)
             mean, squares = np.zeros((2, *planes.shape), dtype=np.float32)
         if sampling != camera:
             raise CalibrationError(
@@ -316,7 +322,9 @@ def stack_frames(
             )
         strength.append(np.array([plane.mean(dtype=np.float64) for plane in planes]) - black)
         zeros = max(zeros, *(float((plane == 0).mean()) for plane in planes))
-        piled_at = piled_at or next(filter(None, (saturation_pile(plane, sampling.white) for plane in planes)), None)
+        pile_level = pile_level or next(
+            filter(None, (saturation_pile(plane, sampling.white) for plane in planes)), None
+        )
         scale = _ratio(strength[0], strength[-1]) if drifts else np.ones(len(planes))
         values = (planes.astype(np.float32) - _column(black)) * _column(scale)
         step = values - mean
@@ -335,14 +343,14 @@ def stack_frames(
         clipped=clipped,
         strength=levels,
         zeros=zeros,
-        piled_at=piled_at,
-        uneven=uneven,
+        pile_level=pile_level,
+        unevenness=unevenness_first,
         exposure=exposure,
     )
 
 
 def _column(figures: FloatArray) -> FloatImage:
-    """Figures of the planes (P,), for images (P, h, w)."""
+    """Return the figures of the planes (P,), for images (P, h, w)."""
     return figures.astype(np.float32)[:, None, None]
 
 
@@ -351,7 +359,7 @@ TILE = 16
 
 
 def tile_means(values: npt.NDArray[np.generic]) -> FloatArray:
-    """Means over tiles of up to TILE x TILE samples; a border that does not fill a tile is left out.
+    """Return the means over tiles of up to TILE x TILE samples; a border that does not fill a tile is left out.
 
     Parameters
     ----------
@@ -370,11 +378,11 @@ def tile_means(values: npt.NDArray[np.generic]) -> FloatArray:
 
 
 def _ratio(levels: FloatArray, by: FloatArray) -> FloatArray:
-    """Ratio of strengths; 1 for strengths up to 1 DN, where there is hardly any light to drift."""
+    """Return the ratio of strengths; 1 for strengths up to 1 DN, where there is hardly any light to drift."""
     return np.where((levels > 1) & (by > 1), levels / np.where(by > 1, by, 1.0), 1.0)
 
 
-def same_camera(stacks: Sequence[TemporalStack]) -> None:
+def require_same_camera(stacks: Sequence[TemporalStack]) -> None:
     """Refuse stacks of different cameras or settings.
 
     Raises
@@ -404,9 +412,9 @@ class BlockMeans:
         Side of a block in px.
     detail : float
         Mean square second difference over the square of the mean, in the brightest plane: how sharp the picture is.
-    piled_at : float or None
+    pile_level : float or None
         Grey level (DN) below the white level at which samples pile up as they do at saturation; None: nowhere.
-    uneven : float
+    unevenness : float
         Unevenness of its histogram (`unevenness_of`).
     name : str
         Of its file, for messages.
@@ -417,8 +425,8 @@ class BlockMeans:
     camera: Sampling
     block: int
     detail: float
-    piled_at: float | None
-    uneven: float
+    pile_level: float | None
+    unevenness: float
     name: str
 
     @property
@@ -437,7 +445,7 @@ class BlockMeans:
     @property
     def centres(self) -> FloatArray:
         """Centres (x, y) of the blocks in px, shape (R, S, 2)."""
-        rows, columns = (_starts(side, self.block) + (self.block - 1) / 2 for side in self.camera.shape)
+        rows, columns = (_block_starts(side, self.block) + (self.block - 1) / 2 for side in self.camera.shape)
         return np.stack(np.meshgrid(columns, rows), axis=-1)
 
 
@@ -458,7 +466,7 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16, name: str = ""
     CalibrationError
         The frame is monochrome, or too small for 3 x 3 blocks.
     """
-    _, planes, black = planes_of(frame)
+    _, planes, black = colour_planes(frame)
     camera = Sampling.of(frame)
     shape, step = camera.shape, camera.step
     if camera.names == ("M",):
@@ -472,50 +480,52 @@ def block_means(frame: Mosaic | ChannelFrame, *, block: int = 16, name: str = ""
         )
     averages = []
     for plane, dark, origin in zip(planes, black, camera.origins, strict=True):
-        down, along = (_window(shape[axis], plane.shape[axis], block, step, origin[axis]) for axis in (0, 1))
-        averages.append(down @ plane @ along.T - dark)
+        row_weights, column_weights = (
+            _window(shape[axis], plane.shape[axis], block, step, origin[axis]) for axis in (0, 1)
+        )
+        averages.append(row_weights @ plane @ column_weights.T - dark)
     means = np.stack(averages)
     brightest = int(means.mean(axis=(1, 2)).argmax())
     picture = planes[brightest].astype(np.float32)
     level = max(float(picture.mean()) - float(black[brightest]), 1.0)
     clipped = np.atleast_3d(frame.white_level <= frame.values.T).any(axis=2).T.astype(np.float32)
     # the window is positive on the block and its rim of one pixel, 0 elsewhere
-    over_rows, over_columns = (_window(side, side, block, 1, 0) for side in shape)
-    saturated = over_rows @ clipped @ over_columns.T > 0
+    row_cover, column_cover = (_window(side, side, block, 1, 0) for side in shape)
+    saturated = row_cover @ clipped @ column_cover.T > 0
     return BlockMeans(
         planes=means,
         saturated=saturated,
         camera=camera,
         block=block,
         detail=float(((picture[:, 2:] - 2 * picture[:, 1:-1] + picture[:, :-2]) ** 2).mean()) / level**2,
-        piled_at=saturation_pile(planes[brightest], frame.white_level),
-        uneven=unevenness_of(frame),
+        pile_level=saturation_pile(planes[brightest], frame.white_level),
+        unevenness=unevenness_of(frame),
         name=name,
     )
 
 
-def _starts(side: int, block: int) -> npt.NDArray[np.intp]:
+def _block_starts(side: int, block: int) -> npt.NDArray[np.intp]:
     # Two pixels at each border stay unused: the window reaches one pixel beyond its block.
     return np.arange(2, side - side % 2 - block - 1, block)
 
 
 def _window(side: int, length: int, block: int, step: int, offset: int) -> FloatArray:
-    """Weights (blocks, samples) that average the samples at offset + step * n with the window of the module."""
+    """Return weights (blocks, samples) that average the samples at offset + step * n with the window of the module."""
     position = offset + step * np.arange(length)
-    distance = position[None, :] - _starts(side, block)[:, None]
+    distance = position[None, :] - _block_starts(side, block)[:, None]
     edges = np.array([-2, -1, 0, 1, block - 2, block - 1, block, block + 1])
     weights = np.interp(distance, edges, [0, 1, 3, 4, 4, 3, 1, 0], left=0.0, right=0.0)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float64)
 
 
-def unevenness_of(frame: Mosaic | ChannelFrame, lit: float = 0.1) -> float:
-    """Largest unevenness of the histogram of a lit plane; NaN where it cannot be determined in any.
+def unevenness_of(frame: Mosaic | ChannelFrame, min_level: float = 0.1) -> float:
+    """Return the largest unevenness of the histogram of a lit plane; NaN where it cannot be determined in any.
 
-    Lit are planes whose mean above black exceeds the fraction `lit` of the full scale: in the dark, noise is too little
-    to smooth it. Some cameras apply gains of their own to red and blue, so all planes are looked at.
+    Lit are planes whose mean above black exceeds the fraction `min_level` of the full scale: in the dark, noise is too
+    little to smooth it. Some cameras apply gains of their own to red and blue, so all planes are looked at.
     """
-    white, found = frame.white_level, [np.nan]
-    for plane, black in zip(*planes_of(frame)[1:], strict=True):
-        if plane.mean() > black + lit * (white - black):
-            found.append(unevenness(plane[plane < white]))
-    return float(np.fmax.reduce(found))
+    white, values = frame.white_level, [np.nan]
+    for plane, black in zip(*colour_planes(frame)[1:], strict=True):
+        if plane.mean() > black + min_level * (white - black):
+            values.append(unevenness(plane[plane < white]))
+    return float(np.fmax.reduce(values))

@@ -49,8 +49,8 @@ def _root(
     command.help_where_alone(context)
 
 
-def _frames(options: Mapping[str, Any]) -> FrameSettings:
-    """Settings of captures as options state them; an option with a value that is not allowed is named."""
+def _frame_settings(options: Mapping[str, Any]) -> FrameSettings:
+    """Return the settings of captures as options state them; an option with a value that is not allowed is named."""
     from rgbmidic.settings import FrameSettings
 
     try:
@@ -60,15 +60,15 @@ def _frames(options: Mapping[str, Any]) -> FrameSettings:
         raise ConfigurationError(as_options) from None
 
 
-def _captures(options: dict[str, Any]) -> partial[Captures]:
-    """How the captures that options name are found, by a call."""
+def _capture_finder(options: dict[str, Any]) -> partial[Captures]:
+    """Return a call that finds the captures which options name."""
     from rgbmidic_calibration.captures import Captures
 
-    lights, dark = read_named(options.pop("light") or (), "--light"), options.pop("dark")
-    return partial(Captures.find, lights, dark, _frames(options))
+    lights, dark = read_name_patterns(options.pop("light") or (), "--light"), options.pop("dark")
+    return partial(Captures.find, lights, dark, _frame_settings(options))
 
 
-def read_named(options: Sequence[str], option: str) -> dict[str, str]:
+def read_name_patterns(options: Sequence[str], option: str) -> dict[str, str]:
     """Split options of the form NAME=FILES.
 
     Raises
@@ -76,16 +76,16 @@ def read_named(options: Sequence[str], option: str) -> dict[str, str]:
     ConfigurationError
         An option has another form, or a name occurs twice.
     """
-    named: dict[str, str] = {}
+    pattern_by_name: dict[str, str] = {}
     for text in options:
         name, separator, pattern = text.partition("=")
         name, pattern = name.strip(), pattern.strip()
         if not (separator and name and pattern):
             raise ConfigurationError(f"{option} takes NAME=FILES, as in {option} red='light_red/*.tif', not {text!r}")
-        if name in named:
+        if name in pattern_by_name:
             raise ConfigurationError(f"{option} {name} is given twice; one pattern may match many files")
-        named[name] = pattern
-    return named
+        pattern_by_name[name] = pattern
+    return pattern_by_name
 
 
 def check_output(path: Path, *, overwrite: bool, option: str = "--out") -> None:
@@ -105,7 +105,7 @@ def check_output(path: Path, *, overwrite: bool, option: str = "--out") -> None:
 
 
 def read_limits(options: Sequence[str]) -> Limits:
-    """Limits from options of the form NAME=VALUE.
+    """Return the limits from options of the form NAME=VALUE.
 
     Raises
     ------
@@ -143,11 +143,11 @@ def _region(text: str | None) -> tuple[float, ...] | None:
     return command.read_place(text, "--region", "X0,Y0,X1,Y1") if text else None
 
 
-_takes_captures = command.gather("captures", CAPTURE_OPTIONS, _captures, light=command.REQUIRED)
+_takes_captures = command.gather("captures", CAPTURE_OPTIONS, _capture_finder, light=command.REQUIRED)
 
 
-def _writes(name: str, hint: Any, default: str | None = None) -> Callable[[Command], Command]:
-    """Decorator of a command with a file to write, which may replace another only where that is stated."""
+def _writes_file(name: str, hint: Any, default: str | None = None) -> Callable[[Command], Command]:
+    """Return the decorator of a command with a file to write, which may replace another only where that is stated."""
 
     def read(options: Mapping[str, Any]) -> Path | None:
         path: Path | None = options[name]
@@ -160,7 +160,7 @@ def _writes(name: str, hint: Any, default: str | None = None) -> Callable[[Comma
 
 
 @app.command()
-@_writes("out", Out, "calibration.json")
+@_writes_file("out", Out, "calibration.json")
 @_takes_captures
 def crosstalk(
     captures: Any,
@@ -183,8 +183,8 @@ def crosstalk(
 
 
 @app.command()
-@_writes("out", Out, "noise.json")
-@command.gather("stated", command.FRAME_OPTIONS, _frames)
+@_writes_file("out", Out, "noise.json")
+@command.gather("user_metadata", command.FRAME_OPTIONS, _frame_settings)
 def noise(
     dark: Annotated[str, Option(help="Dark frames, at least two: lens capped, exposure time of the test.")],
     flat: Annotated[
@@ -194,19 +194,19 @@ def noise(
             "one exposure with its time. May be repeated."
         ),
     ],
-    stated: Any,
+    user_metadata: Any,
     out: Path,
 ) -> None:
     """Measure gain, read noise, black level, saturation, linearity, fixed pattern and defects of the camera."""
     from rgbmidic_calibration import display, jobs
 
-    calibration, estimate = jobs.calibrate_noise(dark, flat, stated)
+    calibration, estimate = jobs.calibrate_noise(dark, flat, user_metadata)
     calibration.write(out)
     display.noise(estimate, out)
 
 
 @app.command()
-@_writes("out", Out, "registration.json")
+@_writes_file("out", Out, "registration.json")
 @_takes_captures
 def registration(
     captures: Any,
@@ -226,11 +226,11 @@ def registration(
 
 
 @app.command()
-@command.gather("stated", command.FRAME_OPTIONS, _frames)
-@command.gather("photographed", command.TARGET_LIGHT_OPTIONS, command.read_target_lights)
+@command.gather("user_metadata", command.FRAME_OPTIONS, _frame_settings)
+@command.gather("target_lights", command.TARGET_LIGHT_OPTIONS, command.read_target_lights)
 def camera(
-    stated: Any,
-    photographed: Any,
+    user_metadata: Any,
+    target_lights: Any,
     target: Annotated[
         str | None,
         Option(
@@ -270,11 +270,11 @@ def camera(
     if plane is not None and corners is not None:
         raise ConfigurationError("--plane and --corners both state the plane: state one of them")
     estimate = jobs.calibrate_camera(
-        stated,
+        user_metadata,
         None if target is None else Target.parse(target),
         lens=views if lens is None else CameraCalibration.read(lens),
         plane=plane if corners is None or size is None else (corners, size, corner_std),
-        lights=photographed,
+        lights=target_lights,
     )
     estimate.camera.write(out)
     display.camera(estimate.camera, out)
@@ -283,7 +283,7 @@ def camera(
 
 
 @app.command()
-@command.gather("captures", CAPTURE_OPTIONS, _captures)
+@command.gather("captures", CAPTURE_OPTIONS, _capture_finder)
 def check(
     file: Annotated[Path, Argument(help="Calibration file, or camera file with --distance.")],
     captures: Any,
@@ -309,23 +309,25 @@ def check(
 
     limits = read_limits(limit or ())
     if CameraCalibration.is_in(file):
-        known = [_distance(text) for text in distance or ()]
-        if not known:
+        true_distances = [_distance(text) for text in distance or ()]
+        if not true_distances:
             raise ConfigurationError(f"{file} is a camera file: state a known distance, --distance X0,Y0:X1,Y1=MM")
-        checks = check_distances(CameraCalibration.read(file), known, corner_std=corner_std, limits=limits)
+        checks = check_distances(CameraCalibration.read(file), true_distances, corner_std=corner_std, limits=limits)
     elif distance:
         raise ConfigurationError(f"--distance is for a camera file (rgbmidic-calibrate camera), and {file} is none")
     else:
         calibration = Calibration.read(file)
-        found = captures(calibration=calibration, together=read_named(together or (), "--together"))
-        checks = check_calibration(calibration, found, limits=limits, region=_region(region))
+        check_captures = captures(
+            calibration=calibration, simultaneous=read_name_patterns(together or (), "--together")
+        )
+        checks = check_calibration(calibration, check_captures, limits=limits, region=_region(region))
     display.verdict(checks)
-    if not all(one.passed for one in checks):
+    if not all(figure.passed for figure in checks):
         raise typer.Exit(1)
 
 
 @app.command()
-@_writes("picture", Annotated[Path | None, Option(help="Picture of spectra and matrix of the best set.")])
+@_writes_file("picture", Annotated[Path | None, Option(help="Picture of spectra and matrix of the best set.")])
 def design(
     camera: Annotated[
         str, Option(help="FILE.json (rawtoaces), FILE.csv, FILE.csv#NAME, or a camera of colour-science.")
@@ -345,16 +347,16 @@ def design(
     from rgbmidic_calibration import design as designs
     from rgbmidic_calibration import display
 
-    lamps = {name: designs.read_lamp(text) for name, text in read_named(light, "--light").items()}
+    lamps = {name: designs.read_lamp(text) for name, text in read_name_patterns(light, "--light").items()}
     sensitivities = designs.read_camera(camera)
-    found = designs.best_sets(sensitivities, lamps, min(choose, len(lamps)))
-    display.designs(found[:show_sets])
+    ranked_sets = designs.best_sets(sensitivities, lamps, min(choose, len(lamps)))
+    display.designs(ranked_sets[:show_sets])
     if picture is not None:
-        display.draw_design(found[0], sensitivities, lamps, picture)
+        display.draw_design(ranked_sets[0], sensitivities, lamps, picture)
 
 
 @app.command()
-@_writes("out", Out, "calibration.json")
+@_writes_file("out", Out, "calibration.json")
 def merge(
     files: Annotated[list[Path], Argument(help="Calibration files; common sections must be equal.")], out: Path
 ) -> None:
@@ -368,7 +370,7 @@ def merge(
 
 
 @app.command()
-@_writes("picture", Annotated[Path | None, Option(help="Write a picture too (PNG, PDF or SVG).")])
+@_writes_file("picture", Annotated[Path | None, Option(help="Write a picture too (PNG, PDF or SVG).")])
 def show(file: Annotated[Path, Argument(help="Calibration file.")], picture: Path | None = None) -> None:
     """Show a calibration or camera file as tables, and in one picture."""
     from rgbmidic.fields.plane import CameraCalibration
@@ -377,7 +379,7 @@ def show(file: Annotated[Path, Argument(help="Calibration file.")], picture: Pat
 
     if CameraCalibration.is_in(file):
         camera = CameraCalibration.read(file)
-        display.camera(camera, file, written=False)
+        display.camera(camera, file, is_written=False)
         if picture is not None:
             display.draw_camera(camera, picture)
         return

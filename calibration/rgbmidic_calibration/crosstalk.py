@@ -29,7 +29,7 @@ from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, legendre_products
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic_calibration.captures import BlockMeans
-from rgbmidic_calibration.plausibility import CHECKS, capture_checks, judged
+from rgbmidic_calibration.plausibility import CHECKS, capture_checks, collect_warnings
 
 CHANNELS = ("R", "G", "B")
 COLOURS = ("red", "green", "blue")
@@ -95,7 +95,7 @@ class LightSignal:
 
     @classmethod
     def of(cls, name: str, captures: Sequence[BlockMeans], dark: FloatArray) -> LightSignal:
-        """The averages of captures above the dark level."""
+        """Return the averages of captures above the dark level."""
         values = np.stack([frame.signals for frame in captures]) - dark
         valid = ~np.stack([frame.saturated for frame in captures])
         return cls(name, values, valid, int(np.median(values[:, :3].transpose(0, 2, 3, 1)[valid], axis=0).argmax()))
@@ -106,12 +106,12 @@ class LightSignal:
         return self.values[:, self.reference]
 
     @property
-    def others(self) -> list[int]:
+    def other_channels(self) -> list[int]:
         """The channels R, G, B but the reference."""
         return [c for c in range(3) if c != self.reference]
 
     def residual(self, design: FloatArray, coefficients: FloatArray) -> FloatArray:
-        """Residuals y - a x, (N, C, R, S)."""
+        """Return the residuals y - a x, (N, C, R, S)."""
         return np.asarray(self.values - np.einsum("rst,tc->crs", design, coefficients) * self.base[:, None])
 
 
@@ -153,7 +153,7 @@ class LightFit:
         return float(self.mass.sum() / self.weights.sum(axis=(1, 2)).sum())
 
     @property
-    def rejected(self) -> float:
+    def rejected_fraction(self) -> float:
         """Fraction of the blocks that were left out as outliers."""
         return float((self.signal.valid & (self.weights == 0)).mean())
 
@@ -174,7 +174,7 @@ def fit_column(signal: LightSignal, design: FloatArray) -> LightFit:
     design : ndarray, shape (R, S, T)
         Legendre products at the blocks' centres; T = 1 for a constant column.
     """
-    weights, coefficients = _without_outliers(signal, design)
+    weights, coefficients = _fit_without_outliers(signal, design)
     residual = weights[:, None] * signal.residual(design, coefficients)
     inverse = np.linalg.inv(_moment(weights * signal.base, design))
     sums = _cluster_sums(np.einsum("ncrs,rst->tcrs", residual, design))
@@ -199,8 +199,8 @@ def _moment(weights: FloatArray, design: FloatArray) -> FloatArray:
     return np.asarray((flat * weights.sum(axis=0).reshape(-1, 1)).T @ flat)
 
 
-def _without_outliers(signal: LightSignal, design: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Weights and coefficients, iterated from the median of the blocks' ratios.
+def _fit_without_outliers(signal: LightSignal, design: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the weights and coefficients, iterated from the median of the blocks' ratios.
 
     Every channel's residual is compared with its median spread times the square root of x (shot noise). Beyond 5 robust
     standard deviations a block is left out: a fluorescent spot, a label, a hot cluster. Of normal noise 6e-7 are
@@ -219,8 +219,8 @@ def _without_outliers(signal: LightSignal, design: FloatArray) -> tuple[FloatArr
         limit = np.where(spread > 0, 5.0 * spread, np.inf)[:, None, None]
         weights = (valid & (np.abs(scaled) <= limit).all(axis=1)).astype(np.float64)
         right = np.einsum("crs,rst->tc", (weights[:, None] * signal.values).sum(axis=0), design)
-        before, coefficients = coefficients, np.linalg.solve(_moment(weights * base, design), right)
-        if np.abs(coefficients - before).max() < 1e-10:
+        previous, coefficients = coefficients, np.linalg.solve(_moment(weights * base, design), right)
+        if np.abs(coefficients - previous).max() < 1e-10:
             break
     coefficients[:, signal.reference] = np.eye(len(coefficients))[0]
     return weights, coefficients
@@ -251,8 +251,10 @@ class Variation:
     rms: float
 
 
-def variation(signal: LightSignal, design: FloatArray, known: int, channels: Sequence[int] | None = None) -> Variation:
-    """Test whether the Legendre products after the first `known` ones are needed in any channel.
+def variation(
+    signal: LightSignal, design: FloatArray, n_null_terms: int, channels: Sequence[int] | None = None
+) -> Variation:
+    """Test whether the Legendre products after the first `n_null_terms` ones are needed in any channel.
 
     A score test with random signs: the model of the first terms is fitted, its residuals are correlated with the other
     terms in clusters of blocks, and the sum is compared with those of 4999 random choices of the clusters' signs. It
@@ -263,23 +265,25 @@ def variation(signal: LightSignal, design: FloatArray, known: int, channels: Seq
     ----------
     signal, design
         See `fit_column`; `design` has all terms.
-    known
+    n_null_terms
         How many of the terms the null hypothesis has.
     channels
         Channels that are tested together; None: R, G, B but the reference.
     """
-    channels = signal.others if channels is None else channels
-    null = fit_column(signal, design[..., :known])
+    channels = signal.other_channels if channels is None else channels
+    null = fit_column(signal, design[..., :n_null_terms])
     moment = _moment(null.weights * signal.base, design)
     # What the fitted terms cannot imitate of the others.
-    extra = design[..., known:] - design[..., :known] @ np.linalg.solve(moment[:known, :known], moment[:known, known:])
+    extra = design[..., n_null_terms:] - design[..., :n_null_terms] @ np.linalg.solve(
+        moment[:n_null_terms, :n_null_terms], moment[:n_null_terms, n_null_terms:]
+    )
     sums = _cluster_sums(np.einsum("crs,rst->ctrs", null.residual[:, channels].sum(axis=0), extra))
     inverse = np.linalg.pinv(sums.T @ sums)
     flips = np.random.default_rng(0).choice((-1.0, 1.0), (4999, len(sums))) @ sums
     flipped = ((flips @ inverse) * flips).sum(axis=1)
     observed = sums.sum(axis=0) @ inverse @ sums.sum(axis=0)
-    coefficients = fit_column(signal, design).coefficients[known:, channels]
-    norms = (design[..., known:] ** 2).mean(axis=(0, 1))
+    coefficients = fit_column(signal, design).coefficients[n_null_terms:, channels]
+    norms = (design[..., n_null_terms:] ** 2).mean(axis=(0, 1))
     return Variation(
         p_value=float((1 + (flipped >= observed).sum()) / (1 + len(flipped))),
         rms=float(np.sqrt((coefficients**2 * norms[:, None]).sum(axis=0)).max()),
@@ -287,7 +291,7 @@ def variation(signal: LightSignal, design: FloatArray, known: int, channels: Seq
 
 
 def capture_scatter(fit: LightFit, significance: float = 0.01) -> FloatArray:
-    """Variance (C,) of the entries between captures beyond their noise; zero where an F test finds none.
+    """Return the variance (C,) of the entries between captures beyond their noise; zero where an F test finds none.
 
     The noise comes from the residuals' departures from the mean over the captures, where the target's texture cancels.
     At the default level one calibration in a hundred gets a needless addition to its covariance.
@@ -303,8 +307,8 @@ def capture_scatter(fit: LightFit, significance: float = 0.01) -> FloatArray:
     return np.where(scatter > limit * noise, scatter - noise, 0.0)
 
 
-def offsets_left(fit: LightFit, design: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Grey level (C,) that every channel keeps where the light is absent, and its standard uncertainty.
+def residual_offsets(fit: LightFit, design: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the grey level (C,) that every channel keeps where the light is absent, and its standard uncertainty.
 
     ``y = x a + o`` with the other captures' x as instrument for the slope: their noise is independent. NaN for fewer
     than two captures. The offset of a dark level that is right is zero; on a plain target it is poorly determined.
@@ -315,14 +319,14 @@ def offsets_left(fit: LightFit, design: FloatArray) -> tuple[FloatArray, FloatAr
     if count < 2:
         return offset, std
     base = signal.base
-    others = (base.sum(axis=0) - base) / (count - 1)
-    instruments = [np.broadcast_to(design, (count, *design.shape)), others[..., None]]
-    left = fit.weights[..., None] * np.concatenate(instruments, axis=-1)
-    right = np.concatenate([base[..., None] * design, np.ones((*base.shape, 1))], axis=-1)
-    inverse = np.linalg.inv(np.einsum("nrsi,nrsj->ij", left, right))
-    for channel in signal.others:
-        solution = inverse @ np.einsum("nrsi,nrs->i", left, signal.values[:, channel])
-        score = (left * (signal.values[:, channel] - right @ solution)[..., None]).sum(axis=0)
+    other_means = (base.sum(axis=0) - base) / (count - 1)
+    instruments = [np.broadcast_to(design, (count, *design.shape)), other_means[..., None]]
+    instrument_matrix = fit.weights[..., None] * np.concatenate(instruments, axis=-1)
+    regressors = np.concatenate([base[..., None] * design, np.ones((*base.shape, 1))], axis=-1)
+    inverse = np.linalg.inv(np.einsum("nrsi,nrsj->ij", instrument_matrix, regressors))
+    for channel in signal.other_channels:
+        solution = inverse @ np.einsum("nrsi,nrs->i", instrument_matrix, signal.values[:, channel])
+        score = (instrument_matrix * (signal.values[:, channel] - regressors @ solution)[..., None]).sum(axis=0)
         sums = _cluster_sums(score.transpose(2, 0, 1)) @ inverse.T
         offset[channel], std[channel] = solution[-1], np.sqrt((sums[:, -1] ** 2).sum())
     return offset, std
@@ -382,26 +386,26 @@ def estimate_crosstalk(
         raise CalibrationError(f"unknown check {', '.join(unknown)}; those that can be waived are {', '.join(CHECKS)}")
     if order is not None and not 0 <= order <= LIMITS.largest_order:
         raise CalibrationError(f"the degree of the field is 0 to {LIMITS.largest_order}, not {order}")
-    warnings = judged(capture_checks(lights, dark), allow)
-    like = next(iter(lights.values()))[0]
-    shape, centres = like.camera.shape, like.centres
-    count = len(like.signals)
-    level, of_frame = np.zeros((count, *like.saturated.shape)), np.zeros((count, count))
-    of_mean = LIMITS.black_level_std**2 * np.eye(count)
+    warnings = collect_warnings(capture_checks(lights, dark), allow)
+    first_means = next(iter(lights.values()))[0]
+    shape, centres = first_means.camera.shape, first_means.centres
+    count = len(first_means.signals)
+    level, frame_covariance = np.zeros((count, *first_means.saturated.shape)), np.zeros((count, count))
+    mean_covariance = LIMITS.black_level_std**2 * np.eye(count)
     if dark:
         frames = np.stack([frame.signals for frame in dark])
         level = frames.mean(axis=0)
-        of_frame = np.cov(frames.mean(axis=(2, 3)), rowvar=False) if len(frames) > 1 else of_mean
-        of_mean = of_frame / len(frames)
+        frame_covariance = np.cov(frames.mean(axis=(2, 3)), rowvar=False) if len(frames) > 1 else mean_covariance
+        mean_covariance = frame_covariance / len(frames)
     signals = [LightSignal.of(name, captures, level) for name, captures in lights.items()]
-    asked = legendre_products(centres, shape, LIMITS.automatic_order)
-    needed, variations = zip(*(_needed_degree(signal, asked) for signal in signals), strict=True)
-    order = max(needed) if order is None else order
+    full_design = legendre_products(centres, shape, LIMITS.automatic_order)
+    degrees, variations = zip(*(_needed_degree(signal, full_design) for signal in signals), strict=True)
+    order = max(degrees) if order is None else order
     design = legendre_products(centres, shape, order)
     fits = tuple(fit_column(signal, design) for signal in signals)
-    warnings += judged(matrix_checks(fits, design), allow)
+    warnings += collect_warnings(matrix_checks(fits, design), allow)
     matrices = np.stack([fit.coefficients for fit in fits], axis=-1)
-    covariance = _covariance(fits, of_mean, of_frame)
+    covariance = _covariance(fits, mean_covariance, frame_covariance)
     std = np.sqrt(np.einsum("tcktck->tck", covariance))
     field, size = None, matrices[0, :3].size
     if order:
@@ -415,7 +419,7 @@ def estimate_crosstalk(
         **greens,
     )
     if count > 3:
-        warnings += judged(_green_checks(signals, asked, crosstalk))
+        warnings += collect_warnings(_green_checks(signals, full_design, crosstalk))
     return CrosstalkEstimate(crosstalk=crosstalk, lights=fits, variations=variations, warnings=tuple(warnings))
 
 
@@ -432,7 +436,7 @@ def _green_checks(signals: Sequence[LightSignal], design: FloatArray, crosstalk:
 
 
 def _needed_degree(signal: LightSignal, design: FloatArray) -> tuple[int, Variation]:
-    """Degree that the light's captures ask for, and the test of all terms that are not constant."""
+    """Return the degree that the light's captures ask for, and the test of all terms that are not constant."""
     tests: list[Variation] = []
     for order in range(LIMITS.automatic_order):
         tests.append(variation(signal, design, (order + 1) * (order + 2) // 2))
@@ -441,18 +445,18 @@ def _needed_degree(signal: LightSignal, design: FloatArray) -> tuple[int, Variat
     return LIMITS.automatic_order, tests[0]
 
 
-def _covariance(columns: Sequence[LightFit], of_mean: FloatArray, of_frame: FloatArray) -> FloatArray:
-    """Covariance (T, C, k, T, C, k) of all coefficients.
+def _covariance(columns: Sequence[LightFit], mean_covariance: FloatArray, frame_covariance: FloatArray) -> FloatArray:
+    """Return the covariance (T, C, k, T, C, k) of all coefficients.
 
-    The error of the dark frames' mean (covariance `of_mean`) is common to all blocks and lights, that of one frame's
-    own offset (`of_frame`) to the blocks of a frame.
+    The error of the dark frames' mean (covariance `mean_covariance`) is common to all blocks and lights, that of one
+    frame's own offset (`frame_covariance`) to the blocks of a frame.
     """
     terms, channels = columns[0].coefficients.shape
     full = np.zeros((terms, channels, len(columns), terms, channels, len(columns)))
     for i, first in enumerate(columns):
         for j, second in enumerate(columns):
-            shared = of_mean + (of_frame / len(first.mass) if i == j else 0)
-            full[:, :, i, :, :, j] = np.einsum("tcx,xy,udy->tcud", first.leverage, shared, second.leverage)
+            common = mean_covariance + (frame_covariance / len(first.mass) if i == j else 0)
+            full[:, :, i, :, :, j] = np.einsum("tcx,xy,udy->tcud", first.leverage, common, second.leverage)
         full[:, :, i, :, :, i] += first.covariance
         full[0, :, i, 0, :, i] += np.diag(capture_scatter(first) / len(first.mass))
     return full
@@ -475,7 +479,7 @@ def matrix_checks(fits: Sequence[LightFit], design: FloatArray) -> Iterator[Chec
             )
             yield Check("name", text)
     for index, signal in enumerate(signals):
-        for twin in [other for other in signals[:index] if other.reference == signal.reference][:1]:
+        for twin in [earlier for earlier in signals[:index] if earlier.reference == signal.reference][:1]:
             text = (
                 f"lights {twin.name} and {signal.name} are both seen best by the {COLOURS[signal.reference]} channel: "
                 "did the same lamp shine in both captures?"
@@ -512,14 +516,16 @@ def _fit_checks(fit: LightFit, design: FloatArray) -> Iterator[Check]:
     )
     yield warning(light + text, scatter, above=LIMITS.tolerance)
     # .2 % of the signal leaks as much, of the order of what `check` allows (`verify.Limits.leakage`)
-    offset, std = offsets_left(fit, design)
-    left = np.where((np.abs(offset) > 5 * std) & (np.abs(offset) > 0.002 * fit.level), np.abs(offset), 0)
-    channel = int(left.argmax())
+    offset, std = residual_offsets(fit, design)
+    significant = np.where((np.abs(offset) > 5 * std) & (np.abs(offset) > 0.002 * fit.level), np.abs(offset), 0)
+    channel = int(significant.argmax())
     text = (
         f"the {COLOURS[channel]} channel keeps {offset[channel]:+.1f} DN where the light is absent: dark frames of "
         "other settings or another ambient light, or a camera that is not linear"
     )
-    yield warning(light + text, left[channel])
+    yield warning(light + text, significant[channel])
     # of normal noise less than 1e-5 of the blocks are outliers
-    text = f"{100 * fit.rejected:.0f} % of the blocks are outliers: coloured or fluorescent spots on the target?"
-    yield warning(light + text, fit.rejected, above=0.05)
+    text = (
+        f"{100 * fit.rejected_fraction:.0f} % of the blocks are outliers: coloured or fluorescent spots on the target?"
+    )
+    yield warning(light + text, fit.rejected_fraction, above=0.05)

@@ -34,13 +34,13 @@ class MeasuredLamp:
     values: FloatArray
 
     def __post_init__(self) -> None:
-        places, values = self.wavelengths, self.values
-        rising = places.ndim == 1 and places.size > 1 and (np.diff(places) > 0).all()
-        if not (rising and values.shape == places.shape and np.isfinite(values).all() and values.max() > 0):
+        wavelengths, values = self.wavelengths, self.values
+        rising = wavelengths.ndim == 1 and wavelengths.size > 1 and (np.diff(wavelengths) > 0).all()
+        if not (rising and values.shape == wavelengths.shape and np.isfinite(values).all() and values.max() > 0):
             raise InputError("a spectrum needs rising wavelengths and as many finite values, not all zero")
 
     def power(self, wavelengths: FloatArray) -> FloatArray:
-        """Spectral power at equally spaced wavelengths (nm), of unit sum; zero outside the measured range."""
+        """Return spectral power at equally spaced wavelengths (nm), of unit sum; zero outside the measured range."""
         values = np.interp(wavelengths, self.wavelengths, np.maximum(self.values, 0), left=0.0, right=0.0)
         if not values.sum() > 0:
             raise InputError(f"the lamp emits nothing within {wavelengths[0]:g} to {wavelengths[-1]:g} nm")
@@ -85,18 +85,22 @@ def design(camera: Sensitivities, lamps: Mapping[str, Lamp]) -> Design:
     """
     spectra = np.stack([lamp.power(camera.wavelengths) for lamp in lamps.values()], axis=1)
     response = camera.values @ spectra
-    seen = response.max(axis=0)
+    largest_response = response.max(axis=0)
     # chosen: to a lamp under .001 of the best wavelength's response it would need a thousand times another's power
-    if unseen := [name for name, value in zip(lamps, seen, strict=True) if value < 1e-3 * camera.values.max()]:
-        raise CalibrationError(f"the camera does not see {', '.join(unseen)}")
-    crosstalk = Crosstalk(matrix=response / seen, lights=tuple(lamps))
+    if invisible := [
+        name for name, value in zip(lamps, largest_response, strict=True) if value < 1e-3 * camera.values.max()
+    ]:
+        raise CalibrationError(f"the camera does not see {', '.join(invisible)}")
+    crosstalk = Crosstalk(matrix=response / largest_response, lights=tuple(lamps))
     return Design(
-        crosstalk=crosstalk, power=(1 / seen) / (1 / seen).max(), headroom=float(1 / crosstalk.matrix.sum(axis=1).max())
+        crosstalk=crosstalk,
+        power=(1 / largest_response) / (1 / largest_response).max(),
+        headroom=float(1 / crosstalk.matrix.sum(axis=1).max()),
     )
 
 
 def best_sets(camera: Sensitivities, lamps: Mapping[str, Lamp], count: int = 3) -> list[Design]:
-    """All sets of `count` lamps that the camera can separate, those with the least noise first.
+    """Return all sets of `count` lamps that the camera can separate, those with the least noise first.
 
     Raises
     ------
@@ -105,19 +109,19 @@ def best_sets(camera: Sensitivities, lamps: Mapping[str, Lamp], count: int = 3) 
     """
     if not 1 <= count <= 3 or len(lamps) < count:
         raise CalibrationError(f"cannot choose {count} of {len(lamps)} lamps: a colour camera separates one to three")
-    found = []
+    designs = []
     for names in combinations(lamps, count):
         try:
-            found.append(design(camera, {name: lamps[name] for name in names}))
+            designs.append(design(camera, {name: lamps[name] for name in names}))
         except CalibrationError:  # a set that cannot be separated is no candidate
             continue
-    if not found:
+    if not designs:
         raise CalibrationError("the camera can separate no set of these lamps")
-    return sorted(found, key=lambda candidate: candidate.noise)
+    return sorted(designs, key=lambda candidate: candidate.noise)
 
 
 def read_lamp(text: str) -> Lamp:
-    """A lamp from CENTRE or CENTRE:WIDTH in nm, FILE.csv, FILE.csv#COLUMN, or a name that colour-science knows.
+    """Return a lamp from CENTRE or CENTRE:WIDTH in nm, FILE.csv, FILE.csv#COLUMN, or a name that colour-science knows.
 
     WIDTH is the full width at half maximum; an LED without one gets 25 nm.
 
@@ -138,13 +142,13 @@ def read_lamp(text: str) -> Lamp:
         return MeasuredLamp(wavelengths=wavelengths, values=columns[0])
     import colour
 
-    known = {**colour.SDS_LIGHT_SOURCES, **colour.SDS_ILLUMINANTS}
-    if text not in known:
-        leds = ", ".join(sorted(key for key in known if "LED" in key))
+    spectra = {**colour.SDS_LIGHT_SOURCES, **colour.SDS_ILLUMINANTS}
+    if text not in spectra:
+        leds = ", ".join(sorted(key for key in spectra if "LED" in key))
         raise ConfigurationError(
             f"a lamp is CENTRE:WIDTH in nm, a CSV file, or a light source of colour-science ({leds} ...), not {text!r}"
         )
-    return MeasuredLamp(wavelengths=known[text].wavelengths, values=known[text].values)
+    return MeasuredLamp(wavelengths=spectra[text].wavelengths, values=spectra[text].values)
 
 
 def read_camera(text: str) -> Sensitivities:
@@ -161,7 +165,7 @@ def read_camera(text: str) -> Sensitivities:
 
 
 def _read_table(text: str, endings: Sequence[str] = ("",)) -> tuple[FloatArray, FloatArray]:
-    """Wavelengths and the columns that a text FILE.csv#NAME means, shape (columns, n)."""
+    """Return the wavelengths and the columns that a text FILE.csv#NAME means, shape (columns, n)."""
     file, _, column = text.partition("#")
     try:
         head, table = read_columns(Path(file))

@@ -38,49 +38,49 @@ def crosstalk(estimate: CrosstalkEstimate, out: Path) -> None:
     table.add_row("signal, DN", *(f"{fit.level:.0f}" for fit in fits))
     table.add_row("captures", *(str(len(fit.weights)) for fit in fits))
     table.add_row("blocks used, %", *(f"{100 * fit.weights.mean():.0f}" for fit in fits))
-    table.add_row("varies over field, rms", *(f"{found.rms:.5f}" for found in variations))
-    table.add_row("  by chance, p", *(f"{found.p_value:.2g}" for found in variations))
+    table.add_row("varies over field, rms", *(f"{variation.rms:.5f}" for variation in variations))
+    table.add_row("  by chance, p", *(f"{variation.p_value:.2g}" for variation in variations))
     table.add_row("strength drift, %", *(f"{100 * fit.intensity_drift:.2f}" for fit in fits))
-    _print([*_marked(estimate.warnings), table, words, _written(out)])
+    _print([*_warning_lines(estimate.warnings), table, words, _written_line(out)])
 
 
 def noise(estimate: NoiseEstimate, out: Path) -> None:
     """Print the noise figures per plane and the warnings."""
-    _print([*_marked(estimate.warnings), *_noise(estimate.camera_noise), _written(out)])
+    _print([*_warning_lines(estimate.warnings), *_noise(estimate.camera_noise), _written_line(out)])
 
 
 def registration(estimate: RegistrationEstimate, out: Path) -> None:
     """Print the parameters of every light, how well they fit, and the warnings."""
     fits = (
         f"{escape(match.name)}: residual {match.rms:.3f} px rms per node, "
-        f"{100 * float(match.used.mean()):.0f} % of the nodes used"
+        f"{100 * float(match.is_used.mean()):.0f} % of the nodes used"
         for match in estimate.matches
     )
     size = f"elements of {estimate.element_size:g} px"
-    _print([*_marked(estimate.warnings), _registration(estimate.registration), *fits, size, _written(out)])
+    _print([*_warning_lines(estimate.warnings), _registration(estimate.registration), *fits, size, _written_line(out)])
 
 
-def camera(found: CameraCalibration, file: Path, *, written: bool = True) -> None:
+def camera(result: CameraCalibration, file: Path, *, is_written: bool = True) -> None:
     """Print the parameters of lens and plane with their standard uncertainty, how they were found, and the warnings."""
-    details = dict(found.details)
-    parts: list[str | Table] = list(_marked(details.get("warnings", ())))
-    if found.lens is not None:
+    details = dict(result.details)
+    lines: list[str | Table] = list(_warning_lines(details.get("warnings", ())))
+    if result.lens is not None:
         table = _table("Lens", ("parameter", "value", "standard uncertainty"))
-        for name, value, variance in zip(LENS_PARAMETERS, found.lens, np.diag(found.covariance), strict=False):
+        for name, value, variance in zip(LENS_PARAMETERS, result.lens, np.diag(result.covariance), strict=False):
             unit = " px" if name in ("f", "cx", "cy") else ""
             table.add_row(name, f"{value:.6g}{unit}", f"{np.sqrt(variance):.2g}{unit}" if variance else "not taken up")
-        parts.append(table)
+        lines.append(table)
     if lens := details.get("lens"):
         tests = ", ".join(f"{name}: p = {value:.2g}" for name, value in lens["p_values"].items())
-        parts.append(
+        lines.append(
             f"{len(lens['views'])} views, up to {lens['largest_angle_deg']:.0f} degrees apart, over "
             f"{lens['covered']:.0%} of the frame; residual {lens['rms_px']:.3f} px rms; {tests}"
         )
-    if found.homography is not None:
+    if result.homography is not None:
         residual = f"; residual {details['plane']['rms_px']:.3f} px rms" if "plane" in details else ""
-        parts.append(f"plane: {found.summary()}{residual}")
-    parts.append(f"frames of {found.shape[1]} x {found.shape[0]} px")
-    _print([*parts, _written(file) if written else escape(str(file))])
+        lines.append(f"plane: {result.summary()}{residual}")
+    lines.append(f"frames of {result.shape[1]} x {result.shape[0]} px")
+    _print([*lines, _written_line(file) if is_written else escape(str(file))])
 
 
 def verdict(checks: Sequence[Check]) -> None:
@@ -96,21 +96,21 @@ def verdict(checks: Sequence[Check]) -> None:
     skipped = (f"[dim]{escape(check.text)}[/]" for check in checks if not check.name and check.text not in doubts)
     failed = sum(not item.passed for item in figures)
     words = f"[bold red]FAILED[/]: {failed} of {len(figures)} figures break their limit"
-    _print([*_marked(doubts), table, *sums, *skipped, words if failed else "[bold green]PASSED[/]"])
+    _print([*_warning_lines(doubts), table, *sums, *skipped, words if failed else "[bold green]PASSED[/]"])
 
 
-def designs(found: Sequence[Design]) -> None:
+def designs(ranked_sets: Sequence[Design]) -> None:
     """Print the predicted matrix of the best set of lamps, and how the other sets compare."""
-    best = found[0]
+    best = ranked_sets[0]
     table, words = _matrix(best.crosstalk)
-    table.title = "Predicted crosstalk of the best set" if len(found) > 1 else "Predicted crosstalk"
+    table.title = "Predicted crosstalk of the best set" if len(ranked_sets) > 1 else "Predicted crosstalk"
     table.add_row("relative lamp power", *(f"{value:.2f}" for value in best.power))
     _print([table, words, f"with all lights on, each may reach {100 * best.headroom:.0f} % of full scale"])
-    if len(found) == 1:
+    if len(ranked_sets) == 1:
         return
     heads = ("lamps", "condition number", "noise amplification")
     ranking = _table("Sets of lamps, least noise first", heads, justify="left")
-    for candidate in found:
+    for candidate in ranked_sets:
         matrix = candidate.crosstalk
         amplification = " ".join(f"{value:.2f}" for value in matrix.noise_amplification)
         ranking.add_row(escape(", ".join(matrix.lights)), f"{matrix.condition_number:.2f}", amplification)
@@ -119,51 +119,51 @@ def designs(found: Sequence[Design]) -> None:
 
 def merged(result: Calibration, out: Path) -> None:
     """Print which sections a merged file has."""
-    _print([f"sections: {', '.join(_sections(result))}", _written(out)])
+    _print([f"sections: {', '.join(_sections(result))}", _written_line(out)])
 
 
 def calibration(result: Calibration, path: Path) -> None:
     """Print the content of a calibration file."""
     names = {"kind": "kind", "cfa": "pattern", "black_level": "black level", "white_level": "white level"}
-    stated = [f"{word} {value}" for name, word in names.items() if (value := getattr(result, name)) is not None]
-    stated += [f"{result.shape[1]} x {result.shape[0]} px"] if result.shape else []
-    parts: list[str | Table] = [f"[bold]{escape(str(path))}[/]: {', '.join(_sections(result)) or 'empty'}"]
-    parts.append(f"camera: {', '.join(stated) or 'nothing stated'}")
+    settings_text = [f"{word} {value}" for name, word in names.items() if (value := getattr(result, name)) is not None]
+    settings_text += [f"{result.shape[1]} x {result.shape[0]} px"] if result.shape else []
+    lines: list[str | Table] = [f"[bold]{escape(str(path))}[/]: {', '.join(_sections(result)) or 'empty'}"]
+    lines.append(f"camera: {', '.join(settings_text) or 'nothing stated'}")
     if result.crosstalk is not None:
-        parts += _matrix(result.crosstalk)
+        lines += _matrix(result.crosstalk)
         if result.crosstalk.green_difference is None and "bayer" in result.kinds:
-            parts.append("the two greens are taken as equal: measure the crosstalk again to know their difference")
+            lines.append("the two greens are taken as equal: measure the crosstalk again to know their difference")
     if result.camera_noise is not None:
-        parts += _noise(result.camera_noise)
+        lines += _noise(result.camera_noise)
     elif result.noise is not None:
-        parts.append(f"noise: gain {result.noise.gain:.4g} e-/DN, read noise {result.noise.read_noise:.4g} DN")
+        lines.append(f"noise: gain {result.noise.gain:.4g} e-/DN, read noise {result.noise.read_noise:.4g} DN")
     if result.registration is not None:
-        parts.append(_registration(result.registration))
+        lines.append(_registration(result.registration))
     for section, origin in result.provenance.items():
         if isinstance(origin, dict):
             files = len(origin.get("inputs", ()))
-            parts.append(f"{section}: {files} files, {origin.get('date', '?')}, version {origin.get('version', '?')}")
-            parts += _marked(origin.get("warnings", ()))
-    _print(parts)
+            lines.append(f"{section}: {files} files, {origin.get('date', '?')}, version {origin.get('version', '?')}")
+            lines += _warning_lines(origin.get("warnings", ()))
+    _print(lines)
 
 
-def _print(parts: Iterable[str | Table]) -> None:
-    Console(highlight=False).print(*parts, sep="\n")
+def _print(lines: Iterable[str | Table]) -> None:
+    Console(highlight=False).print(*lines, sep="\n")
 
 
 def _table(title: str, heads: Sequence[str], justify: Literal["left", "right"] = "right") -> Table:
-    """A table whose first column is text, never wrapped."""
+    """Return a table whose first column is text, never wrapped."""
     table = Table(title=title, title_justify="left")
     for index, head in enumerate(heads):
         table.add_column(escape(head), justify=justify if index else "left", no_wrap=index == 0)
     return table
 
 
-def _marked(warnings: Sequence[str]) -> list[str]:
+def _warning_lines(warnings: Sequence[str]) -> list[str]:
     return [f"[yellow]warning:[/] {escape(warning)}" for warning in warnings]
 
 
-def _written(out: Path) -> str:
+def _written_line(out: Path) -> str:
     return f"written: {escape(str(out))}"
 
 
@@ -172,7 +172,7 @@ def _sections(result: Calibration) -> list[str]:
 
 
 def _registration(result: Registration) -> Table:
-    """The parameters of every light with their uncertainties."""
+    """Return the parameters of every light with their uncertainties."""
     heads = ("light", "x (px)", "y (px)", "rotation (mrad)", "scale (1e-3)", "radial (1e-3)")
     table = _table(f"Registration against {escape(result.lights[0])}", heads)
     factors = np.array([1, 1, 1e3, 1e3, 1e3])
@@ -184,7 +184,7 @@ def _registration(result: Registration) -> Table:
 
 
 def _matrix(result: Crosstalk) -> tuple[Table, str]:
-    """The matrix with its uncertainties, and what it means for the noise."""
+    """Return the matrix with its uncertainties, and what it means for the noise."""
     heads = ("channel", *result.lights)
     table, std = _table("Crosstalk: camera channels = A . lights (± standard uncertainty)", heads), result.std
     for row, values in enumerate(result.matrix):
@@ -207,7 +207,7 @@ def _matrix(result: Crosstalk) -> tuple[Table, str]:
 
 
 def _noise(result: CameraNoise) -> tuple[Table, str]:
-    """The figures of every plane, and the number of defects."""
+    """Return the figures of every plane, and the number of defects."""
     table = _table("Camera noise (EMVA 1288; ± standard uncertainty)", ("", *result.planes))
     rows = (
         ("gain 1/K, e-/DN", result.gain),
@@ -267,7 +267,7 @@ def _save(panels: list[Callable[[Axes], None]], path: Path) -> None:
 
 
 def _draw_matrix(axes: Axes, crosstalk: Crosstalk) -> None:
-    """The crosstalk matrix as a coloured table."""
+    """Draw the crosstalk matrix as a coloured table."""
     matrix = crosstalk.matrix
     axes.imshow(matrix, cmap="Greys", vmin=0, vmax=1.4)
     for (row, column), value in np.ndenumerate(matrix):
@@ -279,7 +279,7 @@ def _draw_matrix(axes: Axes, crosstalk: Crosstalk) -> None:
 
 
 def _draw_field(axes: Axes, crosstalk: Crosstalk) -> None:
-    """The entry of A that varies most, over the field."""
+    """Draw the entry of A that varies most, over the field."""
     assert crosstalk.field is not None
     height, width = crosstalk.field.shape
     points = np.stack(np.meshgrid(np.linspace(0, width - 1, 60), np.linspace(0, height - 1, 60)), axis=-1)
@@ -292,7 +292,7 @@ def _draw_field(axes: Axes, crosstalk: Crosstalk) -> None:
 
 
 def _draw_noise(axes: Axes, noise: CameraNoise) -> None:
-    """Standard deviation of a sample over its grey level, per plane."""
+    """Draw the standard deviation of a sample over its grey level, per plane."""
     for index, plane in enumerate(noise.planes):
         level = np.geomspace(1, noise.saturation.value[index], 200)
         std = np.sqrt(noise.read_noise.value[index] ** 2 + level / noise.gain.value[index])
@@ -304,14 +304,16 @@ def _draw_noise(axes: Axes, noise: CameraNoise) -> None:
 
 
 def _draw_registration(axes: Axes, registration: Registration) -> None:
-    """Where the lights see the points of a grid, magnified."""
+    """Draw the displacement of the lights' images at the points of a grid, magnified."""
     (x, y), radius = registration.centre, registration.radius
     points = np.stack(np.meshgrid(np.linspace(0, 2 * x, 9), np.linspace(0, 2 * y, 9)), axis=-1).reshape(-1, 2)
-    moved = registration.displacement(points)
-    largest = max(float(np.abs(moved).max()), 1e-6)
+    displacement = registration.displacement(points)
+    largest = max(float(np.abs(displacement).max()), 1e-6)
     for index, name in enumerate(registration.lights[1:], start=1):
         look: dict[str, Any] = {"color": PALETTE[index % len(PALETTE)], "label": literal(name)}
-        axes.quiver(*points.T, *moved[index].T, angles="xy", scale_units="xy", scale=10 * largest / radius, **look)
+        axes.quiver(
+            *points.T, *displacement[index].T, angles="xy", scale_units="xy", scale=10 * largest / radius, **look
+        )
     title = f"seen elsewhere than by {literal(registration.lights[0])}, up to {largest:.2f} px"
     axes.set(xlabel="x (px)", ylabel="y (px)", title=title)
     axes.set(xlim=(-0.1 * x, 2.1 * x), ylim=(2.1 * y, -0.1 * y), aspect="equal")
@@ -319,7 +321,7 @@ def _draw_registration(axes: Axes, registration: Registration) -> None:
 
 
 def draw_design(result: Design, camera: Sensitivities, lamps: Mapping[str, Lamp], path: Path) -> None:
-    """Picture of the spectra over the camera's sensitivities, and of the predicted matrix."""
+    """Draw the spectra over the camera's sensitivities, and of the predicted matrix."""
 
     def spectra(axes: Axes) -> None:
         for name, values, colour in zip("RGB", camera.values, PALETTE, strict=False):
@@ -354,27 +356,27 @@ def draw_camera(camera: CameraCalibration, path: Path, residuals: Sequence[tuple
     rows, columns = camera.shape
     y, x = np.mgrid[0 : rows - 1 : 24j, 0 : columns - 1 : 24j]
     grid = np.stack([x.ravel(), y.ravel()], axis=1)  # what is drawn there is rounded: noise of 1e-14 would be contoured
-    whole: dict[str, Any] = {"xlim": (-0.5, columns - 0.5), "ylim": (rows - 0.5, -0.5), "aspect": "equal"}
-    whole |= {"xlabel": "x (px)", "ylabel": "y (px)"}
+    axes_options: dict[str, Any] = {"xlim": (-0.5, columns - 0.5), "ylim": (rows - 0.5, -0.5), "aspect": "equal"}
+    axes_options |= {"xlabel": "x (px)", "ylabel": "y (px)"}
 
     def points_off(axes: Axes) -> None:
         unit = float(f"{max(1e-6, *(np.abs(residual).max() for _, residual in residuals)):.0e}")
         for points, residual in residuals:
             axes.quiver(*points.T, *residual.T, angles="xy", scale_units="width", scale=10 * unit, width=0.003)
-        axes.set(title=f"residuals of the points (a tenth of the width: {unit:g} px)", **whole)
+        axes.set(title=f"residuals of the points (a tenth of the width: {unit:g} px)", **axes_options)
 
     def distortion(axes: Axes) -> None:
         if camera.lens is not None:
             shift = np.linalg.norm(distorted(camera.lens, grid) - grid, axis=1).reshape(x.shape)
             axes.figure.colorbar(axes.contourf(x, y, shift.round(6), 12, cmap="viridis"), ax=axes, shrink=0.8)
-        axes.set(title="distortion (px)" if camera.lens is not None else "no lens calibrated", **whole)
+        axes.set(title="distortion (px)" if camera.lens is not None else "no lens calibrated", **axes_options)
 
     def scale(axes: Axes) -> None:
-        known = camera.homography is not None
-        if known:
+        has_plane = camera.homography is not None
+        if has_plane:
             local = np.sqrt(np.linalg.det(camera.jacobian(grid))).reshape(x.shape)
             filled = axes.contourf(x, y, (100 * (local / local.mean() - 1)).round(6), 12, cmap="viridis")
             axes.figure.colorbar(filled, ax=axes, shrink=0.8)
-        axes.set(title="scale on the plane (% of its mean)" if known else "no plane calibrated", **whole)
+        axes.set(title="scale on the plane (% of its mean)" if has_plane else "no plane calibrated", **axes_options)
 
     _save([*([points_off] if residuals else []), distortion, scale], path)

@@ -33,17 +33,19 @@ def calibrate_crosstalk(
     means = {name: files.means(block) for name, files in captures.lights.items()}
     dark = captures.dark.means(block) if captures.dark else []
     estimate = estimate_crosstalk(means, dark, order=order, allow=allow)
-    uneven = [frame.uneven for frames in (*means.values(), dark) for frame in frames]
+    unevenness = [frame.unevenness for frames in (*means.values(), dark) for frame in frames]
     details = {
         "block": block,
         "waived_checks": list(allow),
-        "variation_over_field": {name: asdict(found) for name, found in zip(means, estimate.variations, strict=True)},
+        "variation_over_field": {
+            name: asdict(variation) for name, variation in zip(means, estimate.variations, strict=True)
+        },
     }
-    return _calibration("crosstalk", captures.groups, uneven, details, estimate), estimate
+    return _calibration("crosstalk", captures.groups, unevenness, details, estimate), estimate
 
 
-def calibrate_noise(dark: str, flats: Sequence[str], stated: FrameSettings) -> tuple[Calibration, NoiseEstimate]:
-    """Noise section from capture files.
+def calibrate_noise(dark: str, flats: Sequence[str], user_metadata: FrameSettings) -> tuple[Calibration, NoiseEstimate]:
+    """Return the noise section from capture files.
 
     Parameters
     ----------
@@ -52,45 +54,45 @@ def calibrate_noise(dark: str, flats: Sequence[str], stated: FrameSettings) -> t
     flats
         Patterns of the flat frames. A pattern ``TIME=FILES`` is one exposure with its time; else the files of every
         folder are one exposure.
-    stated
+    user_metadata
         What is stated of the files.
     """
-    groups = [CaptureFiles.find("dark", dark, stated)]
+    groups = [CaptureFiles.find("dark", dark, user_metadata)]
     for text in flats:
         time, separator, pattern = text.partition("=")
         if not separator:
-            groups += CaptureFiles.find(f"flat {text}", text, stated).by_folder()
+            groups += CaptureFiles.find(f"flat {text}", text, user_metadata).by_folder()
             continue
         try:
             seconds = float(time)
         except ValueError:
             raise ConfigurationError(f"--flat takes FILES or TIME=FILES with a number as time, not {text!r}") from None
-        groups.append(replace(CaptureFiles.find(f"flat exposure {time}", pattern, stated), exposure=seconds))
-    dark_frames, *lit = [files.stack() for files in groups]
-    estimate = photon_transfer(dark_frames, lit)
-    details = {"exposures": [stack.exposure for stack in lit]}
-    return _calibration("noise", groups, [stack.uneven for stack in lit], details, estimate), estimate
+        groups.append(replace(CaptureFiles.find(f"flat exposure {time}", pattern, user_metadata), exposure=seconds))
+    dark_frames, *flat_stacks = [files.stack() for files in groups]
+    estimate = photon_transfer(dark_frames, flat_stacks)
+    details = {"exposures": [stack.exposure for stack in flat_stacks]}
+    return _calibration("noise", groups, [stack.unevenness for stack in flat_stacks], details, estimate), estimate
 
 
 def calibrate_registration(
     captures: Captures, *, region: Sequence[float] | None = None, element_size: float | None = None
 ) -> tuple[Calibration, RegistrationEstimate]:
-    """Registration section from captures of a speckled target; the first light is the reference."""
+    """Return the registration section from captures of a speckled target; the first light is the reference."""
     lights, dark = captures.stacks()
     estimate = estimate_registration(lights, dark, region=region, element_size=element_size)
-    uneven = [stack.uneven for stack in lights.values()]
+    unevenness = [stack.unevenness for stack in lights.values()]
     details = {
         "region": None if region is None else list(region),
         "element_size": estimate.element_size,
         "residual_rms_px": {match.name: match.rms for match in estimate.matches},
     }
-    return _calibration("registration", captures.groups, uneven, details, estimate), estimate
+    return _calibration("registration", captures.groups, unevenness, details, estimate), estimate
 
 
 def _calibration(
     section: str,
     groups: Sequence[CaptureFiles],
-    uneven: Sequence[float],
+    unevenness: Sequence[float],
     details: Mapping[str, Any],
     estimate: CrosstalkEstimate | NoiseEstimate | RegistrationEstimate,
 ) -> Calibration:
@@ -101,15 +103,17 @@ def _calibration(
     files, field = groups[0], "camera_noise" if section == "noise" else section
     header, (_, frame) = files.series.lights[0][0].stored(0), next(files.frames())
     levels: dict[str, Any] = {"black_level": float(frame.black_level.mean()), "white_level": frame.white_level}
-    known = {name for name in levels for source in (header, files.stated) if getattr(source, name) is not None}
+    stated_levels = {
+        name for name in levels for source in (header, files.user_metadata) if getattr(source, name) is not None
+    }
     return Calibration(
         **{field: getattr(estimate, field)},
         provenance={section: provenance(section, groups, {**details, "warnings": list(estimate.warnings)})},
         kind="bayer" if isinstance(frame, Mosaic) else "rgb" if len(frame.values) == 3 else "monochrome",
         cfa=frame.cfa if isinstance(frame, Mosaic) else None,
         shape=(frame.values.shape[-2], frame.values.shape[-1]),
-        unevenness=max(filter(np.isfinite, uneven), default=None),
-        **{name: level for name, level in levels.items() if name in known},
+        unevenness=max(filter(np.isfinite, unevenness), default=None),
+        **{name: level for name, level in levels.items() if name in stated_levels},
     )
 
 
@@ -133,7 +137,7 @@ def read_corners(corners: str, size: str, std: float, shape: tuple[int, int]) ->
         An option has another form, the corners lie outside the frame or do not go around a convex quadrilateral.
     """
     sides = re.fullmatch(r"([\d.]+)x([\d.]+)mm", size)
-    groups = [part.split(",") for part in corners.split(":")]
+    groups = [corner.split(",") for corner in corners.split(":")]
     try:
         pixels = np.array([[float(number) for number in group] for group in groups])
         width, height = (float(side) for side in sides.groups()) if sides else (0.0, 0.0)
@@ -157,7 +161,7 @@ def read_corners(corners: str, size: str, std: float, shape: tuple[int, int]) ->
 
 
 def calibrate_camera(
-    stated: FrameSettings,
+    user_metadata: FrameSettings,
     target: Target | None,
     *,
     lens: str | CameraCalibration | None = None,
@@ -168,7 +172,7 @@ def calibrate_camera(
 
     Parameters
     ----------
-    stated
+    user_metadata
         What is stated of the files.
     target
         The target; None where there are no photographs.
@@ -190,34 +194,34 @@ def calibrate_camera(
     """
     if (isinstance(lens, str) or isinstance(plane, str)) and target is None:
         raise ConfigurationError("--views and --plane need --target, what the photographs show")
-    groups, parts = list[CaptureFiles](), list[CameraEstimate]()
+    groups, estimates = list[CaptureFiles](), list[CameraEstimate]()
     camera, view = None, None
     if isinstance(lens, str) and target:
-        groups.append(CaptureFiles.find("views", lens, stated))
+        groups.append(CaptureFiles.find("views", lens, user_metadata))
         views, reasons = find_views(groups[-1], target)
-        parts.append(estimate_lens([_on_first_light(one, lights) for one in views], reasons))
-        camera = parts[-1].camera
+        estimates.append(estimate_lens([_on_first_light(lens_view, lights) for lens_view in views], reasons))
+        camera = estimates[-1].camera
     elif isinstance(lens, CameraCalibration):
-        camera = _lens_of(lens, lights)
+        camera = _without_plane(lens, lights)
     if isinstance(plane, str) and target:
-        groups.append(CaptureFiles.find("plane", plane, stated))
+        groups.append(CaptureFiles.find("plane", plane, user_metadata))
         view = _mean_view(groups[-1], target)
     elif isinstance(plane, tuple):
-        shape = camera.shape if camera is not None else stated.shape
+        shape = camera.shape if camera is not None else user_metadata.shape
         if shape is None:
             raise ConfigurationError("--corners need the frames' size: --shape ROWSxCOLUMNS, or --lens")
         view = read_corners(*plane, shape)
     if view is not None:
         camera = camera or CameraCalibration(shape=view.shape)
         std = plane[2] if isinstance(plane, tuple) else None
-        parts.append(estimate_plane(_on_first_light(view, lights), camera, std))
-        camera = parts[-1].camera
-    if camera is None or not parts:
+        estimates.append(estimate_plane(_on_first_light(view, lights), camera, std))
+        camera = estimates[-1].camera
+    if camera is None or not estimates:
         raise ConfigurationError("nothing to calibrate: state --views, --plane or --corners")
     details = {**camera.details, "provenance": provenance("camera", groups, {})}
     if lights is not None:
         details |= {"lights": list(lights.names), "first_light": lights.first}
-    residuals = tuple(points for part in parts for points in part.residuals)
+    residuals = tuple(points for estimate in estimates for points in estimate.residuals)
     return CameraEstimate(camera=replace(camera, details=details), residuals=residuals)
 
 
@@ -229,7 +233,7 @@ def _on_first_light(view: View, lights: TargetLights | None) -> View:
     return replace(view, pixels=pixels, factor=factor)
 
 
-def _lens_of(camera: CameraCalibration, lights: TargetLights | None) -> CameraCalibration:
+def _without_plane(camera: CameraCalibration, lights: TargetLights | None) -> CameraCalibration:
     """Return an earlier calibration without its plane.
 
     Raises
@@ -237,12 +241,12 @@ def _lens_of(camera: CameraCalibration, lights: TargetLights | None) -> CameraCa
     CalibrationError
         It is of the image of another light.
     """
-    before, now = camera.details.get("first_light"), None if lights is None else lights.first
-    if before is not None and before != now:
-        image = "with no light stated" if now is None else f"of light {now}'s image"
+    earlier_light, present_light = camera.details.get("first_light"), None if lights is None else lights.first
+    if earlier_light is not None and earlier_light != present_light:
+        image = "with no light stated" if present_light is None else f"of light {present_light}'s image"
         raise CalibrationError(
-            f"{camera.name} (--lens) is of light {before}'s image, the plane {image}: state --light and --calibration "
-            "as for the lens"
+            f"{camera.name} (--lens) is of light {earlier_light}'s image, the plane {image}: state --light and "
+            "--calibration as for the lens"
         )
     covariance = np.pad(camera.covariance[:8, :8], (0, 8))
     return replace(camera, homography=None, covariance=covariance, details={"lens": camera.details.get("lens")})
@@ -256,16 +260,16 @@ def _mean_view(files: CaptureFiles, target: Target) -> View:
     for shot in shots[1:]:
         if not np.array_equal(shot.points, shots[0].points):
             raise CalibrationError("--plane: the photographs show different points of the target: state one of them")
-        if (moved := float(np.abs(shot.pixels - shots[0].pixels).max())) > LIMITS.largest_residual:
+        if (motion_px := float(np.abs(shot.pixels - shots[0].pixels).max())) > LIMITS.max_residual:
             raise CalibrationError(
-                f"--plane: from {shots[0].name} to {shot.name} the target moved by up to {moved:.2f} px, at most "
-                f"{LIMITS.largest_residual:g} may be: state photographs of one plane"
+                f"--plane: from {shots[0].name} to {shot.name} the target moved by up to {motion_px:.2f} px, at most "
+                f"{LIMITS.max_residual:g} may be: state photographs of one plane"
             )
     return replace(shots[0], pixels=np.mean([shot.pixels for shot in shots], axis=0))
 
 
 def merge_files(paths: Sequence[Path]) -> Calibration:
-    """One calibration with every section that any of the files has.
+    """Return one calibration with every section that any of the files has.
 
     Raises
     ------
@@ -277,20 +281,22 @@ def merge_files(paths: Sequence[Path]) -> Calibration:
     """
     if len(paths) < 2:
         raise ConfigurationError(f"merge needs at least two calibration files, given is {len(paths)}")
-    found: dict[tuple[str, str], tuple[Any, Path]] = {}
+    sections: dict[tuple[str, str], tuple[Any, Path]] = {}
     for path in paths:
         for name, section in Calibration.read(path).to_document().items():
             for key, value in section.items() if name in ("camera", "provenance") else [("", section)]:
-                before, where = found.setdefault((name, key), (value, path))
+                earlier, earlier_path = sections.setdefault((name, key), (value, path))
                 if key == "unevenness":
-                    found[name, key] = max(before, value), path
-                elif before != value:
-                    part = f"the provenance of {key}" if name == "provenance" else (key or name).replace("_", " ")
+                    sections[name, key] = max(earlier, value), path
+                elif earlier != value:
+                    section_name = (
+                        f"the provenance of {key}" if name == "provenance" else (key or name).replace("_", " ")
+                    )
                     raise CalibrationError(
-                        f"{where} and {path} differ in {part}: merge takes it from one file only, and the camera "
-                        "settings must be the same in all"
+                        f"{earlier_path} and {path} differ in {section_name}: merge takes it from one file only, and "
+                        "the camera settings must be the same in all"
                     )
     document: dict[str, Any] = {}
-    for (name, key), (value, _) in found.items():
+    for (name, key), (value, _) in sections.items():
         document[name] = document.get(name, {}) | {key: value} if key else value
     return Calibration.from_document(document)

@@ -19,8 +19,8 @@ from rgbmidic.errors import CalibrationError
 from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.linear import CameraNoise, Quantity
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
-from rgbmidic_calibration.captures import TILE, TemporalStack, same_camera, tile_means
-from rgbmidic_calibration.plausibility import judged
+from rgbmidic_calibration.captures import TILE, TemporalStack, require_same_camera, tile_means
+from rgbmidic_calibration.plausibility import collect_warnings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,7 +29,7 @@ class NoiseConstants:
 
     Attributes
     ----------
-    highest
+    max_level
         Blocks brighter than this fraction of the range are not used: the variance falls as samples reach white. From .7
         to .95 the gain of the virtual camera changes by .7 of its standard uncertainty at most.
     knee
@@ -40,7 +40,7 @@ class NoiseConstants:
         one strength, so that drift does no harm; a fifth is another exposure rather than a lamp that warms up.
     window
         Side (samples of a plane) of the neighbourhood whose mean is taken out: shading and dirt are wider than this.
-    hot
+    hot_sigma
         Robust standard deviations above the neighbourhood's median that make a pixel hot in the dark: of normal noise
         one sample in 1e15 lies there; from 6 to 10 the virtual camera has no false one.
     hot_fraction
@@ -51,20 +51,20 @@ class NoiseConstants:
         from a black one; from .3 to .7 the virtual camera has no false one.
     lit_fraction
         Signal over the full scale below which neither is determined (chosen).
-    textured
+    max_response_variation
         Local variation of the response above which the target, not the sensor, is uneven: from .03 to .08 the virtual
         camera's white card is judged alike.
     """
 
-    highest: float = 0.9
+    max_level: float = 0.9
     knee: float = 0.8
     drift: float = 0.2
     window: int = 7
-    hot: float = 8.0
+    hot_sigma: float = 8.0
     hot_fraction: float = 0.005
     dead_fraction: float = 0.5
     lit_fraction: float = 0.02
-    textured: float = 0.05
+    max_response_variation: float = 0.05
 
 
 LIMITS = NoiseConstants()
@@ -82,20 +82,21 @@ class NoiseEstimate:
 class _Line:
     """Photon transfer line of one plane: variance over mean.
 
-    `reach` is the mean of the brightest exposure above dark (DN), `scatter` that of the tiles' variances about the line
-    over what noise alone explains, `bend` the largest relative departure of an exposure's mean beyond its noise.
+    `max_mean` is the mean of the brightest exposure above dark (DN), `scatter` that of the tiles' variances about the
+    line over what noise alone explains, `max_departure` the largest relative departure of an exposure's mean beyond
+    its noise.
     """
 
     read_variance: float
     slope: float
     covariance: FloatArray  # (2, 2)
-    reach: float
+    max_mean: float
     scatter: float
-    bend: float
+    max_departure: float
 
 
 def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> NoiseEstimate:
-    """Noise figures of every colour plane from dark frames and flat frames at several exposures.
+    """Return the noise figures of every colour plane from dark frames and flat frames at several exposures.
 
     Parameters
     ----------
@@ -112,36 +113,42 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
         as the flats.
     """
     stacks, names = [dark, *flats], dark.camera.names
-    same_camera(stacks)
-    _refuse(dark, flats)
-    range_ = dark.camera.white - np.array(dark.camera.black)
+    require_same_camera(stacks)
+    _require_usable(dark, flats)
+    full_range = dark.camera.white - np.array(dark.camera.black)
     freedom = TILE**2 * (np.array([stack.count for stack in stacks]) - 1)
     # tiles of every exposure and plane, those of the dark frames first
     level = np.stack([tile_means(stack.mean) for stack in stacks])
     variance = np.stack([tile_means(stack.variance) for stack in stacks])
     free = np.stack([tile_means(stack.clipped) == 0 for stack in stacks])
-    used = free & (level < LIMITS.highest * range_[:, None])
-    used[0] = True
+    is_used = free & (level < LIMITS.max_level * full_range[:, None])
+    is_used[0] = True
     mean = level - level[0]
-    lines = [_fit_line(name, mean[:, p], variance[:, p], used[:, p], freedom) for p, name in enumerate(names)]
+    lines = [_fit_line(name, mean[:, p], variance[:, p], is_used[:, p], freedom) for p, name in enumerate(names)]
     drift = dark.strength.var(axis=0, ddof=1)
-    rest = np.array([plane.mean(dtype=np.float64) / plane.size for plane in dark.variance])
-    black_std = np.sqrt(np.maximum(drift, rest) / dark.count)
+    mean_variance = np.array([plane.mean(dtype=np.float64) / plane.size for plane in dark.variance])
+    black_std = np.sqrt(np.maximum(drift, mean_variance) / dark.count)
     black = Quantity(np.array(dark.camera.black) + dark.strength.mean(axis=0), black_std)
     knees = []  # lowest level at which the variance of a plane breaks down
     for plane, line in enumerate(lines):
         ratio = variance[1:, plane] / (line.read_variance + line.slope * np.maximum(mean[1:, plane], 0))
         broken = free[1:, plane] & (ratio < LIMITS.knee - 3 * np.sqrt(2 / freedom[1:, None]))
-        broken &= mean[1:, plane] > 0.3 * range_[plane]
-        many = broken.mean(axis=1) > 0.02
-        found = [np.median(level[where]) for level, where in zip(mean[1:, plane][many], broken[many], strict=True)]
-        knees.append(min(found, default=np.nan))
+        broken &= mean[1:, plane] > 0.3 * full_range[plane]
+        is_broken = broken.mean(axis=1) > 0.02
+        levels = [
+            np.median(level[mask]) for level, mask in zip(mean[1:, plane][is_broken], broken[is_broken], strict=True)
+        ]
+        knees.append(min(levels, default=np.nan))
     white, std = dark.camera.white - black.value, np.hypot(black.std, 0.5)
-    early = np.nan_to_num(knees, nan=np.inf) < 0.95 * white  # the sensor saturates before the white level does
-    saturation = Quantity(np.where(early, knees, white), np.where(early, 0.05 * np.array(knees), std))
+    saturates_early = (
+        np.nan_to_num(knees, nan=np.inf) < 0.95 * white
+    )  # the sensor saturates before the white level does
+    saturation = Quantity(
+        np.where(saturates_early, knees, white), np.where(saturates_early, 0.05 * np.array(knees), std)
+    )
     read, gain = np.sqrt([line.read_variance for line in lines]), np.array([1 / line.slope for line in lines])
     read_std, slope_std = np.sqrt([np.diag(line.covariance) for line in lines]).T
-    dsnu, prnu, defects, uneven = fixed_pattern(dark, flats, saturation)
+    dsnu, prnu, defects, texture_warnings = fixed_pattern(dark, flats, saturation)
     noise = CameraNoise(
         planes=names,
         gain=Quantity(gain, gain**2 * slope_std),
@@ -153,11 +160,11 @@ def photon_transfer(dark: TemporalStack, flats: Sequence[TemporalStack]) -> Nois
         prnu=prnu,
         defects=defects,
     )
-    warnings = judged(_checks(dark, flats, noise, lines, early))
-    return NoiseEstimate(camera_noise=noise, warnings=(*warnings, *uneven))
+    warnings = collect_warnings(_checks(dark, flats, noise, lines, saturates_early))
+    return NoiseEstimate(camera_noise=noise, warnings=(*warnings, *texture_warnings))
 
 
-def _refuse(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
+def _require_usable(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
     if not flats:
         raise CalibrationError("no flat exposure is given: the gain needs lit frames at one exposure at least")
     for index, stack in enumerate([dark, *flats]):
@@ -169,10 +176,10 @@ def _refuse(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
                 f"{name}: the frames' strengths differ by {100 * stack.drift:.0f} %: each group must be frames of one "
                 "exposure with a steady lamp"
             )
-        if index and stack.piled_at is not None:
+        if index and stack.pile_level is not None:
             raise CalibrationError(
-                f"{name}: samples pile up at {stack.piled_at:.0f} DN, below the stated white level "
-                f"{stack.camera.white:g}: the camera saturates there; state --white-level {stack.piled_at:.0f}"
+                f"{name}: samples pile up at {stack.pile_level:.0f} DN, below the stated white level "
+                f"{stack.camera.white:g}: the camera saturates there; state --white-level {stack.pile_level:.0f}"
             )
     brightest = max(float(flat.strength.mean(axis=0).max()) for flat in flats)
     if float(dark.strength.mean(axis=0).max()) > 0.5 * brightest:
@@ -180,17 +187,17 @@ def _refuse(dark: TemporalStack, flats: Sequence[TemporalStack]) -> None:
 
 
 def _fit_line(
-    name: str, mean: FloatArray, variance: FloatArray, used: BoolArray, freedom: npt.NDArray[np.intp]
+    name: str, mean: FloatArray, variance: FloatArray, is_used: BoolArray, freedom: npt.NDArray[np.intp]
 ) -> _Line:
     """Line of variance over mean through the tiles of all exposures (E, T), weighted by the variance of a variance."""
-    if not used[1:].any():
+    if not is_used[1:].any():
         raise CalibrationError(
             f"plane {name}: every block of every flat exposure is saturated or nearly so; shorten the exposure"
         )
     exposure, freedom = (
-        np.broadcast_to(values[:, None], mean.shape)[used] for values in (np.arange(len(mean)), freedom)
+        np.broadcast_to(values[:, None], mean.shape)[is_used] for values in (np.arange(len(mean)), freedom)
     )
-    mean, variance = mean[used], variance[used]
+    mean, variance = mean[is_used], variance[is_used]
     if mean.max() <= 0:
         raise CalibrationError(f"plane {name}: the flat frames are not brighter than the dark ones")
     design = np.stack([np.ones_like(mean), mean], axis=1)
@@ -217,21 +224,21 @@ def _fit_line(
         read_variance=max(float(solution[0]), 1e-12),
         slope=float(solution[1]),
         covariance=inverse @ (score.T @ score) @ inverse,
-        reach=float(means[0].max()),
+        max_mean=float(means[0].max()),
         scatter=scatter,
-        bend=float(np.maximum(np.abs(means[1] / means[2] - 1) - 4 * noise, 0).max()),
+        max_departure=float(np.maximum(np.abs(means[1] / means[2] - 1) - 4 * noise, 0).max()),
     )
 
 
 def _linearity(dark: TemporalStack, flats: Sequence[TemporalStack], saturation: FloatArray) -> Quantity:
-    """EMVA 1288 LE: mean relative deviation in % from the line through mean against exposure time, 5 to 95 %."""
-    known = [flat for flat in flats if flat.exposure is not None]
-    time = np.array([flat.exposure for flat in known], dtype=np.float64)
+    """Return LE of EMVA 1288, mean relative deviation in % from the line of mean against exposure time, 5 to 95 %."""
+    timed_flats = [flat for flat in flats if flat.exposure is not None]
+    time = np.array([flat.exposure for flat in timed_flats], dtype=np.float64)
     error, std = np.full((2, len(dark.camera.names)), np.nan)
     for plane, full in enumerate(saturation):
-        mean = np.array([flat.strength[:, plane].mean() for flat in known]) - dark.strength[:, plane].mean()
-        steady = np.array([flat.strength[:, plane].std(ddof=1) / np.sqrt(flat.count) for flat in known])
-        free = np.array([not flat.clipped[plane].any() for flat in known], dtype=bool)
+        mean = np.array([flat.strength[:, plane].mean() for flat in timed_flats]) - dark.strength[:, plane].mean()
+        steady = np.array([flat.strength[:, plane].std(ddof=1) / np.sqrt(flat.count) for flat in timed_flats])
+        free = np.array([not flat.clipped[plane].any() for flat in timed_flats], dtype=bool)
         good = free & (mean > 0.05 * full) & (mean < 0.95 * full)
         if len(np.unique(time[good])) < 3:
             continue
@@ -244,7 +251,7 @@ def _linearity(dark: TemporalStack, flats: Sequence[TemporalStack], saturation: 
 def fixed_pattern(
     dark: TemporalStack, flats: Sequence[TemporalStack], saturation: Quantity
 ) -> tuple[Quantity, Quantity, tuple[tuple[int, int, str], ...], list[str]]:
-    """Fixed pattern from the mean dark frame and the mean flat frame nearest to half of saturation.
+    """Return the fixed pattern from the mean dark frame and the mean flat frame nearest to half of saturation.
 
     The variance of the temporal noise that remains in a mean over n frames, its n-th part, is taken out.
 
@@ -260,11 +267,11 @@ def fixed_pattern(
     for plane, name in enumerate(dark.camera.names):
         excess = dark.mean[plane] - ndimage.median_filter(dark.mean[plane], 5)
         floor = LIMITS.hot_fraction * (dark.camera.white - dark.camera.black[plane])
-        hot = excess > max(LIMITS.hot * float(np.median(np.abs(excess))) / 0.6745, floor)
+        hot = excess > max(LIMITS.hot_sigma * float(np.median(np.abs(excess))) / 0.6745, floor)
         dsnu.append(_spread(dark.mean[plane], dark.variance[plane] / dark.count, ~hot))
         flat = min(flats, key=lambda f: abs(float(f.strength[:, plane].mean()) - saturation.value[plane] / 2))
         response, dead = _response(dark, flat, plane, hot)
-        if response[0] > LIMITS.textured:
+        if response[0] > LIMITS.max_response_variation:
             textured.append(f"{name} {100 * response[0]:.0f} %")
             response, dead = (np.nan, np.nan), np.zeros_like(hot)
         prnu.append((100 * response[0], 100 * response[1]))
@@ -285,14 +292,14 @@ def fixed_pattern(
 def _response(
     dark: TemporalStack, flat: TemporalStack, plane: int, hot: BoolArray
 ) -> tuple[tuple[float, float], BoolArray]:
-    """Relative spread of the response with its uncertainty, NaN where it cannot be determined; dead pixels."""
-    lit = LIMITS.lit_fraction * (flat.camera.white - flat.camera.black[plane])
+    """Return relative spread of the response with its uncertainty, NaN where it cannot be determined; dead pixels."""
+    min_signal = LIMITS.lit_fraction * (flat.camera.white - flat.camera.black[plane])
     signal = flat.mean[plane] - dark.mean[plane]
-    around = ndimage.median_filter(signal, 5)
+    local_median = ndimage.median_filter(signal, 5)
     usable = ~hot & ~flat.clipped[plane]
-    dead = usable & (signal < LIMITS.dead_fraction * around) & (around > lit)
+    dead = usable & (signal < LIMITS.dead_fraction * local_median) & (local_median > min_signal)
     level = float(signal[usable].mean()) if usable.any() else 0.0
-    if level < lit:
+    if level < min_signal:
         return (np.nan, np.nan), np.zeros_like(dead)
     temporal = flat.variance[plane] / flat.count + dark.variance[plane] / dark.count
     local = np.maximum(ndimage.uniform_filter(signal, 4 * LIMITS.window), 1e-3 * level)
@@ -314,17 +321,21 @@ def _spread(mean: AnyArray, temporal: AnyArray, usable: BoolArray) -> tuple[floa
 
 
 def _checks(
-    dark: TemporalStack, flats: Sequence[TemporalStack], noise: CameraNoise, lines: Sequence[_Line], early: BoolArray
+    dark: TemporalStack,
+    flats: Sequence[TemporalStack],
+    noise: CameraNoise,
+    lines: Sequence[_Line],
+    saturates_early: BoolArray,
 ) -> Iterator[Check]:
-    """What the user should know; the limits are chosen where no source is given, and decide on nothing else."""
+    """Warn the user of doubts; the limits are chosen where no source is given, and decide on nothing else."""
     planes, black = noise.planes, noise.black_level.value
-    for plane in np.flatnonzero(early).tolist():
+    for plane in np.flatnonzero(saturates_early).tolist():
         knee = noise.saturation.value[plane]
         yield warning(
             f"plane {planes[plane]}: the variance breaks down at {knee:.0f} DN above black, below the white level: the "
             f"sensor saturates there (white_level {knee + black[plane]:.0f} in the test)"
         )
-    if not any(flat.clipped.any() for flat in flats) and not early.any():
+    if not any(flat.clipped.any() for flat in flats) and not saturates_early.any():
         yield warning("no exposure reached saturation: the full well is that of the stated white level")
     text = (
         f"{100 * dark.zeros:.1f} % of the dark samples are 0: the black level is cut off and the read noise comes out "
@@ -334,15 +345,15 @@ def _checks(
     drift = max(flat.drift for flat in flats)
     text = f"the lamp's strength differs by {100 * drift:.1f} % within an exposure; it was taken out"
     yield warning(text, drift, above=0.02)
-    reach, range_ = max(line.reach for line in lines), dark.camera.white - min(dark.camera.black)
+    reach, full_range = max(line.max_mean for line in lines), dark.camera.white - min(dark.camera.black)
     text = f"the brightest exposure reaches {reach:.0f} DN only: expose up to 70 % of the range for a good gain"
-    yield warning(text, reach < 0.2 * range_)  # the relative error of the gain grows as its inverse
+    yield warning(text, reach < 0.2 * full_range)  # the relative error of the gain grows as its inverse
     for name, line in zip(planes, lines, strict=True):
         text = (
-            f"plane {name}: the variance does not follow a line (departs by {100 * line.bend:.1f} %, scatters "
+            f"plane {name}: the variance does not follow a line (departs by {100 * line.max_departure:.1f} %, scatters "
             f"{line.scatter:.1f} times as much as noise): did the target move, or the lamp flicker, between frames?"
         )
-        yield warning(text, max(line.scatter / 1.5, line.bend / 0.03), above=1)
+        yield warning(text, max(line.scatter / 1.5, line.max_departure / 0.03), above=1)
     # lights that shine together are then the sum of the single ones as `check` allows (`verify.Limits.additivity`);
     # EMVA 1288 defines the figure and sets no limit
     error, limit = np.nan_to_num(noise.linearity_error.value), 0.5

@@ -22,18 +22,18 @@ enough signal; the captures of one light agree in colour; the dark frames agree 
 below the white level."""
 
 
-def judged(checks: Iterable[Check], allow: Collection[str] = ()) -> list[str]:
-    """Warnings that checks give rise to, those among them that fail and are waived.
+def collect_warnings(checks: Iterable[Check], allow: Collection[str] = ()) -> list[str]:
+    """Return the warnings that checks give rise to, those among them that fail and are waived.
 
     Raises
     ------
     CalibrationError
         One fails that `allow` does not name.
     """
-    found = reported(checks)
-    if wrong := refused(found, allow):
-        raise CalibrationError(f"{wrong[0].text} (--allow {wrong[0].name} goes on all the same)")
-    return [check.text for check in found]
+    reported_checks = reported(checks)
+    if refused_checks := refused(reported_checks, allow):
+        raise CalibrationError(f"{refused_checks[0].text} (--allow {refused_checks[0].name} goes on all the same)")
+    return [check.text for check in reported_checks]
 
 
 def capture_checks(lights: Mapping[str, Sequence[BlockMeans]], dark: Sequence[BlockMeans]) -> Iterator[Check]:
@@ -54,9 +54,9 @@ def capture_checks(lights: Mapping[str, Sequence[BlockMeans]], dark: Sequence[Bl
     labels: dict[str, list[str]] = {}
     first = next(iter(lights.values()))[0].camera
     for name, captures in {**lights, "dark": dark}.items():
-        whose = "the dark frames" if name == "dark" else f"light {name}"
+        group_name = "the dark frames" if name == "dark" else f"light {name}"
         files = [f" ({frame.name})" if frame.name else "" for frame in captures]
-        labels[name] = [f"capture {index} of {whose}{file}" for index, file in enumerate(files, start=1)]
+        labels[name] = [f"capture {index} of {group_name}{file}" for index, file in enumerate(files, start=1)]
         for frame, label in zip(captures, labels[name], strict=True):
             if frame.camera != first:
                 raise CalibrationError(
@@ -114,10 +114,10 @@ def _signal_checks(name: str, captures: Sequence[BlockMeans], signals: Sequence[
             f"light {name}: {100 * clipped:.0f} % of the blocks hold saturated samples; shorten the exposure until "
             "none does"
         )
-    for piled in [frame.piled_at for frame in captures if frame.piled_at is not None][:1]:
+    for pile_level in [frame.pile_level for frame in captures if frame.pile_level is not None][:1]:
         text = (
-            f"light {name}: samples pile up at {piled:.0f} DN, below the stated white level: the camera saturates "
-            f"there; state --white-level {piled:.0f}"
+            f"light {name}: samples pile up at {pile_level:.0f} DN, below the stated white level: the camera saturates "
+            f"there; state --white-level {pile_level:.0f}"
         )
         yield Check("white-level", text)
     scale = captures[0].camera.full_scale

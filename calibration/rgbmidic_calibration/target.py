@@ -55,19 +55,19 @@ class Target:
         ConfigurationError
             The text has another form, or names what cannot be a target.
         """
-        found = _FORM.fullmatch(text.strip())
+        match = _FORM.fullmatch(text.strip())
         form = (
             f"--target is KIND:COLUMNSxROWS:SPACINGmm with a kind of {', '.join(_KINDS)}, such as chessboard:9x6:2.5mm "
             "(inner corners), charuco:8x6:10mm:7.5mm:DICT_5X5_100 (squares, markers)"
         )
-        if found is None:
+        if match is None:
             raise ConfigurationError(f"{form}; not {text!r}")
-        kind, columns, rows, spacing, marker, dictionary = found.groups()
+        kind, columns, rows, spacing, marker, dictionary = match.groups()
         target = cls(kind=kind, columns=int(columns), rows=int(rows), spacing=float(spacing))
         if kind == "charuco":
             target = replace(target, marker=float(marker or 0), dictionary=dictionary or target.dictionary)
-        wrong = min(target.columns, target.rows) < 3 or target.spacing <= 0
-        if wrong or (kind == "charuco") != bool(marker) or not target.marker < target.spacing:
+        is_invalid = min(target.columns, target.rows) < 3 or target.spacing <= 0
+        if is_invalid or (kind == "charuco") != bool(marker) or not target.marker < target.spacing:
             raise ConfigurationError(
                 f"{form}; at least 3 points along a side, markers smaller than squares; not {text!r}"
             )
@@ -106,16 +106,16 @@ class Target:
         if self.kind == "chessboard":
             # normalised images (CALIB_CB_NORMALIZE_IMAGE) cost .2 px
             for flags in (cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE):
-                there, points = cv2.findChessboardCornersSB(image, size, flags=flags)
-                if there:
+                is_found, points = cv2.findChessboardCornersSB(image, size, flags=flags)
+                if is_found:
                     break
         else:
             grid = cv2.CALIB_CB_ASYMMETRIC_GRID if self.kind == "acircles" else cv2.CALIB_CB_SYMMETRIC_GRID
-            there, points = cv2.findCirclesGrid(image, size, flags=grid)
-        return (self.points, np.asarray(points, dtype=np.float64).reshape(-1, 2)) if there else None
+            is_found, points = cv2.findCirclesGrid(image, size, flags=grid)
+        return (self.points, np.asarray(points, dtype=np.float64).reshape(-1, 2)) if is_found else None
 
 
-def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, reach: float) -> FloatArray:
+def refine_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, reach: float) -> FloatArray:
     """Fit the model of a blurred corner to the image around each corner of a chessboard.
 
     The grey levels are ``a + b erf(d1 / s) erf(d2 / s)`` with the distances d1 and d2 from the two edges: seven
@@ -137,18 +137,18 @@ def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, r
     """
     homography = np.asarray(cv2.findHomography(points, pixels)[0], dtype=np.float64)
 
-    def seen(places: FloatArray) -> FloatArray:
-        values = np.c_[places, np.ones(len(places))] @ homography.T
+    def project(target_points: FloatArray) -> FloatArray:
+        values = np.c_[target_points, np.ones(len(target_points))] @ homography.T
         return np.asarray(values[:, :2] / values[:, 2:])
 
-    edges = [seen(points + step) - seen(points - step) for step in reach * np.eye(2)]
+    edges = [project(points + step) - project(points - step) for step in reach * np.eye(2)]
     # half width (px) of the window: beyond 15 nothing is gained, below 4 there are hardly more samples than unknowns
     half = int(min(15, np.min([np.linalg.norm(edge, axis=1).min() for edge in edges]) / (2 * np.sqrt(2))))
     if half < 4:
         return pixels
-    y, x = (part.ravel() for part in np.mgrid[-half : half + 1, -half : half + 1])
+    y, x = (axis_indices.ravel() for axis_indices in np.mgrid[-half : half + 1, -half : half + 1])
     corner = np.round(pixels).astype(int)
-    inside = ((corner >= half) & (corner < np.array(image.shape[::-1]) - half)).all(axis=1)
+    in_image = ((corner >= half) & (corner < np.array(image.shape[::-1]) - half)).all(axis=1)
     values = image[
         np.clip(corner[:, 1:] + y, 0, image.shape[0] - 1), np.clip(corner[:, :1] + x, 0, image.shape[1] - 1)
     ].astype(np.float64)
@@ -156,7 +156,7 @@ def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, r
     low, high = np.percentile(values, (5, 95), axis=1)
 
     def model(state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Grey levels (m, p) and their derivatives (m, p, 7)."""
+        """Return the grey levels (m, p) and their derivatives (m, p, 7)."""
         dx, dy = (x - state[:, :1])[:, None], (y - state[:, 1:2])[:, None]
         width, step = np.exp(state[:, 4:5, None]), state[:, 6:7]
         # of both edges: coordinates along and across, the profile of a blurred edge and its derivative by the distance
@@ -165,13 +165,13 @@ def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, r
         profile = special.erf(across / width)
         e, f = profile[:, 0], profile[:, 1]
         de, df = np.moveaxis(2 / np.sqrt(np.pi) * np.exp(-((across / width) ** 2)) / width, 1, 0)
-        left, right = step * de * f, step * e * df
+        first_slope, second_slope = step * de * f, step * e * df
         slopes = (
-            left * sines[:, 0] + right * sines[:, 1],
-            -left * cosines[:, 0] - right * cosines[:, 1],
-            -left * along[:, 0],
-            -right * along[:, 1],
-            -left * across[:, 0] - right * across[:, 1],
+            first_slope * sines[:, 0] + second_slope * sines[:, 1],
+            -first_slope * cosines[:, 0] - second_slope * cosines[:, 1],
+            -first_slope * along[:, 0],
+            -second_slope * along[:, 1],
+            -first_slope * across[:, 0] - second_slope * across[:, 1],
             np.ones_like(e),
             e * f,
         )
@@ -191,9 +191,9 @@ def refined_corners(image: FloatImage, points: FloatArray, pixels: FloatArray, r
         state += np.clip(change, -largest_change, largest_change)
         if not (np.abs(change[:, :2]) > 1e-4).any():
             break
-    found = corner + state[:, :2]
-    sure = inside & (np.abs(found - pixels) < half / 2).all(axis=1) & np.isfinite(state).all(axis=1)
-    return np.where(sure[:, None], found, pixels)
+    refined = corner + state[:, :2]
+    is_accepted = in_image & (np.abs(refined - pixels) < half / 2).all(axis=1) & np.isfinite(state).all(axis=1)
+    return np.where(is_accepted[:, None], refined, pixels)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -250,10 +250,10 @@ def find_view(frame: Mosaic | ChannelFrame, target: Target, name: str) -> View:
     image, clipped = photograph(frame)
     low, high = np.percentile(image, (0.5, 99.5))
     grey = np.round(np.clip((image - low) * (255 / max(high - low, 1e-6)), 0, 255)).astype(np.uint8)
-    found = target.find(grey)
-    if found is None:
+    detected = target.find(grey)
+    if detected is None:
         raise CalibrationError(f"{name}: the {target.kind} of {target.columns} x {target.rows} is not found")
-    points, pixels = found
+    points, pixels = detected
     inside = np.zeros(image.shape, dtype=np.uint8)
     cv2.fillConvexPoly(inside, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
     # in OpenCV's own pictures up to 2.9 % lie in white squares and leave the residual of the corners as it is
@@ -275,7 +275,7 @@ def find_view(frame: Mosaic | ChannelFrame, target: Target, name: str) -> View:
     radius = 0.0
     if target.kind in ("chessboard", "charuco"):
         reach = target.spacing if target.kind == "chessboard" else (target.spacing - target.marker) / 2
-        pixels = refined_corners(image, points, pixels, 0.8 * reach)
+        pixels = refine_corners(image, points, pixels, 0.8 * reach)
     else:
         radius = _radius(grey, points, pixels)
     return View(name=name, points=points, pixels=pixels, shape=(image.shape[0], image.shape[1]), radius=radius)
@@ -284,12 +284,12 @@ def find_view(frame: Mosaic | ChannelFrame, target: Target, name: str) -> View:
 def _radius(image: Any, points: FloatArray, pixels: FloatArray) -> float:
     """Radius of a grid's circles, mm: the median of the blobs that OpenCV finds at the points (m, 2), mm and px."""
     blobs = cv2.SimpleBlobDetector.create().detect(image)
-    places, sizes = np.array([blob.pt for blob in blobs]), np.array([blob.size for blob in blobs])
-    away, nearest = cKDTree(places).query(pixels)
+    blob_centres, sizes = np.array([blob.pt for blob in blobs]), np.array([blob.size for blob in blobs])
+    distance, nearest = cKDTree(blob_centres).query(pixels)
     homography = np.asarray(cv2.findHomography(points, pixels)[0], dtype=np.float64)
     w = homography[2, :2] @ points.T + 1
     scale = np.sqrt(np.abs(np.linalg.det(homography)) / np.abs(w) ** 3)  # px per mm, by the determinant of the map
-    return float(np.median((sizes[nearest] / 2 / scale)[away < 1]))
+    return float(np.median((sizes[nearest] / 2 / scale)[distance < 1]))
 
 
 def find_views(files: CaptureFiles, target: Target) -> tuple[list[View], tuple[str, ...]]:

@@ -18,7 +18,7 @@ from rgbmidic.illumination.checks import Check, warning
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import QUANTISATION, NoiseModel
-from rgbmidic_calibration.captures import TILE, BlockMeans, Captures, TemporalStack, same_camera, tile_means
+from rgbmidic_calibration.captures import TILE, BlockMeans, Captures, TemporalStack, require_same_camera, tile_means
 from rgbmidic_calibration.registration import estimate_registration
 
 
@@ -103,31 +103,31 @@ def leakage(
             raise CalibrationError(f"light {name}: nearly every block holds saturated samples; shorten the exposure")
         signals = np.mean([frame.signals for frame in captures], axis=0) - level
         values = np.einsum("rskc,crs->krs", unmixing, signals[:3])[:, clear]
-        lit, brightest = crosstalk.lights.index(name), int(values.sum(axis=1).argmax())
-        total = float(values[lit].sum())
-        if total <= 0 or brightest != lit:
+        light_index, brightest = crosstalk.lights.index(name), int(values.sum(axis=1).argmax())
+        total = float(values[light_index].sum())
+        if total <= 0 or brightest != light_index:
             raise CalibrationError(
                 f"the captures of light {name} show most light in {crosstalk.lights[brightest]} after unmixing: are "
                 "the captures swapped, was the lamp off, or is the calibration of another camera?"
             )
         mean = values.sum(axis=1) / total
-        std = np.sqrt(((values - mean[:, None] * values[lit]) ** 2).sum(axis=1)) / total
+        std = np.sqrt(((values - mean[:, None] * values[light_index]) ** 2).sum(axis=1)) / total
         checks += [
             Check(f"{name} left in {light}", "", 100 * mean[row], limits.leakage, std=100 * std[row], unit="%")
             for row, light in enumerate(crosstalk.lights)
             if light != name
         ]
         if len(signals) > 3:  # what the greens differ by beyond the calibration
-            difference = signals[3][clear] - values[lit] * (0 if greens is None else greens[lit])
+            difference = signals[3][clear] - values[light_index] * (0 if greens is None else greens[light_index])
             relative = float(difference.sum()) / total
-            scatter = np.sqrt(((difference - relative * values[lit]) ** 2).sum()) / total
+            scatter = np.sqrt(((difference - relative * values[light_index]) ** 2).sum()) / total
             amplitude, std = 100 * np.abs(crosstalk.checkerboard(np.array([relative, scatter]))).max(axis=0)
             checks.append(Check(f"checkerboard of {name}", "", amplitude, limits.checkerboard, std=std, unit="%"))
     return checks
 
 
 def additivity(
-    together: TemporalStack,
+    combined: TemporalStack,
     singles: Mapping[str, TemporalStack],
     dark: TemporalStack | None = None,
     *,
@@ -142,7 +142,7 @@ def additivity(
 
     Parameters
     ----------
-    together
+    combined
         Captures with these lights on.
     singles
         Captures of each of them alone.
@@ -159,30 +159,30 @@ def additivity(
         Rms over tiles of what remains, noise taken out, as a fraction of the mean signal, with a sentence about the
         difference; then the relative change of every light's strength between its own and the common capture.
     """
-    same_camera([together, *singles.values(), *([dark] if dark else [])])
+    require_same_camera([combined, *singles.values(), *([dark] if dark else [])])
     level = dark.mean if dark else np.float32(0)
     lights = [stack.mean - level for stack in singles.values()]
-    stacks = [together, *singles.values()]
+    stacks = [combined, *singles.values()]
     variance = np.sum([_variance(stack, noise) for stack in stacks], axis=0)
     if dark:
         variance = variance + (len(lights) - 1) ** 2 * _variance(dark, noise)
     # difference, its noise variance, and every light's image, NaN where saturated
-    rows = np.stack([together.mean - level - np.sum(lights, axis=0), variance, *lights]).astype(np.float64)
+    rows = np.stack([combined.mean - level - np.sum(lights, axis=0), variance, *lights]).astype(np.float64)
     rows[:, np.any([stack.clipped for stack in stacks], axis=0)] = np.nan
     samples = rows[:, np.isfinite(rows[0])]
     if samples.shape[1] < TILE**2:
         raise CalibrationError("nearly every sample is saturated in one of the captures; shorten the exposure")
     tiles = tile_means(rows).reshape(len(rows), -1)
     tiles = tiles[:, np.isfinite(tiles[0])]  # without saturated samples
-    difference, variance, of_lights = tiles[0], tiles[1] / min(TILE, *rows.shape[2:]) ** 2, tiles[2:]
-    design = np.concatenate([np.ones((1, len(difference))), of_lights]).T
+    difference, variance, light_tiles = tiles[0], tiles[1] / min(TILE, *rows.shape[2:]) ** 2, tiles[2:]
+    design = np.concatenate([np.ones((1, len(difference))), light_tiles]).T
     inverse = np.linalg.pinv(design.T @ design)
     solution = inverse @ (design.T @ difference)
     residual = difference - design @ solution
     score = design * residual[:, None]
     std = np.sqrt(np.diag(inverse @ (score.T @ score) @ inverse))
-    signal = float(of_lights.sum(axis=0).mean())
-    left = np.sqrt(max(float((residual**2).mean() - variance.mean()), 0.0)) / max(signal, 1e-9)
+    signal = float(light_tiles.sum(axis=0).mean())
+    remaining = np.sqrt(max(float((residual**2).mean() - variance.mean()), 0.0)) / max(signal, 1e-9)
     names = "+".join(singles)
     text = (
         f"{names} minus the sum of the single captures: {samples[0].mean():+.2f} DN on average, scatter "
@@ -190,7 +190,7 @@ def additivity(
         f"{solution[0]:+.2f} DN"
     )
     return [
-        Check(f"{names} not the sum", text, 100 * left, limits.additivity, unit="%"),
+        Check(f"{names} not the sum", text, 100 * remaining, limits.additivity, unit="%"),
         *(
             Check(f"strength of {name} in {names}", "", 100 * change, limits.strength, std=100 * error, unit="%")
             for name, change, error in zip(singles, solution[1:], std[1:], strict=True)
@@ -205,7 +205,7 @@ def _variance(stack: TemporalStack, noise: NoiseModel | None) -> npt.NDArray[np.
     return stack.variance / stack.count if stack.count > 1 else np.full(stack.mean.shape, QUANTISATION)
 
 
-def registration_left(
+def remaining_registration(
     registration: Registration,
     lights: Mapping[str, TemporalStack],
     dark: TemporalStack | None = None,
@@ -213,7 +213,7 @@ def registration_left(
     region: Sequence[float] | None = None,
     limits: Limits = LIMITS,
 ) -> list[Check]:
-    """Displacement between the lights that the registration leaves in captures of a speckled target.
+    """Return the displacement between the lights that the registration leaves in captures of a speckled target.
 
     Parameters
     ----------
@@ -235,23 +235,23 @@ def registration_left(
         uncertainty there.
     """
     ordered = {name: lights[name] for name in registration.lights if name in lights}
-    found = estimate_registration(ordered, dark, region=region).registration
+    estimated = estimate_registration(ordered, dark, region=region).registration
     height, width = next(iter(ordered.values())).camera.shape
     x0, y0, x1, y1 = region if region is not None else (0, 0, width - 1, height - 1)
     grid = np.stack(np.meshgrid(np.linspace(x0, x1, 9), np.linspace(y0, y1, 9)), axis=-1).reshape(-1, 2)
-    known = registration.displacement(grid)[[registration.lights.index(name) for name in ordered]]
+    calibrated = registration.displacement(grid)[[registration.lights.index(name) for name in ordered]]
     # The first of the captured lights need not be the calibration's first.
-    left = np.linalg.norm(found.displacement(grid) - (known - known[0]), axis=2)
-    std = found.displacement_std(grid)
-    errors = np.zeros_like(left) if std is None else np.linalg.norm(std, axis=2)
+    remaining = np.linalg.norm(estimated.displacement(grid) - (calibrated - calibrated[0]), axis=2)
+    std = estimated.displacement_std(grid)
+    errors = np.zeros_like(remaining) if std is None else np.linalg.norm(std, axis=2)
     return [
         Check(f"registration of {name}", "", row.max(), limits.registration, std=error[row.argmax()], unit="px")
-        for name, row, error in list(zip(ordered, left, errors, strict=True))[1:]
+        for name, row, error in list(zip(ordered, remaining, errors, strict=True))[1:]
     ]
 
 
 def noise_ratio(stack: TemporalStack, noise: NoiseModel, same_exposure: float = 0.05) -> tuple[float, float]:
-    """Observed over predicted noise of captures at rest (standard deviations), and its uncertainty.
+    """Return the observed over predicted noise of captures at rest (standard deviations), and its uncertainty.
 
     Captures count as one exposure up to the drift `same_exposure` (`TemporalStack.drift`); more is a lamp that drifts
     or an exposure series, as of the warning in `rgbmidic_calibration.crosstalk.matrix_checks`.
@@ -358,25 +358,30 @@ def check_calibration(
     calibration = calibration.cropped(None, next(iter(captures.lights.values())).series.shape)
     if calibration.crosstalk is None:
         raise CalibrationError("the calibration has no crosstalk to check; make it with rgbmidic-calibrate crosstalk")
-    known = {
+    input_hashes = {
         entry.get("sha256")
         for origin in calibration.provenance.values()
         if isinstance(origin, Mapping)
         for entry in origin.get("inputs", ())
     }
-    lit = (*captures.lights.values(), *captures.together.values())
-    reused = [path for group in lit for path, fingerprint in group.fingerprints.items() if fingerprint in known]
+    light_groups = (*captures.lights.values(), *captures.simultaneous.values())
+    reused = [
+        path
+        for group in light_groups
+        for path, fingerprint in group.fingerprints.items()
+        if fingerprint in input_hashes
+    ]
     checks = []
     if reused:
-        made = f"{len(reused)} of these captures made the calibration ({reused[0]} ...): they always agree"
-        checks.append(warning(f"{made}; a check needs others"))
+        reuse_text = f"{len(reused)} of these captures made the calibration ({reused[0]} ...): they always agree"
+        checks.append(warning(f"{reuse_text}; a check needs others"))
     stacks, dark = captures.stacks()
     if dark is None:
         checks.append(warning("no dark frames: the stated black level is taken for the dark level"))
     means = {name: files.means() for name, files in captures.lights.items()}
     dark_means = captures.dark.means() if captures.dark else []
     checks += leakage(calibration.crosstalk, means, dark_means, limits)
-    for names, files in captures.together.items():
+    for names, files in captures.simultaneous.items():
         singles = {name: stacks[name] for name in names.split("+")}
         checks += additivity(files.stack(), singles, dark, noise=calibration.noise, limits=limits)
 
@@ -391,13 +396,13 @@ def check_calibration(
     def registration() -> list[Check]:
         if calibration.registration is None:
             raise CalibrationError("the calibration has no registration section")
-        return registration_left(calibration.registration, stacks, dark, region=region, limits=limits)
+        return remaining_registration(calibration.registration, stacks, dark, region=region, limits=limits)
 
     for measure in (noise, registration):
         try:
             checks += list(measure())
         except CalibrationError as error:
             checks.append(Check("", f"{measure.__name__} was not checked: {error}", value=0))
-    if not captures.together:
+    if not captures.simultaneous:
         checks.append(Check("", "additivity was not checked: no captures with lights together (--together)", value=0))
     return checks

@@ -148,7 +148,7 @@ def _several(hint: Any) -> str:
 
 def test_keys() -> dict[str, dict[str, tuple[str, str]]]:
     """Type and default of every key of TEST.toml, by section and key."""
-    from rgbmidic.settings.schema import section_kinds
+    from rgbmidic.settings.schema import section_types
 
     return {
         name: {
@@ -158,7 +158,7 @@ def test_keys() -> dict[str, dict[str, tuple[str, str]]]:
             )
             for entry in fields(kind)
         }
-        for name, kind in section_kinds().items()
+        for name, kind in section_types().items()
     }
 
 
@@ -289,10 +289,10 @@ def quantities() -> str:
 
 def formats() -> str:
     """Formats of frame files, as ``rgbmidic frames --formats`` lists them."""
-    from rgbmidic.frames import known_formats
+    from rgbmidic.frames import frame_formats
 
     rows = []
-    for entry in known_formats():
+    for entry in frame_formats():
         endings = [" ".join(f"`{ending}`" for ending in group) for group in (entry.endings, entry.movies)]
         rows.append((entry.name, *(endings if any(endings) else ("by content", ""))))
     return table(("format", "one frame a file", "several frames a file"), rows)

@@ -8,8 +8,8 @@ from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
-from rgbmidic.settings.conversion import hints_of, plain
-from rgbmidic.settings.schema import section_kinds
+from rgbmidic.settings.conversion import to_plain, type_hints
+from rgbmidic.settings.schema import section_types
 
 _TYPES = {bool: "boolean", float: "number", int: "integer", str: "string", Path: "string"}
 _BOUNDS = {
@@ -33,10 +33,10 @@ def json_schema() -> dict[str, Any]:
         name: {
             "type": "object",
             "additionalProperties": False,
-            "properties": {entry.name: _described(hints_of(kind)[entry.name], entry) for entry in fields(kind)},
+            "properties": {entry.name: _described(type_hints(kind)[entry.name], entry) for entry in fields(kind)},
             "required": [entry.name for entry in fields(kind) if entry.default is entry.default_factory is MISSING],
         }
-        for name, kind in section_kinds().items()
+        for name, kind in section_types().items()
     }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -68,7 +68,7 @@ def _described(hint: Any, entry: Field[Any]) -> dict[str, Any]:
     known = _value(hint)
     if hint in (int, float):
         known |= {_BOUNDS[name]: value for name, value in entry.metadata.get("bounds", {}).items()}
-    return known if entry.default in (MISSING, None) else known | {"default": plain(entry.default)}
+    return known if entry.default in (MISSING, None) else known | {"default": to_plain(entry.default)}
 
 
 if __name__ == "__main__":

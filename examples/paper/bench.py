@@ -17,8 +17,8 @@ from rgbmidic import Calibration, Region
 from rgbmidic.errors import InputError
 from rgbmidic.illumination import IlluminationImages, separate
 from rgbmidic.lab.measures import (
-    Area,
     Goniometry,
+    MeasureArea,
     areas_along_x,
     detrend,
     goniometry,
@@ -93,7 +93,7 @@ class Bench:
 
     name: str  # one of `CAMERAS`
     scene: Scene
-    areas: tuple[Area, ...]  # A0 to A4
+    areas: tuple[MeasureArea, ...]  # A0 to A4
     half: float  # half the side (px) of the measured square, about the middle of the frame
     light: int  # index of the light whose reflection crosses the areas
     prefilter: str  # of the solves: none as in the paper, or what the Bayer mosaic needs
@@ -182,7 +182,7 @@ class Bench:
                 camera,
                 lights,
                 seed=int(np.random.SeedSequence([self.seed, shot, number]).generate_state(1)[0]),
-                on=on,
+                shining=on,
             )
             for number, on in enumerate(shots)
         )

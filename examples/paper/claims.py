@@ -376,7 +376,7 @@ def _specimen(study: PaperStudy) -> list[Claim]:
             "diffuse above 30°, none at 90°, two bundles (white, black); a reflection from 0 to 30°, largest at 15°",
             f"erratic from {first:.0f} to {last:.0f}°; lobe at {turning.lobe.centre_deg:.1f} ± "
             f"{turning.lobe.std[2]:.1f}°, standard deviation {turning.lobe.width_deg:.1f} ± "
-            f"{turning.lobe.std[3]:.1f}°, {turning.white.sum()} white and {(~turning.white).sum()} black pixels",
+            f"{turning.lobe.std[3]:.1f}°, {turning.is_white.sum()} white and {(~turning.is_white).sum()} black pixels",
             **_graded(
                 [_under(abs(first), 10), _under(abs(last - 30), 10), _under(abs(turning.lobe.centre_deg - 15), 2)]
             ),

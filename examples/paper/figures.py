@@ -128,7 +128,7 @@ def goniometry_figure(turning: Goniometry) -> Figure:
     figure, axes = _axes(1, 1, 3.6, width=5.5)
     axis = axes[0][0]
     top = turning.levels.max()
-    for series, white in zip(turning.levels.T, turning.white, strict=True):
+    for series, white in zip(turning.levels.T, turning.is_white, strict=True):
         axis.plot(turning.angles_deg, 100 * series / top, linewidth=0.5, color="#e0a030" if white else "#406090")
     axis.plot(
         turning.angles_deg,

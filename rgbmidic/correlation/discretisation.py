@@ -161,7 +161,7 @@ def _finer_field(
     """
     mesh, fine, count = halves.mesh, halves.fine, len(halves.mesh.nodes)
     used = np.asarray(solution.measured[mesh.elements].all(axis=1))
-    start = halves.interpolated(solution.displacement[mesh.nearest(solution.measured)[1]], used)
+    start = halves.interpolated(solution.displacement[mesh.nearest_nodes(solution.measured)[1]], used)
     functions = rigid_functions(mesh.nodes, options.rigid).reshape(count, -1)
     functions = halves.prolonged(functions).reshape(2 * len(start), -1)
     problem = Problem(reference=fine, deformed=deformed, options=options, method=method, functions=functions)
@@ -182,7 +182,7 @@ def _finer_field(
     recovery = halves.recovery(children & equations.textured[fine.mesh.elements].all(axis=1), equations)
     straight = halves.straightened(last, equations, recovery, found)
     variance = _score_variance(straight, equations.weights) * (loss[:, None] ** 2)
-    known = (equations.textured & ~fine.mesh.beside(~equations.textured))[:count]
+    known = (equations.textured & ~fine.mesh.adjacent_nodes(~equations.textured))[:count]
     return np.where(known[:, None], recovery.field(*found.T), np.nan), variance[:count], equations.rotation[:count]
 
 

@@ -82,8 +82,10 @@ def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> 
     reference, pixels = residual.reference, residual.reference.pixels
     mesh = reference.mesh
     elements = np.asarray(nodes[mesh.elements].any(axis=1))
-    around, column, row = pixels.of_elements(elements)
-    beside, columns_beside, rows_beside = pixels.of_elements(np.asarray(mesh.beside(nodes)[mesh.elements].any(axis=1)))
+    around, column, row = pixels.element_pixels(elements)
+    beside, columns_beside, rows_beside = pixels.element_pixels(
+        np.asarray(mesh.adjacent_nodes(nodes)[mesh.elements].any(axis=1))
+    )
     offsets = np.concatenate([[0], np.cumsum(np.diff(pixels.offsets)[elements])])
     place = pixels.local_x[around], pixels.local_y[around], offsets, pixels.barycentric[elements]
     own, total = np.zeros((int(elements.sum()), 3, 3, 3)), np.zeros((elements.size, 3, 3, 3))

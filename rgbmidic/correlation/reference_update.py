@@ -223,7 +223,7 @@ class ReferenceUpdate:
         mesh, measured = self.first.mesh, solution.measured
         if not measured[mesh.elements].all(axis=1).any():
             raise InputError("a frame in which no element is measured cannot be a reference")
-        displacement = solution.displacement[mesh.nearest(measured)[1]]
+        displacement = solution.displacement[mesh.nearest_nodes(measured)[1]]
         origin, prefilter = self.first.origin if origin is None else origin, self.first.prefilter
         motion = displacement - np.subtract(origin, self.first.origin)
         moved = Tri3Mesh(nodes=mesh.nodes + motion, elements=mesh.elements)

@@ -397,7 +397,9 @@ def follow(points: FloatArray, motion: FloatArray, mesh: Tri3Mesh, scale: float)
     basis, at_nodes = (np.c_[np.ones(len(where)), (where - middle) / size] for where in (points, nodes))
     affine = _robust_fit(basis[None], motion[None], 1e-6, 4 * scale)[0]
     rest = motion - basis @ affine
-    distance, near = map(np.asarray, cKDTree(points).query(mesh.places, k=[*range(1, min(_FITTED, len(points)) + 1)]))
+    distance, near = map(
+        np.asarray, cKDTree(points).query(mesh.observation_points, k=[*range(1, min(_FITTED, len(points)) + 1)])
+    )
     step = (points[near] - nodes[:, None]) / np.maximum(distance[:, -1:, None], 1.0)
     local = np.concatenate([np.ones((*step.shape[:2], 1)), step], axis=2)
     return np.asarray(at_nodes @ affine + _robust_fit(local, rest[near], 0.3, scale)[:, 0])

@@ -243,7 +243,7 @@ def fill(mesh: Tri3Mesh, solution: Solution, longest: float) -> Solution:
     measured = solution.measured
     if measured.all() or measured.sum() < 6:
         return solution
-    distance, nearest = mesh.nearest(measured)
+    distance, nearest = mesh.nearest_nodes(measured)
     filled = ~measured & (distance <= longest)
     if not filled.any():
         return solution

@@ -341,7 +341,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
             'solver.rigid = "none"',
             estimate,
         )
-    inner = measured & ~mesh.beside(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
+    inner = measured & ~mesh.adjacent_nodes(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
     squares = weighting.residual.squares(equations.weights)
     square, total, _ = squares.sum(axis=1).T
     some = equations.weights[:, :: max(1, equations.weights.shape[1] // 100_000)]

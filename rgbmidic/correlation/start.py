@@ -365,7 +365,7 @@ class Start:
         intact = measured[mesh.elements].all(axis=1) & ~torn_elements(mesh, known, constants)
         weight = np.where(intact, mesh.areas, 0.0)
         around = mesh.to_nodes(weight)
-        nearest = mesh.nearest(measured & (around > 0) if intact.any() else measured)[1]
+        nearest = mesh.nearest_nodes(measured & (around > 0) if intact.any() else measured)[1]
         parts = [mesh.to_nodes(weight * part) for part in gradient.reshape(-1, 4).T]
         slope = (np.stack(parts, axis=1) / np.maximum(around, 1e-300)[:, None]).reshape(-1, 2, 2)[nearest]
         beyond = displacement[nearest] + np.einsum("nij,nj->ni", slope, mesh.nodes - mesh.nodes[nearest])

@@ -289,7 +289,7 @@ def standard_uncertainty(
     value = sp.eye(len(textured), format="csr") if recovery is None else recovery.value
     asked: list[tuple[Functional, BoolArray]] = [((value, None), textured), ((None, value), textured)]
     if recovery is not None:
-        inner = textured & ~reference.mesh.beside(~textured)
+        inner = textured & ~reference.mesh.adjacent_nodes(~textured)
         asked += [(one, inner) for one in recovery.strain_functionals]
     asked = [(_in_reference_axes(functional, equations.rotation), nodes) for functional, nodes in asked]
     scores = score_covariance(residual, equations.weights, equations.blocks)

@@ -226,7 +226,7 @@ class CrackTip:
     def __init__(self, covariance: NodalCovariance, name: str, *place: float, williams: Williams) -> None:
         mesh, (inner, outer) = covariance.mesh, place[2:]
         self.name, self.williams, self.radii = name, williams, (float(inner), float(outer))
-        faces, places = crack_faces(mesh), mesh.one_of_copies
+        faces, places = crack_faces(mesh), mesh.merged_index
         alone = np.setdiff1d(faces, mesh.copies)
         node = nearest_node(mesh, name, alone, np.array(place[:2]), "the tip of a crack")
         self.tip = tip = mesh.nodes[node]

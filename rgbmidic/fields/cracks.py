@@ -59,7 +59,7 @@ class JumpAlong:
         from scipy.sparse.csgraph import dijkstra
 
         mesh, faces = covariance.mesh, crack_faces(covariance.mesh)
-        places = mesh.one_of_copies[faces]
+        places = mesh.merged_index[faces]
         ends = [nearest_node(mesh, name, places.ravel(), np.array(place[i : i + 2])) for i in (0, 2)]
         length = np.hypot(*(mesh.nodes[faces[:, 1]] - mesh.nodes[faces[:, 0]]).T)
         graph = csr_matrix((length, places.T), shape=(len(mesh.nodes),) * 2)

@@ -164,10 +164,12 @@ class Places:
         """
         mesh, near = self.mesh, np.zeros(len(self.mesh.nodes), dtype=bool)
         near[mesh.elements[self.element[self.inside]]] = True
-        near = mesh.beside(mesh.beside(mesh.beside(near)))  # two edges from those beside an element's nodes
+        near = mesh.adjacent_nodes(
+            mesh.adjacent_nodes(mesh.adjacent_nodes(near))
+        )  # two edges from those beside an element's nodes
         number = np.cumsum(near[mesh.elements].all(axis=1)) - 1
         element = np.where(self.inside, number[self.element], 0)
-        return np.flatnonzero(near), replace(self, mesh=mesh.part(near), element=element)
+        return np.flatnonzero(near), replace(self, mesh=mesh.submesh(near), element=element)
 
     def measured(self, has_data: BoolArray) -> BoolArray:
         """Report which points (P,) are inside, and have data at the corners around them.

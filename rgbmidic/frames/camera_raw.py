@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
+from rgbmidic.frames.metadata import BROKEN_JPEG, StoredFrame, captured_stderr, check_size, damaged_file
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import BROKEN_JPEG, StoredFrame, check_size, complaints, damaged
-from rgbmidic.frames.tiff_pages import Tag, is_stored_as_is, missing_data, tag, tiff_pages
-from rgbmidic.settings import BAYER_PATTERNS, FrameKind, regular
+from rgbmidic.frames.tiff_pages import Tag, has_uncompressed_data, missing_data, tag, tiff_pages
+from rgbmidic.settings import BAYER_PATTERNS, FrameKind, require_regular_file
 from rgbmidic.typing import AnyArray, FloatArray
 
 if TYPE_CHECKING:
@@ -38,8 +38,8 @@ _CAMERA_HEADERS = (
     *(b"\0MRM", b"FUJIFILM", b"FOVb"),  # Minolta, Fujifilm, Sigma
 )
 _CR3_HEADER = b"ftypcrx "
-_ODD_JPEG = ("Invalid SOS parameters", "Unknown Adobe color transform code", "Warning: unknown JFIF revision")
-"""How libjpeg's warnings begin of headers that it can read all the same."""
+_HARMLESS_JPEG = ("Invalid SOS parameters", "Unknown Adobe color transform code", "Warning: unknown JFIF revision")
+"""Beginnings of libjpeg's warnings of headers that it can read all the same."""
 
 _MALLOPT = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
 """Sets what allocated memory is filled with; only glibc has it."""
@@ -63,31 +63,31 @@ class CameraRaw(FrameSource):
             return int(raw.sizes.height), int(raw.sizes.width)
 
     def _stored(self, index: int) -> StoredFrame:
-        stored_as_is, black_by_tags, _ = _tags(self.path)
-        values, black, white, cfa, margin = self._decoded(_MARKS[0])
+        is_uncompressed, black_by_tags, _ = _tags(self.path)
+        values, black, white, cfa, margin = self._decode(_MARKS[0])
         if _MALLOPT is None or (values == 257 * _MARKS[0]).any():
             # LibRaw returns from some damage without an error: what it did not write is what memory held
-            undecoded = values != self._decoded(_MARKS[1])[0]
-            if undecoded.any():
-                raise damaged(self.path, f"LibRaw does not decode {undecoded.mean():.2%} of its samples")
+            is_undecoded = values != self._decode(_MARKS[1])[0]
+            if is_undecoded.any():
+                raise damaged_file(self.path, f"LibRaw does not decode {is_undecoded.mean():.2%} of its samples")
         if black_by_tags is not None:
             # LibRaw moves odd margins to the next even row and column without moving the black levels along
             black = np.roll(black_by_tags, margin, axis=(0, 1))
-        _check_filled(values, black, white, stored_as_is=stored_as_is, path=self.path)
+        _refuse_filled_rows(values, black, white, is_uncompressed=is_uncompressed, path=self.path)
         kind: FrameKind = "bayer" if cfa else "monochrome"
         return StoredFrame(values=values, kind=kind, cfa=cfa, black_level=black, white_level=white)
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a user should know of the black levels."""
+        """Doubts about the black levels."""
         try:
             _, _, spread = _tags(self.path)
         except FrameError:  # reported when it is read
             return ()
-        what = "its black level varies from row to row, column to column or over more than 2x2 pixels by {:.3g} DN"
-        return (f"{what.format(spread)}: the mean of each position is taken",) if spread > 1 else ()
+        remark = "its black level varies from row to row, column to column or over more than 2x2 pixels by {:.3g} DN"
+        return (f"{remark.format(spread)}: the mean of each position is taken",) if spread > 1 else ()
 
-    def _decoded(self, mark: int) -> tuple[AnyArray, FloatArray, float, str | None, tuple[int, int]]:
+    def _decode(self, mark: int) -> tuple[AnyArray, FloatArray, float, str | None, tuple[int, int]]:
         """Decode the samples into memory filled with the byte `mark`: samples, levels, pattern, minus the margins."""
         with _libraw(self.path) as raw:
             with _filled_memory(mark):
@@ -95,11 +95,13 @@ class CameraRaw(FrameSource):
             cell = _colour_cell(raw, self.path)
             values, sizes = np.array(raw.raw_image_visible, dtype=np.uint16), raw.sizes
             black = np.asarray(raw.black_level_per_channel, dtype=np.float64)[cell]
-            white, cfa = float(raw.white_level), None if raw.num_colors == 1 else _names(raw, cell)
+            white, cfa = float(raw.white_level), None if raw.num_colors == 1 else _colour_names(raw, cell)
             if _MALLOPT is None:
                 raw.raw_image[...] = ~raw.raw_image  # the next raw of this size is mostly decoded into this memory
         if values.shape != (sizes.height, sizes.width):
-            raise damaged(self.path, f"its visible part ({sizes.height} x {sizes.width}) reaches beyond its samples")
+            raise damaged_file(
+                self.path, f"its visible part ({sizes.height} x {sizes.width}) reaches beyond its samples"
+            )
         return values, black, white, cfa, (-sizes.top_margin, -sizes.left_margin)
 
 
@@ -121,7 +123,7 @@ def _tags(path: Path) -> tuple[bool, FloatArray | None, float]:
 
     Returns
     -------
-    stored_as_is : bool
+    is_uncompressed : bool
         Whether the samples are uncompressed and all there, so that zeros in them are real.
     black : ndarray, shape (2, 2), or None
         DNG black level by position from the sensor's first pixel on, the mean where it varies further; None where no
@@ -138,15 +140,15 @@ def _tags(path: Path) -> tuple[bool, FloatArray | None, float]:
         with tiff_pages(path) as pages:
             raw = [page for page in pages if page.photometric in (32803, 34892)] or pages  # CFA, linear raw
             page = max(raw, key=lambda page: page.imagewidth * page.imagelength)
-            top, left, *_ = tag(page, Tag.ACTIVE_AREA) or (0, 0)
-            stored_as_is, (black, spread) = is_stored_as_is(page), _black_cell(page)
+            first_row, first_column, *_ = tag(page, Tag.ACTIVE_AREA) or (0, 0)
+            is_uncompressed, (black, spread) = has_uncompressed_data(page), _black_cell(page)
             missing = [reason for page in raw if (reason := missing_data(page, path.stat().st_size))]
-            black = None if black is None else np.roll(black, (top, left), axis=(0, 1))
+            black = None if black is None else np.roll(black, (first_row, first_column), axis=(0, 1))
     except FrameError:
         return False, None, 0.0
     if missing:
-        raise damaged(path, missing[0])
-    return stored_as_is, black, spread
+        raise damaged_file(path, missing[0])
+    return is_uncompressed, black, spread
 
 
 def _black_cell(page: tifffile.TiffPage) -> tuple[FloatArray | None, float]:
@@ -159,13 +161,13 @@ def _black_cell(page: tifffile.TiffPage) -> tuple[FloatArray | None, float]:
     if levels is None or levels.size != rows * columns:
         return None, 0.0
     cell = np.tile(levels.reshape(rows, columns), (math.lcm(rows, 2) // rows, math.lcm(columns, 2) // columns))
-    parts = [[cell[row::2, column::2] for column in (0, 1)] for row in (0, 1)]
-    black = np.array([[part.mean() for part in line] for line in parts])
-    spread = max(float(np.ptp(part)) for line in parts for part in line)
+    positions = [[cell[row::2, column::2] for column in (0, 1)] for row in (0, 1)]
+    black = np.array([[levels_at.mean() for levels_at in line] for line in positions])
+    spread = max(float(np.ptp(levels_at)) for line in positions for levels_at in line)
     for code, shape in ((Tag.BLACK_DELTA_H, (1, 2)), (Tag.BLACK_DELTA_V, (2, 1))):
-        if (added := _reals(page, code)) is not None and added.size > 1:
-            black = black + np.array([added[0::2].mean(), added[1::2].mean()]).reshape(shape)
-            spread += max(float(np.ptp(added[0::2])), float(np.ptp(added[1::2])))
+        if (deltas := _reals(page, code)) is not None and deltas.size > 1:
+            black = black + np.array([deltas[0::2].mean(), deltas[1::2].mean()]).reshape(shape)
+            spread += max(float(np.ptp(deltas[0::2])), float(np.ptp(deltas[1::2])))
     return black, spread
 
 
@@ -188,10 +190,10 @@ def _libraw(path: Path) -> Iterator[rawpy.RawPy]:
     import rawpy
 
     try:
-        starts = (os.fsencode(path), *(start.encode() for start in BROKEN_JPEG + _ODD_JPEG))
-        with complaints(*starts) as lines, rawpy.imread(str(path)) as raw:
-            needed = 2 * raw.sizes.raw_height * raw.sizes.raw_width
-            check_size(path, needed=needed, stored=path.stat().st_size)
+        prefixes = (os.fsencode(path), *(start.encode() for start in BROKEN_JPEG + _HARMLESS_JPEG))
+        with captured_stderr(*prefixes) as lines, rawpy.imread(str(path)) as raw:
+            n_bytes = 2 * raw.sizes.raw_height * raw.sizes.raw_width
+            check_size(path, unpacked=n_bytes, stored=path.stat().st_size)
             yield raw
     except rawpy.LibRawFileUnsupportedError:
         raise FrameError(f"{path} is a camera raw that LibRaw does not know") from None
@@ -200,10 +202,10 @@ def _libraw(path: Path) -> Iterator[rawpy.RawPy]:
     except rawpy.LibRawError as error:
         reason = error.args[0] if error.args else type(error).__name__
         reason = reason.decode(errors="replace") if isinstance(reason, bytes) else reason
-        raise damaged(path, f"LibRaw reports: {reason}") from None
+        raise damaged_file(path, f"LibRaw reports: {reason}") from None
     for line in lines:
         if line.startswith(BROKEN_JPEG):
-            raise damaged(path, f"libjpeg reports: {line}")
+            raise damaged_file(path, f"libjpeg reports: {line}")
         logger.warning("LibRaw reports: %s", line)
 
 
@@ -213,16 +215,16 @@ def has_camera_header(path: Path) -> bool:
     LibRaw takes a file without a header for some camera's by its length alone, and so gives a wrong picture.
     """
     try:
-        with regular(path).open("rb") as file:
+        with require_regular_file(path).open("rb") as file:
             head = file.read(12)
     except OSError:  # reported by whoever reads the file
         return False
     return head.startswith(_CAMERA_HEADERS) or head[4:] == _CR3_HEADER
 
 
-def _not_bayer(path: Path, what: str) -> FrameError:
+def _not_bayer(path: Path, description: str) -> FrameError:
     allowed = ", ".join(BAYER_PATTERNS)
-    return FrameError(f"{path} has a colour filter array {what}; allowed are the Bayer patterns {allowed}")
+    return FrameError(f"{path} has a colour filter array {description}; allowed are the Bayer patterns {allowed}")
 
 
 def _colour_cell(raw: rawpy.RawPy, path: Path) -> AnyArray:
@@ -235,20 +237,23 @@ def _colour_cell(raw: rawpy.RawPy, path: Path) -> AnyArray:
         )
     if raw.num_colors == 1:
         return np.zeros((2, 2), dtype=np.intp)
-    top, left = raw.sizes.top_margin, raw.sizes.left_margin  # `raw_colors_visible` would fill the whole frame
-    cell = np.array([[raw.raw_color(top + row, left + column) for column in (0, 1)] for row in (0, 1)])
-    if pattern.shape != (2, 2) or _names(raw, cell) not in BAYER_PATTERNS:
+    first_row, first_column = (
+        raw.sizes.top_margin,
+        raw.sizes.left_margin,
+    )  # `raw_colors_visible` would fill the whole frame
+    cell = np.array([[raw.raw_color(first_row + row, first_column + column) for column in (0, 1)] for row in (0, 1)])
+    if pattern.shape != (2, 2) or _colour_names(raw, cell) not in BAYER_PATTERNS:
         rows, columns = pattern.shape
-        raise _not_bayer(path, f"of {rows}x{columns} pixels with the colours {_names(raw, pattern)}")
+        raise _not_bayer(path, f"of {rows}x{columns} pixels with the colours {_colour_names(raw, pattern)}")
     return cell
 
 
-def _names(raw: rawpy.RawPy, colours: AnyArray) -> str:
+def _colour_names(raw: rawpy.RawPy, colours: AnyArray) -> str:
     return "".join(raw.color_desc.decode()[colour] for colour in colours.ravel())
 
 
-def _check_filled(
-    values: npt.NDArray[np.uint16], black: FloatArray, white: float, *, stored_as_is: bool, path: Path
+def _refuse_filled_rows(
+    values: npt.NDArray[np.uint16], black: FloatArray, white: float, *, is_uncompressed: bool, path: Path
 ) -> None:
     """Refuse a mosaic that LibRaw filled with zeros because the file's data ended.
 
@@ -257,9 +262,11 @@ def _check_filled(
     frame), except zeros below a positive black level, which no sensor gives.
     """
     lowest, highest = values.min(axis=1), values.max(axis=1)
-    flat = (lowest == highest) & (highest < white)
-    if stored_as_is:
-        flat &= (highest == 0) & (black.min() > 0)
-    fraction = float(flat.mean())
-    if flat[-1] or fraction > 0.01:  # defective rows may exist
-        raise damaged(path, f"{fraction:.1%} of its rows are empty (one single value, {highest[flat][-1]} in the last)")
+    is_constant = (lowest == highest) & (highest < white)
+    if is_uncompressed:
+        is_constant &= (highest == 0) & (black.min() > 0)
+    fraction = float(is_constant.mean())
+    if is_constant[-1] or fraction > 0.01:  # defective rows may exist
+        raise damaged_file(
+            path, f"{fraction:.1%} of its rows are empty (one single value, {highest[is_constant][-1]} in the last)"
+        )

@@ -21,8 +21,8 @@ import numpy.typing as npt
 
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import SECOND, Recording
-from rgbmidic.frames.source import Movie, remembered
-from rgbmidic.frames.stored import MovieHeader, StoredFrame, check_size, cut_short, damaged, unpack_bits
+from rgbmidic.frames.metadata import MovieHeader, StoredFrame, check_size, damaged_file, truncated_file, unpack_bits
+from rgbmidic.frames.source import MovieSource, cache_by_file
 from rgbmidic.settings import FrameKind
 from rgbmidic.typing import AnyArray
 
@@ -48,15 +48,15 @@ _SETUP = {
 _MARK, _LENGTH = 140, 142
 _TIMES, _EXPOSURES = 1002, 1003
 _STAMPS = {_TIMES: "<u8", _EXPOSURES: "<u4"}
-_MOST_BLOCKS, _MOST_FRAMES = 100, 2**25
-"""What no file of a camera has: Phantom's own have five blocks, and the largest memories hold some million frames."""
+_MAX_BLOCKS, _MAX_FRAMES = 100, 2**25
+"""Limits beyond any file of a camera: Phantom's own have five blocks, the largest memories some million frames."""
 
 _LEAD, _UNINTERPOLATED = 1, 2
 _PACKED_BITS = {256: 10, 1024: 12}
 """Bits of a sample that each code of packed frames means."""
 _PATTERNS = {3: "GBRG", 4: "RGGB"}
 
-_Reading = Callable[[int, int], bytes]
+_ReadBytes = Callable[[int, int], bytes]
 """Gives the bytes of a movie's header from some byte on, so many."""
 
 _STEPS = (
@@ -79,7 +79,7 @@ Stored as the steps from one code to the next; the codes above 1014, white, are 
 """
 
 
-class CineFile(Movie):
+class CineFile(MovieSource):
     """A Phantom .cine file. Flips and rotation are settings of the camera's viewer and left to it."""
 
     def _header(self) -> _Header:
@@ -88,7 +88,7 @@ class CineFile(Movie):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Header(MovieHeader):
-    """What a movie's header states, levels of codes made linear.
+    """Header of a movie, with its levels of codes made linear.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class _Header(MovieHeader):
         Bits that a sample is stored in: 8, 16, or packed 10 or 12.
     bottom_up
         Whether the last row is stored first.
-    stated
+    metadata
         Pattern and grey levels (DN), without samples; no black level where that of the header cannot be.
     pointers : ndarray, shape (count,), int64
         Where each frame begins in the file.
@@ -106,7 +106,7 @@ class _Header(MovieHeader):
 
     bits: int
     bottom_up: bool
-    stated: StoredFrame
+    metadata: StoredFrame
     pointers: npt.NDArray[np.int64]
     size: int
 
@@ -121,35 +121,39 @@ class _Header(MovieHeader):
         values = samples[:, : columns * len(rows) // len(lines)].reshape(len(rows), columns)
         if self.bits == 10:  # packed samples of 10 bit are codes
             values = _LINEAR[values]
-        return replace(self.stated, values=values[::-1] if self.bottom_up else values)
+        return replace(self.metadata, values=values[::-1] if self.bottom_up else values)
 
     def _lines(self, path: Path, index: int, rows: range) -> npt.NDArray[np.uint8]:
         """Read the bytes of some rows of a frame, (n, bytes), or (1, bytes) where a row ends within a byte."""
-        start, needed, tight = int(self.pointers[index]), _needed(self.shape, self.bits), self.shape[1] * self.bits
-        filled = math.ceil(tight / 32) * 32  # bits from one row to the next, as in Windows bitmaps
-        is_whole = (self.pointers >= _FILE.size) & (self.pointers <= self.size - 8 - needed)
-        before = int(np.argmin(np.append(is_whole, False)))
-        ends = cut_short(path, whole=min(before, index), count=self.recording.count)
+        start, n_bytes, packed_bits = (
+            int(self.pointers[index]),
+            _frame_bytes(self.shape, self.bits),
+            self.shape[1] * self.bits,
+        )
+        padded_bits = math.ceil(packed_bits / 32) * 32  # bits from one row to the next, as in Windows bitmaps
+        is_whole = (self.pointers >= _FILE.size) & (self.pointers <= self.size - 8 - n_bytes)
+        first_missing = int(np.argmin(np.append(is_whole, False)))
+        end_error = truncated_file(path, n_complete=min(first_missing, index), count=self.recording.count)
         with path.open("rb") as file:
             if start < _FILE.size or start + 8 > self.size:
-                raise ends
+                raise end_error
             file.seek(start)
             annotation = int.from_bytes(file.read(4), "little")
             if annotation < 8 or start + annotation > self.size:
-                raise damaged(path, f"the annotation of frame {index} has {annotation} bytes")
+                raise damaged_file(path, f"the annotation of frame {index} has {annotation} bytes")
             file.seek(start + annotation - 4)
             size = int.from_bytes(file.read(4), "little")
-            if (row_bits := {self.shape[0] * filled // 8: filled, needed: tight}.get(size)) is None:
-                raise damaged(path, f"frame {index} has not the size that its header announces")
+            if (row_bits := {self.shape[0] * padded_bits // 8: padded_bits, n_bytes: packed_bits}.get(size)) is None:
+                raise damaged_file(path, f"frame {index} has not the size that its header announces")
             if start + annotation + size > self.size:
-                raise ends
+                raise end_error
             first, last = rows.start * row_bits // 8, math.ceil(rows.stop * row_bits / 8)
             file.seek(first, 1)
-            part = np.fromfile(file, dtype=np.uint8, count=last - first)
-            return part.reshape(1 if row_bits % 8 else len(rows), -1)
+            samples = np.fromfile(file, dtype=np.uint8, count=last - first)
+            return samples.reshape(1 if row_bits % 8 else len(rows), -1)
 
 
-@remembered
+@cache_by_file
 def _header(path: Path) -> _Header:
     """Read the header of a movie.
 
@@ -163,34 +167,36 @@ def _header(path: Path) -> _Header:
 
         def piece(start: int, length: int) -> bytes:
             if start + length > size:
-                what = f"its header goes on to byte {start + length}, behind the end of the file at byte {size}"
-                raise damaged(path, what)
+                problem = f"its header goes on to byte {start + length}, behind the end of the file at byte {size}"
+                raise damaged_file(path, problem)
             file.seek(start)
             return file.read(length)
 
-        mark, _, compression, version, _, _, first, count, *places, trigger = _FILE.unpack(piece(0, _FILE.size))
+        mark, _, compression, version, _, _, first, count, *offsets, trigger = _FILE.unpack(piece(0, _FILE.size))
         if mark != b"CI":
             raise FrameError(f"{path} is no Phantom movie: it does not begin as one")
-        if not 0 < count <= _MOST_FRAMES:
-            raise damaged(path, f"its header announces {count} frames")
-        _, columns, height, _, bit_count, packing, *_, levels = _BITMAP.unpack(piece(places[0], _BITMAP.size))
-        setup, end = _setup(path, piece, places[1])
+        if not 0 < count <= _MAX_FRAMES:
+            raise damaged_file(path, f"its header announces {count} frames")
+        _, columns, height, _, bit_count, packing, *_, levels = _BITMAP.unpack(piece(offsets[0], _BITMAP.size))
+        setup, end = _setup(path, piece, offsets[1])
         kind, cfa = _colours(path, compression, bit_count, setup.get("cfa", 0))
         bits, shape = _PACKED_BITS.get(packing, bit_count), (abs(height), columns)
         if packing not in _PACKED_BITS and (packing != 0 or bit_count not in (8, 16)):
-            way = f"packed in the way {packing}, which is unknown"
-            raise damaged(path, f"its header announces samples of {bit_count} bit, {way}")
+            packing_error = f"packed in the way {packing}, which is unknown"
+            raise damaged_file(path, f"its header announces samples of {bit_count} bit, {packing_error}")
         if min(shape) < 1:
-            raise damaged(path, f"its header announces {shape[0]} rows of {shape[1]} pixels")
-        check_size(path, needed=2 * math.prod(shape), stored=_needed(shape, bits))
+            raise damaged_file(path, f"its header announces {shape[0]} rows of {shape[1]} pixels")
+        check_size(path, unpacked=2 * math.prod(shape), stored=_frame_bytes(shape, bits))
         if version not in (0, 1):
-            raise damaged(path, f"its header announces the version {version} of the format; known are 0 and 1")
-        place = np.dtype("<i8" if version else "<u4")
-        pointers = np.frombuffer(piece(places[2], count * place.itemsize), place)
-        stamps = _stamps(path, piece, (end, places[2]), count)
+            raise damaged_file(path, f"its header announces the version {version} of the format; known are 0 and 1")
+        pointer_type = np.dtype("<i8" if version else "<u4")
+        pointers = np.frombuffer(piece(offsets[2], count * pointer_type.itemsize), pointer_type)
+        stamps = _stamps(path, piece, (end, offsets[2]), count)
     # of the code of 10 bit, 12; else the header's number, or as its number of levels needs
-    stated = next((one for one in (setup.get("bits", 0), (levels - 1).bit_length()) if 8 <= one <= bits), bits)
-    depth = 12 if bits in (10, 12) else stated
+    bit_depth = next(
+        (bits_used for bits_used in (setup.get("bits", 0), (levels - 1).bit_length()) if 8 <= bits_used <= bits), bits
+    )
+    depth = 12 if bits in (10, 12) else bit_depth
     black, white, remarks = _levels(setup, depth)
     if bits == 10 and white < len(_LINEAR):  # levels of 10 bit are codes as the samples are
         black, white = None if black is None else int(_LINEAR[black]), int(_LINEAR[white])
@@ -198,7 +204,7 @@ def _header(path: Path) -> _Header:
         shape=shape,
         bits=bits,
         bottom_up=height > 0 and bits in (8, 16),
-        stated=StoredFrame(
+        metadata=StoredFrame(
             kind=kind,
             cfa=cfa,
             black_level=None if black is None else np.full((2, 2), float(black)),
@@ -208,7 +214,7 @@ def _header(path: Path) -> _Header:
             count=count,
             bit_depth=depth,
             trigger=-first,
-            times_ns=_since(stamps[_TIMES], trigger) if _TIMES in stamps else None,
+            times_ns=_since_trigger(stamps[_TIMES], trigger) if _TIMES in stamps else None,
             **_settings(setup, stamps.get(_EXPOSURES), remarks),
         ),
         pointers=pointers.astype(np.int64),
@@ -216,22 +222,22 @@ def _header(path: Path) -> _Header:
     )
 
 
-def _needed(shape: tuple[int, int], bits: int) -> int:
+def _frame_bytes(shape: tuple[int, int], bits: int) -> int:
     """Return the bytes of a frame."""
     return -(-math.prod(shape) * bits // 8)
 
 
-def _setup(path: Path, piece: _Reading, start: int) -> tuple[dict[str, Any], int]:
+def _setup(path: Path, piece: _ReadBytes, start: int) -> tuple[dict[str, Any], int]:
     """Read the fields that the camera's settings store, and where these end."""
     head = piece(start, _LENGTH + 2)
     length = int.from_bytes(head[_LENGTH:], "little")
     if head[_MARK:_LENGTH] != b"ST" or length < len(head):
-        raise damaged(path, "the camera's settings in its header are not where they should be")
-    stored = piece(start, length)
+        raise damaged_file(path, "the camera's settings in its header are not where they should be")
+    content = piece(start, length)
     fields = {
-        name: struct.unpack_from("<" + kind, stored, place)[0]
-        for name, (place, kind) in _SETUP.items()
-        if place + struct.calcsize(kind) <= length
+        name: struct.unpack_from("<" + kind, content, offset)[0]
+        for name, (offset, kind) in _SETUP.items()
+        if offset + struct.calcsize(kind) <= length
     }
     return fields, start + length
 
@@ -245,12 +251,13 @@ def _colours(path: Path, compression: int, bit_count: int, code: int) -> tuple[F
         The samples are not the sensor's, or the pattern is no Bayer pattern.
     """
     if compression == _LEAD or bit_count > 16:
-        what = "compressed (JPEG)" if compression == _LEAD else "processed (interpolated) colour"
+        processing = "compressed (JPEG)" if compression == _LEAD else "processed (interpolated) colour"
         raise FrameError(
-            f"{path} is {what}: its samples are no longer the sensor's; save it as raw .cine from the camera's software"
+            f"{path} is {processing}: its samples are no longer the sensor's; save it as raw .cine from the camera's "
+            "software"
         )
     if compression not in (0, _UNINTERPOLATED):
-        raise damaged(path, f"its header announces the kind of compression {compression}, which is unknown")
+        raise damaged_file(path, f"its header announces the kind of compression {compression}, which is unknown")
     if code & 0xF0000000:
         raise FrameError(f"{path} joins the pictures of grey and colour heads (code {code:#x}), which is not read")
     if compression == _UNINTERPOLATED and code in (1, 2):
@@ -270,24 +277,24 @@ def _levels(setup: Mapping[str, int], depth: int) -> tuple[int | None, int, tupl
     return None, largest, (remark,) if black or white else ()
 
 
-def _stamps(path: Path, piece: _Reading, between: tuple[int, int], count: int) -> dict[int, npt.NDArray[Any]]:
+def _stamps(path: Path, piece: _ReadBytes, limits: tuple[int, int], count: int) -> dict[int, npt.NDArray[Any]]:
     """Read times and exposures (count,) of the frames from the tagged blocks, as far as there are any."""
-    found: dict[int, npt.NDArray[Any]] = {}
-    (place, end), length = between, 8
-    for _ in range(_MOST_BLOCKS):
-        if place + 8 > end or length < 8:
+    stamps: dict[int, npt.NDArray[Any]] = {}
+    (offset, end), length = limits, 8
+    for _ in range(_MAX_BLOCKS):
+        if offset + 8 > end or length < 8:
             break
-        length, kind = struct.unpack("<IH", piece(place, 6))
+        length, kind = struct.unpack("<IH", piece(offset, 6))
         if kind in _STAMPS:
-            stored = np.dtype(_STAMPS[kind])
-            if length - 8 < count * stored.itemsize:
-                raise damaged(path, f"block {kind} of its header has {length} bytes, too few for {count} frames")
-            found[kind] = np.frombuffer(piece(place + 8, count * stored.itemsize), stored)
-        place += length
-    return found
+            stamp_type = np.dtype(_STAMPS[kind])
+            if length - 8 < count * stamp_type.itemsize:
+                raise damaged_file(path, f"block {kind} of its header has {length} bytes, too few for {count} frames")
+            stamps[kind] = np.frombuffer(piece(offset + 8, count * stamp_type.itemsize), stamp_type)
+        offset += length
+    return stamps
 
 
-def _since(times: npt.NDArray[np.uint64], trigger: int) -> npt.NDArray[np.int64]:
+def _since_trigger(times: npt.NDArray[np.uint64], trigger: int) -> npt.NDArray[np.int64]:
     """Convert to ns from the trigger; both are seconds in fixed point 32.32, whose last two bits are flags."""
     flags = np.uint64(3)
     ticks = ((times & ~flags) - (np.uint64(trigger) & ~flags)).astype(np.int64)
@@ -301,9 +308,9 @@ def _settings(
     rates = (setup.get(name, 0.0) for name in ("frame_rate", "frame_rate_32", "frame_rate_16"))
     stamped = 0 if exposures is None else (int(np.sort(exposures)[len(exposures) // 2]) * SECOND + 2**31) >> 32
     us = setup.get("shutter_us", 0) or setup.get("shutter_us_16", 0)
-    turned = [name for name in ("flip_horizontally", "flip_vertically", "rotate") if setup.get(name, 0)]
-    if turned:
-        names = ", ".join(turned).replace("_", " ")
+    ignored = [name for name in ("flip_horizontally", "flip_vertically", "rotate") if setup.get(name, 0)]
+    if ignored:
+        names = ", ".join(ignored).replace("_", " ")
         remarks += (f"the viewer's settings are left out ({names}): frames are as the sensor gave them",)
     return {
         "frame_rate": next((float(rate) for rate in rates if math.isfinite(rate) and rate > 0), None),

@@ -36,7 +36,7 @@ class Window:
     frame: tuple[int, int]
 
     @classmethod
-    def whole(cls, frame: tuple[int, int]) -> Window:
+    def of_frame(cls, frame: tuple[int, int]) -> Window:
         """Return the window that is all of a frame.
 
         Parameters
@@ -51,7 +51,7 @@ class Window:
         return cls(origin=(0, 0), shape=frame, frame=frame)
 
     @classmethod
-    def around(cls, points: FloatArray, margin: float, frame: tuple[int, int]) -> Window:
+    def around_points(cls, points: FloatArray, margin: float, frame: tuple[int, int]) -> Window:
         """Return what lies within `margin` px of points (N, 2) in x and y, and little more.
 
         Parameters
@@ -73,28 +73,28 @@ class Window:
         low = np.clip(np.floor(points.min(axis=0) - margin), 0, size - 1).astype(int) // grid * grid
         last = np.clip(np.ceil(points.max(axis=0) + margin), low, size - 1).astype(int)
         high = np.minimum((last // grid + 1) * grid, size)
-        (left, top), (columns, rows) = low.tolist(), (high - low).tolist()
-        return cls(origin=(left, top), shape=(rows, columns), frame=frame)
+        (first_column, first_row), (columns, rows) = low.tolist(), (high - low).tolist()
+        return cls(origin=(first_column, first_row), shape=(rows, columns), frame=frame)
 
     @property
     def is_whole(self) -> bool:
-        """Whether it is all of the frame."""
+        """True where it is all of the frame."""
         return self.shape == self.frame
 
-    def part_of(self, other: Window) -> tuple[slice, slice]:
+    def slices_in(self, outer: Window) -> tuple[slice, slice]:
         """Return where it lies, rows and columns, in a window that holds all of it.
 
         Parameters
         ----------
-        other
+        outer
             Window that holds all of this one.
 
         Returns
         -------
         rows, columns : slice
         """
-        (left, top), (x, y), (rows, columns) = self.origin, other.origin, self.shape
-        return slice(top - y, top - y + rows), slice(left - x, left - x + columns)
+        (first_column, first_row), (x, y), (rows, columns) = self.origin, outer.origin, self.shape
+        return slice(first_row - y, first_row - y + rows), slice(first_column - x, first_column - x + columns)
 
 
 def cfa_channels(cfa: str) -> npt.NDArray[np.intp]:
@@ -222,7 +222,7 @@ def _convert(frame: Mosaic | ChannelFrame, levels: tuple[int, ...]) -> None:
     object.__setattr__(frame, "white_level", float(white))
 
 
-def planes_of(frame: Mosaic | ChannelFrame) -> tuple[tuple[str, ...], list[npt.NDArray[np.uint16]], FloatArray]:
+def colour_planes(frame: Mosaic | ChannelFrame) -> tuple[tuple[str, ...], list[npt.NDArray[np.uint16]], FloatArray]:
     """Return the colour planes of a frame: their names, their samples and their black levels.
 
     Parameters
@@ -246,7 +246,7 @@ Integers = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recording:
-    """What a file states of its frames as a sequence; None where it does not state it.
+    """Number, times and settings of the frames of a file; None where it does not state them.
 
     Attributes
     ----------
@@ -269,7 +269,7 @@ class Recording:
         Of how many frames that the camera took one is in the file, as the file states.
     planes
         Number of frames that belong to one time, such as the channels of a hyperstack, each an image of one light.
-    planes_in_words
+    planes_description
         What these are.
     count_is_certain
         Whether the file holds no other frames: False where the list of them leads out of it.
@@ -287,7 +287,7 @@ class Recording:
     numbers: Integers | None = None
     saved_every: int = 1
     planes: int = 1
-    planes_in_words: str = ""
+    planes_description: str = ""
     count_is_certain: bool = True
     remarks: tuple[str, ...] = ()
 
@@ -296,22 +296,22 @@ class Recording:
         times = None if self.times_ns is None else np.asarray(self.times_ns)[:: self.planes]
         if times is None or len(times) < 2:
             return
-        if (falls := (times[1:] <= times[:-1]) | (times[:-1] == np.iinfo(np.int64).min)).any():
-            where = self.planes * (int(np.argmax(falls)) + 1)
-            remark = f"its time stamps do not rise (at frame {where}): they are not used"
+        if (is_falling := (times[1:] <= times[:-1]) | (times[:-1] == np.iinfo(np.int64).min)).any():
+            frame_index = self.planes * (int(np.argmax(is_falling)) + 1)
+            remark = f"its time stamps do not rise (at frame {frame_index}): they are not used"
             object.__setattr__(self, "times_ns", None)
         elif rate := self.frame_rate:
-            periods = int(self.numbered[-1]) if self.planes == 1 else len(times) - 1
-            stamped = self.saved_every * periods * SECOND / float(times[-1] - times[0])
-            if abs(rate / stamped - 1) <= max(0.01, rate * 1e-6):  # stamps may be whole microseconds
+            periods = int(self.relative_numbers[-1]) if self.planes == 1 else len(times) - 1
+            stamped_rate = self.saved_every * periods * SECOND / float(times[-1] - times[0])
+            if abs(rate / stamped_rate - 1) <= max(0.01, rate * 1e-6):  # stamps may be whole microseconds
                 return
-            remark = f"it states {rate:g} frames per second, its time stamps {stamped:.6g}: these are taken"
+            remark = f"it states {rate:g} frames per second, its time stamps {stamped_rate:.6g}: these are taken"
         else:
             return
         object.__setattr__(self, "remarks", (*self.remarks, remark))
 
     @property
-    def numbered(self) -> Integers:
+    def relative_numbers(self) -> Integers:
         """Number (count,) of every frame from the first, which has 0; with gaps where frames are lost.
 
         They are the camera's, else whole periods between even time stamps. Frames that are not taken at even intervals
@@ -323,15 +323,15 @@ class Recording:
             steps = np.diff(self.times_ns)
             period = float(np.median(steps))
             periods = np.round(steps / max(period, 1.0))
-            even = 0.1 * period * np.sqrt(np.abs(periods))  # a clock of 1 MHz at 100,000 frames a second
-            if (periods >= 1).all() and (np.abs(steps - periods * period) <= even).all():
+            tolerance = 0.1 * period * np.sqrt(np.abs(periods))  # a clock of 1 MHz at 100,000 frames a second
+            if (periods >= 1).all() and (np.abs(steps - periods * period) <= tolerance).all():
                 return np.concatenate([[0], np.cumsum(periods)]).astype(np.int64)
         return np.arange(self.count)
 
     @property
-    def lost(self) -> int:
+    def n_lost(self) -> int:
         """Number of frames lost between the first and the last."""
-        return int(self.numbered[-1]) + 1 - self.count
+        return int(self.relative_numbers[-1]) + 1 - self.count
 
 
 def even_times(numbers: range, interval: Fraction) -> Integers:
@@ -342,13 +342,15 @@ def even_times(numbers: range, interval: Fraction) -> Integers:
     OverflowError
         More than 292 years lie between them.
     """
-    above, below = SECOND * interval.numerator, interval.denominator
-    return np.fromiter(((2 * number * above + below) // (2 * below) for number in numbers), np.int64, len(numbers))
+    numerator, denominator = SECOND * interval.numerator, interval.denominator
+    return np.fromiter(
+        ((2 * number * numerator + denominator) // (2 * denominator) for number in numbers), np.int64, len(numbers)
+    )
 
 
 _NUMBER = re.compile(r"[0-9]{1,9}(/0{0,8}[1-9][0-9]{0,8}|(\.[0-9]{1,15})?([eE]-?[0-9])?)")
 
 
-def fraction(text: str) -> Fraction | None:
+def parse_fraction(text: str) -> Fraction | None:
     """Return the number that a header states as text, such as "0.25", "1/500" or "2.5e-3"; None where it is none."""
     return Fraction(text) if _NUMBER.fullmatch(text) else None

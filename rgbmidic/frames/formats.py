@@ -16,10 +16,10 @@ from rgbmidic.frames.camera_raw import CAMERA_RAW_ENDINGS, CameraRaw, has_camera
 from rgbmidic.frames.cine import CINE_ENDINGS, CineFile
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import HeaderlessFile, PngFile, is_headerless
+from rgbmidic.frames.metadata import CameraMetadata
 from rgbmidic.frames.movies import MRAW_ENDINGS, MrawFile, SeqFile
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stacks import HDF5_ENDINGS, Hdf5File, NpyFile, split_dataset
-from rgbmidic.frames.stored import Camera
 from rgbmidic.frames.tiff import TIFF_ENDINGS, TiffFile, TiffStack, is_tiff_stack
 from rgbmidic.frames.tiff_pages import is_dng
 from rgbmidic.settings import FrameKind, FrameSettings
@@ -43,7 +43,7 @@ class FrameFormat:
         Whether a file, with what the user states of it, is read as this format; it raises nothing for any file. None:
         by its ending.
     source
-        Its reader; built with `path` and `stated`, it reads nothing yet.
+        Its reader; built with `path` and `user_metadata`, it reads nothing yet.
     """
 
     name: str
@@ -52,14 +52,14 @@ class FrameFormat:
     source: type[FrameSource]
     movies: tuple[str, ...] = ()
 
-    def reads(self, path: Path, stated: FrameSettings) -> bool:
+    def reads(self, path: Path, user_metadata: FrameSettings) -> bool:
         """Report whether it reads a file of which the user states this.
 
         Parameters
         ----------
         path
             The file.
-        stated
+        user_metadata
             What the user states of it.
 
         Returns
@@ -68,7 +68,7 @@ class FrameFormat:
         """
         if self.recognises is None:
             return path.suffix.lower() in self.endings + self.movies
-        return self.recognises(path, stated)
+        return self.recognises(path, user_metadata)
 
 
 def _is_tiff(path: Path) -> bool:
@@ -113,28 +113,28 @@ ENTRY_POINTS = "rgbmidic.frame_formats"
 
 
 @cache
-def _added_formats() -> tuple[FrameFormat, ...]:
-    """Formats of other packages; one that cannot be loaded is left out with a warning."""
-    found = list[FrameFormat]()
+def _plugin_formats() -> tuple[FrameFormat, ...]:
+    """Return the formats of other packages; one that cannot be loaded is left out with a warning."""
+    formats = list[FrameFormat]()
     for point in entry_points(group=ENTRY_POINTS):
         try:
-            known = point.load()
-            if not isinstance(known, FrameFormat):
-                raise TypeError(f"it is a {type(known).__name__}, not a rgbmidic.frames.FrameFormat")
-            found.append(known)
+            frame_format = point.load()
+            if not isinstance(frame_format, FrameFormat):
+                raise TypeError(f"it is a {type(frame_format).__name__}, not a rgbmidic.frames.FrameFormat")
+            formats.append(frame_format)
         except Exception as error:  # of whatever package it is
             logger.warning("the frame format %s (%s) is left out: %s", point.name, point.value, error)
-    return tuple(found)
+    return tuple(formats)
 
 
-def known_formats() -> tuple[FrameFormat, ...]:
-    """All formats, the package's own first: the first that recognises a file reads it.
+def frame_formats() -> tuple[FrameFormat, ...]:
+    """Return all formats, the package's own first: the first that recognises a file reads it.
 
     Returns
     -------
     tuple of FrameFormat
     """
-    return (*FORMATS, *_added_formats())
+    return (*FORMATS, *_plugin_formats())
 
 
 _ADVICE = (
@@ -144,7 +144,7 @@ _ADVICE = (
         "camera's own file, or export from it DNG or 16-bit TIFF, without demosaicing",
     ),
     (
-        tuple(ending for known in FORMATS for ending in known.movies),
+        tuple(ending for frame_format in FORMATS for ending in frame_format.movies),
         "a movie or a stack: a folder stands for frames in files of their own; name the movie itself, or a pattern",
     ),
     (
@@ -172,21 +172,21 @@ class _UnknownFile(FrameSource):
         if text := advice(self.path):
             raise FrameError(f"{self.path} is {text}")
         with self.path.open("rb"):  # one that cannot be opened is told as that
-            allowed = ", ".join(known.name for known in known_formats())
+            allowed = ", ".join(frame_format.name for frame_format in frame_formats())
         raise FrameError(f"{self.path} is not a frame that rgbmidic reads; allowed are {allowed}")
 
     def _stored(self, index: int) -> NoReturn:
         self._shape()
 
 
-def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None = None) -> FrameSource:
+def open_source(path: Path | str, user_metadata: FrameSettings, camera: CameraMetadata | None = None) -> FrameSource:
     """Return the file as a source of frames; a missing or damaged one is reported when it is read.
 
     Parameters
     ----------
     path
         Frame file.
-    stated
+    user_metadata
         What the user states of it (`path` and `reference` are not used); it must agree with what the file states.
     camera
         What a calibration states of it; it must agree with both, and fills in what neither states.
@@ -197,12 +197,15 @@ def open_source(path: Path | str, stated: FrameSettings, camera: Camera | None =
         Of the first of `FORMATS` that recognises the file.
     """
     path = Path(path)
-    source = next((known.source for known in known_formats() if known.reads(path, stated)), _UnknownFile)
-    return source(path=path, stated=stated, camera=camera)
+    source = next(
+        (frame_format.source for frame_format in frame_formats() if frame_format.reads(path, user_metadata)),
+        _UnknownFile,
+    )
+    return source(path=path, user_metadata=user_metadata, camera=camera)
 
 
-class Statements(TypedDict, total=False):
-    """What the caller of `read_frame` states of a file; None: what the file states."""
+class FrameMetadata(TypedDict, total=False):
+    """Properties of a frame that the caller of `read_frame` states; None: as the file states."""
 
     kind: FrameKind | None
     cfa: str | None
@@ -212,7 +215,7 @@ class Statements(TypedDict, total=False):
     dtype: Literal["uint8", "uint16", ">u2"] | None
 
 
-def read_frame(path: Path | str, **stated: Unpack[Statements]) -> Mosaic | ChannelFrame:
+def read_frame(path: Path | str, **metadata: Unpack[FrameMetadata]) -> Mosaic | ChannelFrame:
     """Read one raw frame.
 
     Camera raw files (LibRaw) state everything. TIFF and PNG state size and number of channels; headerless ``.raw`` and
@@ -222,7 +225,7 @@ def read_frame(path: Path | str, **stated: Unpack[Statements]) -> Mosaic | Chann
     ----------
     path
         Frame file.
-    **stated
+    **metadata
         Properties of the frame. ``kind``: None means as the file states (three channels: ``"rgb"``), else ``"bayer"``.
         ``cfa``: Bayer pattern of the first visible pixels; needed for a mosaic whose file does not state it.
         ``black_level``, ``white_level``: grey levels (DN); if they are not stated, 0 and the largest value of the
@@ -240,11 +243,22 @@ def read_frame(path: Path | str, **stated: Unpack[Statements]) -> Mosaic | Chann
         The file is missing, damaged, truncated, already demosaiced, or contradicts a statement (both are named).
     InputError
         A stated property is not allowed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rgbmidic import read_frame
+    >>> from rgbmidic.frames import Mosaic, write_tiff
+    >>> values = np.full((4, 6), 100, dtype=np.uint16)
+    >>> write_tiff("frame.tif", Mosaic(values=values, cfa="RGGB", black_level=np.array(16.0), white_level=1023.0))
+    >>> frame = read_frame("frame.tif", cfa="RGGB", black_level=16, white_level=1023)
+    >>> frame.values.shape, frame.cfa, frame.white_level
+    ((4, 6), 'RGGB', 1023.0)
     """
-    if odd := stated.keys() - Statements.__annotations__:
-        raise TypeError(f"read_frame takes {', '.join(Statements.__annotations__)}, not {', '.join(odd)}")
+    if unknown := metadata.keys() - FrameMetadata.__annotations__:
+        raise TypeError(f"read_frame takes {', '.join(FrameMetadata.__annotations__)}, not {', '.join(unknown)}")
     try:
-        settings = FrameSettings(path=(str(path),), **stated)
+        settings = FrameSettings(path=(str(path),), **metadata)
     except ConfigurationError as error:
         raise InputError(str(error).replace("frames.", "")) from None
     return open_source(path, settings).read(0)

@@ -1,4 +1,4 @@
-"""What the description in a TIFF file states of its pages: ImageJ's hyperstacks, OME-TIFF, tifffile's own.
+"""Description of the pages in a TIFF file: ImageJ's hyperstacks, OME-TIFF, tifffile's own.
 
 The times of a test are one axis of a hyperstack; its channels and slices are planes of one time, such as images of
 several lights. A file that has slices or channels alone, as ImageJ imports sequences and tifffile writes stacks, has
@@ -18,11 +18,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from rgbmidic.frames.data import SECOND, Integers, even_times, fraction
+from rgbmidic.frames.data import SECOND, Integers, even_times, parse_fraction
 
 _UNITS = {"s": 1, "sec": 1, "seconds": 1}
 _UNITS |= {"ms": 10**3, "msec": 10**3, "µs": 10**6, "us": 10**6, "usec": 10**6, "ns": SECOND}
-"""Of time, by how many make a second."""
+"""Units of time, by their number in a second."""
 _Plane = tuple[int, int, int]
 
 
@@ -55,11 +55,11 @@ class Hyperstack:
     def parse(cls, text: str, page_samples: int) -> Self | None:
         """Return what the text of a file states whose pages have so many samples; None where it is none of these."""
         if text.startswith("ImageJ="):
-            return cls._of_imagej(text)
+            return cls._from_imagej(text)
         if "<OME" in text[:1000] and "<!ENTITY" not in text:
-            return cls._of_ome(text)
+            return cls._from_ome(text)
         if text.startswith('{"shape": ['):
-            return cls._of_tifffile(text, page_samples)
+            return cls._from_tifffile(text, page_samples)
         return None
 
     @property
@@ -69,7 +69,7 @@ class Hyperstack:
 
     @property
     def has_times(self) -> bool:
-        """Whether its planes are those of several times."""
+        """True where its planes are those of several times."""
         return self.sizes[0] > 1
 
     @property
@@ -79,8 +79,8 @@ class Hyperstack:
         return slices * channels if times > 1 else channels if slices > 1 else 1
 
     @property
-    def planes_in_words(self) -> str:
-        """What the planes of one time are."""
+    def planes_description(self) -> str:
+        """Description of the planes of one time."""
         _, slices, channels = self.sizes
         words = [f"{channels} channels"] * (channels > 1) + [f"{slices} slices"] * (slices > 1 and self.has_times)
         return " of ".join(words)
@@ -105,12 +105,12 @@ class Hyperstack:
             if self.interval:
                 return np.repeat(even_times(range(self.sizes[0]), self.interval), self.planes)
             seconds = [stamps.get(plane) or stamps[plane[0], 0, 0] for plane in np.ndindex(self.sizes)]
-            return np.array([round(one * SECOND) for one in seconds], dtype=np.int64)
+            return np.array([round(time * SECOND) for time in seconds], dtype=np.int64)
         except (OverflowError, KeyError):
             return None
 
     @classmethod
-    def _of_imagej(cls, text: str) -> Self | None:
+    def _from_imagej(cls, text: str) -> Self | None:
         entries = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
         images, channels, slices, frames = (
             int(entries[name]) if re.fullmatch("[0-9]{1,9}", entries.get(name, "")) else 0
@@ -125,7 +125,7 @@ class Hyperstack:
         return cls(sizes=sizes, interval=interval, by_imagej=True)
 
     @classmethod
-    def _of_ome(cls, text: str) -> Self | None:
+    def _from_ome(cls, text: str) -> Self | None:
         try:
             pixels = ElementTree.fromstring(text.encode()).find(".//{*}Pixels")
         except ElementTree.ParseError:
@@ -133,8 +133,8 @@ class Hyperstack:
         order = "" if pixels is None else pixels.get("DimensionOrder", "XYCZT")[2:]
         if pixels is None or sorted(order) != ["C", "T", "Z"]:
             return None
-        numbers = [_whole(pixels.get(f"Size{axis}", "1")) for axis in "TZC"]
-        samples = [_whole(channel.get("SamplesPerPixel", "1")) for channel in pixels.iterfind("{*}Channel")]
+        numbers = [_parse_count(pixels.get(f"Size{axis}", "1")) for axis in "TZC"]
+        samples = [_parse_count(channel.get("SamplesPerPixel", "1")) for channel in pixels.iterfind("{*}Channel")]
         if len(samples) and sum(samples) == numbers[2]:  # colours lie in one plane
             numbers[2] = len(samples)
         if not all(numbers):
@@ -145,31 +145,33 @@ class Hyperstack:
             for plane in pixels.iterfind("{*}Plane")
             if (time := _seconds(plane.get("DeltaT", ""), plane.get("DeltaTUnit", "s"))) is not None
         }
-        single = (
-            part for part in pixels.iterfind("{*}TiffData") if part.get("PlaneCount", "1") == "1" and part.get("IFD")
+        elements = (
+            element
+            for element in pixels.iterfind("{*}TiffData")
+            if element.get("PlaneCount", "1") == "1" and element.get("IFD")
         )
-        pages = {_position(part, "First"): _whole(part.get("IFD", "")) for part in single}
+        pages = {_position(element, "First"): _parse_count(element.get("IFD", "")) for element in elements}
         sizes = (numbers[0], numbers[1], numbers[2])
         return cls(sizes=sizes, order=order[::-1], interval=interval, plane_times=stamps, pages=pages)
 
     @classmethod
-    def _of_tifffile(cls, text: str, page_samples: int) -> Self | None:
+    def _from_tifffile(cls, text: str, page_samples: int) -> Self | None:
         try:
-            pages, rest = divmod(math.prod(map(int, json.loads(text)["shape"])), page_samples)
+            pages, remainder = divmod(math.prod(map(int, json.loads(text)["shape"])), page_samples)
         except (ValueError, TypeError, KeyError, ArithmeticError, RecursionError):
             return None
-        return cls(sizes=(1, pages, 1)) if rest == 0 < pages else None
+        return cls(sizes=(1, pages, 1)) if remainder == 0 < pages else None
 
 
-def _whole(text: str) -> int:
+def _parse_count(text: str) -> int:
     return int(text) if re.fullmatch("[0-9]{1,9}", text) else 0
 
 
-def _position(part: ElementTree.Element[Any], prefix: str) -> _Plane:
-    t, z, c = (_whole(part.get(prefix + axis, "0")) for axis in "TZC")
+def _position(element: ElementTree.Element[Any], prefix: str) -> _Plane:
+    t, z, c = (_parse_count(element.get(prefix + axis, "0")) for axis in "TZC")
     return t, z, c
 
 
 def _seconds(text: str, unit: str) -> Fraction | None:
-    number = fraction(text)
+    number = parse_fraction(text)
     return None if number is None or unit not in _UNITS else number / _UNITS[unit]

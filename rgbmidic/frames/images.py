@@ -18,13 +18,13 @@ import numpy as np
 
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
+from rgbmidic.frames.metadata import BROKEN_JPEG, EvenFrames, StoredFrame, captured_stderr, check_size, damaged_file
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import BROKEN_JPEG, EvenFrames, StoredFrame, check_size, complaints, damaged
 from rgbmidic.settings import FrameSettings
 from rgbmidic.typing import AnyArray
 
-_PLACE = re.compile(r"^\[ *(ERROR|WARN)\S*\] global \S+ \S+ ")
-"""Where in OpenCV a line of its log comes from."""
+_LOG_PREFIX = re.compile(r"^\[ *(ERROR|WARN)\S*\] global \S+ \S+ ")
+"""Origin of a line in OpenCV's log."""
 
 
 def decode(content: bytes, path: Path) -> AnyArray:
@@ -53,17 +53,17 @@ def decode(content: bytes, path: Path) -> AnyArray:
     set_log_level = cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel
     previous = set_log_level(3)  # LOG_LEVEL_WARNING
     try:
-        with complaints(b"libpng error", b"libpng warning", b"[ERROR", b"[ WARN", b"> ") as lines:
+        with captured_stderr(b"libpng error", b"libpng warning", b"[ERROR", b"[ WARN", b"> ") as lines:
             # OpenCV opens no non-ASCII names on Windows, hence decoding from memory
             image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     finally:
         set_log_level(previous)
-    of_unused_parts = [line for line in lines if line.startswith(("libpng warning", "[ WARN"))]
-    errors = [line for line in lines if line not in of_unused_parts or any(text in line for text in BROKEN_JPEG)]
+    harmless = [line for line in lines if line.startswith(("libpng warning", "[ WARN"))]
+    errors = [line for line in lines if line not in harmless or any(text in line for text in BROKEN_JPEG)]
     if image is None or errors:  # libtiff's errors do not always keep OpenCV from giving a picture
-        raise damaged(path, _PLACE.sub("", errors[0]) if errors else "its image data cannot be decoded")
+        raise damaged_file(path, _LOG_PREFIX.sub("", errors[0]) if errors else "its image data cannot be decoded")
     return image[..., ::-1] if image.ndim == 3 and image.shape[2] == 3 else image
 
 
@@ -79,59 +79,62 @@ class PngFile(FrameSource):
         with self.path.open("rb") as file:
             head = file.read(33)
         if len(head) < 33 or head[:8] != _SIGNATURE or head[12:16] != b"IHDR":
-            raise damaged(self.path, "it has no PNG header")
+            raise damaged_file(self.path, "it has no PNG header")
         columns, rows, bits, colour = struct.unpack(">IIBB", head[16:26])
         if bits not in (8, 16) or colour not in _CHANNELS:
             raise FrameError(
                 f"{self.path} is not a plain image; allowed are grey or RGB PNGs of 8 or 16 bit without alpha"
             )
-        needed = rows * columns * _CHANNELS[colour] * bits // 8
-        check_size(self.path, needed=needed, stored=self.path.stat().st_size)
+        n_bytes = rows * columns * _CHANNELS[colour] * bits // 8
+        check_size(self.path, unpacked=n_bytes, stored=self.path.stat().st_size)
         return rows, columns
 
     def _stored(self, index: int) -> StoredFrame:
         self._shape()
         content = self.path.read_bytes()
         _check_chunks(content, self.path)
-        return StoredFrame.plain(decode(content, self.path), self.path)
+        return StoredFrame.from_samples(decode(content, self.path), self.path)
 
 
 def _check_chunks(content: bytes, path: Path) -> None:
     """Refuse a file with a wrong checksum up to IEND, or that ends before it."""
-    start, name, whole = len(_SIGNATURE), b"", memoryview(content)
+    start, name, view = len(_SIGNATURE), b"", memoryview(content)
     while name != b"IEND":
         name = content[start + 4 : start + 8]
-        end = start + 8 + int.from_bytes(whole[start : start + 4], "big")
+        end = start + 8 + int.from_bytes(view[start : start + 4], "big")
         if end + 4 > len(content):
-            raise damaged(path, "it ends before its end mark")
-        if zlib.crc32(whole[start + 4 : end]) != int.from_bytes(whole[end : end + 4], "big"):
-            raise damaged(path, f"the checksum of its {name.decode(errors='replace')} part is wrong")
+            raise damaged_file(path, "it ends before its end mark")
+        if zlib.crc32(view[start + 4 : end]) != int.from_bytes(view[end : end + 4], "big"):
+            raise damaged_file(path, f"the checksum of its {name.decode(errors='replace')} part is wrong")
         start = end + 4
 
 
-def is_headerless(path: Path, stated: FrameSettings) -> bool:
+def is_headerless(path: Path, user_metadata: FrameSettings) -> bool:
     """Return whether a file has no header: .bin, and .raw whose shape is stated, as some cameras' .raw have one."""
-    return path.suffix.lower() == ".bin" or (path.suffix.lower() == ".raw" and stated.shape is not None)
+    return path.suffix.lower() == ".bin" or (path.suffix.lower() == ".raw" and user_metadata.shape is not None)
 
 
 class HeaderlessFile(FrameSource):
     """A file without a header: shape and sample type are stated."""
 
     def _shape(self) -> tuple[int, int]:
-        if self.stated.shape is None or self.stated.dtype is None:
+        if self.user_metadata.shape is None or self.user_metadata.dtype is None:
             raise FrameError(f"{self.path} has no header: both its shape (rows, columns) and its dtype must be stated")
-        return self.stated.shape
+        return self.user_metadata.shape
 
     def _rows(self, index: int, rows: slice) -> StoredFrame:
-        shape, dtype = self._shape(), np.dtype("<u2" if self.stated.dtype == "uint16" else self.stated.dtype)
-        channels, size = 3 if self.stated.kind == "rgb" else 1, self.path.stat().st_size
+        shape, dtype = (
+            self._shape(),
+            np.dtype("<u2" if self.user_metadata.dtype == "uint16" else self.user_metadata.dtype),
+        )
+        channels, size = 3 if self.user_metadata.kind == "rgb" else 1, self.path.stat().st_size
         frame = EvenFrames(shape=shape, channels=(channels,), stored_bits=8 * dtype.itemsize, order=dtype.str[0])
         if size != frame.size:
             raise FrameError(
-                f"{self.path} has {size} bytes; {shape[0]} rows of {shape[1]} {self.stated.dtype} samples with "
+                f"{self.path} has {size} bytes; {shape[0]} rows of {shape[1]} {self.user_metadata.dtype} samples with "
                 f"{channels} channel(s) need {frame.size}"
             )
-        return StoredFrame.plain(frame.read(self.path, 0, range(shape[0])[rows]).values, self.path)
+        return StoredFrame.from_samples(frame.read(self.path, 0, range(shape[0])[rows]).values, self.path)
 
 
 def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float] | None = None) -> None:
@@ -197,7 +200,7 @@ def _dng_tags(mosaic: Mosaic, white_balance: Sequence[float], path: Path | str) 
     if len(white_balance) != 3 or not all(np.isfinite(factor) and factor > 0 for factor in white_balance):
         raise InputError(f"white_balance is three positive factors (R, G, B), not {white_balance!r}")
     xyz_to_srgb = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
-    black = [_whole(level, "black", path) for level in mosaic.black_level.ravel()]
+    black = [_require_integer(level, "black", path) for level in mosaic.black_level.ravel()]
     channels = bytes(int(channel) for channel in cfa_channels(mosaic.cfa).ravel())
     return [
         (50706, "B", 4, b"\x01\x04\x00\x00", True),  # DNGVersion
@@ -209,7 +212,7 @@ def _dng_tags(mosaic: Mosaic, white_balance: Sequence[float], path: Path | str) 
         (50711, "H", 1, 1, True),  # CFALayout: rectangular
         (50713, "H", 2, (2, 2), True),  # BlackLevelRepeatDim
         (50714, "I", 4, black, True),  # BlackLevel, by position
-        (50717, "I", 1, _whole(mosaic.white_level, "white", path), True),  # WhiteLevel
+        (50717, "I", 1, _require_integer(mosaic.white_level, "white", path), True),  # WhiteLevel
         (50721, "2i", 9, _rationals(xyz_to_srgb), True),  # ColorMatrix1
         (50728, "2I", 3, _rationals(min(white_balance) / factor for factor in white_balance), True),  # AsShotNeutral
         (50778, "H", 1, 21, True),  # CalibrationIlluminant1: D65
@@ -218,10 +221,10 @@ def _dng_tags(mosaic: Mosaic, white_balance: Sequence[float], path: Path | str) 
 
 def _rationals(numbers: Iterable[float]) -> list[int]:
     fractions = [Fraction(number).limit_denominator(10_000) for number in numbers]
-    return [part for fraction in fractions for part in (fraction.numerator, fraction.denominator)]
+    return [term for fraction in fractions for term in (fraction.numerator, fraction.denominator)]
 
 
-def _whole(level: float, name: str, path: Path | str) -> int:
+def _require_integer(level: float, name: str, path: Path | str) -> int:
     if level != int(level) or level > 65535:
         raise InputError(f"a DNG holds a {name} level that is a whole number up to 65535, not {level}: {path}")
     return int(level)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rgbmidic.errors import FrameError, disk_reason
-from rgbmidic.settings import regular
+from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import AnyArray, FloatImage
 
 SOFTWARE = 305
@@ -36,8 +36,8 @@ def read_mask(path: Path) -> FloatImage:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        stored = np.load if regular(path).suffix.lower() == ".npy" else _grey
-        values = stored(path)
+        load = np.load if require_regular_file(path).suffix.lower() == ".npy" else _strongest_channel
+        values = load(path)
     except UnidentifiedImageError:
         raise FrameError(f"{path} is no mask: allowed are pictures (PNG, TIFF, BMP, JPEG) and .npy arrays") from None
     except FileNotFoundError:
@@ -54,8 +54,8 @@ def read_mask(path: Path) -> FloatImage:
     return np.asarray(values / largest, dtype=np.float32)
 
 
-def _grey(path: Path) -> AnyArray:
-    """Strongest channel of each pixel of a picture, times its opacity."""
+def _strongest_channel(path: Path) -> AnyArray:
+    """Return the strongest channel of each pixel of a picture, times its opacity."""
     from PIL import Image
 
     with warnings.catch_warnings():

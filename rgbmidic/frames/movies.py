@@ -25,9 +25,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.data import SECOND, Integers, Recording, even_times, fraction
-from rgbmidic.frames.source import Movie, remembered
-from rgbmidic.frames.stored import EvenFrames, StoredFrame, damaged
+from rgbmidic.frames.data import SECOND, Integers, Recording, even_times, parse_fraction
+from rgbmidic.frames.metadata import EvenFrames, StoredFrame, damaged_file
+from rgbmidic.frames.source import MovieSource, cache_by_file
 
 logger = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ _NAMES = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MrawFile(Movie):
+class MrawFile(MovieSource):
     """A movie of a Photron camera, named by its samples or by its header, of monochrome or raw samples.
 
     The header does not state the Bayer pattern: its colour type "Raw" occurs on monochrome cameras, too.
@@ -63,28 +63,28 @@ class MrawFile(Movie):
     def __post_init__(self) -> None:
         """Take the file of the samples where the header is named."""
         if self.path.suffix.lower() != ".mraw":
-            object.__setattr__(self, "path", _beside(self.path, ".mraw") or self.path.with_suffix(".mraw"))
+            object.__setattr__(self, "path", _companion(self.path, ".mraw") or self.path.with_suffix(".mraw"))
 
     def _header(self) -> EvenFrames:
-        found = _beside(self.path, *MRAW_ENDINGS[1:])
-        if found is None:
+        header_path = _companion(self.path, *MRAW_ENDINGS[1:])
+        if header_path is None:
             raise FrameError(f"{self.path} needs its header {self.path.stem}.cihx or {self.path.stem}.cih beside it")
-        return _mraw_header(found).noting_rest(self.path.stat().st_size)
+        return _mraw_header(header_path).with_rest_noted(self.path.stat().st_size)
 
 
-def _beside(path: Path, *endings: str) -> Path | None:
+def _companion(path: Path, *endings: str) -> Path | None:
     """Find the file of the same name with the first of these endings that exists, in lower or upper case."""
-    spelled = (path.with_suffix(text) for ending in endings for text in (ending, ending.upper()))
-    return next((other for other in spelled if other.is_file()), None)
+    candidates = (path.with_suffix(text) for ending in endings for text in (ending, ending.upper()))
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
-@remembered
+@cache_by_file
 def _mraw_header(path: Path) -> EvenFrames:
     with path.open("rb") as file:
         content = file.read(4 * 2**20)  # those seen have 9 and 19 kB
     entries = _xml(content, path) if path.suffix.lower() == ".cihx" else _lines(content)
-    whole = partial(_whole, path, entries)
-    rows, columns, stored_bits = map(whole, ("Image Height", "Image Width", "Color Bit"))
+    read_int = partial(_read_int, path, entries)
+    rows, columns, stored_bits = map(read_int, ("Image Height", "Image Width", "Color Bit"))
     kind = entries.get("Color Type", "")
     if kind.lower() not in ("mono", "raw", "bayer") or stored_bits in (24, 30, 36, 48):
         raise FrameError(
@@ -92,13 +92,13 @@ def _mraw_header(path: Path) -> EvenFrames:
             "the movie as raw (Bayer) or monochrome"
         )
     if stored_bits not in (8, 10, 12, 16):
-        raise damaged(path, f"it announces samples of {stored_bits} bit; allowed are 8, 10, 12 and 16")
-    depth, side = whole("EffectiveBit Depth", stored_bits), entries.get("EffectiveBit Side", "Lower").lower()
+        raise damaged_file(path, f"it announces samples of {stored_bits} bit; allowed are 8, 10, 12 and 16")
+    depth, side = read_int("EffectiveBit Depth", stored_bits), entries.get("EffectiveBit Side", "Lower").lower()
     if min(rows, columns) < 1 or rows * columns * stored_bits % 8:
-        raise damaged(path, f"it announces {rows} rows of {columns} samples of {stored_bits} bit")
-    count = whole("Total Frame")
+        raise damaged_file(path, f"it announces {rows} rows of {columns} samples of {stored_bits} bit")
+    count = read_int("Total Frame")
     if side not in ("lower", "higher", "upper") or not 8 <= depth <= 16:
-        raise damaged(path, f'it announces {depth} effective bits, "{side}"; allowed are lower and higher')
+        raise damaged_file(path, f'it announces {depth} effective bits, "{side}"; allowed are lower and higher')
     if side == "lower" and depth > stored_bits:
         logger.warning("%s holds the lower %d of %d bits: brighter samples are lost", path, stored_bits, depth)
     header = EvenFrames(
@@ -106,56 +106,57 @@ def _mraw_header(path: Path) -> EvenFrames:
         recording=Recording(count=count),
         stored_bits=stored_bits,
         shift=0 if side == "lower" else max(stored_bits - depth, 0),
-        stated=StoredFrame(kind="bayer" if kind.lower() == "bayer" else None, bits=min(stored_bits, depth)),
-    ).checked(path)
+        metadata=StoredFrame(kind="bayer" if kind.lower() == "bayer" else None, bits=min(stored_bits, depth)),
+    ).require_plausible(path)
     return replace(header, recording=_recording(path, entries, count, depth))
 
 
-def _whole(path: Path, entries: Mapping[str, str], name: str, default: int | None = None) -> int:
+def _read_int(path: Path, entries: Mapping[str, str], name: str, default: int | None = None) -> int:
     """Return a whole number that a header states."""
     text = entries.get(name, "" if default is None else str(default))
     largest = 2**40  # the number of a frame after 12 days at a million a second
     if not re.fullmatch(r"-?[0-9]{1,13}", text) or abs(int(text)) > largest:
-        raise damaged(path, f'its "{name}" is "{text}"' if text else f'it does not state "{name}"')
+        raise damaged_file(path, f'its "{name}" is "{text}"' if text else f'it does not state "{name}"')
     return int(text)
 
 
 def _lines(content: bytes) -> dict[str, str]:
     """Find the entries "name : value" of the first header: a movie that was saved again carries the older ones too."""
-    found: dict[str, str] = {}
+    entries: dict[str, str] = {}
     for line in content.decode("latin-1").splitlines():
         name, colon, value = line.partition(":")
         if colon:
-            found.setdefault(name.strip(), value.strip())
-    return found
+            entries.setdefault(name.strip(), value.strip())
+    return entries
 
 
 def _xml(content: bytes, path: Path) -> dict[str, str]:
     begin, end = content.find(b"<cih>"), content.rfind(b"</cih>")
     if begin < 0 or end < begin:
-        raise damaged(path, "it holds no <cih> element")
+        raise damaged_file(path, "it holds no <cih> element")
     try:
         root = ElementTree.fromstring(content[begin : end + len(b"</cih>")].decode(errors="replace"))
     except ElementTree.ParseError as error:
-        raise damaged(path, error) from None
-    texts = {name: root.findtext(place) for name, place in _NAMES.items()}
+        raise damaged_file(path, error) from None
+    texts = {name: root.findtext(element_path) for name, element_path in _NAMES.items()}
     return {name: text.strip() for name, text in texts.items() if text and text.strip()}
 
 
 def _recording(path: Path, entries: Mapping[str, str], count: int, depth: int) -> Recording:
     """Return how the frames were recorded: they count from the trigger, and every `step`-th is stored."""
-    step = max(_whole(path, entries, "Save Step", 1), 1)
-    first = _whole(path, entries, "Start Frame", 0) - _whole(path, entries, "Correct Trigger Frame", 0)
+    step = max(_read_int(path, entries, "Save Step", 1), 1)
+    first = _read_int(path, entries, "Start Frame", 0) - _read_int(path, entries, "Correct Trigger Frame", 0)
     numbers = range(first, first + count * step, step)
     rate, shutter, exposure = (
-        fraction(entries.get(name, "")) for name in ("Record Rate(fps)", "Shutter Speed(s)", "Shutter Type2(nsec)")
+        parse_fraction(entries.get(name, ""))
+        for name in ("Record Rate(fps)", "Shutter Speed(s)", "Shutter Type2(nsec)")
     )
     exposure = exposure or (SECOND * shutter if shutter else None)
     try:
         times = even_times(numbers, 1 / rate) if rate else None
     except OverflowError:
         text = f"it announces frames up to number {numbers[-1]} at {float(rate or 0)} per second"
-        raise damaged(path, text) from None
+        raise damaged_file(path, text) from None
     return Recording(
         count=count,
         bit_depth=depth,
@@ -181,33 +182,35 @@ _PATTERNS = {1: "GRBG", 2: "BGGR", 3: "RGGB"}
 """By NorPix's `eHBayerPatternOrigin`; 0, green beside blue, is also what a header holds that states no pattern."""
 
 
-class SeqFile(Movie):
+class SeqFile(MovieSource):
     """An uncompressed sequence of StreamPix, of monochrome or raw samples with a time stamp behind each frame."""
 
     def _header(self) -> EvenFrames:
         return _seq_header(self.path)
 
 
-@remembered
+@cache_by_file
 def _seq_header(path: Path) -> EvenFrames:
     with path.open("rb") as file:
         content = file.read(_SEQ_FIELDS.size)
         if len(content) < _SEQ_FIELDS.size or int.from_bytes(content[:4], "little") != 0xFEED:
-            raise damaged(path, "it does not begin as a NorPix sequence")
-        _, version, columns, rows, stored_bits, bits, size, form, *others = _SEQ_FIELDS.unpack(content)
-        count, _, stride, rate, pattern, compression, oldest = others
-        if compression or form not in _RAW:
-            what = f"holds colours (format {form}): its samples are no longer the sensor's, and it"
-            what = f"holds packed samples (format {form})" if form in _PACKED else what
-            what = f"is compressed (method {compression})" if compression else what
+            raise damaged_file(path, "it does not begin as a NorPix sequence")
+        _, version, columns, rows, stored_bits, bits, size, sample_format, *remaining = _SEQ_FIELDS.unpack(content)
+        count, _, stride, rate, pattern, compression, oldest = remaining
+        if compression or sample_format not in _RAW:
+            problem = f"holds colours (format {sample_format}): its samples are no longer the sensor's, and it"
+            problem = f"holds packed samples (format {sample_format})" if sample_format in _PACKED else problem
+            problem = f"is compressed (method {compression})" if compression else problem
             advice = "export it uncompressed, 8 or 16 bit, monochrome or raw Bayer"
-            raise FrameError(f"{path} {what} and is not read: {advice}")
+            raise FrameError(f"{path} {problem} and is not read: {advice}")
         if not columns or not rows or stored_bits not in (8, 16) or not 1 <= bits <= stored_bits:
-            raise damaged(path, f"it announces {rows} rows of {columns} samples, {bits} of {stored_bits} bits")
+            raise damaged_file(path, f"it announces {rows} rows of {columns} samples, {bits} of {stored_bits} bits")
         if size != rows * columns * stored_bits // 8 or oldest >= max(count, 1):
-            raise damaged(path, f"it announces {size} bytes for {rows} rows of {columns} samples of {stored_bits} bits")
-        order, upper = _RAW[form]
-        cfa = _PATTERNS.get(pattern) if form % 2 else None
+            raise damaged_file(
+                path, f"it announces {size} bytes for {rows} rows of {columns} samples of {stored_bits} bits"
+            )
+        order, in_upper_bits = _RAW[sample_format]
+        cfa = _PATTERNS.get(pattern) if sample_format % 2 else None
         header = EvenFrames(
             shape=(rows, columns),
             recording=Recording(
@@ -217,10 +220,10 @@ def _seq_header(path: Path) -> EvenFrames:
             gap=stride - size,
             stored_bits=stored_bits,
             order=order,
-            shift=stored_bits - bits if upper else 0,
-            stated=StoredFrame(kind="bayer" if cfa else None, cfa=cfa, bits=bits),
+            shift=stored_bits - bits if in_upper_bits else 0,
+            metadata=StoredFrame(kind="bayer" if cfa else None, cfa=cfa, bits=bits),
             oldest=oldest,
-        ).checked(path)
+        ).require_plausible(path)
         times = _stamps_ns(file, header, "<iHH" if version >= 5 else "<iH")
     return replace(header, recording=replace(header.recording, times_ns=times))
 
@@ -232,7 +235,9 @@ def _stamps_ns(file: BinaryIO, header: EvenFrames, stamp: str) -> Integers | Non
         return None
     times = np.empty(count, dtype=np.int64)
     for index in range(count):
-        file.seek(header.begin(index) + header.size)
-        seconds, *parts = struct.unpack(stamp, file.read(size))
-        times[index] = seconds * SECOND + sum(part * 10**power for part, power in zip(parts, (6, 3), strict=False))
+        file.seek(header.frame_offset(index) + header.size)
+        seconds, *fractions = struct.unpack(stamp, file.read(size))
+        times[index] = seconds * SECOND + sum(
+            value * 10**power for value, power in zip(fractions, (6, 3), strict=False)
+        )
     return np.asarray(times - times[0])

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Self
 
 from rgbmidic.errors import FrameError, disk_faults, legible
-from rgbmidic.frames.formats import advice, known_formats
+from rgbmidic.frames.formats import advice, frame_formats
 from rgbmidic.frames.stacks import split_dataset
 
-_WHOLE, _DECIMAL = "[0-9]+", r"[0-9]+(?:[.,][0-9]+)?"
+_INTEGER, _DECIMAL = "[0-9]+", r"[0-9]+(?:[.,][0-9]+)?"
 _RESET = 9999
 """Last number of a camera's counter, after which it begins with 1 (DCF: four digits, 0001 to 9999)."""
 
@@ -42,32 +42,32 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
         Nothing matches.
     """
     text, dataset = split_dataset(pattern)
-    place = Path(base) / text
+    full_path = Path(base) / text
     with disk_faults(FrameError, f"the frames {pattern} cannot be looked for"):
-        if place.is_dir():
-            found = sorted(file for file in place.iterdir() if file.name[0] != ".")
-            endings = {ending for known in known_formats() for ending in known.endings}
-            files = [file for file in found if file.suffix.lower() in endings]
+        if full_path.is_dir():
+            candidates = sorted(file for file in full_path.iterdir() if file.name[0] != ".")
+            endings = {ending for frame_format in frame_formats() for ending in frame_format.endings}
+            files = [file for file in candidates if file.suffix.lower() in endings]
         else:
-            found = files = _matching(Path(text), Path(base))
+            candidates = files = _find_matches(Path(text), Path(base))
         files = [file for file in files if not file.is_dir()]  # what else is no file is reported when it is read
     if not files:
-        what = "a folder without frames" if place.is_dir() else "no file matches"
-        other = next((f"; {file.name} is {text}" for file in found if (text := advice(file))), "")
-        raise FrameError(f"no frames: {what}: {pattern} (looked for in {Path(base).resolve()}){other}")
+        problem = "a folder without frames" if full_path.is_dir() else "no file matches"
+        hint = next((f"; {file.name} is {text}" for file in candidates if (text := advice(file))), "")
+        raise FrameError(f"no frames: {problem}: {pattern} (looked for in {Path(base).resolve()}){hint}")
 
-    paths = NamedFiles.ordered(files).paths
+    paths = NamedFiles.from_files(files).paths
     return tuple(Path(f"{path}:{dataset}") if dataset else path for path in paths)
 
 
-def _matching(pattern: Path, base: Path) -> list[Path]:
+def _find_matches(pattern: Path, base: Path) -> list[Path]:
     """Find files that match; what exists of the pattern's beginning is taken literally, brackets included."""
-    parts = list(pattern.parts)
-    while parts and (base / parts[0]).exists():
-        base /= parts.pop(0)
-    if not parts:
+    components = list(pattern.parts)
+    while components and (base / components[0]).exists():
+        base /= components.pop(0)
+    if not components:
         return [base]
-    return [base / match for match in glob.glob(str(Path(*parts)), root_dir=base, recursive=True)]  # noqa: PTH207
+    return [base / match for match in glob.glob(str(Path(*components)), root_dir=base, recursive=True)]  # noqa: PTH207
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,14 +97,14 @@ class NamedFiles:
     doubt: str = ""
 
     @classmethod
-    def ordered(cls, files: Collection[Path]) -> Self:
+    def from_files(cls, files: Collection[Path]) -> Self:
         """Return files in the order of their names."""
         one_folder = len({file.parent for file in files}) == 1
         common = "" if one_folder or not files else os.path.commonpath([file.parent for file in files])
         names = [file.stem if one_folder else str(file.relative_to(common).with_suffix("")) for file in files]
         splits, doubt = _split([name.casefold() for name in names])
         keys = {
-            file: [(_number(part), "") if place % 2 else (Fraction(), part) for place, part in enumerate(split)]
+            file: [(_number(text), "") if index % 2 else (Fraction(), text) for index, text in enumerate(split)]
             for file, split in zip(files, splits, strict=True)
         }
         paths = sorted(keys, key=lambda file: (keys[file], file.suffix.casefold(), str(file)))
@@ -119,13 +119,13 @@ class NamedFiles:
 
     @property
     def counts(self) -> tuple[Fraction, ...]:
-        """What the names count, rising; empty unless a counter is the only thing in which they differ."""
+        """Counters in the names, rising; empty unless a counter is the only thing in which the names differ."""
         counts = _counter(self.numbers) if len(self.forms) == 1 else ()
         counts = tuple(count + _RESET * (count < counts[0]) for count in counts)
         return counts if len(set(counts)) == len(counts) else ()
 
     @property
-    def listed(self) -> str:
+    def first_and_last(self) -> str:
         """The first and the last names."""
         names = [legible(path.name) for path in self.paths]
         return ", ".join(names if len(names) <= 5 else (*names[:3], "...", names[-1]))
@@ -137,16 +137,16 @@ def _number(text: str) -> Fraction:
 
 def _split(names: Sequence[str]) -> tuple[list[list[str]], str]:
     """Split names into texts and, between them, numbers as the series writes them; also what is uncertain of it."""
-    fractions = {found for name in names for found in re.findall(r"[0-9]+[.,]([0-9]+)", name)}
-    uneven = len({len(digits) for digits in fractions}) > 1
-    allowed = [_WHOLE, _DECIMAL]
-    if uneven:
+    fractions = {decimals for name in names for decimals in re.findall(r"[0-9]+[.,]([0-9]+)", name)}
+    is_uneven = len({len(digits) for digits in fractions}) > 1
+    allowed = [_INTEGER, _DECIMAL]
+    if is_uneven:
         is_counter = any(len(digits) > 1 and digits.endswith("0") for digits in fractions)
-        allowed = [_WHOLE] if is_counter else [_DECIMAL, _WHOLE]
+        allowed = [_INTEGER] if is_counter else [_DECIMAL, _INTEGER]
     splits = [[re.split(f"({sign}{number})", name) for name in names] for number in allowed for sign in ("", "[+-]?")]
-    counts = [len({tuple(split[::2]) for split in one}) for one in splits]
+    counts = [len({tuple(split[::2]) for split in texts}) for texts in splits]
     best = counts.index(min(counts))  # the first where several are as good
-    is_uncertain = uneven and len(allowed) > 1 and best < 2 and min(counts) == min(counts[2:])
+    is_uncertain = is_uneven and len(allowed) > 1 and best < 2 and min(counts) == min(counts[2:])
     return splits[best], "the fractions in their names may be counters" if is_uncertain else ""
 
 
@@ -160,10 +160,10 @@ def _after_reset(splits: Sequence[Sequence[str]], numbers: Sequence[tuple[Fracti
     """Return the index of the first file, sorted, before which a camera's counter began again; 0 where it did not."""
     counts = _counter(numbers)
     columns = (set(column) for column in zip(*(split[1::2] for split in splits), strict=True))
-    digits = {len(part) for column in columns if len(column) > 1 for part in column}
+    digits = {len(text) for column in columns if len(column) > 1 for text in column}
     if len(counts) < 3 or counts[0] < 1 or digits != {4}:
         return 0
-    steps = [after - before for before, after in pairwise(counts)]
+    steps = [later - earlier for earlier, later in pairwise(counts)]
     begin = steps.index(max(steps)) + 1
-    usual = max(steps[: begin - 1] + steps[begin:])
-    return begin if steps[begin - 1] > _RESET / 2 and counts[0] + _RESET - counts[-1] <= usual else 0
+    largest_other = max(steps[: begin - 1] + steps[begin:])
+    return begin if steps[begin - 1] > _RESET / 2 and counts[0] + _RESET - counts[-1] <= largest_other else 0

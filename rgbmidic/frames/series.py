@@ -20,11 +20,11 @@ from typing import Any
 
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.formats import known_formats, open_source
+from rgbmidic.frames.formats import frame_formats, open_source
 from rgbmidic.frames.images import write_tiff
+from rgbmidic.frames.metadata import CameraMetadata
 from rgbmidic.frames.names import NamedFiles, list_frames
 from rgbmidic.frames.source import FrameSource, file_fingerprint
-from rgbmidic.frames.stored import Camera
 from rgbmidic.frames.tiff import TIFF_ENDINGS
 from rgbmidic.settings import FrameSettings
 
@@ -43,35 +43,37 @@ class FrameSeries:
     numbers
         Number of the frame that each state is, from 0 and with gaps where frames are missing; by default the states
         are numbered through.
-    turn
+    n_lights
         Number of lights that fire in turn in one series.
-    begins
-        Index in that series of the frame that each state begins with; by default every `turn`-th.
-    chosen
+    first_frames
+        Index in that series of the frame that each state begins with; by default every `n_lights`-th.
+    selected
         The states that are to be measured; by default all.
     """
 
     lights: tuple[tuple[FrameSource, ...], ...]
     numbers: Sequence[int] = ()
-    turn: int = 1
-    begins: Sequence[int] = ()
-    chosen: range = range(0)
+    n_lights: int = 1
+    first_frames: Sequence[int] = ()
+    selected: range = range(0)
     _ends: tuple[tuple[int, ...], ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Count the frames and fill in what follows from their number."""
         ends = tuple(tuple(accumulate(len(source) for source in sources)) for sources in self.lights)
         object.__setattr__(self, "_ends", ends)
-        object.__setattr__(self, "begins", self.begins or range(0, ends[0][-1] - self.turn + 1, self.turn))
+        object.__setattr__(
+            self, "first_frames", self.first_frames or range(0, ends[0][-1] - self.n_lights + 1, self.n_lights)
+        )
         object.__setattr__(self, "numbers", self.numbers or range(len(self)))
-        object.__setattr__(self, "chosen", self.chosen or range(len(self)))
+        object.__setattr__(self, "selected", self.selected or range(len(self)))
 
     def __len__(self) -> int:
         """Return the number of mechanical states."""
-        return len(self.begins)
+        return len(self.first_frames)
 
     def __getitem__(self, index: int) -> tuple[Mosaic | ChannelFrame, ...]:
-        """State `index`, as `read` gives it: a series of files is a frame source as any other."""
+        """Return the state `index`, as `read` gives it: a series of files is a frame source as any other."""
         return self.read(index)
 
     @property
@@ -87,32 +89,36 @@ class FrameSeries:
 
     @property
     def recording(self) -> Recording:
-        """How the frames were recorded, as the first file states it."""
+        """Recording of the frames, as the first file states it."""
         return self.lights[0][0].recording
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What the headers state that a user should know, each once, with the file or files.
+        """Remarks of the headers for the user, each once, with the file or files.
 
         Of files of one frame each the first is looked at: one camera wrote them all.
         """
-        found: dict[str, list[str]] = {}
+        names_by_remark: dict[str, list[str]] = {}
         stacks = any(len(source) > 1 for sources in self.lights for source in sources)
-        for source in (one for sources in self.lights for one in (sources if stacks else sources[:1])):
+        for source in (
+            representative for sources in self.lights for representative in (sources if stacks else sources[:1])
+        ):
             for remark in source.remarks:
-                found.setdefault(remark, []).append(legible(source.path.name))
-        more = {remark: f" and {len(names) - 1} more" if len(names) > 1 else "" for remark, names in found.items()}
-        return tuple(f"{names[0]}{more[remark]}: {remark}" for remark, names in found.items())
+                names_by_remark.setdefault(remark, []).append(legible(source.path.name))
+        suffix = {
+            remark: f" and {len(names) - 1} more" if len(names) > 1 else "" for remark, names in names_by_remark.items()
+        }
+        return tuple(f"{names[0]}{suffix[remark]}: {remark}" for remark, names in names_by_remark.items())
 
     @property
-    def lost(self) -> int:
+    def n_lost(self) -> int:
         """Number of frames missing between the first and the last of those that are chosen."""
-        numbers = [self.numbers[index] for index in self.chosen]
-        step = self.chosen.step
+        numbers = [self.numbers[index] for index in self.selected]
+        step = self.selected.step
         return max((numbers[-1] - numbers[0]) // step + 1 - len(numbers), 0) if numbers else 0
 
     def shapes(self) -> Iterator[tuple[FrameSource, tuple[int, int]]]:
-        """Every source whose header can be read, with its rows and columns.
+        """Yield every source whose header can be read, with its rows and columns.
 
         Yields
         ------
@@ -152,7 +158,7 @@ class FrameSeries:
         """
         return tuple(source.read(inner, window) for source, inner in self._locate(index))
 
-    def gone(self) -> str:
+    def missing_lights(self) -> str:
         """Name the lights of which no file exists any more, by first file and number of files; else empty.
 
         Returns
@@ -160,8 +166,8 @@ class FrameSeries:
         str
         """
         exists = os.path.exists  # which raises nothing
-        lost = [sources for sources in self.lights if not any(exists(source.path) for source in sources)]
-        return "; ".join(f"{sources[0].path} and all {len(sources)} files of its series" for sources in lost)
+        missing = [sources for sources in self.lights if not any(exists(source.path) for source in sources)]
+        return "; ".join(f"{sources[0].path} and all {len(sources)} files of its series" for sources in missing)
 
     def name(self, index: int) -> str:
         """Return the name of state `index`; those of several lights in succession joined by " + ".
@@ -210,9 +216,12 @@ class FrameSeries:
         -------
         dict of str to str
         """
-        in_part = window is not None and not window.is_whole
+        is_windowed = window is not None and not window.is_whole
         sources = [source for source, _ in self._locate(index)]
-        return {legible(one.path): file_fingerprint(one.path) if in_part else one.fingerprint for one in sources}
+        return {
+            legible(frame_source.path): file_fingerprint(frame_source.path) if is_windowed else frame_source.fingerprint
+            for frame_source in sources
+        }
 
     def fingerprint(self, unread: Collection[str] = ()) -> tuple[str, tuple[str, ...]]:
         """Return the SHA-256 of names and sampled content of all files, and the names of those that count without it.
@@ -246,15 +255,15 @@ class FrameSeries:
         """Return source, and frame in it, of every light of a state."""
         if not 0 <= index < len(self):
             raise IndexError(f"there is no frame {index} in a series of {len(self)}")
-        begin = self.begins[index]
-        for light in range(max(self.turn, len(self.lights))):
-            series, frame = (0, begin + light) if self.turn > 1 else (light, begin)
+        begin = self.first_frames[index]
+        for light in range(max(self.n_lights, len(self.lights))):
+            series, frame = (0, begin + light) if self.n_lights > 1 else (light, begin)
             position = bisect_right(self._ends[series], frame)
             yield self.lights[series][position], frame - (self._ends[series][position - 1] if position else 0)
 
 
 def open_series(
-    settings: FrameSettings, base: Path | str = ".", camera: Camera | None = None, *, in_order: bool = True
+    settings: FrameSettings, base: Path | str = ".", camera: CameraMetadata | None = None, *, in_order: bool = True
 ) -> FrameSeries:
     """Find the frames of a test and check that they belong together, from their headers alone.
 
@@ -300,8 +309,8 @@ def open_series(
     begins: Sequence[int] = ()
     numbers = _numbers(settings, lights) if in_order else ()
     if settings.lights > 1:
-        begins, numbers = _turns(numbers or range(counts[0]), settings.lights)
-    series = FrameSeries(lights=lights, numbers=numbers, turn=settings.lights, begins=begins)
+        begins, numbers = _complete_states(numbers or range(counts[0]), settings.lights)
+    series = FrameSeries(lights=lights, numbers=numbers, n_lights=settings.lights, first_frames=begins)
     shapes = series.shapes()
     for first, (rows, columns) in shapes:
         for source, shape in shapes:
@@ -310,7 +319,7 @@ def open_series(
                     f"all frames must have one size: {source.path} has {shape[0]} rows of {shape[1]} pixels, "
                     f"{first.path} has {rows} of {columns}"
                 )
-    return replace(series, chosen=chosen_frames(settings, len(series)))
+    return replace(series, selected=selected_frames(settings, len(series)))
 
 
 def _check_sources(text: str, sources: Sequence[FrameSource], lights: int) -> None:
@@ -323,12 +332,12 @@ def _check_sources(text: str, sources: Sequence[FrameSource], lights: int) -> No
     """
     kinds = {source.path.with_suffix(""): source.path for source in sources}
     for source in sources:
-        if (other := kinds[source.path.with_suffix("")]) != source.path:
-            pair = f"{text} stands for {source.path.name} and {other.name}: is that one frame in two files?"
+        if (twin := kinds[source.path.with_suffix("")]) != source.path:
+            pair = f"{text} stands for {source.path.name} and {twin.name}: is that one frame in two files?"
             raise FrameError(f"{pair} State the pattern of one kind of them, as in *{source.path.suffix}")
         if (planes := source.recording.planes) not in (1, lights):
             raise FrameError(
-                f"{source.path} holds {source.recording.planes_in_words} of {len(source) // planes} times: state "
+                f"{source.path} holds {source.recording.planes_description} of {len(source) // planes} times: state "
                 f"frames.lights = {planes} where each shows one light, else save one of them alone; lights is {lights}"
             )
     if max(map(len, sources)) > 1:
@@ -340,22 +349,22 @@ def _check_sources(text: str, sources: Sequence[FrameSource], lights: int) -> No
                 )
 
 
-def _turns(numbers: Sequence[int], lights: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def _complete_states(numbers: Sequence[int], lights: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Return first frame and number of every state of which no light's frame is lost, where the lights fire in turn."""
-    place = {number: index for index, number in enumerate(numbers)}
-    whole = [
-        (place[number], number // lights)
+    index_of = {number: index for index, number in enumerate(numbers)}
+    complete = [
+        (index_of[number], number // lights)
         for number in numbers
-        if number % lights == 0 and all(number + light in place for light in range(lights))
+        if number % lights == 0 and all(number + light in index_of for light in range(lights))
     ]
-    if not whole:
+    if not complete:
         raise FrameError(f"frames.lights states {lights} lights in turn, but no {lights} frames make a state")
-    begins, states = zip(*whole, strict=True)
+    begins, states = zip(*complete, strict=True)
     return begins, tuple(state - states[0] for state in states)
 
 
-def chosen_frames(settings: FrameSettings, count: int) -> range:
-    """The states that the settings choose.
+def selected_frames(settings: FrameSettings, count: int) -> range:
+    """Return the states that the settings choose.
 
     Raises
     ------
@@ -371,36 +380,38 @@ def chosen_frames(settings: FrameSettings, count: int) -> range:
 
 def _numbers(settings: FrameSettings, lights: Sequence[Sequence[FrameSource]]) -> Sequence[int]:
     """Return the frame numbers that the names or the headers of all lights hold; empty where they hold none."""
-    found: dict[str, tuple[int, ...]] = {}
+    numbers_by_pattern: dict[str, tuple[int, ...]] = {}
     for text, sources in zip(settings.path, lights, strict=True):
         if counts := _counts(text, sources):
             scale = math.lcm(*(count.denominator for count in counts))
             step = Fraction(math.gcd(*(int(scale * (count - counts[0])) for count in counts)) or 1, scale)
-            numbers = found[text] = tuple(int((count - counts[0]) / step) for count in counts)
+            numbers = numbers_by_pattern[text] = tuple(int((count - counts[0]) / step) for count in counts)
             # where more numbers are missing than there are, somebody chose some frames
             if len(counts) <= numbers[-1] < 2 * len(counts):
                 missing = [counts[0] + step * number for number in sorted(set(range(numbers[-1])) - set(numbers))]
                 gaps = f"{len(missing)} in the numbering, {_listed(missing)}; the frames after keep their numbers"
                 logger.warning("frames are missing from %s: %s", text, gaps)
-    if len(set(found.values())) > 1:
-        there = "; ".join(f"{text}: {_listed(numbers)}" for text, numbers in found.items())
-        raise FrameError(f"lights fired in succession need the same frames; those there are, counted from 0, {there}")
-    return next(iter(found.values()), ())
+    if len(set(numbers_by_pattern.values())) > 1:
+        available = "; ".join(f"{text}: {_listed(numbers)}" for text, numbers in numbers_by_pattern.items())
+        raise FrameError(
+            f"lights fired in succession need the same frames; those there are, counted from 0, {available}"
+        )
+    return next(iter(numbers_by_pattern.values()), ())
 
 
 def _counts(text: str, sources: Sequence[FrameSource]) -> tuple[Fraction, ...]:
     """Return the camera's numbers in a movie's header, else those in the names; empty where there are none."""
     if len(sources) == 1 and len(sources[0]) > 1:
-        return tuple(map(Fraction, sources[0].recording.numbered.tolist()))
-    named = NamedFiles.ordered([source.path for source in sources])
-    if named.doubt:
-        logger.warning("the order of %s is uncertain (%s): taken as %s", text, named.doubt, named.listed)
-    return () if any(len(source) > 1 for source in sources) else named.counts
+        return tuple(map(Fraction, sources[0].recording.relative_numbers.tolist()))
+    files = NamedFiles.from_files([source.path for source in sources])
+    if files.doubt:
+        logger.warning("the order of %s is uncertain (%s): taken as %s", text, files.doubt, files.first_and_last)
+    return () if any(len(source) > 1 for source in sources) else files.counts
 
 
-def _listed(numbers: Sequence[int | Fraction], most: int = 10) -> str:
-    texts = [str(number) if number == int(number) else str(float(number)) for number in numbers[:most]]
-    return ", ".join(texts) + (", ..." if len(numbers) > most else "")
+def _listed(numbers: Sequence[int | Fraction], max_count: int = 10) -> str:
+    texts = [str(number) if number == int(number) else str(float(number)) for number in numbers[:max_count]]
+    return ", ".join(texts) + (", ..." if len(numbers) > max_count else "")
 
 
 def describe(settings: FrameSettings) -> dict[str, Any]:
@@ -429,21 +440,23 @@ def describe(settings: FrameSettings) -> dict[str, Any]:
     FrameError
         Nothing can be read, or what is stated contradicts the file.
     """
-    series = _opened(settings)
+    series = _open_described(settings)
     source, recording = series.lights[0][0], series.recording
     stored = source.stored(0)
     frame, *_ = series.read(0)
     cfa, levels = getattr(frame, "cfa", None), tuple(frame.black_level.ravel().tolist())
     warnings = list(series.remarks)
     if recording.planes > 1:
-        warnings.append(f"it holds {recording.planes_in_words} of each time: frames.lights = {recording.planes}")
+        warnings.append(f"it holds {recording.planes_description} of each time: frames.lights = {recording.planes}")
     try:
         series.read(len(series) - 1)
     except FrameError as error:  # a movie that is truncated, or still being written
         warnings.append(str(error))
-    numbered = recording.times_ns is not None or recording.numbers is not None or len(series.lights[0]) > 1
+    has_numbers = recording.times_ns is not None or recording.numbers is not None or len(series.lights[0]) > 1
     return {
-        "reader": next((known.name for known in known_formats() if known.source is type(source)), "unknown"),
+        "reader": next(
+            (frame_format.name for frame_format in frame_formats() if frame_format.source is type(source)), "unknown"
+        ),
         "count": len(series),
         "shape": frame.values.shape[-2:],
         "kind": "bayer" if cfa else settings.kind or stored.kind,
@@ -454,7 +467,7 @@ def describe(settings: FrameSettings) -> dict[str, Any]:
         "frame_rate": recording.frame_rate,
         "exposure": None if recording.exposure_ns is None else recording.exposure_ns / 1e9,
         "trigger": recording.trigger,
-        "lost_frames": series.lost if numbered else None,
+        "lost_frames": series.n_lost if has_numbers else None,
         "first_time_ns": series.time_ns(0),
         "last_time_ns": series.time_ns(len(series) - 1),
         "warnings": tuple(warnings),
@@ -462,15 +475,15 @@ def describe(settings: FrameSettings) -> dict[str, Any]:
 
 
 def description_text(description: Mapping[str, Any]) -> str:
-    """One line for each thing that is known of frames (`describe`)."""
+    """Return one line for each known property of frames (`describe`)."""
 
     def text(value: object) -> str:
         if isinstance(value, tuple):
             return ", ".join(map(text, value))
         return f"{value:.6g}" if isinstance(value, float) else str(value)
 
-    known = {name: value for name, value in description.items() if value is not None and name != "warnings"}
-    return "\n".join(f"{name:<15}{text(value)}" for name, value in known.items())
+    available = {name: value for name, value in description.items() if value is not None and name != "warnings"}
+    return "\n".join(f"{name:<15}{text(value)}" for name, value in available.items())
 
 
 def save_frame(settings: FrameSettings, index: int, path: Path, *, overwrite: bool = False) -> None:
@@ -483,7 +496,7 @@ def save_frame(settings: FrameSettings, index: int, path: Path, *, overwrite: bo
     InputError
         There is no such frame, or the file exists and is not to be replaced.
     """
-    series = _opened(settings)
+    series = _open_described(settings)
     if not 0 <= index < len(series):
         raise InputError(f"there is no frame {index}: {settings.path[0]} holds {len(series)} (0 to {len(series) - 1})")
     if path.suffix.lower() not in TIFF_ENDINGS:
@@ -495,7 +508,7 @@ def save_frame(settings: FrameSettings, index: int, path: Path, *, overwrite: bo
     write_tiff(path, series.read(index)[0])
 
 
-def _opened(settings: FrameSettings) -> FrameSeries:
+def _open_described(settings: FrameSettings) -> FrameSeries:
     """Open the frames; a mosaic whose pattern nobody states is read as it is, one grey level at every pixel."""
     first = open_source(list_frames(settings.path[0])[0], settings)
     if (planes := first.recording.planes) > 1:

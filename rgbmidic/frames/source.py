@@ -13,8 +13,8 @@ from typing import ClassVar, TypeVar
 
 from rgbmidic.errors import FrameError, disk_faults, legible
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.stored import Camera, MovieHeader, StoredFrame, damaged, raw_frame
-from rgbmidic.settings import FrameSettings, regular
+from rgbmidic.frames.metadata import CameraMetadata, MovieHeader, StoredFrame, damaged_file, raw_frame
+from rgbmidic.settings import FrameSettings, require_regular_file
 
 _T = TypeVar("_T")
 
@@ -23,14 +23,14 @@ _T = TypeVar("_T")
 class FrameSource(ABC):
     """A file of one frame or several, read in any order; frames count from 0.
 
-    A format says how header and samples are read; one of several frames is a `Movie`. It is a dataclass only where it
-    has fields of its own.
+    A format defines how header and samples are read; one of several frames is a `MovieSource`. It is a dataclass only
+    where it has fields of its own.
 
     Attributes
     ----------
     path
         The file; it need not exist before it is read.
-    stated
+    user_metadata
         What the user states of it.
     camera
         What a calibration states of it.
@@ -40,13 +40,13 @@ class FrameSource(ABC):
     """Packages, beside numpy and OpenCV, whose version decides on what is read."""
 
     path: Path
-    stated: FrameSettings
-    camera: Camera | None = field(default=None, compare=False, repr=False)
+    user_metadata: FrameSettings
+    camera: CameraMetadata | None = field(default=None, compare=False, repr=False)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of every frame, from the header alone."""
-        with _on_disk(self.path):
+        with _require_file(self.path):
             return self._shape()
 
     @property
@@ -56,12 +56,12 @@ class FrameSource(ABC):
 
     @property
     def recording(self) -> Recording:
-        """How the frames were recorded, from the header alone; a file of one frame states nothing and is not read."""
+        """Recording of the frames, from the header alone; a file of one frame states nothing and is not read."""
         return Recording()
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What else the header states that a user should know."""
+        """Remarks of the header for the user."""
         return self.recording.remarks
 
     def __len__(self) -> int:
@@ -69,7 +69,7 @@ class FrameSource(ABC):
         return self.recording.count
 
     def __getitem__(self, index: int) -> Mosaic | ChannelFrame:
-        """Frame `index`, as `read` gives it."""
+        """Return the frame `index`, as `read` gives it."""
         return self.read(index)
 
     def name(self, index: int) -> str:
@@ -109,7 +109,7 @@ class FrameSource(ABC):
             There is no such frame.
         """
         shape = None if window is None or window.is_whole else window.frame
-        return raw_frame(self.stored(index, window), self.stated, self.path, self.camera, shape)
+        return raw_frame(self.stored(index, window), self.user_metadata, self.path, self.camera, shape)
 
     def stored(self, index: int, window: Window | None = None) -> StoredFrame:
         """Return the samples of frame `index`, or of a part of it, with what the file alone states.
@@ -134,13 +134,13 @@ class FrameSource(ABC):
         """
         if not 0 <= index < len(self):
             raise IndexError(f"there is no frame {index} in {self.path}, which holds {len(self)}")
-        with _on_disk(self.path):
+        with _require_file(self.path):
             if window is None or window.is_whole:
                 return self._rows(index, slice(None))
             if (shape := self._shape()) != window.frame:
                 sizes = "{} rows of {} pixels, the frames of the test {} of {}".format(*shape, *window.frame)
                 raise FrameError(f"{self.path} has {sizes}")
-            rows, columns = window.part_of(Window.whole(shape))
+            rows, columns = window.slices_in(Window.of_frame(shape))
             stored = self._rows(index, rows)
         return replace(stored, values=stored.values[:, columns])
 
@@ -158,22 +158,23 @@ class FrameSource(ABC):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Movie(FrameSource):
+class MovieSource(FrameSource):
     """A file of several frames, whose header is read when the number of its frames is asked for, and reads the frames.
 
-    Of a frame only its own samples are read, whatever the size of the file; a header that is `remembered` is read once.
+    Of a frame only its own samples are read, whatever the size of the file; a header behind `cache_by_file` is read
+    once.
     """
 
     @property
     def recording(self) -> Recording:
-        """How the frames were recorded, from the header alone.
+        """Recording of the frames, from the header alone.
 
         Raises
         ------
         FrameError
             The file is missing, or its header is damaged.
         """
-        with _on_disk(self.path):
+        with _require_file(self.path):
             return self._header().recording
 
     @property
@@ -207,35 +208,35 @@ class Movie(FrameSource):
 
 
 @contextmanager
-def _on_disk(path: Path) -> Iterator[None]:
+def _require_file(path: Path) -> Iterator[None]:
     """Check that there is something to read; what the disk refuses becomes a FrameError."""
     with disk_faults(FrameError, f"{path} cannot be read"):
         if path.is_symlink() and not path.exists():
             raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
-        if not regular(path).is_file():
+        if not require_regular_file(path).is_file():
             raise FrameError(f"not a file but a folder: {path}" if path.exists() else f"frame file not found: {path}")
         if path.stat().st_size == 0:
-            raise damaged(path, "it is empty")
+            raise damaged_file(path, "it is empty")
         yield
 
 
-def remembered(parse: Callable[[Path], _T]) -> Callable[[Path | str], _T]:
+def cache_by_file(parse: Callable[[Path], _T]) -> Callable[[Path | str], _T]:
     """Decorate `parse` so that a file that does not change is parsed once; what the disk refuses is a FrameError."""
 
     @lru_cache(maxsize=1024)
-    def found(path: Path, size: int, modified: int) -> _T:
+    def parse_cached(path: Path, size: int, modified: int) -> _T:
         return parse(path)
 
     @wraps(parse)
-    def look(path: Path | str) -> _T:
+    def parse_current(path: Path | str) -> _T:
         with disk_faults(FrameError, f"{path} cannot be read"):
             status = Path(path).stat()
-            return found(Path(path), status.st_size, status.st_mtime_ns)
+            return parse_cached(Path(path), status.st_size, status.st_mtime_ns)
 
-    return look
+    return parse_current
 
 
-@remembered
+@cache_by_file
 def file_hash(path: Path | str) -> str:
     """Return the SHA-256 of a file, in hexadecimal digits; it is computed once for a file that does not change.
 
@@ -254,11 +255,11 @@ def file_hash(path: Path | str) -> str:
     FrameError
         The file cannot be read.
     """
-    with regular(Path(path)).open("rb") as file:
+    with require_regular_file(Path(path)).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-@remembered
+@cache_by_file
 def file_fingerprint(path: Path | str) -> str:
     """Return the SHA-256 of a file's size and of 64 pieces of 4 KiB spread evenly over it: of all of it up to 256 KiB.
 
@@ -280,7 +281,7 @@ def file_fingerprint(path: Path | str) -> str:
     # 256 KiB, in pages of memory, are read in a millisecond; a movie that was exchanged differs in all of them, and one
     # that was cut in its size
     pieces, page = 64, 4096
-    with regular(Path(path)).open("rb") as file:
+    with require_regular_file(Path(path)).open("rb") as file:
         size = file.seek(0, 2)
         digest = hashlib.sha256(str(size).encode())
         for number in range(pieces):

@@ -18,26 +18,26 @@ import numpy as np
 
 from rgbmidic.errors import FrameError, first_line, legible
 from rgbmidic.frames.data import Integers, Recording, even_times
-from rgbmidic.frames.source import Movie, remembered
-from rgbmidic.frames.stored import (
-    MAXIMUM_BYTES,
-    MAXIMUM_FRAMES,
+from rgbmidic.frames.metadata import (
+    MAX_BYTES,
+    MAX_FRAMES,
     EvenFrames,
     MovieHeader,
     StoredFrame,
     check_count,
     check_size,
-    cut_short,
-    damaged,
-    faults_of,
+    damaged_file,
+    library_faults,
+    truncated_file,
 )
+from rgbmidic.frames.source import MovieSource, cache_by_file
 
 if TYPE_CHECKING:
     import h5py
 
 
-def _take_apart(shape: tuple[int, ...], dtype: np.dtype[Any], what: object) -> tuple[int, tuple[int, ...]]:
-    """Number of frames in an array, and the shape of one, (H, W) or (H, W, 3).
+def _split_shape(shape: tuple[int, ...], dtype: np.dtype[Any], name: object) -> tuple[int, tuple[int, ...]]:
+    """Return the number of frames in an array, and the shape of one, (H, W) or (H, W, 3).
 
     Raises
     ------
@@ -48,31 +48,31 @@ def _take_apart(shape: tuple[int, ...], dtype: np.dtype[Any], what: object) -> t
     count = (1, *shape)[-axes - 1] if len(shape) in (axes, axes + 1) else 0
     if not count or not all(shape) or dtype.kind != "u" or dtype.itemsize > 2:
         raise FrameError(
-            f"{what} is an array of shape {shape} and type {dtype}; allowed are (frames, rows, columns), the same with "
+            f"{name} is an array of shape {shape} and type {dtype}; allowed are (frames, rows, columns), the same with "
             "3 channels behind, or one frame alone, of uint8 or uint16"
         )
     return count, shape[-axes:]
 
 
-class NpyFile(Movie):
+class NpyFile(MovieSource):
     """A numpy array of frames, of which one is read at a time."""
 
     def _header(self) -> EvenFrames:
         return _npy_header(self.path)
 
 
-@remembered
+@cache_by_file
 def _npy_header(path: Path) -> EvenFrames:
     with path.open("rb") as file:
         # numpy refuses to parse more than 10,000 bytes, but reads as many as a damaged header announces, up to 4 GB
         head, size = io.BytesIO(file.read(2**16)), file.seek(0, 2)
     try:
         version = np.lib.format.read_magic(head)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read(head)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read_header(head)
     except Exception as error:  # a damaged header is parsed as Python and fails in many ways
-        raise damaged(path, f"its header is not numpy's: {first_line(error)}") from None
-    count, (height, width, *channels) = _take_apart(shape, dtype, path)
+        raise damaged_file(path, f"its header is not numpy's: {first_line(error)}") from None
+    count, (height, width, *channels) = _split_shape(shape, dtype, path)
     if fortran:
         raise FrameError(
             f"{path} is stored in Fortran order; save it with numpy.save(file, numpy.ascontiguousarray(stack))"
@@ -84,24 +84,24 @@ def _npy_header(path: Path) -> EvenFrames:
         channels=tuple(channels),
         stored_bits=8 * dtype.itemsize,
         order=dtype.str[0],
-        stated=StoredFrame(kind="rgb" if channels else None),
+        metadata=StoredFrame(kind="rgb" if channels else None),
     )
-    return header.checked(path).noting_rest(size)
+    return header.require_plausible(path).with_rest_noted(size)
 
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".nxs")
 
-_NAMED = re.compile(r"(.*\.(?:h5|hdf5|nxs)):(.+)", re.IGNORECASE | re.DOTALL)
+_WITH_DATASET = re.compile(r"(.*\.(?:h5|hdf5|nxs)):(.+)", re.IGNORECASE | re.DOTALL)
 
 
 def split_dataset(path: Path | str) -> tuple[str, str]:
     """Split a name into the file and the dataset named behind it: ``run.h5:/entry/data``; empty where none is."""
-    found = _NAMED.fullmatch(str(path))
-    return (found[1], found[2]) if found else (str(path), "")
+    match = _WITH_DATASET.fullmatch(str(path))
+    return (match[1], match[2]) if match else (str(path), "")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Hdf5File(Movie):
+class Hdf5File(MovieSource):
     """A dataset of frames, (T, H, W) or (T, H, W, 3), of which the chunks of one frame are read at a time.
 
     Attributes
@@ -139,8 +139,8 @@ class Hdf5File(Movie):
                 raise FrameError(f"{self.path} holds several datasets of frames, {', '.join(names)}: {example}")
             (name,) = names
         if name not in stacks:
-            there = ", ".join(stacks) or "none"
-            raise FrameError(f"{self.path} has no dataset of frames {name}; those there are: {there}")
+            available = ", ".join(stacks) or "none"
+            raise FrameError(f"{self.path} has no dataset of frames {name}; those there are: {available}")
         check_count(self.path, stacks[name].recording.count)
         return stacks[name]
 
@@ -156,29 +156,29 @@ class _Dataset(MovieHeader):
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         import h5py
 
-        part = slice(rows.start, rows.stop)
-        with faults_of(path), h5py.File(path, "r", locking=False) as file:
+        rows_slice = slice(rows.start, rows.stop)
+        with library_faults(path), h5py.File(path, "r", locking=False) as file:
             dataset = file[self.name]
             _check_written(dataset, index, self, path)
-            values = np.asarray(dataset[index, part] if dataset.ndim > len(self.frame) else dataset[part])
-        return StoredFrame.plain(values.astype(self.dtype.newbyteorder("="), copy=False), path)
+            values = np.asarray(dataset[index, rows_slice] if dataset.ndim > len(self.frame) else dataset[rows_slice])
+        return StoredFrame.from_samples(values.astype(self.dtype.newbyteorder("="), copy=False), path)
 
 
-@remembered
+@cache_by_file
 def _hdf5_stacks(path: Path) -> dict[str, _Dataset]:
     """Find what can be frames: every dataset of unsigned integers in two to four dimensions."""
     import h5py
 
-    found: dict[str, _Dataset] = {}
+    stacks: dict[str, _Dataset] = {}
 
-    def look(name: str, item: Any) -> None:
+    def visit(name: str, item: Any) -> None:
         if not isinstance(item, h5py.Dataset):
             return
         try:
-            count, frame = _take_apart(item.shape or (), item.dtype, name)
+            count, frame = _split_shape(item.shape or (), item.dtype, name)
         except (FrameError, TypeError):
             return
-        found[f"/{name}"] = _Dataset(
+        stacks[f"/{name}"] = _Dataset(
             shape=(frame[0], frame[1]),
             recording=_recording(item, count),
             frame=frame,
@@ -186,55 +186,55 @@ def _hdf5_stacks(path: Path) -> dict[str, _Dataset]:
             name=f"/{name}",
         )
 
-    with faults_of(path), h5py.File(path, "r", locking=False) as file:
-        file.visititems(look)
-    return found
+    with library_faults(path), h5py.File(path, "r", locking=False) as file:
+        file.visititems(visit)
+    return stacks
 
 
 def _recording(dataset: h5py.Dataset, count: int) -> Recording:
     """Read the attributes `times_ns` (one whole number a frame) or `frame_rate`."""
-    if count > MAXIMUM_FRAMES:  # refused when it is asked for: another dataset may be meant
+    if count > MAX_FRAMES:  # refused when it is asked for: another dataset may be meant
         return Recording(count=count)
     rate, stamps = dataset.attrs.get("frame_rate"), dataset.attrs.get("times_ns")
-    known = rate is not None and np.ndim(rate) == 0 and np.isreal(rate) and 1e-3 <= float(rate) <= 1e12
+    has_rate = rate is not None and np.ndim(rate) == 0 and np.isreal(rate) and 1e-3 <= float(rate) <= 1e12
     times: Integers | None = None
     if stamps is not None and np.shape(stamps) == (count,) and np.asarray(stamps).dtype.kind in "iu":
         times = np.asarray(stamps).astype(np.int64)
-    elif known:
+    elif has_rate:
         times = even_times(range(count), 1 / Fraction(float(rate)).limit_denominator(10**6))
-    return Recording(count=count, frame_rate=float(rate) if known else None, times_ns=times)
+    return Recording(count=count, frame_rate=float(rate) if has_rate else None, times_ns=times)
 
 
 def _check_written(dataset: h5py.Dataset, index: int, stack: _Dataset, path: Path) -> None:
     """Refuse a frame of absurd size, or of which something is not in the file: libhdf5 fills it up with zeros."""
     import h5py
 
-    size, needed, count = path.stat().st_size, math.prod(stack.frame) * stack.dtype.itemsize, stack.recording.count
-    check_size(path, needed=needed, stored=min(dataset.id.get_storage_size(), size))
+    size, n_bytes, count = path.stat().st_size, math.prod(stack.frame) * stack.dtype.itemsize, stack.recording.count
+    check_size(path, unpacked=n_bytes, stored=min(dataset.id.get_storage_size(), size))
     if dataset.external or dataset.is_virtual:
         raise FrameError(f"{path}: the samples of {dataset.name} lie in other files; name the file that holds them")
-    created = dataset.id.get_create_plist()
+    creation = dataset.id.get_create_plist()
     if dataset.chunks is None:
-        offset, inside_header = dataset.id.get_offset(), created.get_layout() == h5py.h5d.COMPACT
-        if not inside_header and (offset is None or offset + (index + 1) * needed > size):
-            raise cut_short(path, whole=max(size - offset, 0) // needed if offset else 0, count=count)
+        offset, is_compact = dataset.id.get_offset(), creation.get_layout() == h5py.h5d.COMPACT
+        if not is_compact and (offset is None or offset + (index + 1) * n_bytes > size):
+            raise truncated_file(path, n_complete=max(size - offset, 0) // n_bytes if offset else 0, count=count)
         return
-    whole = math.prod(dataset.chunks) * dataset.dtype.itemsize
-    if whole > MAXIMUM_BYTES:
+    chunk_bytes = math.prod(dataset.chunks) * dataset.dtype.itemsize
+    if chunk_bytes > MAX_BYTES:
         raise FrameError(
-            f"{path} is stored in chunks of shape {dataset.chunks}, more than {MAXIMUM_BYTES / 1e6:.0f} MB each"
+            f"{path} is stored in chunks of shape {dataset.chunks}, more than {MAX_BYTES / 1e6:.0f} MB each"
         )
-    filters = [created.get_filter(place)[0] for place in range(created.get_nfilters())]
+    filters = [creation.get_filter(coordinates)[0] for coordinates in range(creation.get_nfilters())]
     axes = len(stack.frame)
-    before, lengths = [index // step * step for step in dataset.chunks[:-axes]], dataset.chunks[-axes:]
+    leading, lengths = [index // step * step for step in dataset.chunks[:-axes]], dataset.chunks[-axes:]
     corners = itertools.product(*(range(0, end, step) for end, step in zip(stack.frame, lengths, strict=True)))
     for corner in corners:  # the first element of every chunk that holds a part of the frame
-        place = (*before, *corner)
-        chunk = dataset.id.get_chunk_info_by_coord(place)
+        coordinates = (*leading, *corner)
+        chunk = dataset.id.get_chunk_info_by_coord(coordinates)
         if chunk.byte_offset is None or chunk.byte_offset + chunk.size > size:
             raise FrameError(f"{path}: frame {index} of {count} is not all there: truncated or still being written")
-        used = {code for number, code in enumerate(filters) if not chunk.filter_mask >> number & 1}
+        applied = {code for number, code in enumerate(filters) if not chunk.filter_mask >> number & 1}
         # the list of chunks may name one that a damaged index does not lead to: libhdf5 gives what memory holds instead
-        found = len(dataset.id.read_direct_chunk(place)[1])
-        if used <= {h5py.h5z.FILTER_SHUFFLE} and found != whole:
-            raise damaged(path, f"a chunk of frame {index} has {found} bytes; needed are {whole}")
+        n_stored = len(dataset.id.read_direct_chunk(coordinates)[1])
+        if applied <= {h5py.h5z.FILTER_SHUFFLE} and n_stored != chunk_bytes:
+            raise damaged_file(path, f"a chunk of frame {index} has {n_stored} bytes; needed are {chunk_bytes}")

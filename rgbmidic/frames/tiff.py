@@ -20,28 +20,28 @@ from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import Integers, Recording
 from rgbmidic.frames.hyperstacks import Hyperstack
 from rgbmidic.frames.images import decode
-from rgbmidic.frames.source import FrameSource, Movie, remembered
-from rgbmidic.frames.stored import (
-    CHECKED_FROM,
+from rgbmidic.frames.metadata import (
+    CHECKED_BYTES,
     EvenFrames,
     MovieHeader,
     StoredFrame,
     check_count,
     check_size,
-    damaged,
+    damaged_file,
     unpack_bits,
 )
+from rgbmidic.frames.source import FrameSource, MovieSource, cache_by_file
 from rgbmidic.frames.tiff_pages import (
     UNCOMPRESSED,
     PageList,
     Tag,
-    is_stored_as_is,
+    has_uncompressed_data,
     missing_data,
-    opened_tiff,
+    open_tiff,
     tag,
     tiff_pages,
 )
-from rgbmidic.settings import regular
+from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import AnyArray
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 TIFF_ENDINGS = (".tif", ".tiff")
 
-_BY_TIFFFILE: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
+_DECOMPRESSORS: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
 """Compressions (deflate, LZMA) that tifffile undoes, without a limit, and what undoes them up to one."""
 _MIN_IS_WHITE, _PALETTE = 0, 3
 _PACKED = (10, 12, 14)
@@ -65,7 +65,7 @@ class TiffFile(FrameSource):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What else the header states that a user should know."""
+        """Remarks of the header for the user."""
         try:
             return _stack(self.path).recording.remarks
         except FrameError:  # reported when it is read
@@ -78,7 +78,9 @@ class TiffFile(FrameSource):
     def _rows(self, index: int, rows: slice) -> StoredFrame:
         with _only_page(self.path) as page:
             values = _stored_rows(page, self.path, range(page.imagelength)[rows])
-            return _as_shown(_by_opencv(page, self.path)[rows] if values is None else values, page, self.path)
+            return _to_stored_frame(
+                _unpack_with_opencv(page, self.path)[rows] if values is None else values, page, self.path
+            )
 
 
 def _stored_rows(page: tifffile.TiffPage, path: Path, rows: range, index: int = 0, count: int = 1) -> AnyArray | None:
@@ -96,10 +98,10 @@ def _stored_rows(page: tifffile.TiffPage, path: Path, rows: range, index: int = 
         stored_bits=page.bitspersample,
         order=page.parent.byteorder,
     )
-    return frames.checked(path).read(path, index, rows).values
+    return frames.require_plausible(path).read(path, index, rows).values
 
 
-def _as_shown(values: AnyArray, page: tifffile.TiffPage, path: Path) -> StoredFrame:
+def _to_stored_frame(values: AnyArray, page: tifffile.TiffPage, path: Path) -> StoredFrame:
     """Return samples of a page as its tags state that they are shown; a colour table that changes them is refused."""
     if page.photometric == _PALETTE:
         table = np.asarray(page.tags[Tag.COLOUR_MAP].value, dtype=np.int64).reshape(3, -1)
@@ -110,7 +112,7 @@ def _as_shown(values: AnyArray, page: tifffile.TiffPage, path: Path) -> StoredFr
         values = values.dtype.type(2**page.bitspersample - 1) - values
     pattern = tag(page, Tag.CFA_PATTERN) or ()
     is_bayer = tag(page, Tag.CFA_REPEAT) == (2, 2) and set(pattern) <= {0, 1, 2}
-    frame = StoredFrame.plain(values, path, "".join("RGB"[channel] for channel in pattern if is_bayer) or None)
+    frame = StoredFrame.from_samples(values, path, "".join("RGB"[channel] for channel in pattern if is_bayer) or None)
     return replace(frame, bits=page.bitspersample) if page.bitspersample in _PACKED else frame
 
 
@@ -118,7 +120,7 @@ def _as_shown(values: AnyArray, page: tifffile.TiffPage, path: Path) -> StoredFr
 def _only_page(path: Path) -> Iterator[tifffile.TiffPage]:
     with tiff_pages(path) as pages:
         if not pages:
-            raise damaged(path, "its header leads to no image")
+            raise damaged_file(path, "its header leads to no image")
         if len(pages) > 1:
             raise FrameError(f"{path} holds {len(pages)} frames; allowed is one frame per TIFF file")
         _check_page(pages[0], path)
@@ -133,77 +135,79 @@ def _check_page(page: tifffile.TiffPage, path: Path) -> None:
         allowed = "unsigned 8 or 16 bit, and uncompressed 10, 12 or 14 bit"
         raise FrameError(f"{path} has {kind or 'unknown'} samples; allowed are {allowed}")
     if not (page.imagelength and page.imagewidth and page.samplesperpixel):  # an entry that is damaged counts as 0
-        told = f"{page.imagelength} rows of {page.imagewidth} pixels with {page.samplesperpixel} samples"
-        raise damaged(path, f"its header announces {told}")
+        size_text = f"{page.imagelength} rows of {page.imagewidth} pixels with {page.samplesperpixel} samples"
+        raise damaged_file(path, f"its header announces {size_text}")
     size = path.stat().st_size
     if reason := missing_data(page, size):
-        raise damaged(path, reason)
-    stored = sum(page.databytecounts)
-    if page.compression == UNCOMPRESSED and not is_stored_as_is(page):
-        raise damaged(path, f"its header announces {stored} bytes of image data, too few for its size")
-    check_size(path, needed=page.nbytes, stored=min(stored, size))
+        raise damaged_file(path, reason)
+    n_stored = sum(page.databytecounts)
+    if page.compression == UNCOMPRESSED and not has_uncompressed_data(page):
+        raise damaged_file(path, f"its header announces {n_stored} bytes of image data, too few for its size")
+    check_size(path, unpacked=page.nbytes, stored=min(n_stored, size))
 
 
-def _unpacked(page: tifffile.TiffPage, path: Path) -> AnyArray:
+def _unpack(page: tifffile.TiffPage, path: Path) -> AnyArray:
     """Unpack the samples of a page, (H, W) or (H, W, C)."""
-    if page.compression not in (UNCOMPRESSED, *_BY_TIFFFILE):
+    if page.compression not in (UNCOMPRESSED, *_DECOMPRESSORS):
         name = getattr(page.compression, "name", page.compression)
         raise FrameError(f"{path} is stored in a way that is not read ({name}); save it as a plain uncompressed TIFF")
     if page.bitspersample in _PACKED:
-        return _unpacked_bits(page, path)
-    if page.compression in _BY_TIFFFILE:
+        return _unpack_bits(page, path)
+    if page.compression in _DECOMPRESSORS:
         _check_unpacked(page, path)
     values = np.asarray(page.asarray())
     # where one plane lies after the other
     return np.moveaxis(values, 0, -1) if values.ndim == 3 and page.planarconfig == 2 else values
 
 
-def _unpacked_bits(page: tifffile.TiffPage, path: Path) -> AnyArray:
+def _unpack_bits(page: tifffile.TiffPage, path: Path) -> AnyArray:
     """Unpack samples (H, W, C) of 10, 12 or 14 bit, the highest bit first; every row begins with a byte (TIFF 6.0)."""
     columns = page.imagewidth * page.samplesperpixel
     line = -(-columns * page.bitspersample // 8)
     if page.is_tiled or page.fillorder != 1 or (page.planarconfig == 2 and page.samplesperpixel > 1):
-        what = "in tiles, in planes or from the lowest bit on"
-        raise FrameError(f"{path} has packed samples of {page.bitspersample} bit {what}, which is not read")
-    needed, parts = page.imagelength * line, b""
+        layout = "in tiles, in planes or from the lowest bit on"
+        raise FrameError(f"{path} has packed samples of {page.bitspersample} bit {layout}, which is not read")
+    n_bytes, content = page.imagelength * line, b""
     with path.open("rb") as file:
         for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
             file.seek(offset)
-            parts += file.read(min(count, page.rowsperstrip * line, needed - len(parts)))
-    if len(parts) < needed:
-        raise damaged(path, f"its image data have {len(parts)} bytes, too few for its size")
-    lines = np.frombuffer(parts, dtype=np.uint8).reshape(page.imagelength, line)
+            content += file.read(min(count, page.rowsperstrip * line, n_bytes - len(content)))
+    if len(content) < n_bytes:
+        raise damaged_file(path, f"its image data have {len(content)} bytes, too few for its size")
+    lines = np.frombuffer(content, dtype=np.uint8).reshape(page.imagelength, line)
     values = unpack_bits(lines, page.bitspersample)[:, :columns]
     return values.reshape(page.imagelength, page.imagewidth, page.samplesperpixel)
 
 
-def _by_opencv(page: tifffile.TiffPage, path: Path) -> AnyArray:
+def _unpack_with_opencv(page: tifffile.TiffPage, path: Path) -> AnyArray:
     """Unpack the samples of the only page of a file, by OpenCV what tifffile cannot."""
     # OpenCV turns such samples, some more than others
-    turned = (tag(page, Tag.ORIENTATION) or (1,)) != (1,) or page.photometric in (_MIN_IS_WHITE, _PALETTE)
-    if turned or page.compression not in (5, 7, 32773):  # LZW, JPEG, PackBits
-        return _unpacked(page, path)
+    is_transformed = (tag(page, Tag.ORIENTATION) or (1,)) != (1,) or page.photometric in (_MIN_IS_WHITE, _PALETTE)
+    if is_transformed or page.compression not in (5, 7, 32773):  # LZW, JPEG, PackBits
+        return _unpack(page, path)
     values = decode(path.read_bytes(), path)
     if (*values.shape[:2], values.dtype) != (page.imagelength, page.imagewidth, page.dtype):
-        raise damaged(path, f"its header announces another image than its data hold, {values.shape} {values.dtype}")
+        raise damaged_file(
+            path, f"its header announces another image than its data hold, {values.shape} {values.dtype}"
+        )
     return values
 
 
 def _check_unpacked(page: tifffile.TiffPage, path: Path) -> None:
     """Refuse parts that unpack to more than the whole image, and all of them to less: tifffile fills up with zeros."""
-    limit, total = max(page.nbytes, CHECKED_FROM), 0
+    limit, total = max(page.nbytes, CHECKED_BYTES), 0
     with path.open("rb") as file:
         for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
             file.seek(offset)
-            unpacked = len(_BY_TIFFFILE[page.compression]().decompress(file.read(count), limit + 1))
+            unpacked = len(_DECOMPRESSORS[page.compression]().decompress(file.read(count), limit + 1))
             if unpacked > limit:
-                raise damaged(path, f"a part of its image data unpacks to more than {limit} bytes")
+                raise damaged_file(path, f"a part of its image data unpacks to more than {limit} bytes")
             total += unpacked
     if total < page.nbytes:
-        raise damaged(path, f"its image data unpack to {total} bytes, too few for its size")
+        raise damaged_file(path, f"its image data unpack to {total} bytes, too few for its size")
 
 
-class TiffStack(Movie):
+class TiffStack(MovieSource):
     """A TIFF file of several frames of one size, in the order of the file."""
 
     packages = ("tifffile",)
@@ -222,33 +226,33 @@ def is_tiff_stack(path: Path) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Pages(MovieHeader):
-    """Where the pages begin (one, where ImageJ stored all frames behind it), of which the first has the `shape`."""
+    """Offsets of the pages (one, where ImageJ stored all frames behind it), of which the first has the `shape`."""
 
     offsets: Integers
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame."""
         count, readable = self.recording.count, int((self.offsets != _MISSING).sum())
-        behind = len(self.offsets) == 1 and self.recording.count_is_certain  # as ImageJ stores more than 4 GB
-        if not behind and (index >= len(self.offsets) or self.offsets[index] == _MISSING):
+        is_contiguous = len(self.offsets) == 1 and self.recording.count_is_certain  # as ImageJ stores more than 4 GB
+        if not is_contiguous and (index >= len(self.offsets) or self.offsets[index] == _MISSING):
             raise FrameError(f"{path}: its list of frames ends after {readable - 1}: truncated or still being written")
-        with _page_at(path, int(self.offsets[0 if behind else index])) as page:
+        with _page_at(path, int(self.offsets[0 if is_contiguous else index])) as page:
             _check_page(page, path)
             if (page.imagelength, page.imagewidth) != self.shape:
-                here = f"{page.imagelength} rows of {page.imagewidth} pixels"
-                raise FrameError(f"{path}: frame {index} has {here}, the first {self.shape[0]} of {self.shape[1]}")
-            values = _stored_rows(page, path, rows, *((index, count) if behind else ()))
+                size_text = f"{page.imagelength} rows of {page.imagewidth} pixels"
+                raise FrameError(f"{path}: frame {index} has {size_text}, the first {self.shape[0]} of {self.shape[1]}")
+            values = _stored_rows(page, path, rows, *((index, count) if is_contiguous else ()))
             if values is None:
-                if behind:
+                if is_contiguous:
                     reason = "has one page, whose samples are compressed or in pieces"
                     raise FrameError(f"{path} announces {count} frames but {reason}")
-                values = _unpacked(page, path)[rows.start : rows.stop]
-            return _as_shown(values, page, path)
+                values = _unpack(page, path)[rows.start : rows.stop]
+            return _to_stored_frame(values, page, path)
 
 
-@remembered
+@cache_by_file
 def _stack(path: Path) -> _Pages:
-    with regular(path).open("rb") as file:
+    with require_regular_file(path).open("rb") as file:
         pages = PageList(file, path)
         offsets, ends_early = pages.offsets(path)
         entries, _ = pages.page(offsets[0]) or ({}, 0)
@@ -258,40 +262,49 @@ def _stack(path: Path) -> _Pages:
     stack, count, remarks = Hyperstack.parse(text, samples), len(offsets) + ends_early, list[str]()
     if stack is None and "<OME" in text[:1000]:
         remarks.append("its OME description cannot be read")
-    if stack and stack.by_imagej and len(offsets) == 1 < stack.count and (room := _room_behind(path, offsets[0])):
+    if (
+        stack
+        and stack.by_imagej
+        and len(offsets) == 1 < stack.count
+        and (n_fitting := _frames_that_fit(path, offsets[0]))
+    ):
         count = stack.count
-        if room > count:
-            remarks.append(f"its text announces {count} images, and it has room for {room}")
+        if n_fitting > count:
+            remarks.append(f"its text announces {count} images, and it has room for {n_fitting}")
     elif stack and ends_early and stack.count > len(offsets):
         count, ends_early = stack.count, False
         offsets += [_MISSING] * (count - len(offsets))
     check_count(path, count)
     order = stack.page_order if stack and len(offsets) == stack.count else [0]
     if stack and (stack.count != count or sorted(order) != list(range(len(offsets)))):
-        what = f"its text announces {stack.count} images, it holds {count}: the text is not used"
-        stack, order, remarks = None, list(range(len(offsets))), remarks if ends_early else [*remarks, what]
+        remark = f"its text announces {stack.count} images, it holds {count}: the text is not used"
+        stack, order, remarks = None, list(range(len(offsets))), remarks if ends_early else [*remarks, remark]
     recording = Recording(count=count, count_is_certain=not ends_early, remarks=tuple(remarks))
     if stack:
         times, planes = stack.times_ns, stack.planes
-        recording = replace(recording, times_ns=times, planes=planes, planes_in_words=stack.planes_in_words)
+        recording = replace(recording, times_ns=times, planes=planes, planes_description=stack.planes_description)
         offsets = [offsets[page] for page in order]
     return _Pages(shape=shape, recording=recording, offsets=np.array(offsets))
 
 
-def _room_behind(path: Path, offset: int) -> int:
+def _frames_that_fit(path: Path, offset: int) -> int:
     """Return for how many frames there is room from the samples of the only page on, as ImageJ stores more than 4 GB.
 
     0 where none follows: ImageJ writes a page before its samples, and they end with the file.
     """
     with _page_at(path, offset) as page:
-        begin, size = min(page.dataoffsets, default=0), path.stat().st_size
-        return -(-(size - begin) // page.nbytes) if offset < begin and size > begin + page.nbytes > begin else 0
+        first_byte, size = min(page.dataoffsets, default=0), path.stat().st_size
+        return (
+            -(-(size - first_byte) // page.nbytes)
+            if offset < first_byte and size > first_byte + page.nbytes > first_byte
+            else 0
+        )
 
 
 @contextmanager
 def _page_at(path: Path, offset: int) -> Iterator[tifffile.TiffPage]:
     import tifffile
 
-    with opened_tiff(path) as tiff:
+    with open_tiff(path) as tiff:
         tiff.filehandle.seek(offset)
         yield tifffile.TiffPage(tiff, index=0)

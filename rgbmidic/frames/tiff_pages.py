@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
 from rgbmidic.errors import FrameError
-from rgbmidic.frames.stored import (
-    damaged,
-    faults_of,
+from rgbmidic.frames.metadata import (
+    damaged_file,
+    library_faults,
 )
-from rgbmidic.settings import regular
+from rgbmidic.settings import require_regular_file
 
 if TYPE_CHECKING:
     import tifffile
@@ -30,7 +30,7 @@ logging.getLogger("tifffile").propagate = False
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 _HEADERS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-"""Of TIFF and BigTIFF; several cameras' raws begin with II or MM, too, and are none."""
+"""First bytes of TIFF and BigTIFF; several cameras' raws begin with II or MM, too, and are none."""
 _FIRST_OFFSET = 8
 """Bytes of the header of a TIFF file, the shortest."""
 UNCOMPRESSED = 1
@@ -70,32 +70,34 @@ def tiff_pages(path: Path) -> Iterator[list[tifffile.TiffPage]]:
     FrameError
         It is no TIFF file, or what is done inside fails over a damaged header.
     """
-    with opened_tiff(path) as tiff:
+    with open_tiff(path) as tiff:
         pages: dict[int, tifffile.TiffPage] = {}
         for frame in tiff.pages:
             page = frame.aspage()
             if page.offset in pages:  # tifffile would go round for ever
                 raise ValueError("its list of images leads back to itself")
             pages[page.offset] = page
-        found = (one for page in pages.values() for one in (page, *(child.aspage() for child in page.pages or ())))
-        yield [page for page in found if not int(page.subfiletype) & 1]  # not reduced
+        all_pages = (
+            image for page in pages.values() for image in (page, *(child.aspage() for child in page.pages or ()))
+        )
+        yield [page for page in all_pages if not int(page.subfiletype) & 1]  # not reduced
 
 
 @contextmanager
-def opened_tiff(path: Path) -> Iterator[tifffile.TiffFile]:
+def open_tiff(path: Path) -> Iterator[tifffile.TiffFile]:
     """Open a TIFF file; what is done inside and fails over a damaged header becomes a FrameError."""
     import tifffile
 
-    with regular(path).open("rb") as file:
+    with require_regular_file(path).open("rb") as file:
         PageList(file, path)  # tifffile tries some camera raws that begin as a TIFF file does
-    with faults_of(path, OSError), tifffile.TiffFile(path) as tiff:
+    with library_faults(path, OSError), tifffile.TiffFile(path) as tiff:
         yield tiff
 
 
 def is_dng(path: Path) -> bool:
     """Return whether the first image has the tag of DNG, whatever the file's name; False for what cannot be read."""
     try:
-        with regular(path).open("rb") as file:
+        with require_regular_file(path).open("rb") as file:
             pages = PageList(file, path)
             first = pages.page(pages.first) if pages.offset == 4 else None  # LibRaw reads no BigTIFF
             return first is not None and Tag.DNG_VERSION in first[0]
@@ -113,7 +115,7 @@ class PageList:
         """Read the header; a FrameError where it is no TIFF file's."""
         head = file.read(4)
         if head not in _HEADERS:
-            raise damaged(path, "it is not a TIFF file")
+            raise damaged_file(path, "it is not a TIFF file")
         self.file, self.offset = file, 8 if head in _HEADERS[2:] else 4
         self.order: Literal["little", "big"] = "little" if head[:1] == b"I" else "big"
         file.seek(self.offset)  # of both headers the offset of the first page is the last field
@@ -121,19 +123,19 @@ class PageList:
         self.size = file.seek(0, 2)
 
     def offsets(self, path: Path) -> tuple[list[int], bool]:
-        """Where the pages in full resolution begin, and whether their list leads out of the file."""
-        offset, found, seen = self.first, list[int](), set[int]()
+        """Return the offsets of the pages in full resolution, and whether their list leads out of the file."""
+        offset, page_offsets, visited = self.first, list[int](), set[int]()
         while offset and (page := self.page(offset)) is not None:
-            if offset in seen:
-                raise damaged(path, "its list of images leads back to itself")
-            seen.add(offset)
-            entries, following = page
+            if offset in visited:
+                raise damaged_file(path, "its list of images leads back to itself")
+            visited.add(offset)
+            entries, next_offset = page
             if not self.value(entries, Tag.NEW_SUBFILE_TYPE) & 1:
-                found.append(offset)
-            offset = following
-        if not found:
-            raise damaged(path, "its header leads to no image")
-        return found, offset > 0
+                page_offsets.append(offset)
+            offset = next_offset
+        if not page_offsets:
+            raise damaged_file(path, "its header leads to no image")
+        return page_offsets, offset > 0
 
     def page(self, offset: int) -> tuple[Entries, int] | None:
         """Read the entries of a page and the offset of the next one; None where the file ends before."""
@@ -141,20 +143,20 @@ class PageList:
         if offset + counter > self.size:
             return None
         self.file.seek(offset)
-        number = int.from_bytes(self.file.read(counter), self.order)
-        length = number * (4 + 2 * self.offset)
+        n_entries = int.from_bytes(self.file.read(counter), self.order)
+        length = n_entries * (4 + 2 * self.offset)
         # pages that are seen have a few dozen entries
-        if not 0 < number <= 4096 or offset + counter + length + self.offset > self.size:
+        if not 0 < n_entries <= 4096 or offset + counter + length + self.offset > self.size:
             return None
-        stored = struct.iter_unpack(("<" if self.order == "little" else ">") + entry, self.file.read(length))
-        entries = {code: (kind, many, place) for code, kind, many, place in stored}
+        fields = struct.iter_unpack(("<" if self.order == "little" else ">") + entry, self.file.read(length))
+        entries = {code: (kind, count, content) for code, kind, count, content in fields}
         return entries, int.from_bytes(self.file.read(self.offset), self.order)
 
     def value(self, entries: Entries, code: int) -> int:
         """Return the one value of an entry; 0 where there is none."""
         short = 3  # the type of numbers of 16 bit
-        kind, _, place = entries.get(code, (short, 0, b""))
-        return int.from_bytes(place[: 2 if kind == short else 4], self.order)
+        kind, _, content = entries.get(code, (short, 0, b""))
+        return int.from_bytes(content[: 2 if kind == short else 4], self.order)
 
     def text(self, entries: Entries, code: int) -> str:
         """Return the text of an entry; empty where there is none."""
@@ -167,22 +169,22 @@ class PageList:
 
 def missing_data(page: tifffile.TiffPage, size: int) -> str | None:
     """Describe what the page announces that a file of `size` bytes does not hold; None where all is there."""
-    parts = list(zip(page.dataoffsets, page.databytecounts, strict=False))
-    end = max((offset + count for offset, count in parts), default=0)
+    segments = list(zip(page.dataoffsets, page.databytecounts, strict=False))
+    end = max((offset + count for offset, count in segments), default=0)
     if end > size:
         return f"the header announces image data up to byte {end}, the file has {size} bytes"
-    if any(count == 0 for _, count in parts):
+    if any(count == 0 for _, count in segments):
         return "a part of its image data has the length zero"
-    if any(offset < _FIRST_OFFSET for offset, _ in parts):
+    if any(offset < _FIRST_OFFSET for offset, _ in segments):
         return "a part of its image data lies in the file's header"
     return None
 
 
-def is_stored_as_is(page: tifffile.TiffPage) -> bool:
+def has_uncompressed_data(page: tifffile.TiffPage) -> bool:
     """Return whether the page's samples are uncompressed and their bytes are all there."""
     bits = page.bitspersample if isinstance(page.bitspersample, int) else page.bitspersample[0]
-    needed = math.ceil(page.imagewidth * page.imagelength * page.samplesperpixel * bits / 8)
-    return bool(page.compression == UNCOMPRESSED and sum(page.databytecounts) >= needed)
+    n_bytes = math.ceil(page.imagewidth * page.imagelength * page.samplesperpixel * bits / 8)
+    return bool(page.compression == UNCOMPRESSED and sum(page.databytecounts) >= n_bytes)
 
 
 def tag(page: tifffile.TiffPage, code: int) -> tuple[Any, ...] | None:

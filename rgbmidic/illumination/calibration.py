@@ -21,7 +21,15 @@ from rgbmidic.frames.data import shift_cfa
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise, NoiseModel
-from rgbmidic.settings import BAYER_PATTERNS, FrameKind, plain, read_section, read_table, regular, unique_keys
+from rgbmidic.settings import (
+    BAYER_PATTERNS,
+    FrameKind,
+    read_section,
+    read_table,
+    require_regular_file,
+    to_plain,
+    unique_keys,
+)
 from rgbmidic.typing import FloatArray
 
 _Section = TypeVar("_Section")
@@ -225,16 +233,16 @@ class Calibration:
         dict
         """
         document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION}
-        camera = {name: plain(getattr(self, name)) for name in _CAMERA}
+        camera = {name: to_plain(getattr(self, name)) for name in _CAMERA}
         document["camera"] = {key: value for key, value in camera.items() if value is not None}
         for name in ("crosstalk", "noise", "registration"):
             if (section := getattr(self, name)) is not None:
-                document[name] = plain(section)
+                document[name] = to_plain(section)
         if self.crosstalk is not None:
             document["crosstalk"]["condition_number"] = self.crosstalk.condition_number
-            document["crosstalk"]["noise_amplification"] = plain(self.crosstalk.noise_amplification)
+            document["crosstalk"]["noise_amplification"] = to_plain(self.crosstalk.noise_amplification)
         if self.camera_noise is not None:
-            document["noise"]["planes"] = plain(self.camera_noise)
+            document["noise"]["planes"] = to_plain(self.camera_noise)
         if self.registration is not None:
             document["registration"]["parameter_names"] = _PARAMETERS
         return {**document, **self.extra, "provenance": dict(self.provenance)}
@@ -370,7 +378,7 @@ def read_document(path: Path | str, what: str, schema: str, version: int) -> dic
         The file is missing, not JSON, or of another schema or version; `what` it should be is named.
     """
     try:
-        text = regular(Path(path)).read_text(encoding="utf-8")
+        text = require_regular_file(Path(path)).read_text(encoding="utf-8")
         document = json.loads(
             text,
             object_pairs_hook=unique_keys,

@@ -31,7 +31,7 @@ from rgbmidic._kernels.splines import PAD, bspline_coefficients, sample_with_gra
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.images import IlluminationImages, check_names, fill_holes
 from rgbmidic.illumination.linear import LinearChannels
-from rgbmidic.settings import regular, unique_keys
+from rgbmidic.settings import require_regular_file, unique_keys
 from rgbmidic.typing import BoolArray, FloatArray
 
 
@@ -390,7 +390,9 @@ class Sensitivities:
         path = Path(path)
         try:
             if path.suffix.lower() == ".json":
-                document: Any = json.loads(regular(path).read_text(encoding="utf-8"), object_pairs_hook=unique_keys)
+                document: Any = json.loads(
+                    require_regular_file(path).read_text(encoding="utf-8"), object_pairs_hook=unique_keys
+                )
                 spectra = document["spectral_data"]["data"]["main"]
                 rows = [[float(key), *values] for key, values in spectra.items()]
                 table = np.array(sorted(rows), dtype=float)
@@ -418,7 +420,7 @@ def read_columns(path: Path, count: int | None = None) -> tuple[list[str], Float
     heading : list of str
     table : ndarray, shape (columns, n)
     """
-    with regular(path).open(newline="", encoding="utf-8") as stream:
+    with require_regular_file(path).open(newline="", encoding="utf-8") as stream:
         rows = [row[:count] for row in csv.reader(stream) if row]
     try:
         float(rows[0][0])

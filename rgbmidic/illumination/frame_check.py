@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.special import erf
 
 from rgbmidic.errors import ConfigurationError, FrameError
-from rgbmidic.frames.data import ChannelFrame, Mosaic, planes_of
+from rgbmidic.frames.data import ChannelFrame, Mosaic, colour_planes
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.checks import Check, refused, reported
 from rgbmidic.illumination.crosstalk import Crosstalk
@@ -51,7 +51,7 @@ class _Samples:
     def of(cls, frame: Frame, calibration: Calibration, inside: BoolArray, window: tuple[slice, slice]) -> _Samples:
         """Cut the colour planes in a window out of the frame."""
         step = 2 if isinstance(frame, Mosaic) else 1
-        names, planes, black = planes_of(replace(frame, values=frame.values[..., *window]))
+        names, planes, black = colour_planes(replace(frame, values=frame.values[..., *window]))
         stored = np.stack(planes)
         height, width = stored.shape[1:]
         inner = inside[window][: step * height : step, : step * width : step]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rgbmidic._version import __version__
 from rgbmidic.errors import ResultError
 from rgbmidic.results.files import write_json, write_text, writing
-from rgbmidic.settings.conversion import plain
+from rgbmidic.settings.conversion import to_plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,22 +37,23 @@ def check_folder(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
     """
     if out.exists() and not out.is_dir():
         raise ResultError(f"{out} is a file; state a folder")
-    taken = [name for name in files if (out / name).exists()]
-    if taken and not overwrite:
+    existing = [name for name in files if (out / name).exists()]
+    if existing and not overwrite:
         raise ResultError(
-            f"{out / taken[0]} is already there; choose another folder, or overwrite it (overwrite=True, --overwrite)"
+            f"{out / existing[0]} is already there; choose another folder, or overwrite it (overwrite=True, "
+            "--overwrite)"
         )
 
 
-def number(value: float, form: str = ".3g") -> str:
+def format_number(value: float, form: str = ".3g") -> str:
     """Write a number in a format of Python's; a dash where it is not finite."""
     return format(value, form) if math.isfinite(value) else "-"
 
 
-def document(kind: str, figures: Mapping[str, Any]) -> dict[str, Any]:
+def schema_document(kind: str, figures: Mapping[str, Any]) -> dict[str, Any]:
     """Return figures as plain values under the name of their schema, for JSON; a number that is not known is null."""
-    stated: dict[str, Any] = plain({"schema": f"rgbmidic-{kind}", "rgbmidic": __version__, **figures})
-    return stated
+    content: dict[str, Any] = to_plain({"schema": f"rgbmidic-{kind}", "rgbmidic": __version__, **figures})
+    return content
 
 
 def write_findings(out: Path, files: Sequence[str], *contents: dict[str, Any] | str | Figure, overwrite: bool) -> None:

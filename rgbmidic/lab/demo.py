@@ -55,7 +55,7 @@ PLATE_MOTIONS = {"shifted by 1.22 mm": ((1.0, -0.7), 0.0), "and stretched by 1 %
 """Motions of the tilted plate: shift (x, y) in mm, strain along x."""
 _PLATE_SHAPE, _LENS = (480, 640), (2400.0, 327.0, 232.0, -0.72, 0.0, 0.0, 0.0, 0.0)
 """Its frames, px, and `rgbmidic.fields.plane.LENS_PARAMETERS`: a barrel of 2 % in the corners."""
-_FAR, _TILT = 225.0, (4.0, 3.0)
+_PLATE_DISTANCE, _TILT = 225.0, (4.0, 3.0)
 """mm to the plate, at which the frame is 60 mm wide, and its tilt about x and y, degrees."""
 _BOARD, _SQUARE = (9, 7), 5.0
 """Inner corners of the chessboard, and its squares' side, mm."""
@@ -69,7 +69,7 @@ _VIEWS = (
 )
 """Turns of the chessboard about x, y and z, degrees, and its place beside the axis, mm."""
 _WAVES = 36
-"""Of the speckle: a sum of cosines whose contrast is then cut off."""
+"""Waves of the speckle: a sum of cosines whose contrast is then cut off."""
 _PLATE_SETTINGS = """\
 # A flat specimen tilted by 5 degrees behind a lens that distorts by 2 % in the corners.
 [frames]
@@ -157,7 +157,7 @@ def run_demo(
     states = "".join(f"\n[[states]]\nangle_deg = {angle}\n" for angle in angles)
     scene.write_text(_SCENE.format(size=size) + states, encoding="utf-8")
     report(f"1 of 7: virtual test, some 15 s: raw DNG frames, calibration captures and the exact truth in {test}")
-    with kernels_compiled_meanwhile():
+    with compile_kernels_in_background():
         settings_file = write_dataset(scene, test, progress)
         (test / "calibration.json").rename(test / "true_calibration.json")
         report("2 of 7: calibration, 2 s, as rgbmidic-calibrate crosstalk, registration and merge do from captures")
@@ -185,7 +185,9 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
     rows = []
     for index in range(1, len(result)):
         field = np.stack([result.u[index], result.v[index]], axis=1)
-        alone = [correlate(*pair, **options).displacement for pair in zip(images[0], images[index], strict=True)]
+        single_fields = [
+            correlate(*pair, **options).displacement for pair in zip(images[0], images[index], strict=True)
+        ]
         std = np.stack([result.u_std[index], result.v_std[index]], axis=1)
         rows.append(
             DemoRow(
@@ -193,7 +195,7 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
                 rms_px=field_rms(mesh, field, truth[index]),
                 nodal_px=rms(field - at_nodes(truth[index], mesh.nodes)),
                 predicted_px=rms(std),
-                single_px=tuple(field_rms(mesh, single, truth[index]) for single in alone),
+                single_px=tuple(field_rms(mesh, single, truth[index]) for single in single_fields),
                 measured=float(np.isfinite(field[:, 0]).mean()),
             )
         )
@@ -241,33 +243,33 @@ def write_plate(test: Path) -> CameraCalibration:
     straight = undistorted(np.array(_LENS), np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64))
 
     def photograph(name: str, values: FloatArray) -> None:
-        """Values of 0 to 1 as grey levels, with noise of .25 % of the full scale."""
+        """Write values of 0 to 1 as grey levels, with noise of .25 % of the full scale."""
         (test / name).parent.mkdir(exist_ok=True)
         levels = 65535 * (0.05 + 0.8 * values + random.normal(0, 0.0025, values.shape))
         _, content = cv2.imencode(".png", np.round(levels).clip(0, 65535).astype(np.uint16).reshape(_PLATE_SHAPE))
         with writing(test / name):  # OpenCV itself opens no non-ASCII names on Windows
             (test / name).write_bytes(content.tobytes())
 
-    def board(name: str, turns: Sequence[float], place: tuple[float, float, float]) -> None:
-        places = replace(_posed(turns, place), lens=None).to_mm(straight)
+    def board(name: str, turns: Sequence[float], position: tuple[float, float, float]) -> None:
+        positions = replace(_posed_camera(turns, position), lens=None).to_mm(straight)
         waves = []
-        for along, count in zip(places.T, _BOARD, strict=True):
-            line = np.clip(np.round(along / _SQUARE + (count - 1) / 2), -1, count) - (count - 1) / 2
+        for coordinates, count in zip(positions.T, _BOARD, strict=True):
+            line = np.clip(np.round(coordinates / _SQUARE + (count - 1) / 2), -1, count) - (count - 1) / 2
             sign = np.where((line - (count - 1) / 2) % 2 == 0, 1, -1)
-            waves.append(sign * erf((along - line * _SQUARE) / (0.1 * place[2] / _FAR)))
-        on_board = (np.abs(places) < (np.array(_BOARD) + 1) / 2 * _SQUARE).all(axis=1)
+            waves.append(sign * erf((coordinates - line * _SQUARE) / (0.1 * position[2] / _PLATE_DISTANCE)))
+        on_board = (np.abs(positions) < (np.array(_BOARD) + 1) / 2 * _SQUARE).all(axis=1)
         photograph(name, np.where(on_board, 0.5 - 0.5 * waves[0] * waves[1], 1.0))
 
-    for number, (turns, beside) in enumerate(_VIEWS):
-        board(f"target/view_{number}.png", turns, (*beside, 1.15 * _FAR))
-    board("plane/plane.png", (*_TILT, 0.0), (0.0, 0.0, _FAR))
-    camera, _ = _posed((*_TILT, 0.0), (0.0, 0.0, _FAR)).in_image_axes()
-    places = replace(camera, lens=None).to_mm(straight)
+    for number, (turns, offset) in enumerate(_VIEWS):
+        board(f"target/view_{number}.png", turns, (*offset, 1.15 * _PLATE_DISTANCE))
+    board("plane/plane.png", (*_TILT, 0.0), (0.0, 0.0, _PLATE_DISTANCE))
+    camera, _ = _posed_camera((*_TILT, 0.0), (0.0, 0.0, _PLATE_DISTANCE)).in_image_axes()
+    positions = replace(camera, lens=None).to_mm(straight)
     directions, lengths = random.uniform(0, np.pi, _WAVES), random.uniform(0.6, 1.5, _WAVES)
     waves = 2 * np.pi * np.stack([np.cos(directions), np.sin(directions)]) / lengths  # per mm: of 6 to 16 px
     phases = random.uniform(0, 2 * np.pi, _WAVES)
     for number, (shift, stretch) in enumerate([((0.0, 0.0), 0.0), *PLATE_MOTIONS.values()]):
-        material = (places - np.array(shift)) / np.array([1 + stretch, 1.0])
+        material = (positions - np.array(shift)) / np.array([1 + stretch, 1.0])
         paint = sum(np.cos(material @ wave + phase) for wave, phase in zip(waves.T, phases, strict=True))
         photograph(f"plate/frame_{number}.png", 0.5 + 0.5 * np.tanh(2 / np.sqrt(_WAVES) * np.asarray(paint)))
     (test / "plate.toml").write_text(_PLATE_SETTINGS, encoding="utf-8")
@@ -277,40 +279,40 @@ def write_plate(test: Path) -> CameraCalibration:
 def run_plate(test: Path, truth: CameraCalibration) -> list[PlateRow]:
     """Measure the plate of `write_plate` by `test`/camera.json and plate.toml, and compare with the `truth`."""
     result = measure(read_test(test / "plate.toml"), test.parent / "plate_result")
-    places, scale = truth.to_mm(result.nodes), truth.scale(truth.centre)[0]
-    ways = (Physical.of(result), Physical.of(result, ScaleSettings(mm_per_pixel=scale)))
+    positions, scale = truth.to_mm(result.nodes), truth.scale(truth.centre)[0]
+    scales = (Physical.of(result), Physical.of(result, ScaleSettings(mm_per_pixel=scale)))
     rows = []
     for index, (name, (shift, stretch)) in enumerate(PLATE_MOTIONS.items(), start=1):
-        exact = places * np.array([stretch, 0.0]) + np.array(shift)
-        fields = [way.frame(index) for way in ways]
+        exact = positions * np.array([stretch, 0.0]) + np.array(shift)
+        fields = [physical.frame(index) for physical in scales]
         errors = [np.stack([field["u"], field["v"]], axis=1) - exact for field in fields]
-        known = {"exx": stretch + stretch**2 / 2, "eyy": 0.0, "exy": 0.0}
-        strains = [np.stack([field[name] - value for name, value in known.items()]) for field in fields]
+        exact_strain = {"exx": stretch + stretch**2 / 2, "eyy": 0.0, "exy": 0.0}
+        strains = [np.stack([field[name] - value for name, value in exact_strain.items()]) for field in fields]
         rows.append(
             PlateRow(
                 motion=name,
                 displacement_mm=(rms(errors[0]), rms(errors[1])),
                 strain=(rms(strains[0]), rms(strains[1])),
                 stated_mm=rms(np.stack([fields[0]["u_std"], fields[0]["v_std"]])),
-                stated_strain=rms(np.stack([fields[0][f"{name}_std"] for name in known])),
+                stated_strain=rms(np.stack([fields[0][f"{name}_std"] for name in exact_strain])),
             )
         )
     return rows
 
 
-def _posed(turns: Sequence[float], place: tuple[float, float, float]) -> CameraCalibration:
+def _posed_camera(turns: Sequence[float], position: tuple[float, float, float]) -> CameraCalibration:
     """Return the virtual camera before a plane turned about x, y and z (degrees), its middle at a place (mm)."""
     rows, columns = _PLATE_SHAPE
     focal, cx, cy = _LENS[:3]
     offset = np.array([cx - (columns - 1) / 2, cy - (rows - 1) / 2])
     matrix = np.array([[focal, 0, offset[0]], [0, focal, offset[1]], [0, 0, 1.0]])
     turn = np.asarray(cv2.Rodrigues(np.radians(turns))[0])
-    homography = np.linalg.inv(matrix @ np.c_[turn[:, :2], place])
+    homography = np.linalg.inv(matrix @ np.c_[turn[:, :2], position])
     return CameraCalibration(shape=_PLATE_SHAPE, lens=np.array(_LENS), homography=homography / homography[2, 2])
 
 
 @contextmanager
-def kernels_compiled_meanwhile() -> Iterator[None]:
+def compile_kernels_in_background() -> Iterator[None]:
     """Compile the kernels of a measurement, while the block runs, by two processes that measure in small.
 
     One compiles those of the separation, the other those of the solve; the kernels then lie in the cache. Nothing is
@@ -322,13 +324,13 @@ def kernels_compiled_meanwhile() -> Iterator[None]:
     with ExitStack() as stack:
         quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         # -P: not the package of a clone in whose folder this runs, whose kernels lie elsewhere
-        commands = [[sys.executable, "-P", "-m", __name__, part] for part in _SMALL_MEASUREMENTS]
-        others = [stack.enter_context(subprocess.Popen(command, **quiet)) for command in commands]
+        commands = [[sys.executable, "-P", "-m", __name__, name] for name in _SMALL_MEASUREMENTS]
+        processes = [stack.enter_context(subprocess.Popen(command, **quiet)) for command in commands]
         try:
             yield
         except BaseException:
-            for one in others:
-                one.kill()
+            for process in processes:
+                process.kill()
             raise
 
 
@@ -353,12 +355,12 @@ def _separate() -> None:
 
 
 def _images(index: int) -> FloatImage:
-    """Blobs under three lights, a fraction of a pixel further from frame to frame."""
+    """Return the blobs under three lights, a fraction of a pixel further from frame to frame."""
     from scipy.ndimage import gaussian_filter, shift
 
     blobs = gaussian_filter(np.random.default_rng(0).normal(size=(3, _SIZE, _SIZE)), (0, 1.5, 1.5))
-    moved = shift(blobs, (0, 0, 0.3 * index), mode="nearest")
-    return np.clip(1000 + 2000 * moved, 0, None).astype(np.float32)
+    images = shift(blobs, (0, 0, 0.3 * index), mode="nearest")
+    return np.clip(1000 + 2000 * images, 0, None).astype(np.float32)
 
 
 _SMALL_MEASUREMENTS: dict[str, Callable[[], object]] = {

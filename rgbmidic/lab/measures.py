@@ -1,4 +1,4 @@
-"""How the paper judges a set-up and a specimen, for any data: perturbation, goniometry, topography.
+"""Measures by which the paper judges a set-up and a specimen, for any data: perturbation, goniometry, topography.
 
 Perturbation P (paper, section 2.2): the displacement minus its Gaussian-filtered copy, and its standard deviation over
 areas; beside it the residual in percent of the dynamic range. Goniometry (section 2.3 and Fig. 9): grey level of chosen
@@ -26,7 +26,7 @@ AREA_SIZE = (50.0, 100.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Area:
+class MeasureArea:
     """A rectangle of the reference image over which the perturbation is assessed.
 
     Attributes
@@ -75,8 +75,8 @@ class Area:
 
 def areas_along_x(
     first: tuple[float, float], *, pitch: float = 100.0, count: int = 5, size: tuple[float, float] = AREA_SIZE
-) -> tuple[Area, ...]:
-    """Areas A0, A1, ... in a row along x, as on the paper's Fig. 4.
+) -> tuple[MeasureArea, ...]:
+    """Return the areas A0, A1, ... in a row along x, as on the paper's Fig. 4.
 
     Parameters
     ----------
@@ -93,10 +93,10 @@ def areas_along_x(
     -------
     tuple of Area
     """
-    return tuple(Area(name=f"A{i}", centre=(first[0] + i * pitch, first[1]), size=size) for i in range(count))
+    return tuple(MeasureArea(name=f"A{i}", centre=(first[0] + i * pitch, first[1]), size=size) for i in range(count))
 
 
-def perturbation(field: npt.ArrayLike, areas: Sequence[Area], *, sigma: float = SIGMA) -> FloatArray:
+def perturbation(field: npt.ArrayLike, areas: Sequence[MeasureArea], *, sigma: float = SIGMA) -> FloatArray:
     """Perturbation P (paper, section 2.2): standard deviation in each area of a displacement without its long waves.
 
     Parameters
@@ -122,7 +122,7 @@ def perturbation(field: npt.ArrayLike, areas: Sequence[Area], *, sigma: float = 
 
 
 def residual_percent(reference: npt.ArrayLike, deformed: npt.ArrayLike, displacement: FloatArray) -> float:
-    """Residual of a measurement in % of the effective dynamic range (paper, section 2.2).
+    """Return the residual of a measurement in % of the effective dynamic range (paper, section 2.2).
 
     Standard deviation of the difference between the reference image and the deformed image warped by the
     displacement (cubic spline interpolation), over the largest minus the smallest grey level of the two images.
@@ -150,23 +150,25 @@ def residual_percent(reference: npt.ArrayLike, deformed: npt.ArrayLike, displace
     rows, columns = np.nonzero(np.isfinite(displacement[0]) & np.isfinite(f))
     if f.shape != g.shape or displacement.shape != (2, *f.shape) or not rows.size:
         raise InputError(f"images and displacement do not fit: {f.shape}, {g.shape}, {displacement.shape}")
-    there = displacement[:, rows, columns]
-    unknown = ~np.isfinite(g)
-    place = np.stack([rows + there[1], columns + there[0]])
-    back = map_coordinates(np.where(unknown, np.nanmean(g), g), place, order=3, mode="constant", cval=np.nan)
-    if unknown.any():
-        back[map_coordinates(unknown.astype(np.float32), place, order=1) > 0] = np.nan
-    used = f[rows, columns]
-    span = max(used.max(), np.nanmax(back)) - min(used.min(), np.nanmin(back))
-    return float(100 * np.nanstd(back - used) / span)
+    displacement_at = displacement[:, rows, columns]
+    is_missing = ~np.isfinite(g)
+    coordinates = np.stack([rows + displacement_at[1], columns + displacement_at[0]])
+    warped_levels = map_coordinates(
+        np.where(is_missing, np.nanmean(g), g), coordinates, order=3, mode="constant", cval=np.nan
+    )
+    if is_missing.any():
+        warped_levels[map_coordinates(is_missing.astype(np.float32), coordinates, order=1) > 0] = np.nan
+    reference_levels = f[rows, columns]
+    span = max(reference_levels.max(), np.nanmax(warped_levels)) - min(reference_levels.min(), np.nanmin(warped_levels))
+    return float(100 * np.nanstd(warped_levels - reference_levels) / span)
 
 
-def _over_areas(image: FloatArray, areas: Sequence[Area], statistic: Callable[..., float]) -> FloatArray:
+def _area_statistics(image: FloatArray, areas: Sequence[MeasureArea], statistic: Callable[..., float]) -> FloatArray:
     cuts = [area.cut(image) for area in areas]
     return np.array([statistic(cut) if np.isfinite(cut).mean() >= 0.5 else np.nan for cut in cuts], dtype=np.float64)
 
 
-def area_stds(high_passed: FloatArray, areas: Sequence[Area]) -> FloatArray:
+def area_stds(high_passed: FloatArray, areas: Sequence[MeasureArea]) -> FloatArray:
     """Return the standard deviation of an image in each area.
 
     Parameters
@@ -181,11 +183,11 @@ def area_stds(high_passed: FloatArray, areas: Sequence[Area]) -> FloatArray:
     ndarray, shape (n,)
         In the unit of the image; NaN where less than half of the area is measured.
     """
-    return _over_areas(high_passed, areas, np.nanstd)
+    return _area_statistics(high_passed, areas, np.nanstd)
 
 
-def area_means(field: FloatArray, areas: Sequence[Area]) -> FloatArray:
-    """Mean of an image in each area.
+def area_means(field: FloatArray, areas: Sequence[MeasureArea]) -> FloatArray:
+    """Return the mean of an image in each area.
 
     Parameters
     ----------
@@ -199,7 +201,7 @@ def area_means(field: FloatArray, areas: Sequence[Area]) -> FloatArray:
     ndarray, shape (n,)
         In the unit of the image; NaN where less than half of the area is measured.
     """
-    return _over_areas(field, areas, np.nanmean)
+    return _area_statistics(field, areas, np.nanmean)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -223,7 +225,7 @@ class Lobe:
     std: tuple[float, float, float, float]
 
     def __call__(self, angles_deg: npt.ArrayLike) -> FloatArray:
-        """Grey level at light angles in degrees from the surface's normal."""
+        """Return the grey level at light angles in degrees from the surface's normal."""
         return _lobe(np.asarray(angles_deg, dtype=np.float64), *astuple(self)[:4])
 
 
@@ -237,7 +239,7 @@ class Goniometry:
         Angle between the light and the surface's normal; positive on the side of the reflection.
     levels : ndarray, shape (n, m)
         Grey level of every pixel.
-    white : ndarray, shape (m,), bool
+    is_white : ndarray, shape (m,), bool
         The pixels of the brighter bundle (paint of high diffuse reflectance).
     lobe
         Fitted to the mean of the pixels; its uncertainty is that of choosing these pixels among others.
@@ -249,14 +251,14 @@ class Goniometry:
 
     angles_deg: FloatArray
     levels: FloatArray
-    white: BoolArray
+    is_white: BoolArray
     lobe: Lobe
     spread: FloatArray
     band: tuple[float, float]
 
 
 def pixel_levels(frames: Sequence[npt.ArrayLike], pixels: npt.ArrayLike) -> FloatArray:
-    """Grey levels (n, m) of chosen pixels in n frames.
+    """Return the grey levels (n, m) of chosen pixels in n frames.
 
     Parameters
     ----------
@@ -275,15 +277,15 @@ def pixel_levels(frames: Sequence[npt.ArrayLike], pixels: npt.ArrayLike) -> Floa
     InputError
         Pixels that are not whole numbers, or lie outside a frame.
     """
-    chosen = np.asarray(pixels)
-    if chosen.ndim != 2 or chosen.shape[1] != 2 or chosen.dtype.kind not in "iu":
-        raise InputError(f"pixels are whole numbers (x, y) of shape (m, 2), not {chosen.dtype} {chosen.shape}")
+    positions = np.asarray(pixels)
+    if positions.ndim != 2 or positions.shape[1] != 2 or positions.dtype.kind not in "iu":
+        raise InputError(f"pixels are whole numbers (x, y) of shape (m, 2), not {positions.dtype} {positions.shape}")
     levels = []
     for number, frame in enumerate(frames):
         image = np.asarray(frame, dtype=np.float64)
-        if image.ndim != 2 or (chosen < 0).any() or (chosen >= image.shape[::-1]).any():
+        if image.ndim != 2 or (positions < 0).any() or (positions >= image.shape[::-1]).any():
             raise InputError(f"frame {number} of shape {image.shape} does not hold all the pixels chosen")
-        levels.append(image[chosen[:, 1], chosen[:, 0]])
+        levels.append(image[positions[:, 1], positions[:, 0]])
     return np.array(levels)
 
 
@@ -307,10 +309,10 @@ def fit_lobe(angles_deg: npt.ArrayLike, levels: npt.ArrayLike) -> Lobe:
     from scipy.optimize import curve_fit
 
     angles, values = np.asarray(angles_deg, dtype=np.float64), np.asarray(levels, dtype=np.float64)
-    used = np.isfinite(values) & (abs(angles) < 90) if angles.shape == values.shape else np.zeros(0, dtype=bool)
-    if angles.ndim != 1 or used.sum() < 8:
+    is_valid = np.isfinite(values) & (abs(angles) < 90) if angles.shape == values.shape else np.zeros(0, dtype=bool)
+    if angles.ndim != 1 or is_valid.sum() < 8:
         raise InputError(f"a lobe is fitted to at least 8 angles below 90 degrees; given are {angles.shape}")
-    angles, values = angles[used], values[used]
+    angles, values = angles[is_valid], values[is_valid]
     oblique = abs(angles) > np.quantile(abs(angles), 0.6)
     diffuse = float(np.median(values[oblique] / np.cos(np.radians(angles[oblique]))))
     excess = values - diffuse * np.cos(np.radians(angles))
@@ -325,8 +327,8 @@ def fit_lobe(angles_deg: npt.ArrayLike, levels: npt.ArrayLike) -> Lobe:
     return Lobe(diffuse=diffuse, specular=specular, centre_deg=centre, width_deg=width, std=(a, b, c, d))
 
 
-def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, visible: float = 0.05) -> Goniometry:
-    """Diffuse light, specular lobe and erratic band of a series of grey levels.
+def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, min_spread: float = 0.05) -> Goniometry:
+    """Return the diffuse light, specular lobe and erratic band of a series of grey levels.
 
     Every pixel has its own diffuse level, found where the light is far from the reflection; the excess over it is
     reflection. A smooth reflection would be the same at every pixel of one paint: the spread between the pixels is the
@@ -338,7 +340,7 @@ def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, visible: flo
         Angle (degrees) between the light and the surface's normal, positive on the side of the reflection.
     levels : array_like, shape (n, m)
         Grey levels of m pixels (`pixel_levels`).
-    visible
+    min_spread
         The band is where the spread exceeds this fraction of the white paint's diffuse level.
 
     Returns
@@ -367,28 +369,31 @@ def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, visible: flo
     excess = values - cosine[:, None] * diffuse
     spread = np.sqrt(np.mean([excess[:, group].var(axis=1) for group in (white, ~white) if group.any()], axis=0))
     # the run of angles around the largest spread on which it is visible
-    hidden, peak = np.flatnonzero(~(spread > visible * float(diffuse[white].mean()))), int(spread.argmax())
+    is_invisible, peak = np.flatnonzero(~(spread > min_spread * float(diffuse[white].mean()))), int(spread.argmax())
     band = (float("nan"), float("nan"))
-    if peak not in hidden:
-        first, last = hidden[hidden < peak].max(initial=-1) + 1, hidden[hidden > peak].min(initial=len(angles)) - 1
+    if peak not in is_invisible:
+        first, last = (
+            is_invisible[is_invisible < peak].max(initial=-1) + 1,
+            is_invisible[is_invisible > peak].min(initial=len(angles)) - 1,
+        )
         band = (float(angles[first]), float(angles[last]))
-    return Goniometry(angles_deg=angles, levels=values, white=white, lobe=lobe, spread=spread, band=band)
+    return Goniometry(angles_deg=angles, levels=values, is_white=white, lobe=lobe, spread=spread, band=band)
 
 
-def _lobe_of_pixels(angles: FloatArray, levels: FloatArray, most_groups: int = 10) -> Lobe:
-    """Lobe of the mean of m pixels; its uncertainty from leaving out groups of them in turn (jackknife).
+def _lobe_of_pixels(angles: FloatArray, levels: FloatArray, max_groups: int = 10) -> Lobe:
+    """Return the lobe of the mean of m pixels; its uncertainty from leaving out groups of them in turn (jackknife).
 
     The residual of the fit does not show it: a pixel's deviation is the same at neighbouring angles.
     """
-    whole = fit_lobe(angles, levels.mean(axis=1))
-    groups = min(most_groups, levels.shape[1])
+    full_fit = fit_lobe(angles, levels.mean(axis=1))
+    groups = min(max_groups, levels.shape[1])
     if groups < 2:
-        return whole
+        return full_fit
     members = np.arange(levels.shape[1]) % groups
     trials = [fit_lobe(angles, levels[:, members != group].mean(axis=1)) for group in range(groups)]
-    values = np.array([astuple(one)[:4] for one in trials])
-    a, b, c, d = map(float, np.hypot(values.std(axis=0) * np.sqrt(groups - 1), whole.std))
-    return replace(whole, std=(a, b, c, d))
+    values = np.array([astuple(lobe)[:4] for lobe in trials])
+    a, b, c, d = map(float, np.hypot(values.std(axis=0) * np.sqrt(groups - 1), full_fit.std))
+    return replace(full_fit, std=(a, b, c, d))
 
 
 def _lobe(angles: FloatArray, diffuse: float, specular: float, centre: float, width: float) -> FloatArray:
@@ -419,13 +424,13 @@ def detrend(height: npt.ArrayLike, order: int = 4) -> FloatArray:
     from numpy.polynomial.legendre import legvander
 
     values = _as_map(height)
-    known = np.isfinite(values)
-    if order < 0 or known.sum() <= (order + 1) ** 2:
+    is_measured = np.isfinite(values)
+    if order < 0 or is_measured.sum() <= (order + 1) ** 2:
         raise InputError(f"a bipolynomial of order {order} needs more than {(order + 1) ** 2} measured heights")
     along_y, along_x = (legvander(np.linspace(-1, 1, n), order) for n in values.shape)
     terms = (order + 1) ** 2
     normal, right = np.zeros((terms, terms)), np.zeros(terms)
-    for row, line, measured in zip(along_y, values, known, strict=True):
+    for row, line, measured in zip(along_y, values, is_measured, strict=True):
         basis = (row[:, None] * along_x[measured, None, :]).reshape(-1, terms)
         normal += basis.T @ basis
         right += basis.T @ line[measured]
@@ -434,7 +439,7 @@ def detrend(height: npt.ArrayLike, order: int = 4) -> FloatArray:
 
 
 def local_slope(height: npt.ArrayLike, pitch: float) -> FloatArray:
-    """Local slope arctan|grad h| by central differences.
+    """Return the local slope arctan|grad h| by central differences.
 
     Parameters
     ----------
@@ -477,7 +482,7 @@ def slope_uncertainty(height_std: float, pitch: float) -> float:
 
 
 def paint_classes(intensity: npt.ArrayLike) -> BoolArray:
-    """White and black paint of an intensity map, by Otsu's threshold.
+    """Classify white and black paint of an intensity map, by Otsu's threshold.
 
     Parameters
     ----------
@@ -495,23 +500,23 @@ def paint_classes(intensity: npt.ArrayLike) -> BoolArray:
         The map is of one level.
     """
     values = _as_map(intensity)
-    known = np.isfinite(values)
-    if not known.any() or np.ptp(values[known]) == 0:
+    is_measured = np.isfinite(values)
+    if not is_measured.any() or np.ptp(values[is_measured]) == 0:
         raise InputError("the intensity map shows no two paints: it is of one level")
-    low, high = np.percentile(values[known], [0.5, 99.5])
-    grey = np.clip(255 * (np.where(known, values, low) - low) / max(high - low, 1e-300), 0, 255).astype(np.uint8)
+    low, high = np.percentile(values[is_measured], [0.5, 99.5])
+    grey = np.clip(255 * (np.where(is_measured, values, low) - low) / max(high - low, 1e-300), 0, 255).astype(np.uint8)
     level = cv2.threshold(grey, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0]
-    return np.asarray(known & (grey > level))
+    return np.asarray(is_measured & (grey > level))
 
 
-def rms_slope(height: npt.ArrayLike, where: BoolArray, pitch: float, *, height_std: float = 0.0) -> float:
-    """Root mean square local slope of one paint in degrees, measurement noise taken off.
+def rms_slope(height: npt.ArrayLike, on_paint: BoolArray, pitch: float, *, height_std: float = 0.0) -> float:
+    """Return the root mean square local slope of one paint in degrees, measurement noise taken off.
 
     Parameters
     ----------
     height
         Height map without its form (`detrend`).
-    where
+    on_paint
         The paint's points, shape (H, W).
     pitch
         Distance between the points, in the unit of the height.
@@ -529,8 +534,8 @@ def rms_slope(height: npt.ArrayLike, where: BoolArray, pitch: float, *, height_s
         No measured height lies on the paint, with its neighbours.
     """
     values = _as_map(height)
-    used = (where & np.isfinite(values)).astype(np.uint8)
-    slope = local_slope(values, pitch)[cv2.erode(used, np.ones((3, 3), np.uint8), borderValue=0).astype(bool)]
+    is_valid = (on_paint & np.isfinite(values)).astype(np.uint8)
+    slope = local_slope(values, pitch)[cv2.erode(is_valid, np.ones((3, 3), np.uint8), borderValue=0).astype(bool)]
     slope = slope[np.isfinite(slope)]
     if not slope.size:
         raise InputError("no measured height lies on this paint")
@@ -539,7 +544,7 @@ def rms_slope(height: npt.ArrayLike, where: BoolArray, pitch: float, *, height_s
 
 
 def wrinkle_spacing(height: npt.ArrayLike, pitch: float, *, longest: float = 0.06) -> tuple[float, float]:
-    """Distance between wrinkles: where the spectrum of the height, summed over all directions, has its peak.
+    """Return the distance between wrinkles: where the spectrum of the height, summed over all directions, has its peak.
 
     Parameters
     ----------
@@ -568,9 +573,9 @@ def wrinkle_spacing(height: npt.ArrayLike, pitch: float, *, longest: float = 0.0
         )
     blocks = 3  # along each side, for the uncertainty
     rows, columns = (pairwise(np.linspace(0, n, blocks + 1).astype(int)) for n in values.shape)
-    parts = [values, *(values[a:b, c:d] for (a, b), (c, d) in product(rows, columns))]
-    whole, *spacings = (1 / _peak(*_ring_spectrum(part, pitch, longest)) for part in parts)
-    return whole, float(np.std(spacings, ddof=1) / blocks)
+    maps = [values, *(values[a:b, c:d] for (a, b), (c, d) in product(rows, columns))]
+    spacing, *spacings = (1 / _peak(*_ring_spectrum(map_part, pitch, longest)) for map_part in maps)
+    return spacing, float(np.std(spacings, ddof=1) / blocks)
 
 
 def _as_map(values: npt.ArrayLike) -> FloatArray:
@@ -581,9 +586,9 @@ def _as_map(values: npt.ArrayLike) -> FloatArray:
 
 
 def _ring_spectrum(values: FloatArray, pitch: float, longest: float) -> tuple[FloatArray, FloatArray]:
-    """Frequencies and the power summed over the rings of these frequencies (Hann window)."""
-    known = np.isfinite(values)
-    centred = np.where(known, values - values[known].mean(), 0.0)
+    """Return the frequencies and the power summed over the rings of these frequencies (Hann window)."""
+    is_measured = np.isfinite(values)
+    centred = np.where(is_measured, values - values[is_measured].mean(), 0.0)
     window = np.hanning(values.shape[0])[:, None] * np.hanning(values.shape[1])
     power = np.abs(np.fft.fft2(centred * window)) ** 2
     radius = np.hypot(np.fft.fftfreq(values.shape[0], pitch)[:, None], np.fft.fftfreq(values.shape[1], pitch))
@@ -591,12 +596,12 @@ def _ring_spectrum(values: FloatArray, pitch: float, longest: float) -> tuple[Fl
     index = (radius / width).astype(int).ravel()
     frequency = (np.arange(index.max() + 1) + 0.5) * width
     ring = np.bincount(index, weights=power.ravel())
-    seen = (frequency >= 1 / longest) & (frequency <= 0.5 / pitch)
-    return frequency[seen], ring[seen]
+    in_range = (frequency >= 1 / longest) & (frequency <= 0.5 / pitch)
+    return frequency[in_range], ring[in_range]
 
 
 def _peak(frequency: FloatArray, power: FloatArray, width: float = 0.1) -> float:
-    """Peak of a noisy spectrum: vertex of the parabola through its logarithm.
+    """Return the peak of a noisy spectrum: vertex of the parabola through its logarithm.
 
     It is smoothed over `width`, a standard deviation in the logarithm of the frequency.
     """
@@ -604,9 +609,9 @@ def _peak(frequency: FloatArray, power: FloatArray, width: float = 0.1) -> float
     kernel = np.exp(-0.5 * ((position[:, None] - position) / width) ** 2)
     smooth = kernel @ power / kernel.sum(axis=1)
     top = int(smooth.argmax())
-    near = np.abs(position - position[top]) <= width
-    if near.sum() < 3:
+    is_near = np.abs(position - position[top]) <= width
+    if is_near.sum() < 3:
         return float(frequency[top])
-    bend, slope, _ = np.polyfit(position[near] - position[top], np.log(smooth[near] + 1e-300), 2)
-    shift = -slope / (2 * bend) if bend < 0 else 0.0
+    curvature, slope, _ = np.polyfit(position[is_near] - position[top], np.log(smooth[is_near] + 1e-300), 2)
+    shift = -slope / (2 * curvature) if curvature < 0 else 0.0
     return float(frequency[top] * np.exp(np.clip(shift, -width, width)))

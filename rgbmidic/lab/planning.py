@@ -24,7 +24,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.scene.camera import Light
 from rgbmidic.scene.forecast import Forecast, Instrument, trace_change
 from rgbmidic.scene.scene import Experiment, Scene, State
-from rgbmidic.scene.zones import REFLECTS, Zones, material_points, predict_zones, region_in_view, truth, unit
+from rgbmidic.scene.zones import REFLECTS, Zones, material_points, predict_zones, region_in_view, truth, unit_vectors
 from rgbmidic.settings import IlluminationSettings
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -37,44 +37,44 @@ class PlanningConstants:
     ----------
     grid_points
         Points of the prediction along the longer side of the frame; chosen: zones are far wider than a step.
-    points, states
+    n_points, n_states
         Points of the field, and states, at which lamps are compared; chosen for the time that it takes.
     azimuth_step
         Degrees about the optical axis between the directions that are tried.
     inclinations
         Degrees from the optical axis: not before the lens, not so oblique that wrinkles throw shadows.
-    apart
+    min_angle
         Least angle (degrees) between two lamps, seen from the specimen.
     diffuse_power
         Power of the diffuse fraction in the cost; chosen.
-    worthwhile
+    min_gain
         Gain from which lamps are moved; chosen: less is not worth mounting.
-    affordable
+    max_std_growth
         Largest growth of the expected uncertainty for lamps that are moved, which then stand more obliquely: a
         reflection that hardly adds to the uncertainty need not be avoided at any price; chosen.
     """
 
     grid_points: int = 80
-    points: int = 300
-    states: int = 6
+    n_points: int = 300
+    n_states: int = 6
     azimuth_step: float = 15.0
     inclinations: tuple[float, ...] = (20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)
-    apart: float = 20.0
+    min_angle: float = 20.0
     diffuse_power: int = 4
-    worthwhile: float = 1.02
-    affordable: float = 1.2
+    min_gain: float = 1.02
+    max_std_growth: float = 1.2
 
 
 CONSTANTS = PlanningConstants()
 
 
-def propose_colours(plan: Plan) -> Plan:
+def propose_colours(plan: LampPlan) -> LampPlan:
     """Return the present lamp directions with the colours exchanged for the best."""
     search = _Search.of(plan, _directions(plan.scene))
-    return search.proposal(plan, min(permutations(range(len(plan.scene.lights))), key=search.cost), affordable=1.0)
+    return search.proposal(plan, min(permutations(range(len(plan.scene.lights))), key=search.cost), max_std_growth=1.0)
 
 
-def propose_lamps(plan: Plan) -> Plan:
+def propose_lamps(plan: LampPlan) -> LampPlan:
     """Return the best directions of a grid over azimuth and inclination, with the best colour for each."""
     angles = np.arange(0, 360, CONSTANTS.azimuth_step), np.array(CONSTANTS.inclinations)
     azimuth, inclination = np.radians(np.meshgrid(*angles, indexing="ij")).reshape(2, -1)
@@ -84,7 +84,7 @@ def propose_lamps(plan: Plan) -> Plan:
     search = _Search.of(plan, np.concatenate([present, grid]))
     orders = list(permutations(range(len(present))))
     guesses = sorted(orders, key=search.cost)[:2] + [search.greedy(order) for order in orders[:6]]
-    return search.proposal(plan, min(map(search.descend, guesses), key=search.cost), CONSTANTS.affordable)
+    return search.proposal(plan, min(map(search.descend, guesses), key=search.cost), CONSTANTS.max_std_growth)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,53 +98,55 @@ class _Search:
     information: FloatArray
 
     @classmethod
-    def of(cls, plan: Plan, directions: FloatArray) -> _Search:
-        """Inverse variance of each light's pull, times the fourth power of its diffuse fraction."""
+    def of(cls, plan: LampPlan, directions: FloatArray) -> _Search:
+        """Return the search by the inverse variance of each light, times the fourth power of its diffuse fraction."""
         scene = plan.scene
         rows, columns = np.nonzero(plan.inside)
-        some = slice(None, None, max(1, rows.size // CONSTANTS.points))
-        pixels = plan.x[rows[some], columns[some]], plan.y[rows[some], columns[some]]
+        sample = slice(None, None, max(1, rows.size // CONSTANTS.n_points))
+        pixels = plan.x[rows[sample], columns[sample]], plan.y[rows[sample], columns[sample]]
         material = material_points(scene, None, pixels)
-        index = np.unique(np.linspace(0, len(plan.outlooks) - 1, CONSTANTS.states).round().astype(int))
+        index = np.unique(np.linspace(0, len(plan.outlooks) - 1, CONSTANTS.n_states).round().astype(int))
         brightness = np.nan_to_num(np.nanmean(plan.reference.level[:, plan.inside], axis=1))
 
-        def clear(light: int, before: Zones, after: Zones) -> FloatArray:
-            variance = plan.instrument.light_variance(light, before, after, brightness)
+        def light_information(light: int, reference: Zones, deformed: Zones) -> FloatArray:
+            variance = plan.instrument.light_variance(light, reference, deformed, brightness)
             with np.errstate(invalid="ignore"):
-                diffuse = 1 - np.fmax(before.fraction, after.fraction)
-                levels = np.fmax(*(plan.instrument.white_level(zones) for zones in (before, after)))
-                seen = levels < scene.camera.full_scale
-                return np.nan_to_num(np.where(seen, diffuse**CONSTANTS.diffuse_power / variance, 0.0))
+                diffuse = 1 - np.fmax(reference.fraction, deformed.fraction)
+                levels = np.fmax(*(plan.instrument.white_level(zones) for zones in (reference, deformed)))
+                is_unsaturated = levels < scene.camera.full_scale
+                return np.nan_to_num(np.where(is_unsaturated, diffuse**CONSTANTS.diffuse_power / variance, 0.0))
 
         information = []
         for light, lamp in enumerate(scene.lights):
             # one light in all its places, seen as brightly as the camera sees its colour
             camera = replace(scene.camera, crosstalk=None, sensitivities=None)
-            alone = replace(scene, lights=(lamp,), camera=camera)
+            single_light_scene = replace(scene, lights=(lamp,), camera=camera)
             response = scene.camera.response(scene.lights).max(axis=0)[light]
-            candidates = tuple(_placed(lamp, scene, direction) for direction in directions)
+            candidates = tuple(_lamp_in_direction(lamp, scene, direction) for direction in directions)
             predicted = [
-                predict_zones(alone, state, material=material, lights=candidates)
+                predict_zones(single_light_scene, state, material=material, lights=candidates)
                 for state in (State(), *(plan.outlooks[i].state for i in index))
             ]
-            before, *after = (replace(zones, irradiance=zones.irradiance * response) for zones in predicted)
-            information.append(np.stack([clear(light, before, zones) for zones in after], axis=1))
+            reference, *deformed = (replace(zones, irradiance=zones.irradiance * response) for zones in predicted)
+            information.append(np.stack([light_information(light, reference, zones) for zones in deformed], axis=1))
         return cls(directions=directions, information=np.stack(information))
 
     def cost(self, choice: Iterable[int]) -> float:
-        """Root mean square uncertainty, in units of its own, of one direction per light."""
-        total = sum(self.information[light, place] for light, place in enumerate(choice))
+        """Return the root mean square uncertainty, in units of its own, of one direction per light."""
+        total = sum(self.information[light, direction] for light, direction in enumerate(choice))
         return float(np.sqrt(np.mean(1 / np.maximum(total, 1e-9))))
 
-    def best(self, light: int, others: Mapping[int, int]) -> int:
-        """Direction in which a light adds most to `others` (light to direction), at an angle from all of them."""
-        total = self.information[light] + sum(self.information[other, place] for other, place in others.items())
+    def best(self, light: int, fixed: Mapping[int, int]) -> int:
+        """Return direction in which a light adds most to `fixed` (light to direction), at an angle from all of them."""
+        total = self.information[light] + sum(
+            self.information[fixed_light, direction] for fixed_light, direction in fixed.items()
+        )
         costs = np.mean(1 / np.maximum(total, 1e-9), axis=(1, 2))
-        near = self.directions @ self.directions[list(others.values())].T > np.cos(np.radians(CONSTANTS.apart))
+        near = self.directions @ self.directions[list(fixed.values())].T > np.cos(np.radians(CONSTANTS.min_angle))
         return int(np.where(near.any(axis=1), np.inf, costs).argmin())
 
     def greedy(self, order: tuple[int, ...]) -> tuple[int, ...]:
-        """One light after the other where it adds most."""
+        """Return one light after the other where it adds most."""
         choice: dict[int, int] = {}
         for light in order:
             choice[light] = self.best(light, choice)
@@ -153,40 +155,41 @@ class _Search:
     def descend(self, choice: tuple[int, ...]) -> tuple[int, ...]:
         """Move one light at a time to its best direction until none gains."""
         while True:
-            before = self.cost(choice)
+            previous_cost = self.cost(choice)
             for light in range(len(choice)):
-                others = {other: place for other, place in enumerate(choice) if other != light}
-                moved = (*choice[:light], self.best(light, others), *choice[light + 1 :])
-                choice = min(choice, moved, key=self.cost)
-            if not self.cost(choice) < before * (1 - 1e-6):
+                fixed = {fixed_light: direction for fixed_light, direction in enumerate(choice) if fixed_light != light}
+                candidate = (*choice[:light], self.best(light, fixed), *choice[light + 1 :])
+                choice = min(choice, candidate, key=self.cost)
+            if not self.cost(choice) < previous_cost * (1 - 1e-6):
                 return choice
 
-    def proposal(self, plan: Plan, choice: tuple[int, ...], affordable: float) -> Plan:
+    def proposal(self, plan: LampPlan, choice: tuple[int, ...], max_std_growth: float) -> LampPlan:
         """Return the plan with the lights in the chosen directions, if that gains.
 
-        The uncertainty must not grow by more than the factor `affordable`.
+        The uncertainty must not grow by more than the factor `max_std_growth`.
         """
         gain = self.cost(range(len(choice))) / self.cost(choice)
-        if gain >= CONSTANTS.worthwhile:
-            scene, chosen = plan.scene, self.directions[list(choice)]
+        if gain >= CONSTANTS.min_gain:
+            scene, directions = plan.scene, self.directions[list(choice)]
             lights = tuple(
-                _placed(lamp, scene, direction) for lamp, direction in zip(scene.lights, chosen, strict=True)
+                _lamp_in_direction(lamp, scene, direction)
+                for lamp, direction in zip(scene.lights, directions, strict=True)
             )
             scene = replace(scene, lights=lights)
             states = [outlook.state for outlook in plan.outlooks]
             reference, outlooks = _predict(scene, plan.instrument, plan.x, plan.y, states)
-            better = replace(plan, scene=scene, reference=reference, outlooks=outlooks, gain=gain)
-            if better.std <= affordable * plan.std:
-                return better
+            proposed = replace(plan, scene=scene, reference=reference, outlooks=outlooks, gain=gain)
+            if proposed.std <= max_std_growth * plan.std:
+                return proposed
         return plan
 
 
 def _directions(scene: Scene) -> FloatArray:
     """Return unit vectors (k, 3) from the body's front point to the lamps."""
-    return unit(np.array([light.position for light in scene.lights]) - scene.body.front, axis=1)
+    return unit_vectors(np.array([light.position for light in scene.lights]) - scene.body.front, axis=1)
 
 
-def _placed(light: Light, scene: Scene, direction: FloatArray) -> Light:
+def _lamp_in_direction(light: Light, scene: Scene, direction: FloatArray) -> Light:
     """Return the light at its distance from the body's front point, in another direction."""
     front = np.array(scene.body.front)
     position = front + np.linalg.norm(np.array(light.position) - front) * direction
@@ -230,7 +233,7 @@ class Outlook:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
+class LampPlan:
     """A scene with the outlook of each of its states.
 
     Attributes
@@ -264,7 +267,7 @@ class Plan:
     gain: float = 1.0
 
     def fraction(self, mask: BoolArray) -> float:
-        """Fraction of the field on which a mask (h, w) holds."""
+        """Return the fraction of the field on which a mask (h, w) holds."""
         return float(mask[self.inside].mean())
 
     @property
@@ -274,7 +277,7 @@ class Plan:
         return float(np.sqrt(np.mean(np.where(np.isfinite(values), values, np.inf) ** 2)))
 
 
-def make_plan(experiment: Experiment) -> Plan:
+def make_plan(experiment: Experiment) -> LampPlan:
     """Predict every state of a scene.
 
     Parameters
@@ -305,7 +308,7 @@ def make_plan(experiment: Experiment) -> Plan:
     inside = (x >= field[0]) & (y >= field[1]) & (x <= field[2]) & (y <= field[3])
     if not inside.any() or not np.isfinite(motion[:, :, inside]).all():
         raise InputError(f"the field {list(field)} px does not lie on the body in every state")
-    return Plan(
+    return LampPlan(
         scene=scene, instrument=instrument, field=field, x=x, y=y, inside=inside, reference=reference, outlooks=outlooks
     )
 
@@ -313,17 +316,17 @@ def make_plan(experiment: Experiment) -> Plan:
 def _predict(
     scene: Scene, instrument: Instrument, x: FloatArray, y: FloatArray, states: list[State]
 ) -> tuple[Zones, tuple[Outlook, ...]]:
-    """Zones at rest, and the outlook of every state, at points x, y (h, w) of a square grid (px)."""
+    """Return the zones at rest, and the outlook of every state, at points x, y (h, w) of a square grid (px)."""
     material = material_points(scene, None, (x, y))
     reference = predict_zones(scene, material=material)
-    reach = instrument.element_size / float(x[0, 1] - x[0, 0])
+    radius = instrument.element_size / float(x[0, 1] - x[0, 0])
     outlooks = []
     for state in states:
         zones = predict_zones(scene, state, material=material)
         displacement = truth(scene, state, None, (x, y))
         with np.errstate(invalid="ignore"):
             reflects = np.fmax(reference.fraction, zones.fraction) > REFLECTS
-        saturated = instrument.saturated(reference) | instrument.saturated(zones)
+        saturated = instrument.is_saturated(reference) | instrument.is_saturated(zones)
         clean = np.isfinite(reference.fraction + zones.fraction) & ~saturated & ~reflects
         outlooks.append(
             Outlook(
@@ -333,17 +336,17 @@ def _predict(
                 reflects=reflects,
                 clean=clean.sum(axis=0),
                 saturated=saturated,
-                forecast=instrument.forecast(reference, zones, _around(trace_change(displacement), reach)),
+                forecast=instrument.forecast(reference, zones, _nodal_mean(trace_change(displacement), radius)),
             )
         )
     return reference, tuple(outlooks)
 
 
-def _around(values: FloatArray, reach: float) -> FloatArray:
-    """Mean (n, h, w) of the known values within about `reach` points: over the elements of a node."""
-    known = np.isfinite(values)
+def _nodal_mean(values: FloatArray, radius: float) -> FloatArray:
+    """Return the mean (n, h, w) of the known values within about `radius` points: over the elements of a node."""
+    is_finite = np.isfinite(values)
     total, weight = (
-        np.stack([cv2.GaussianBlur(part, (0, 0), 0.5 * reach) for part in stack])
-        for stack in (np.where(known, values, 0.0), known.astype(np.float64))
+        np.stack([cv2.GaussianBlur(layer, (0, 0), 0.5 * radius) for layer in stack])
+        for stack in (np.where(is_finite, values, 0.0), is_finite.astype(np.float64))
     )
-    return np.where(known, total / np.where(known, weight, 1.0), np.nan)
+    return np.where(is_finite, total / np.where(is_finite, weight, 1.0), np.nan)

@@ -10,24 +10,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.lab import document, number, write_findings
-from rgbmidic.lab.planning import Outlook, Plan
+from rgbmidic.lab import format_number, schema_document, write_findings
+from rgbmidic.lab.planning import LampPlan, Outlook
 from rgbmidic.pipeline.resolution import rms
 from rgbmidic.report.style import LIGHT_COLOURS, STYLE, finish_picture, literal
 from rgbmidic.scene.scene import Scene
 from rgbmidic.scene.zones import REFLECTS
-from rgbmidic.settings.conversion import plain
+from rgbmidic.settings.conversion import to_plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FILES = ("plan.json", "plan.png")
-"""What `write_plan` writes."""
+"""Files that `write_plan` writes."""
 
 
 def write_plan(
-    plan: Plan, proposals: dict[str, Plan], out: Path, *, distance: float | None = None, overwrite: bool = False
+    plan: LampPlan, proposals: dict[str, LampPlan], out: Path, *, distance: float | None = None, overwrite: bool = False
 ) -> None:
     """Write plan.json and plan.png.
 
@@ -53,10 +53,10 @@ def write_plan(
     write_findings(out, FILES, figures, picture, overwrite=overwrite)
 
 
-def zone_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
+def zone_rows(plan: LampPlan) -> tuple[list[str], list[list[str]]]:
     """Headings and one row per state: field fractions where each light reflects, all do, one or none is clean."""
     rows = []
-    for label, state in _labelled(plan):
+    for label, state in _labelled_states(plan):
         fractions = [*state["reflecting"].values()]
         fractions += [state[key] for key in ("all_reflect", "one_light", "no_light", "saturated")]
         rows.append([label, f"{state['largest_motion_px']:.1f}", *(f"{fraction:.1%}" for fraction in fractions)])
@@ -64,13 +64,13 @@ def zone_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
     return ["state", "motion (px)", *names, "all", "one", "none", "clipped"], rows
 
 
-def uncertainty_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
-    """Headings and one row per state: standard uncertainty over the field in px, and its parts."""
+def uncertainty_rows(plan: LampPlan) -> tuple[list[str], list[list[str]]]:
+    """Return the headings and one row per state: standard uncertainty over the field in px, and its parts."""
     rows = []
-    for label, state in _labelled(plan):
+    for label, state in _labelled_states(plan):
         std = state["std_px"]
         values = [std["median"], std["q95"], state["random_px"], state["feigned_by_domes_px"]]
-        rows.append([label, *(number(value, ".4f") for value in values)])
+        rows.append([label, *(format_number(value, ".4f") for value in values)])
     return ["state", "median", "95 %", "random", "feigned"], rows
 
 
@@ -79,40 +79,40 @@ ZONE_WORDS = {
     "one, none": "a single light is clean, no light is",
     "clipped": "white paint saturates a channel",
 }
-"""What the headings of `zone_rows` mean."""
+"""Meaning of the headings of `zone_rows`."""
 UNCERTAINTY_WORDS = {
     "random": "camera noise, what demosaicing leaves of the mosaic, reflections that change",
     "feigned": "droplets whose lit sides change look as if they moved",
 }
-"""What the headings of `uncertainty_rows` mean."""
+"""Meaning of the headings of `uncertainty_rows`."""
 
 
-def _labelled(plan: Plan) -> Iterator[tuple[str, dict[str, Any]]]:
-    for place, outlook in enumerate(plan.outlooks, start=1):
+def _labelled_states(plan: LampPlan) -> Iterator[tuple[str, dict[str, Any]]]:
+    for state_number, outlook in enumerate(plan.outlooks, start=1):
         state = _state(plan, outlook)
-        yield f"{place}: {state['angle_deg']:g} deg" if state["angle_deg"] else str(place), state
+        yield f"{state_number}: {state['angle_deg']:g} deg" if state["angle_deg"] else str(state_number), state
 
 
-def lamp_rows(plan: Plan) -> tuple[list[str], list[list[str]]]:
+def lamp_rows(plan: LampPlan) -> tuple[list[str], list[list[str]]]:
     """Headings and one row per lamp: position (mm) as SCENE.toml states it, direction, largest zone of any state."""
     rows = []
     for index, lamp in enumerate(_lamps(plan)):
         worst = max(plan.fraction(outlook.reflects[index]) for outlook in plan.outlooks)
-        place = ", ".join(f"{round(value)}" for value in lamp["position_mm"])
+        position = ", ".join(f"{round(value)}" for value in lamp["position_mm"])
         angles = [f"{lamp[key]:.0f}" for key in ("azimuth_deg", "inclination_deg")]
-        rows.append([lamp["name"], f"[{place}]", *angles, f"{worst:.1%}"])
+        rows.append([lamp["name"], f"[{position}]", *angles, f"{worst:.1%}"])
     return ["light", "position = (mm)", "azimuth", "inclination", "reflects on"], rows
 
 
-def summary(plan: Plan) -> str:
-    """One line: the largest overlap of reflections, and the uncertainty over field and states."""
+def summary(plan: LampPlan) -> str:
+    """Return one line: the largest overlap of reflections, and the uncertainty over field and states."""
     overlap = max(plan.fraction(np.asarray(outlook.reflects.sum(axis=0) > 1)) for outlook in plan.outlooks)
     std = f"{plan.std:.4f} px" if math.isfinite(plan.std) else "unbounded: somewhere no light sees"
     return f"reflections overlap on up to {overlap:.1%} of the field; u_std {std}"
 
 
-def out_of_plane(plan: Plan, distance: float | None = None) -> dict[str, Any]:
-    """What a motion towards the camera feigns, which no single camera tells from a strain: dz / D of all lengths.
+def out_of_plane_error(plan: LampPlan, distance: float | None = None) -> dict[str, Any]:
+    """Return the strain that a motion towards the camera feigns, dz / D of all lengths: no single camera resolves it.
 
     Parameters
     ----------
@@ -139,29 +139,29 @@ def out_of_plane(plan: Plan, distance: float | None = None) -> dict[str, Any]:
     x, y = plan.scene.camera.centre
     edge = math.hypot(max(x - x0, x1 - x), max(y - y0, y1 - y)) / distance
     figures = {"stand_off_mm": distance, "strain_per_mm": 1 / distance, "edge_px_per_mm": edge}
-    return plain(figures | {"unseen_mm": plan.std / edge})  # type: ignore[no-any-return]
+    return to_plain(figures | {"unseen_mm": plan.std / edge})  # type: ignore[no-any-return]
 
 
-def plan_document(plan: Plan, proposals: dict[str, Plan], distance: float | None = None) -> dict[str, Any]:
+def plan_document(plan: LampPlan, proposals: dict[str, LampPlan], distance: float | None = None) -> dict[str, Any]:
     """Return the plan as plain values, for plan.json; fractions are of the field, an unknown number is null."""
     figures = {
         "field_px": plan.field,
         "element_size_px": plan.instrument.element_size,
         "reflects_from_specular_fraction": REFLECTS,
-        "out_of_plane": out_of_plane(plan, distance),
+        "out_of_plane": out_of_plane_error(plan, distance),
         **_arrangement(plan),
         "proposals": {name: {"gain": better.gain, **_arrangement(better)} for name, better in proposals.items()},
     }
-    return document("plan", figures)
+    return schema_document("plan", figures)
 
 
-def _arrangement(plan: Plan) -> dict[str, Any]:
+def _arrangement(plan: LampPlan) -> dict[str, Any]:
     states = [_state(plan, outlook) for outlook in plan.outlooks]
     return {"lights": _lamps(plan), "std_px": plan.std, "states": states}
 
 
-def _lamps(plan: Plan) -> list[dict[str, Any]]:
-    """The lamps; azimuth about the optical axis (0 to the right, 90 down) and inclination from it, from the body."""
+def _lamps(plan: LampPlan) -> list[dict[str, Any]]:
+    """Return lamps; azimuth about the optical axis (0 to the right, 90 down) and inclination from it, from the body."""
     lamps = []
     for light in plan.scene.lights:
         x, y, z = (a - b for a, b in zip(light.position, plan.scene.body.front, strict=True))
@@ -177,7 +177,7 @@ def _lamps(plan: Plan) -> list[dict[str, Any]]:
     return lamps
 
 
-def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
+def _state(plan: LampPlan, outlook: Outlook) -> dict[str, Any]:
     inside, names = plan.inside, [light.name for light in plan.scene.lights]
     std = outlook.std[inside & np.isfinite(outlook.std)]
     quantiles = np.quantile(std, [0.5, 0.95, 1.0]).tolist() if std.size else [math.nan] * 3
@@ -196,30 +196,36 @@ def _state(plan: Plan, outlook: Outlook) -> dict[str, Any]:
     }
 
 
-def plan_figure(plan: Plan, proposals: dict[str, Plan]) -> Figure:
+def plan_figure(plan: LampPlan, proposals: dict[str, LampPlan]) -> Figure:
     """Zones of the lights (above) and uncertainty (below) in the first and last state, and in the last as proposed."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     panels = {"first state": (plan, plan.outlooks[0]), "last state": (plan, plan.outlooks[-1])}
-    panels |= {f"last state, {name}": (one, one.outlooks[-1]) for name, one in proposals.items() if one.gain > 1}
-    levels = np.concatenate([outlook.std[one.inside] for one, outlook in panels.values()])
+    panels |= {
+        f"last state, {name}": (shown_plan, shown_plan.outlooks[-1])
+        for name, shown_plan in proposals.items()
+        if shown_plan.gain > 1
+    }
+    levels = np.concatenate([outlook.std[shown_plan.inside] for shown_plan, outlook in panels.values()])
     levels = levels[np.isfinite(levels)]
     top = float(np.quantile(levels, 0.98)) if levels.size else 1.0
     height, width = plan.scene.camera.shape
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(2.9 * len(panels) + 0.6, 2 * 2.7 * height / width + 0.9), layout="compressed")
         axes = figure.subplots(2, len(panels), squeeze=False, sharex=True, sharey=True)
-        for column, (title, (one, outlook)) in enumerate(panels.items()):
-            _draw_zones(axes[0, column], one, outlook)
-            turned = f": {outlook.state.angle_deg:g}°" if outlook.state.angle_deg else ""
-            axes[0, column].set_title(literal(f"{title}{turned}"))
+        for column, (title, (shown_plan, outlook)) in enumerate(panels.items()):
+            _draw_zones(axes[0, column], shown_plan, outlook)
+            angle_text = f": {outlook.state.angle_deg:g}°" if outlook.state.angle_deg else ""
+            axes[0, column].set_title(literal(f"{title}{angle_text}"))
             axes[1, column].set_facecolor("0.85")
-            look = {"cmap": "magma", "vmin": 0, "vmax": top, "interpolation": "nearest"}
-            shown = axes[1, column].imshow(np.ma.masked_invalid(outlook.std), extent=_extent(one), **look)
-            _draw_field(axes[1, column], one)
-        figure.colorbar(shown, ax=list(axes[1]), label="u_std (px)", extend="max", aspect=20, pad=0.02)
+            image_options = {"cmap": "magma", "vmin": 0, "vmax": top, "interpolation": "nearest"}
+            image = axes[1, column].imshow(
+                np.ma.masked_invalid(outlook.std), extent=_extent(shown_plan), **image_options
+            )
+            _draw_field(axes[1, column], shown_plan)
+        figure.colorbar(image, ax=list(axes[1]), label="u_std (px)", extend="max", aspect=20, pad=0.02)
         lines = [Line2D([], [], color=colour) for colour in _colours(plan.scene)]
         lines += [Line2D([], [], color="0.3", linestyle="--"), Line2D([], [], color="k", linewidth=0.9)]
         labels = [*(literal(light.name) for light in plan.scene.lights), "at rest", "field"]
@@ -231,13 +237,13 @@ def _colours(scene: Scene) -> list[str]:
     return [LIGHT_COLOURS.get(light.name, f"C{index}") for index, light in enumerate(scene.lights)]
 
 
-def _extent(plan: Plan) -> tuple[float, float, float, float]:
+def _extent(plan: LampPlan) -> tuple[float, float, float, float]:
     half = (plan.x[0, 1] - plan.x[0, 0]) / 2
     return plan.x[0, 0] - half, plan.x[0, -1] + half, plan.y[-1, 0] + half, plan.y[0, 0] - half
 
 
-def _draw_zones(axis: Axes, plan: Plan, outlook: Outlook) -> None:
-    """Specular fractions as colours, zones as lines: broken in the reference state, whole in this one."""
+def _draw_zones(axis: Axes, plan: LampPlan, outlook: Outlook) -> None:
+    """Draw the specular fractions as colours, zones as lines: broken in the reference state, whole in this one."""
     from matplotlib.colors import to_rgb
 
     body = np.isfinite(outlook.displacement[0])
@@ -255,12 +261,12 @@ def _draw_zones(axis: Axes, plan: Plan, outlook: Outlook) -> None:
     _draw_field(axis, plan)
 
 
-def _draw_field(axis: Axes, plan: Plan) -> None:
+def _draw_field(axis: Axes, plan: LampPlan) -> None:
     from matplotlib.patches import Rectangle
 
     x0, y0, x1, y1 = plan.field
     axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor="k", linewidth=0.9))
     height, width = plan.scene.camera.shape
-    place = axis.get_subplotspec()
-    finish_picture(axis, (-0.5, width - 0.5), (-0.5, height - 0.5), first=place.is_first_col())  # type: ignore[union-attr]
+    subplot = axis.get_subplotspec()
+    finish_picture(axis, (-0.5, width - 0.5), (-0.5, height - 0.5), first=subplot.is_first_col())  # type: ignore[union-attr]
     axis.label_outer()

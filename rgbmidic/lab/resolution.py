@@ -21,7 +21,7 @@ from scipy.sparse.linalg import splu
 
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.fields import NodalCovariance, StrainGauges
-from rgbmidic.lab import document, number, write_findings
+from rgbmidic.lab import format_number, schema_document, write_findings
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.size_figures import GaugeFigures, ResolutionStudy
 from rgbmidic.pipeline.suitability import SPECKLES
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FILES = ("resolution.csv", "resolution.json", "resolution.png")
-"""What `write_study` writes."""
+"""Files that `write_study` writes."""
 
 
 def cut_offs(gauges: Sequence[float]) -> tuple[float, float, FloatArray]:
@@ -58,24 +58,30 @@ def cut_offs(gauges: Sequence[float]) -> tuple[float, float, FloatArray]:
     fitted = splu(mesh.mass_matrix).solve(_integrals(mesh, 2 * np.pi / (8.0 * periods)))
     recovery = Recovery.over(mesh, np.ones(len(mesh.elements), bool), np.ones(len(mesh.nodes)))
     field = recovery.value @ fitted
-    shown = [_cut_off(mesh, periods, field, 3.0), _cut_off(mesh, periods, recovery.slope_x @ fitted, 3.0, slope=True)]
+    cut_offs_px = [
+        _cut_off(mesh, periods, field, 3.0),
+        _cut_off(mesh, periods, recovery.slope_x @ fitted, 3.0, slope=True),
+    ]
     covariance = NodalCovariance.from_mesh(mesh)
     for length in lengths:
         gauge = StrainGauges.at_nodes(covariance, 8 * length)
         slope = sp.csr_matrix((gauge.whole[0], (gauge.rows, gauge.nodes)), shape=(len(mesh.nodes),) * 2)
-        shown.append(_cut_off(mesh, periods, slope @ field, length / 2 + 2, slope=True))
+        cut_offs_px.append(_cut_off(mesh, periods, slope @ field, length / 2 + 2, slope=True))
     scale = np.asarray(gauges, dtype=np.float64) / lengths
-    return shown[0], shown[1], scale * np.asarray(shown[2:])
+    return cut_offs_px[0], cut_offs_px[1], scale * np.asarray(cut_offs_px[2:])
 
 
-def _integrals(mesh: Tri3Mesh, number: FloatArray, parts: int = 6) -> FloatArray:
-    """Integrals (N, 2 P) of each shape function times cosine and sine of wave numbers (P,) along x.
+def _integrals(mesh: Tri3Mesh, number: FloatArray, n_parts: int = 6) -> FloatArray:
+    """Return the integrals (N, 2 P) of each shape function times cosine and sine of wave numbers (P,) along x.
 
-    They are summed over so many `parts` of an element's side: 1e-3 of the amplitude at a period of two elements.
+    They are summed over so many `n_parts` of an element's side: 1e-3 of the amplitude at a period of two elements.
     """
-    i, j = np.indices((parts, parts)).reshape(2, -1)
-    low, high = i + j < parts, i + j < parts - 1  # the parts as the element lies, and those upside down between them
-    b, c = (np.concatenate([one[low] + 1 / 3, one[high] + 2 / 3]) / parts for one in (i, j))
+    i, j = np.indices((n_parts, n_parts)).reshape(2, -1)
+    low, high = (
+        i + j < n_parts,
+        i + j < n_parts - 1,
+    )  # the parts as the element lies, and those upside down between them
+    b, c = (np.concatenate([index_part[low] + 1 / 3, index_part[high] + 2 / 3]) / n_parts for index_part in (i, j))
     shape = np.stack([1 - b - c, b, c], axis=1)
     x = mesh.nodes[mesh.elements, 0] @ shape.T
     phase = x[..., None] * number
@@ -86,24 +92,30 @@ def _integrals(mesh: Tri3Mesh, number: FloatArray, parts: int = 6) -> FloatArray
 
 
 def _cut_off(
-    mesh: Tri3Mesh, periods: FloatArray, found: FloatArray, rim: float, *, slope: bool = False, kept: float = 0.9
+    mesh: Tri3Mesh,
+    periods: FloatArray,
+    reproduced: FloatArray,
+    rim: float,
+    *,
+    slope: bool = False,
+    min_gain: float = 0.9,
 ) -> float:
-    """Period, in elements, below which less than `kept` is found of cosine and sine (N, 2 P) inside the `rim`."""
+    """Period, in elements, below which less than `min_gain` is found of cosine and sine (N, 2 P) inside the `rim`."""
     number = 2 * np.pi / (8.0 * periods)
     low, high = mesh.nodes.min(axis=0) + 8 * rim, mesh.nodes.max(axis=0) - 8 * rim
     inner = ((mesh.nodes >= low - 1e-9) & (mesh.nodes <= high + 1e-9)).all(axis=1)
     phase = mesh.nodes[inner, :1] * number
-    cosine, sine = np.split(found[inner], 2, axis=1)
+    cosine, sine = np.split(reproduced[inner], 2, axis=1)
     if slope:
         cosine, sine = sine / number, -cosine / number
     gain = (cosine * np.cos(phase) + sine * np.sin(phase)).mean(axis=0)
-    below = np.flatnonzero(gain < kept)
-    if not below.size:
+    under_gain = np.flatnonzero(gain < min_gain)
+    if not under_gain.size:
         return float(periods[0])
-    last = below[-1]
+    last = under_gain[-1]
     if last + 1 == len(gain):
         return float("nan")
-    return float(np.interp(kept, gain[last : last + 2], periods[last : last + 2]))
+    return float(np.interp(min_gain, gain[last : last + 2], periods[last : last + 2]))
 
 
 SIZE_WORDS = {
@@ -115,37 +127,40 @@ SIZE_WORDS = {
     "cut-off": "period of a wave of which a tenth is lost, displacement / strain at the nodes, px",
     "CPU s": "of the solve of a frame",
 }
-"""What the headings of `size_rows` mean."""
+"""Meaning of the headings of `size_rows`."""
 GAUGE_WORDS = {
     "resolution": "noise of the strain, 1e-6",
     "largest": "99 % of the strains in the key frame are smaller, 1e-6: longer gauges level peaks",
     "cut-off": "period of a wave of which a tenth of the strain is lost, px",
 }
-"""What the headings of `gauge_rows` mean."""
+"""Meaning of the headings of `gauge_rows`."""
 
 
 def size_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
-    """Headings and one row per element size."""
+    """Return the headings and one row per element size."""
     rows = []
-    for one in _documents(study):
-        micro = [1e6 * one[f"strain_{key}"] for key in ("noise", "discretisation", "total")]
-        cells = [number(one["speckles"]), f"{one['nodes']}", f"{one['measured']:.0%}"]
-        cells += [", ".join(number(one[key]) for key in ("bias_px", "scatter_px"))]
-        cells += [number(one[key]) for key in ("noise_px", "discretisation_px", "total_px")]
-        cells += [", ".join(map(number, micro)), f"{one['cut_off_px']:.0f}, {one['strain_cut_off_px']:.0f}"]
-        rows.append([f"{one['element_size_px']:g} px", *cells, number(one["solve_cpu_s"])])
+    for size_figures in _documents(study):
+        micro = [1e6 * size_figures[f"strain_{key}"] for key in ("noise", "discretisation", "total")]
+        cells = [format_number(size_figures["speckles"]), f"{size_figures['nodes']}", f"{size_figures['measured']:.0%}"]
+        cells += [", ".join(format_number(size_figures[key]) for key in ("bias_px", "scatter_px"))]
+        cells += [format_number(size_figures[key]) for key in ("noise_px", "discretisation_px", "total_px")]
+        cells += [
+            ", ".join(map(format_number, micro)),
+            f"{size_figures['cut_off_px']:.0f}, {size_figures['strain_cut_off_px']:.0f}",
+        ]
+        rows.append([f"{size_figures['element_size_px']:g} px", *cells, format_number(size_figures["solve_cpu_s"])])
     headings = ["elements", "speckles", "nodes", "measured", "bias, scatter", "noise", "mesh", "total"]
     return [*headings, "strain: noise, mesh, total", "cut-off", "CPU s"], rows
 
 
 def gauge_rows(study: ResolutionStudy) -> tuple[list[str], list[list[str]]]:
-    """Headings and one row per element size and virtual strain gauge."""
+    """Return the headings and one row per element size and virtual strain gauge."""
     rows = []
-    for one in _documents(study):
-        for gauge in one["gauges"]:
-            length, noise, largest, at = gauge.values()
-            cells = [f"{length:g} px", number(1e6 * noise), number(1e6 * largest), f"{at:.0f}"]
-            rows.append([f"{one['element_size_px']:g} px", *cells])
+    for size_figures in _documents(study):
+        for gauge in size_figures["gauges"]:
+            length, noise, largest, cut_off = gauge.values()
+            cells = [f"{length:g} px", format_number(1e6 * noise), format_number(1e6 * largest), f"{cut_off:.0f}"]
+            rows.append([f"{size_figures['element_size_px']:g} px", *cells])
     return ["elements", "gauge", "resolution", "largest", "cut-off"], rows
 
 
@@ -162,9 +177,9 @@ def write_study(study: ResolutionStudy, out: Path, *, overwrite: bool = False) -
     lines = csv.writer(text, lineterminator="\n")
     headings = [key for key, value in sizes[0].items() if not isinstance(value, str | list)]
     lines.writerow([*headings, *(f"gauge_{key}" for key in _NO_GAUGE)])
-    for one in sizes:
-        for gauge in one["gauges"] or [_NO_GAUGE]:
-            lines.writerow([f"{value:.6g}" for value in (*(one[key] for key in headings), *gauge.values())])
+    for size_figures in sizes:
+        for gauge in size_figures["gauges"] or [_NO_GAUGE]:
+            lines.writerow([f"{value:.6g}" for value in (*(size_figures[key] for key in headings), *gauge.values())])
     figures = {
         "key_frame": {"index": study.frame, "name": study.name},
         "static_frames": study.static,
@@ -173,7 +188,7 @@ def write_study(study: ResolutionStudy, out: Path, *, overwrite: bool = False) -
         "recommendation": study.choice,
         "sizes": sizes,
     }
-    contents = text.getvalue(), document("resolution", figures), _figure(study)
+    contents = text.getvalue(), schema_document("resolution", figures), _figure(study)
     write_findings(out, FILES, *contents, overwrite=overwrite)
 
 
@@ -184,30 +199,30 @@ _NO_GAUGE = dict.fromkeys(("length_px", "noise", "largest", "cut_off_px"), float
 
 @lru_cache(maxsize=1)
 def _documents(study: ResolutionStudy) -> list[dict[str, Any]]:
-    """Figures of every size with their units in their names, cut-offs and gauges included."""
-    asked = sorted({gauge.length / one.element_size for one in study.sizes for gauge in one.gauges})
-    moved, strain, found = cut_offs(asked)
-    at = dict(zip(asked, found.tolist(), strict=True))
+    """Return the figures of every size with their units in their names, cut-offs and gauges included."""
+    lengths_in_elements = sorted({gauge.length / size.element_size for size in study.sizes for gauge in size.gauges})
+    displacement_cut_off, strain_cut_off, gauge_cut_offs = cut_offs(lengths_in_elements)
+    cut_off_of = dict(zip(lengths_in_elements, gauge_cut_offs.tolist(), strict=True))
 
     def gauge_figures(gauge: GaugeFigures, side: float) -> dict[str, float]:
-        figures = gauge.length, gauge.noise, gauge.largest, side * at[gauge.length / side]
+        figures = gauge.length, gauge.noise, gauge.largest, side * cut_off_of[gauge.length / side]
         return dict(zip(_NO_GAUGE, figures, strict=True))
 
     return [
         {
-            "element_size_px": one.element_size,
-            "speckles": one.speckles,
-            "nodes": one.nodes,
-            "measured": one.measured,
-            **{f"{name}_px": getattr(one, name) for name in _ERRORS},
-            **{f"strain_{name}": getattr(one.strain, name) for name in _ERRORS},
-            "cut_off_px": one.element_size * moved,
-            "strain_cut_off_px": one.element_size * strain,
-            "solve_cpu_s": one.seconds,
-            "reason": one.reason,
-            "gauges": [gauge_figures(gauge, one.element_size) for gauge in one.gauges],
+            "element_size_px": size.element_size,
+            "speckles": size.speckles,
+            "nodes": size.nodes,
+            "measured": size.measured,
+            **{f"{name}_px": getattr(size, name) for name in _ERRORS},
+            **{f"strain_{name}": getattr(size.strain, name) for name in _ERRORS},
+            "cut_off_px": size.element_size * displacement_cut_off,
+            "strain_cut_off_px": size.element_size * strain_cut_off,
+            "solve_cpu_s": size.seconds,
+            "reason": size.reason,
+            "gauges": [gauge_figures(gauge, size.element_size) for gauge in size.gauges],
         }
-        for one in study.sizes
+        for size in study.sizes
     ]
 
 
@@ -220,31 +235,31 @@ def _figure(study: ResolutionStudy) -> Figure:
     def draw(axes: list[Axes]) -> None:
         _draw_errors(axes[0], study)
         for axis, (key, unit, label) in zip(axes[1:], panels, strict=False):
-            for one in (one for one in study.sizes if one.gauges):
-                values = [unit * getattr(gauge, key) for gauge in one.gauges]
-                axis.plot([gauge.length for gauge in one.gauges], values, "o-", label=f"{one.element_size:g} px")
+            for size in (size for size in study.sizes if size.gauges):
+                values = [unit * getattr(gauge, key) for gauge in size.gauges]
+                axis.plot([gauge.length for gauge in size.gauges], values, "o-", label=f"{size.element_size:g} px")
             axis.set_yscale("log" if key == "noise" else "linear")
-            lengths = [gauge.length for one in study.sizes for gauge in one.gauges]
+            lengths = [gauge.length for size in study.sizes for gauge in size.gauges]
             _finish(axis, lengths, "virtual strain gauge (px)", label)
         if len(axes) > 1:
             axes[-1].legend(title="elements", loc="best")
 
-    count = 3 if any(one.gauges for one in study.sizes) else 1
+    count = 3 if any(size.gauges for size in study.sizes) else 1
     return draw_figure(draw, count=count, aspect=1.4, beside=NUMBERS)
 
 
 def _draw_errors(axis: Axes, study: ResolutionStudy) -> None:
-    sizes = [one.element_size for one in study.sizes]
+    sizes = [size.element_size for size in study.sizes]
     for key, label in (("noise", "noise"), ("discretisation", "discretisation error"), ("total", "both")):
-        axis.plot(sizes, [getattr(one, key) for one in study.sizes], "o-", label=label)
+        axis.plot(sizes, [getattr(size, key) for size in study.sizes], "o-", label=label)
     axis.set_yscale("log")
     if study.choice is not None:
         axis.axvline(study.choice.element_size, color="0.5", linestyle="--", zorder=0)
     if np.isfinite(study.speckle):
         axis.axvspan(0.7 * min(sizes), SPECKLES * study.speckle, color="0.93", zorder=0)
     axis.set_xlim(0.85 * min(sizes), 1.18 * max(sizes))
-    shown = [one.total for one in study.sizes if np.isfinite(one.total)]
-    axis.set_ylim(top=3 * max(shown, default=1 / 3))  # room for the legend
+    totals = [size.total for size in study.sizes if np.isfinite(size.total)]
+    axis.set_ylim(top=3 * max(totals, default=1 / 3))  # room for the legend
     axis.legend(loc="upper center")
     _finish(axis, sizes, "element size (px)", "displacement, rms over the nodes (px)")
 
@@ -256,11 +271,11 @@ def _finish(axis: Axes, lengths: Sequence[float], x: str, y: str) -> None:
     from rgbmidic.report.style import finish_plot
 
     finish_plot(axis, x, y)
-    shown = sorted(set(lengths))
+    ticks = sorted(set(lengths))
     axis.set_xscale("log")
     if axis.get_yscale() == "log":
         axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.yaxis.set_minor_formatter(NullFormatter())
     axis.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-    axis.set_xticks(shown, [f"{length:g}" for length in shown])
+    axis.set_xticks(ticks, [f"{length:g}" for length in ticks])
     axis.set_xticks([], minor=True)

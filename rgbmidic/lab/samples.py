@@ -19,7 +19,7 @@ from rgbmidic.errors import InputError, optional
 from rgbmidic.results.files import writing
 
 ADDRESS = "https://raw.githubusercontent.com"
-"""Where GitHub gives a file of a repository at a commit."""
+"""Address at which GitHub gives a file of a repository at a commit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +79,7 @@ class Sample:
 
     @property
     def source(self) -> str:
-        """Where it comes from."""
+        """Repository of the sample on GitHub."""
         return f"github.com/{self.repository}"
 
     @property
@@ -89,15 +89,15 @@ class Sample:
 
 
 def cache_folder() -> Path:
-    """Folder in which fetched files are kept: RGBMIDIC_SAMPLES, else the user's cache folder.
+    """Return the folder in which fetched files are kept: RGBMIDIC_SAMPLES, else the user's cache folder.
 
     Raises
     ------
     InputError
         pooch (extra ``sample``) is not installed.
     """
-    stated = os.environ.get("RGBMIDIC_SAMPLES")
-    return Path(stated) if stated else Path(optional("pooch", "sample").os_cache("rgbmidic"))
+    folder = os.environ.get("RGBMIDIC_SAMPLES")
+    return Path(folder) if folder else Path(optional("pooch", "sample").os_cache("rgbmidic"))
 
 
 def write_sample(name: str, folder: Path, report: Callable[[str], None] = lambda _: None) -> Sample:
@@ -128,10 +128,10 @@ def write_sample(name: str, folder: Path, report: Callable[[str], None] = lambda
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} is already there; state another folder: rgbmidic sample {name} FOLDER")
     sample = SAMPLES[name]
-    kept = [_fetch(sample, file, report) for file in sample.files]
+    cached = [_fetch(sample, file, report) for file in sample.files]
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        for file in kept:
+        for file in cached:
             shutil.copyfile(file, folder / file.name)
         if sample.settings:
             heading = f"# {sample.shows}\n# {sample.licence}, {sample.source} at commit {sample.commit}\n"
@@ -140,15 +140,15 @@ def write_sample(name: str, folder: Path, report: Callable[[str], None] = lambda
 
 
 def _fetch(sample: Sample, file: SampleFile, report: Callable[[str], None]) -> Path:
-    """The file in the cache, fetched where it is not there or not what was published."""
+    """Return the file in the cache, fetched where it is not there or not what was published."""
     pooch = optional("pooch", "sample")
     url = f"{ADDRESS}/{sample.repository}/{sample.commit}/{quote(file.path)}"
-    place = cache_folder() / sample.name
-    if not (place / file.name).is_file():
+    cache_path = cache_folder() / sample.name
+    if not (cache_path / file.name).is_file():
         report(f"{file.name} ({file.bytes / 1e6:.1f} MB) from {url}")
     pooch.get_logger().disabled = True
     try:
-        found = pooch.retrieve(url, f"sha256:{file.sha256}", fname=file.name, path=place)
+        local_path = pooch.retrieve(url, f"sha256:{file.sha256}", fname=file.name, path=cache_path)
     except ValueError as error:  # pooch's answer to another hash; it keeps nothing of the file
         if "hash" not in str(error):
             raise
@@ -156,21 +156,21 @@ def _fetch(sample: Sample, file: SampleFile, report: Callable[[str], None]) -> P
             f"{url} is not the file that was published: its SHA-256 is not {file.sha256}; nothing of it is kept"
         ) from None
     except OSError as error:  # requests' errors are such
-        answer = getattr(error, "response", None)
-        reason = f"the answer is {answer.status_code}" if answer is not None else error.strerror or "no connection"
+        response = getattr(error, "response", None)
+        reason = f"the answer is {response.status_code}" if response is not None else error.strerror or "no connection"
         raise InputError(
             f"{file.name} of sample {sample.name} cannot be fetched: {reason} ({url}); "
-            f"a file that was fetched by other means belongs into {place}"
+            f"a file that was fetched by other means belongs into {cache_path}"
         ) from None
-    return Path(found)
+    return Path(local_path)
 
 
-def _read() -> Iterator[tuple[str, Sample]]:
+def _read_samples() -> Iterator[tuple[str, Sample]]:
     text = Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
-    for name, stated in tomllib.loads(text).items():
-        files = tuple(SampleFile(**file) for file in stated.pop("files"))
-        yield name, Sample(name=name, files=files, **stated)
+    for name, entry in tomllib.loads(text).items():
+        files = tuple(SampleFile(**file) for file in entry.pop("files"))
+        yield name, Sample(name=name, files=files, **entry)
 
 
-SAMPLES: Mapping[str, Sample] = MappingProxyType(dict(_read()))
+SAMPLES: Mapping[str, Sample] = MappingProxyType(dict(_read_samples()))
 """All samples by name (samples.toml); sizes and hashes are those of the files at the commits."""

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.content import CORNERS, MeshContent, real, text_of
+from rgbmidic.mesh.mesh_file import CORNERS, MeshContent, parse_real, read_text
 
 logger = logging.getLogger(__name__)
 
@@ -29,25 +29,25 @@ _Rows = list[list[str]]
 
 def read_abaqus(path: Path) -> MeshContent:
     """Read nodes, elements and element sets of an input file, of its one part that has elements, or without parts."""
-    parts = dict[str, tuple[list[tuple[int, list[float]]], list[tuple[str, int, list[int]]]]]()
-    unread, part, instances = set[str](), "", dict[str, str]()
-    stated = list[tuple[str, dict[str, str], _Rows]]()
+    contents_by_part = dict[str, tuple[list[tuple[int, list[float]]], list[tuple[str, int, list[int]]]]]()
+    unread, part_name, instances = set[str](), "", dict[str, str]()
+    set_cards = list[tuple[str, dict[str, str], _Rows]]()
     for keyword, options, rows in _cards(path, set()):
-        nodes, elements = parts.setdefault(part, ([], []))
+        nodes, elements = contents_by_part.setdefault(part_name, ([], []))
         if keyword in _GENERATED or (keyword == "NODE" and options.get("SYSTEM", "R").upper() != "R"):
             raise InputError(
                 f"{path}: *{keyword} is not read: write nodes and elements out, in rectangular coordinates"
             )
         if keyword in ("PART", "END PART"):
-            part = options.get("NAME", "").upper()
+            part_name = options.get("NAME", "").upper()
         elif keyword == "INSTANCE":
             instances[options.get("NAME", "").upper()] = options.get("PART", "").upper()
-            if any(real(x) for row in rows for x in row):
+            if any(parse_real(x) for row in rows for x in row):
                 logger.warning(
                     "%s: rotation and translation of an *INSTANCE is not applied: nodes lie as in their part", path
                 )
         elif keyword == "NODE":
-            nodes += [(int(n), [real(x) for x in (*coordinates[:3], "", "", "")[:3]]) for n, *coordinates in rows]
+            nodes += [(int(n), [parse_real(x) for x in (*coordinates[:3], "", "", "")[:3]]) for n, *coordinates in rows]
         elif keyword == "ELEMENT":
             shape, cells = _elements(options["TYPE"], rows)
             if shape is None:
@@ -55,23 +55,25 @@ def read_abaqus(path: Path) -> MeshContent:
             else:
                 elements += [(shape, label, corners) for label, *corners in cells]
             if "ELSET" in options:
-                stated.append((part, {"ELSET": options["ELSET"]}, [[str(label)] for label, *_ in cells]))
+                set_cards.append((part_name, {"ELSET": options["ELSET"]}, [[str(label)] for label, *_ in cells]))
         elif keyword == "ELSET":
-            stated.append((part, options, rows))
-    meshed = {name: content for name, content in parts.items() if content[1]}
-    if len(meshed) > 1:
-        raise InputError(f"{path} has parts that number their nodes alike ({', '.join(meshed)}): write one of them")
-    if not meshed:
+            set_cards.append((part_name, options, rows))
+    parts_with_elements = {name: content for name, content in contents_by_part.items() if content[1]}
+    if len(parts_with_elements) > 1:
+        raise InputError(
+            f"{path} has parts that number their nodes alike ({', '.join(parts_with_elements)}): write one of them"
+        )
+    if not parts_with_elements:
         raise InputError(f"{path} has no elements that are read: plane ones, shells, membranes or solids")
-    ((part, (nodes, elements)),) = meshed.items()
-    if len(names := [name for name, whole in instances.items() if whole == part]) > 1:
-        raise InputError(f"{path} has the part {part} {len(names)} times ({', '.join(names)}): write one of them")
+    ((part_name, (nodes, elements)),) = parts_with_elements.items()
+    if len(names := [name for name, instance_part in instances.items() if instance_part == part_name]) > 1:
+        raise InputError(f"{path} has the part {part_name} {len(names)} times ({', '.join(names)}): write one of them")
     labels = {label for _, label, _ in elements}
     sets = _Sets(labels)
-    for scope, options, rows in stated:
-        if scope in (part, "") and instances.get(options.get("INSTANCE", "").upper(), part) == part:
+    for scope, options, rows in set_cards:
+        if scope in (part_name, "") and instances.get(options.get("INSTANCE", "").upper(), part_name) == part_name:
             sets.add(scope, options, rows)
-    return MeshContent.labelled(nodes, elements, sets.by_name(), unread)
+    return MeshContent.from_labels(nodes, elements, sets.by_name(), unread)
 
 
 class _Sets:
@@ -112,44 +114,46 @@ class _Sets:
 
 
 def _elements(name: str, rows: _Rows) -> tuple[str | None, list[list[int]]]:
-    """Shape of a type of elements, None of one that is not read, and the label and corners of each."""
-    planar, size = found.groups() if (found := _ELEMENT.match(name)) else (None, "")
+    """Return the shape of a type of elements, None of one that is not read, and the label and corners of each."""
+    planar, size = match.groups() if (match := _ELEMENT.match(name)) else (None, "")
     if (shape := (_PLANAR if planar else _SOLIDS).get(size)) is None:
         return None, []
     width = 1 + (6 if size == "65" else int(size))
-    every = [int(number) for row in rows for number in filter(None, row)]
-    if len(every) % width:
+    numbers = [int(number) for row in rows for number in filter(None, row)]
+    if len(numbers) % width:
         raise InputError(f"elements of type {name} have {width - 1} nodes")
-    return shape, [every[i : i + 1 + CORNERS[shape]] for i in range(0, len(every), width)]
+    return shape, [numbers[i : i + 1 + CORNERS[shape]] for i in range(0, len(numbers), width)]
 
 
-def _cards(path: Path, read: set[str]) -> Iterator[tuple[str, dict[str, str], _Rows]]:
-    """Keyword, options and rows of data of every card, in their order, with files that are included."""
+def _cards(path: Path, read_files: set[str]) -> Iterator[tuple[str, dict[str, str], _Rows]]:
+    """Yield the keyword, options and rows of data of every card, in their order, with files that are included."""
     keyword, options, rows = "", dict[str, str](), _Rows()
-    for line in (*_lines(path, read), "*"):
+    for line in (*_lines(path, read_files), "*"):
         entries = [entry.strip() for entry in line.split(",")]
         if not line.startswith("*"):
             rows.append(entries)
             continue
         if keyword == "INCLUDE":
-            yield from _cards(path.parent / options["INPUT"], read)
+            yield from _cards(path.parent / options["INPUT"], read_files)
         elif keyword:
             yield keyword, options, rows
         elif rows:
             raise InputError(f'{path} begins with "{rows[0][0][:40]}", which is no keyword')
         keyword = entries[0][1:].upper()
         options = {key.strip().upper(): value.strip() for key, _, value in (x.partition("=") for x in entries[1:])}
-        if odd := [key for key in options if key and not key[0].isalpha()]:
-            raise InputError(f'the line of *{keyword} ends with a comma and goes on with "{odd[0][:40]}", no option')
+        if invalid := [key for key in options if key and not key[0].isalpha()]:
+            raise InputError(
+                f'the line of *{keyword} ends with a comma and goes on with "{invalid[0][:40]}", no option'
+            )
         rows = []
         if keyword in ("NODE", "ELEMENT") and "INPUT" in options:
-            rows = [[x.strip() for x in row.split(",")] for row in _lines(path.parent / options["INPUT"], read)]
+            rows = [[x.strip() for x in row.split(",")] for row in _lines(path.parent / options["INPUT"], read_files)]
 
 
-def _lines(path: Path, read: set[str]) -> list[str]:
-    """Lines of a file without blank ones and comments; a keyword's goes on after a comma at its end."""
+def _lines(path: Path, read_files: set[str]) -> list[str]:
+    """Return the lines of a file without blank ones and comments; a keyword's goes on after a comma at its end."""
     lines = list[str]()
-    for line in map(str.strip, text_of(path, read).splitlines()):
+    for line in map(str.strip, read_text(path, read_files).splitlines()):
         if not line or line.startswith("**"):
             continue
         if lines and lines[-1].startswith("*") and lines[-1].endswith(",") and not line.startswith("*"):

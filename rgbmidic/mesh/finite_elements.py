@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import InputError
+from rgbmidic.errors import InputError, renamed_attributes
 from rgbmidic.typing import BoolArray, FloatArray, IntArray, as_numbers
 
 ROUNDING = 1e-4
-"""What rounding leaves of a distance, as a fraction of the mesh's extent: single precision and the eight columns of
+"""Error of a distance by rounding, as a fraction of the mesh's extent: single precision and the eight columns of
 Nastran 1e-6 to 1e-5 (derived)."""
 
 
@@ -42,6 +42,19 @@ class FiniteElementMesh:
         Millimetres per unit of length of the file; multiply a displacement in `fields` by it.
     numbering : str
         Origin of the numbers, in words.
+
+    Examples
+    --------
+    >>> from rgbmidic import FiniteElementMesh
+    >>> mesh = FiniteElementMesh(
+    ...     name="plate",
+    ...     points=np.array([[0, 0], [10, 0], [10, 5], [0, 5]]),
+    ...     node_numbers=np.array([1, 2, 3, 4]),
+    ...     elements=np.array([[0, 1, 2], [0, 2, 3]]),
+    ...     element_numbers=np.array([11, 12]),
+    ... )
+    >>> mesh.areas.tolist(), mesh.overlap()
+    ([25.0, 25.0], None)
     """
 
     name: str
@@ -54,9 +67,12 @@ class FiniteElementMesh:
     unit_mm: float = 1.0
     numbering: str = "labels of the file"
 
+    if not TYPE_CHECKING:  # mypy would accept any name
+        __getattr__ = renamed_attributes("FiniteElementMesh", part="subset")
+
     def __post_init__(self) -> None:
         """Check the arrays, convert them to their types and order the corners."""
-        points, elements, area = oriented(self.points, self.elements, self.name)
+        points, elements, area = orient_elements(self.points, self.elements, self.name)
         if not (area > 1e-12 * np.ptp(points, axis=0).max() ** 2).all():
             raise InputError(f"{self.name}: element {np.asarray(self.element_numbers)[area.argmin()]} has no area")
         for key, values, count in (
@@ -70,26 +86,26 @@ class FiniteElementMesh:
             values.setflags(write=False)
             object.__setattr__(self, key, values)
 
-    def part(self, chosen: BoolArray) -> Self:
+    def subset(self, selected: BoolArray) -> Self:
         """Return the chosen triangles (E,), and their nodes.
 
         Parameters
         ----------
-        chosen : ndarray, shape (E,), bool
+        selected : ndarray, shape (E,), bool
             The triangles that stay.
 
         Returns
         -------
         FiniteElementMesh
         """
-        used, index = np.unique(self.elements[chosen], return_inverse=True)
+        used_nodes, index = np.unique(self.elements[selected], return_inverse=True)
         return replace(
             self,
-            points=self.points[used],
-            node_numbers=self.node_numbers[used],
+            points=self.points[used_nodes],
+            node_numbers=self.node_numbers[used_nodes],
             elements=index.reshape(-1, 3).astype(np.int32),
-            element_numbers=self.element_numbers[chosen],
-            fields={key: values[used] for key, values in self.fields.items()},
+            element_numbers=self.element_numbers[selected],
+            fields={key: values[used_nodes] for key, values in self.fields.items()},
         )
 
     @property
@@ -98,7 +114,7 @@ class FiniteElementMesh:
         return cross(self.points, self.elements) / 2
 
     def overlap(self) -> tuple[int, int] | None:
-        """Numbers of two elements whose triangles overlap by more than rounding; None: no two do.
+        """Return the numbers of two elements whose triangles overlap by more than rounding; None: no two do.
 
         The triangles are sorted into strips along x, and those within a strip by their left ends. Two of them overlap
         by the least depth along the normals of their sides (separating axis theorem).
@@ -119,13 +135,15 @@ class FiniteElementMesh:
         strip = first[triangle] + np.arange(len(triangle)) - (np.cumsum(count) - count)[triangle]
         order = np.lexsort((low[triangle, 0], strip))
         triangle, strip = triangle[order], strip[order]
-        left, right = (strip * 2 + (side[triangle, 0] - self.points[:, 0].min()) / extent[0] for side in (low, high))
-        end = np.searchsorted(left, right)
-        one, step = np.arange(len(triangle)), 1
-        while len(one := one[one + step < end[one]]):
-            a, b = triangle[one], triangle[one + step]
-            beside = (low[a, 1] < high[b, 1]) & (low[b, 1] < high[a, 1])
-            a, b = a[beside], b[beside]
+        left_edge, right_edge = (
+            strip * 2 + (side[triangle, 0] - self.points[:, 0].min()) / extent[0] for side in (low, high)
+        )
+        end = np.searchsorted(left_edge, right_edge)
+        index, step = np.arange(len(triangle)), 1
+        while len(index := index[index + step < end[index]]):
+            a, b = triangle[index], triangle[index + step]
+            share_rows = (low[a, 1] < high[b, 1]) & (low[b, 1] < high[a, 1])
+            a, b = a[share_rows], b[share_rows]
             depth = np.minimum(_depth(corners[a], corners[b]), _depth(corners[b], corners[a]))
             if (depth > ROUNDING * extent.max()).any():
                 return int(self.element_numbers[a[depth.argmax()]]), int(self.element_numbers[b[depth.argmax()]])
@@ -133,27 +151,32 @@ class FiniteElementMesh:
         return None
 
 
-def oriented(
-    points: npt.ArrayLike, elements: npt.ArrayLike, what: str
+def orient_elements(
+    points: npt.ArrayLike, elements: npt.ArrayLike, name: str
 ) -> tuple[FloatArray, npt.NDArray[np.int32], FloatArray]:
     """Copies of nodes and triangles, checked and of their types, with corners as the axes turn; and twice the areas."""
-    nodes = np.ascontiguousarray(as_numbers(points, f"{what} has finite nodes (N, 2)", (None, 2)))
-    corners = as_numbers(elements, f"{what} has elements (E, 3), indices of nodes", (None, 3), dtype=np.int32)
+    nodes = np.ascontiguousarray(as_numbers(points, f"{name} has finite nodes (N, 2)", (None, 2)))
+    corners = as_numbers(elements, f"{name} has elements (E, 3), indices of nodes", (None, 3), dtype=np.int32)
     if not len(corners) or corners.min() < 0 or corners.max() >= len(nodes):
-        raise InputError(f"{what}: elements (E, 3) must be there and name existing nodes")
+        raise InputError(f"{name}: elements (E, 3) must be there and name existing nodes")
     area = cross(nodes, corners)
     corners[area < 0] = corners[area < 0][:, [0, 2, 1]]
     return nodes, corners, np.abs(area)
 
 
-def _depth(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Depth (n,) of triangles `other` (n, 3, 2) within `one`, which turns as the axes do, from its nearest side."""
-    side = np.roll(one, -1, axis=1) - one
+def _depth(triangle: FloatArray, other_triangle: FloatArray) -> FloatArray:
+    """Return the depth (n,) of `other_triangle` (n, 3, 2) within `triangle` from its nearest side.
+
+    The corners of `triangle` turn as the axes do.
+    """
+    side = np.roll(triangle, -1, axis=1) - triangle
     inward = np.stack([-side[..., 1], side[..., 0]], axis=2) / np.linalg.norm(side, axis=2, keepdims=True)
-    return np.asarray(np.einsum("nsk,nsck->nsc", inward, other[:, None] - one[:, :, None]).max(axis=2).min(axis=1))
+    return np.asarray(
+        np.einsum("nsk,nsck->nsc", inward, other_triangle[:, None] - triangle[:, :, None]).max(axis=2).min(axis=1)
+    )
 
 
 def cross(points: FloatArray, elements: npt.NDArray[np.integer]) -> FloatArray:
-    """Twice the signed area (...) of triangles (..., 3)."""
+    """Return twice the signed area (...) of triangles (..., 3)."""
     first, second = (points[elements[..., corner]] - points[elements[..., 0]] for corner in (1, 2))
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.content import MeshContent, sized
+from rgbmidic.mesh.mesh_file import MeshContent, limit_size
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ _NUMBERS = {"i": int, "q": int, "d": float}
 
 def read_gmsh(path: Path) -> MeshContent:
     """Read nodes, elements, physical groups and nodal data of such a file."""
-    content = sized(path).read_bytes().removeprefix(b"\xef\xbb\xbf")
+    content = limit_size(path).read_bytes().removeprefix(b"\xef\xbb\xbf")
     if not content.lstrip().startswith(b"$"):
         raise InputError(f"{path} is not a gmsh file: it does not begin with a section such as $MeshFormat")
     if (header := _HEADER.search(content)) is None:
@@ -48,13 +48,13 @@ def read_gmsh(path: Path) -> MeshContent:
     while section is not None:
         if section == "$MeshFormat":
             pass
-        elif (read := _SECTIONS.get(section)) is not None:
-            read(mesh, source)
+        elif (reader := _SECTIONS.get(section)) is not None:
+            reader(mesh, source)
         elif section.startswith("$"):  # of no use here
             source.skip(f"$End{section[1:]}")
         else:
             raise InputError(f'"{section[:40]}" stands in no section')
-        if (end := _word(source)) != f"$End{section[1:]}":
+        if (end := _read_word(source)) != f"$End{section[1:]}":
             raise InputError(f'after its stated number of rows {section} goes on with "{end[:40]}"')
         section = source.word()
     return mesh.content()
@@ -80,22 +80,22 @@ class _Text:
 
     def __init__(self, content: bytes) -> None:
         text = content.decode("utf-8", errors="replace")
-        self._words, self._at = re.findall(r'"[^"\n]*"|\S+', text), 0
+        self._words, self._index = re.findall(r'"[^"\n]*"|\S+', text), 0
 
     def word(self) -> str | None:
-        self._at += 1
-        return self._words[self._at - 1] if self._at <= len(self._words) else None
+        self._index += 1
+        return self._words[self._index - 1] if self._index <= len(self._words) else None
 
     def rows(self, layout: str, count: int = 1) -> list[list[Any]]:
-        kinds, begin, width = [_NUMBERS[kind] for kind in layout], self._at, len(layout)
-        self._at += _positive(count) * width
-        if self._at > len(self._words):
+        kinds, begin, width = [_NUMBERS[kind] for kind in layout], self._index, len(layout)
+        self._index += _require_count(count) * width
+        if self._index > len(self._words):
             raise EOFError
-        numbers = range(begin, self._at, width)
+        numbers = range(begin, self._index, width)
         return [[kind(x) for kind, x in zip(kinds, self._words[i : i + width], strict=True)] for i in numbers]
 
     def skip(self, end: str) -> None:
-        self._at = self._words.index(end, self._at) if end in self._words[self._at :] else len(self._words)
+        self._index = self._words.index(end, self._index) if end in self._words[self._index :] else len(self._words)
 
 
 class _Binary:
@@ -103,28 +103,28 @@ class _Binary:
 
     def __init__(self, content: bytes) -> None:
         """Begin with the number one, which shows the order of bytes."""
-        self._content, self._at, self._order = content, 4, "<" if content[:1] == b"\1" else ">"
+        self._content, self._offset, self._order = content, 4, "<" if content[:1] == b"\1" else ">"
 
     def word(self) -> str | None:
-        if (found := _WORD.match(self._content, self._at)) is None:
+        if (match := _WORD.match(self._content, self._offset)) is None:
             return None
-        self._at = found.end()
-        return found[1].decode("utf-8", errors="replace")
+        self._offset = match.end()
+        return match[1].decode("utf-8", errors="replace")
 
     def rows(self, layout: str, count: int = 1) -> list[tuple[Any, ...]]:
         row = struct.Struct(self._order + layout)
-        begin, self._at = self._at, self._at + _positive(count) * row.size
-        if self._at > len(self._content):
+        begin, self._offset = self._offset, self._offset + _require_count(count) * row.size
+        if self._offset > len(self._content):
             raise EOFError
-        return [*row.iter_unpack(self._content[begin : self._at])]
+        return [*row.iter_unpack(self._content[begin : self._offset])]
 
     def skip(self, end: str) -> None:
-        self._at = max(self._content.find(end.encode(), self._at), 0) or len(self._content)
+        self._offset = max(self._content.find(end.encode(), self._offset), 0) or len(self._content)
 
 
 @dataclass(slots=True)
 class _Mesh:
-    """What the sections of a file have stated."""
+    """Content of the sections of a file that are read so far."""
 
     is_old: bool = False
     names: dict[tuple[int, int], str] = field(default_factory=dict)
@@ -136,7 +136,7 @@ class _Mesh:
 
     def content(self) -> MeshContent:
         """Return it with checks; a node without data has NaN."""
-        content = MeshContent.labelled(self.nodes, self.elements, self.sets, ())
+        content = MeshContent.from_labels(self.nodes, self.elements, self.sets, ())
         fields = {}
         for name, values in self.data.items():
             empty = [np.nan] * len(next(iter(values.values()), [0.0]))
@@ -154,65 +154,65 @@ class _Mesh:
 
     def read_names(self, source: _Source) -> None:
         """Read ``$PhysicalNames``, which are text in every file."""
-        for _ in range(_whole(source)):
-            dimension, number = _whole(source), _whole(source)
-            self.names[dimension, number] = _word(source).strip('"')
+        for _ in range(_read_int(source)):
+            dimension, number = _read_int(source), _read_int(source)
+            self.names[dimension, number] = _read_word(source).strip('"')
 
     def read_entities(self, source: _Source) -> None:
         """Read the physical groups of the entities of version 4."""
         for dimension, count in enumerate(source.rows("qqqq")[0]):
             for _ in range(count):
                 entity = source.rows("i" + "d" * (3 if dimension == 0 else 6))[0][0]
-                self.groups[dimension, entity] = [abs(group) for (group,) in source.rows("i", _size(source))]
+                self.groups[dimension, entity] = [abs(group) for (group,) in source.rows("i", _read_size(source))]
                 if dimension:
-                    source.rows("i", _size(source))
+                    source.rows("i", _read_size(source))
 
     def read_nodes(self, source: _Source) -> None:
         """Read ``$Nodes``; those of curves and surfaces may have parameters."""
         if self.is_old:
-            self.nodes += [(label, place) for label, *place in source.rows("iddd", _whole(source))]
+            self.nodes += [(label, position) for label, *position in source.rows("iddd", _read_int(source))]
             return
         for _ in range(source.rows("qqqq")[0][0]):
             dimension, _, is_parametric = source.rows("iii")[0]
             if not (0 <= is_parametric * dimension <= 3):
                 raise InputError(f"nodes on an entity of {dimension} dimensions: 0 to 3 are possible")
-            labels = [label for (label,) in source.rows("q", _size(source))]
-            places = source.rows("ddd" + "d" * (is_parametric * dimension), len(labels))
-            self.nodes += [(label, place[:3]) for label, place in zip(labels, places, strict=True)]
+            labels = [label for (label,) in source.rows("q", _read_size(source))]
+            positions = source.rows("ddd" + "d" * (is_parametric * dimension), len(labels))
+            self.nodes += [(label, position[:3]) for label, position in zip(labels, positions, strict=True)]
 
     def read_parametric_nodes(self, source: _Source) -> None:
         """Read ``$ParametricNodes`` of version 2: each with dimension and number of its entity, and parameters."""
-        for _ in range(_whole(source)):
-            ((label, *place, dimension, _),) = source.rows("idddii")
+        for _ in range(_read_int(source)):
+            ((label, *position, dimension, _),) = source.rows("idddii")
             source.rows("d", dimension % 3)  # in a volume none are written
-            self.nodes.append((label, place))
+            self.nodes.append((label, position))
 
     def read_elements(self, source: _Source) -> None:
         """Read ``$Elements``: rows of text or blocks of version 2, blocks of entities of version 4."""
         if not self.is_old:
             for _ in range(source.rows("qqqq")[0][0]):
                 level, entity, kind = source.rows("iii")[0]
-                shape, width = _type(kind)
-                for tag, *corners in source.rows("q" * (1 + width), _size(source)):
+                shape, width = _element_type(kind)
+                for tag, *corners in source.rows("q" * (1 + width), _read_size(source)):
                     self.add(shape, tag, corners, self.groups.get((level, entity), ()))
             return
-        missing = _whole(source)
-        while missing > 0:
+        n_remaining = _read_int(source)
+        while n_remaining > 0:
             tag, kind, n_tags = source.rows("iii")[0]
-            kind, many = (tag, kind) if source.is_binary else (kind, 1)
-            shape, width = _type(kind)
+            kind, count = (tag, kind) if source.is_binary else (kind, 1)
+            shape, width = _element_type(kind)
             step = source.is_binary + n_tags + width
-            numbers = [x for (x,) in source.rows("i", many * step)]
+            numbers = [x for (x,) in source.rows("i", count * step)]
             for row in (numbers[i : i + step] for i in range(0, len(numbers), step)):
                 self.add(shape, row.pop(0) if source.is_binary else tag, row[n_tags:], row[: min(n_tags, 1)])
-            missing -= many
+            n_remaining -= count
 
     def read_nodal_data(self, source: _Source) -> None:
         """Read ``$NodeData``, whose head is text in every file."""
-        name, *_ = [_word(source).strip('"') for _ in range(_whole(source))]
-        for _ in range(_whole(source)):
-            _word(source)
-        _, width, count, *_ = [_whole(source) for _ in range(_whole(source))]
+        name, *_ = [_read_word(source).strip('"') for _ in range(_read_int(source))]
+        for _ in range(_read_int(source)):
+            _read_word(source)
+        _, width, count, *_ = [_read_int(source) for _ in range(_read_int(source))]
         if width not in (1, 3, 9):
             raise InputError(f"nodal data have 1, 3 or 9 components, not {width}")
         if name in self.data:
@@ -230,32 +230,32 @@ _SECTIONS = {
 }
 
 
-def _word(source: _Source) -> str:
+def _read_word(source: _Source) -> str:
     """Return the next word of a section."""
     if (word := source.word()) is None:
         raise EOFError
     return word
 
 
-def _whole(source: _Source) -> int:
+def _read_int(source: _Source) -> int:
     """Return the next word, a whole number."""
-    return int(_word(source))
+    return int(_read_word(source))
 
 
-def _size(source: _Source) -> int:
+def _read_size(source: _Source) -> int:
     """Return the next size."""
     return int(source.rows("q")[0][0])
 
 
-def _positive(count: int) -> int:
+def _require_count(count: int) -> int:
     """Refuse a count that is none."""
     if count < 0:
         raise InputError(f"it states {count} rows")
     return count
 
 
-def _type(kind: int) -> tuple[str, int]:
-    """Shape and number of nodes of an element type."""
+def _element_type(kind: int) -> tuple[str, int]:
+    """Return the shape and number of nodes of an element type."""
     if kind not in _TYPES:
         raise InputError(f"its elements of type {kind} are not read; those of types {', '.join(map(str, _TYPES))} are")
     return _TYPES[kind]

@@ -15,8 +15,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rgbmidic.errors import InputError, optional
-from rgbmidic.mesh.content import CORNERS, MOST_BYTES, MeshContent, sized, unique
-from rgbmidic.mesh.vtu import NUMBERS, labels_of
+from rgbmidic.mesh.mesh_file import CORNERS, MAX_BYTES, MeshContent, limit_size, require_unique
+from rgbmidic.mesh.vtu import NUMBERS, entity_labels
 from rgbmidic.typing import IntArray
 
 logger = logging.getLogger(__name__)
@@ -28,14 +28,14 @@ FORMATS = {".vtk": "vtk", ".xdmf": "xdmf", ".mesh": "medit", ".avs": "avsucd", "
 def read_with_meshio(path: Path, kind: str) -> MeshContent:
     """Read a file of one of meshio's formats, and the labels that it leaves out."""
     reader = optional(f"meshio.{kind}", "fe")
-    said = io.StringIO()
+    messages = io.StringIO()
     _check_limits(path, kind)
-    with warnings.catch_warnings(), redirect_stderr(said):
+    with warnings.catch_warnings(), redirect_stderr(messages):
         warnings.simplefilter("ignore")
         warnings.filterwarnings("error", "string or file could not be read to its end")
         mesh = reader.read(str(path))
-    if said.getvalue():
-        logger.warning("%s: %s", path, " ".join(said.getvalue().split()))
+    if messages.getvalue():
+        logger.warning("%s: %s", path, " ".join(messages.getvalue().split()))
     points = np.zeros((len(mesh.points), 3))
     points[:, : np.shape(mesh.points)[1]] = mesh.points
     cells = [(re.sub(r"\d+$", "", block.type), np.asarray(block.data)) for block in mesh.cells]
@@ -44,20 +44,23 @@ def read_with_meshio(path: Path, kind: str) -> MeshContent:
     by_block = np.split(labels, ends[:-1])
     sets: dict[str, Collection[int]] = {}
     for name, members in mesh.cell_sets.items():
-        given = [part[np.isin(np.arange(len(part)), m)] for part, m in zip(by_block, members, strict=False)]
-        sets[name] = np.concatenate(given)
+        member_labels = [
+            block_labels[np.isin(np.arange(len(block_labels)), m)]
+            for block_labels, m in zip(by_block, members, strict=False)
+        ]
+        sets[name] = np.concatenate(member_labels)
     for key in {"medit:ref", "cell_tags"} & set(mesh.cell_data):
         values = np.concatenate(mesh.cell_data[key])
         for tag in np.unique(values):
             sets.setdefault(str(int(tag)), labels[values == tag])
-    if wrong := [nodes.dtype for _, nodes in cells if nodes.dtype.kind not in "iu"]:
-        raise InputError(f"{path}: elements name their nodes by whole numbers, not by {wrong[0]}")
+    if invalid := [nodes.dtype for _, nodes in cells if nodes.dtype.kind not in "iu"]:
+        raise InputError(f"{path}: elements name their nodes by whole numbers, not by {invalid[0]}")
     return MeshContent(
         points=points,
         numbers=numbers,
         blocks=[
-            (shape, nodes.astype(np.int64), part)
-            for (shape, nodes), part in zip(cells, by_block, strict=True)
+            (shape, nodes.astype(np.int64), block_labels)
+            for (shape, nodes), block_labels in zip(cells, by_block, strict=True)
             if shape in CORNERS
         ],
         sets=sets,
@@ -73,15 +76,15 @@ def _labels(path: Path, kind: str, mesh: Any, nodes: int, cells: int) -> tuple[I
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
         rows = [line.split()[0] for line in lines if line.strip() and not line.startswith("#")][1 : 1 + nodes + cells]
         numbers, labels = np.split(np.array(list(map(int, rows)), dtype=np.int64), [nodes])
-        unique("element", labels)
+        require_unique("element", labels)
         return numbers, labels, "labels of the file"
     cell_data = {name: np.concatenate(values) for name, values in mesh.cell_data.items()}
-    return labels_of(mesh.point_data, cell_data, (nodes, cells), 0 if kind in ("vtk", "xdmf") else 1)
+    return entity_labels(mesh.point_data, cell_data, (nodes, cells), 0 if kind in ("vtk", "xdmf") else 1)
 
 
 def _check_limits(path: Path, kind: str) -> None:
     """Refuse what meshio would read for ever, without a limit, or only in part and without a word."""
-    content = sized(path).read_bytes()
+    content = limit_size(path).read_bytes()
     if kind in ("medit", "netgen"):
         counts = re.findall(rb"^[ \t]*(\d+)[ \t\r]*$", content, flags=re.MULTILINE)
         if large := [count for count in counts if int(count) > len(content)]:
@@ -90,11 +93,11 @@ def _check_limits(path: Path, kind: str) -> None:
         from h5py import File
 
         for item in ElementTree.fromstring(content).iter("DataItem"):
-            place = (item.text or "").strip()
+            text = (item.text or "").strip()
             if item.get("Format") == "Binary":
-                sized(Path(place))
+                limit_size(Path(text))
             elif item.get("Format") == "HDF":
-                file, _, name = place.partition(":")
-                with File(sized(path.resolve().parent / file)) as data:
-                    if data[name].nbytes > MOST_BYTES:
-                        raise InputError(f"{path}: {place} has {data[name].nbytes} bytes; up to {MOST_BYTES} are read")
+                file, _, name = text.partition(":")
+                with File(limit_size(path.resolve().parent / file)) as data:
+                    if data[name].nbytes > MAX_BYTES:
+                        raise InputError(f"{path}: {text} has {data[name].nbytes} bytes; up to {MAX_BYTES} are read")

@@ -17,7 +17,7 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.finite_elements import cross
-from rgbmidic.mesh.region import FARTHEST
+from rgbmidic.mesh.region import MAX_COORDINATE
 from rgbmidic.typing import BoolArray, FloatArray, as_numbers
 
 EDGES = np.array([[0, 1], [1, 2], [2, 0]])
@@ -30,47 +30,47 @@ class OutlineConstants:
 
     Attributes
     ----------
-    crowded
+    min_spacing
         Distance under which a node of the outline is left out beside another one, or beside a crack: the least angle of
         a triangle with two other sides of an element is then 17 degrees (derived). A path's end so near the region's
         edge counts as on it.
-    deep
+    min_depth
         Depth from which a lattice point is a node: over half the pitch, so that triangles at the outline are no flatter
         than those inside.
-    smoothed
+    outline_tolerance
         Distance within which the polygon of the outline follows its pixels, but at least a pixel: a chord of an
         element's length is that far from an arc with a radius of two elements (derived).
-    clear
+    crack_clearance
         Distance that nodes inside keep from a crack: they see a piece of it, at most an element long, under less than
         85 degrees, two of them from both sides under less than 180, which makes it an edge of the Delaunay mesh.
-    halvings
+    max_halvings
         Times that a piece of a crack is halved where another crack or the outline keeps it from being an edge: pieces
-        of a 16th of an element, 1.6 px for 25 px elements, are nearly as fine as a path is followed (`fine`).
-    sliver
+        of a 16th of an element, 1.6 px for 25 px elements, are nearly as fine as a path is followed (`path_tolerance`).
+    min_area
         Twice the area, in squares of an element's side, under which a triangle at the edge is left out: a regular one
         has .87, and one under .04 has too few pixels (8 for 20 px elements) for its six unknowns to be measured.
-    step
+    sample_step
         Distance (px) of the points at which a path is looked at: no pixel that it crosses by more than half is missed.
-    fine
+    path_tolerance
         How far (px) the row of nodes may be beside the stated path: pixels that near its edges are left out.
-    along
+    min_path_spacing
         Least distance of nodes along a path, and most by which a branch moves along the path it leaves: the nodes of
         an earlier path are at most an element apart.
-    sharp_deg
+    sharp_angle_deg
         Turn from which a corner of the outline is not given up for a crack beside it: polygons around round holes turn
         less from a radius of 12 px on.
     """
 
-    crowded: float = 0.3
-    deep: float = 0.6
-    smoothed: float = 0.06
-    clear: float = 0.55
-    halvings: int = 4
-    sliver: float = 0.04
-    step: float = 0.5
-    fine: float = 1.0
-    along: float = 0.5
-    sharp_deg: float = 60.0
+    min_spacing: float = 0.3
+    min_depth: float = 0.6
+    outline_tolerance: float = 0.06
+    crack_clearance: float = 0.55
+    max_halvings: int = 4
+    min_area: float = 0.04
+    sample_step: float = 0.5
+    path_tolerance: float = 1.0
+    min_path_spacing: float = 0.5
+    sharp_angle_deg: float = 60.0
 
 
 def outline_mesh(
@@ -80,7 +80,7 @@ def outline_mesh(
     origin: tuple[int, int] = (0, 0),
     constants: OutlineConstants = OutlineConstants(),
 ) -> tuple[FloatArray, npt.NDArray[np.int32]]:
-    """Nodes (N, 2) and elements (E, 3) of about `size` px for the region `mask` (H, W), split along `cracks`.
+    """Return nodes (N, 2) and elements (E, 3) of about `size` px for the region `mask` (H, W), split along `cracks`.
 
     The mask may be a part of a frame that begins at column and row `origin`: the nodes then lie as in all of it.
 
@@ -90,33 +90,35 @@ def outline_mesh(
         The region is too small for one element, or a crack misses it.
     """
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    beside = max(1.0, constants.smoothed * size)
-    polygons = [cv2.approxPolyDP(line, beside, True)[:, 0].astype(np.float64) for line in contours]
+    tolerance = max(1.0, constants.outline_tolerance * size)
+    polygons = [cv2.approxPolyDP(line, tolerance, True)[:, 0].astype(np.float64) for line in contours]
     edge, outlines = np.concatenate(contours)[:, 0].astype(np.float64), [line for line in polygons if len(line) >= 3]
     outline = _outline_points(outlines, size)
-    outline = outline[uncrowded(outline, constants.crowded * size)]
+    outline = outline[spacing_mask(outline, constants.min_spacing * size)]
     padded = np.pad(mask, 1).astype(np.uint8)
     depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
     inner = _lattice_points(mask.shape, size, origin)
-    inner = inner[depth[np.round(inner[:, 1]).astype(int), np.round(inner[:, 0]).astype(int)] > constants.deep * size]
-    sharp = _sharp_corners(outlines, constants.sharp_deg)
+    inner = inner[
+        depth[np.round(inner[:, 1]).astype(int), np.round(inner[:, 0]).astype(int)] > constants.min_depth * size
+    ]
+    sharp = _sharp_corners(outlines, constants.sharp_angle_deg)
     paths = _crack_paths(cracks, mask, edge, sharp, size, constants)
     if paths:
-        near = cKDTree(np.concatenate([_subdivided(path, constants.step) for path in paths]))
+        near = cKDTree(np.concatenate([_subdivide(path, constants.sample_step) for path in paths]))
         is_sharp = (outline[:, None] == sharp).all(axis=2).any(axis=1)
-        outline = outline[is_sharp | (near.query(outline)[0] > constants.crowded * size)]
-        inner = inner[near.query(inner)[0] > constants.clear * size]
-    points, triangles, pieces = _triangulated(np.concatenate([outline, inner]), paths, constants.halvings)
+        outline = outline[is_sharp | (near.query(outline)[0] > constants.min_spacing * size)]
+        inner = inner[near.query(inner)[0] > constants.crack_clearance * size]
+    points, triangles, pieces = _triangulate(np.concatenate([outline, inner]), paths, constants.max_halvings)
     centre = np.round(points[triangles].mean(axis=1)).astype(int)
     inside = mask[np.clip(centre[:, 1], 0, mask.shape[0] - 1), np.clip(centre[:, 0], 0, mask.shape[1] - 1)]
-    large = np.abs(cross(points, triangles)) > constants.sliver * size**2
+    large = np.abs(cross(points, triangles)) > constants.min_area * size**2
     triangles = triangles[inside & large]
     if not len(triangles):
         raise RegionError(f"the region of {int(mask.sum())} px is too small for one element of {size} px")
     return split_along(points, triangles, pieces)
 
 
-def _triangulated(
+def _triangulate(
     points: FloatArray, paths: list[FloatArray], halvings: int
 ) -> tuple[FloatArray, npt.NDArray[np.int32], npt.NDArray[np.int64]]:
     """Delaunay mesh of points (N, 2) and of the nodes of the paths, whose pieces are halved where they are no edges.
@@ -128,7 +130,7 @@ def _triangulated(
     """
     for _ in range(halvings + 1):
         nodes = np.concatenate([points, *paths])
-        nodes = nodes[uncrowded(nodes, 1e-6)]
+        nodes = nodes[spacing_mask(nodes, 1e-6)]
         try:
             triangles = Delaunay(nodes).simplices.astype(np.int32)
         except (QhullError, ValueError):
@@ -139,10 +141,10 @@ def _triangulated(
         missing = ~np.isin(edge_keys(pieces, len(nodes)), edge_keys(edges, len(nodes)))
         if not missing.any():
             return nodes, triangles, pieces
-        parts = np.split(missing, np.cumsum([len(path) - 1 for path in paths])[:-1])
+        missing_by_path = np.split(missing, np.cumsum([len(path) - 1 for path in paths])[:-1])
         paths = [
-            np.insert(path, np.flatnonzero(part) + 1, (path[1:] + path[:-1])[part] / 2, axis=0)
-            for path, part in zip(paths, parts, strict=True)
+            np.insert(path, np.flatnonzero(is_missing) + 1, (path[1:] + path[:-1])[is_missing] / 2, axis=0)
+            for path, is_missing in zip(paths, missing_by_path, strict=True)
         ]
     raise RegionError(
         "mesh.cracks cross, or run too close to each other or to a corner of the region, for the elements"
@@ -151,16 +153,20 @@ def _triangulated(
 
 def _lattice_points(shape: tuple[int, int], size: float, origin: tuple[int, int]) -> FloatArray:
     """Points of a triangular lattice with pitch `size` over a frame, in its part of `shape` that begins at `origin`."""
-    rise, (left, top) = size * np.sqrt(3) / 2, origin
-    rows = np.arange(rise / 2, top + shape[0] - 1, rise)
-    x = np.arange(0, left + shape[1] - 1 - size / 2, size)
-    x = x[x >= left] - left
-    points = [np.stack([x + (i % 2) * size / 2, np.full_like(x, y - top)], 1) for i, y in enumerate(rows) if y >= top]
+    rise, (x_origin, y_origin) = size * np.sqrt(3) / 2, origin
+    rows = np.arange(rise / 2, y_origin + shape[0] - 1, rise)
+    x = np.arange(0, x_origin + shape[1] - 1 - size / 2, size)
+    x = x[x >= x_origin] - x_origin
+    points = [
+        np.stack([x + (i % 2) * size / 2, np.full_like(x, y - y_origin)], 1)
+        for i, y in enumerate(rows)
+        if y >= y_origin
+    ]
     return np.concatenate(points) if points else np.empty((0, 2))
 
 
 def _outline_points(outlines: list[FloatArray], size: float) -> FloatArray:
-    """Points about `size` px apart along polygons; corners are kept."""
+    """Return the points about `size` px apart along polygons; corners are kept."""
     points = [np.empty((0, 2))]
     for corners in outlines:
         for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -177,7 +183,7 @@ def _crack_paths(
     size: float,
     constants: OutlineConstants,
 ) -> list[FloatArray]:
-    """Nodes (n, 2) of every crack (M, 2) within the region, at most `size` px apart.
+    """Return the nodes (n, 2) of every crack (M, 2) within the region, at most `size` px apart.
 
     A path that leaves the region or nearly reaches its edge ends on points of the `edge`, or on a `sharp` corner.
 
@@ -190,62 +196,62 @@ def _crack_paths(
     """
     paths: list[FloatArray] = []
     for number, crack in enumerate(cracks):
-        needed = f"mesh.cracks[{number}] is at least two finite corners (x, y) in px, within {FARTHEST} px"
-        corners = as_numbers(crack, needed, (None, 2))
-        if len(corners) < 2 or np.abs(corners).max() > FARTHEST:
-            raise InputError(f"{needed}; given is {crack!r}")
-        for part in _parts_within(corners, mask, size, number, constants.step):
+        requirement = f"mesh.cracks[{number}] is at least two finite corners (x, y) in px, within {MAX_COORDINATE} px"
+        corners = as_numbers(crack, requirement, (None, 2))
+        if len(corners) < 2 or np.abs(corners).max() > MAX_COORDINATE:
+            raise InputError(f"{requirement}; given is {crack!r}")
+        for segment in _segments_within(corners, mask, size, number, constants.sample_step):
             earlier = np.concatenate([np.empty((0, 2)), *paths])
-            at_edge = constants.crowded * size
-            ends = ((earlier, constants.along * size), (sharp, at_edge), (edge, at_edge))
-            paths.append(_path_nodes(part, ends, size, constants))
+            at_edge = constants.min_spacing * size
+            ends = ((earlier, constants.min_path_spacing * size), (sharp, at_edge), (edge, at_edge))
+            paths.append(_path_nodes(segment, ends, size, constants))
     return paths
 
 
-def _parts_within(corners: FloatArray, mask: BoolArray, size: float, number: int, step: float) -> list[FloatArray]:
+def _segments_within(corners: FloatArray, mask: BoolArray, size: float, number: int, step: float) -> list[FloatArray]:
     """Return the parts of a path within the region that are as long as an element, as points `step` px apart."""
-    points = _subdivided(corners, step)
+    points = _subdivide(corners, step)
     column, row = np.round(points).astype(int).T
     in_image = (column >= 0) & (column < mask.shape[1]) & (row >= 0) & (row < mask.shape[0])
     within = np.zeros(len(points), dtype=bool)
     within[in_image] = mask[row[in_image], column[in_image]]
     changes = np.flatnonzero(np.diff(within, prepend=False, append=False))
-    parts = [points[first:last] for first, last in changes.reshape(-1, 2)]
-    lengths = [float(np.hypot(*np.diff(part, axis=0).T).sum()) for part in parts]
-    long = [part for part, length in zip(parts, lengths, strict=True) if length + 2 * step >= size]
-    if not long:
+    segments = [points[first:last] for first, last in changes.reshape(-1, 2)]
+    lengths = [float(np.hypot(*np.diff(segment, axis=0).T).sum()) for segment in segments]
+    long_segments = [segment for segment, length in zip(segments, lengths, strict=True) if length + 2 * step >= size]
+    if not long_segments:
         rows, columns = np.nonzero(mask)
         raise RegionError(
             f"mesh.cracks[{number}] must run through the region (x {columns.min()} to {columns.max()}, y {rows.min()} "
             f"to {rows.max()} px) for at least an element, {size:g} px; given is {corners.tolist()}, with "
             f"{max(lengths, default=0.0):.0f} px in it"
         )
-    return long
+    return long_segments
 
 
 def _path_nodes(
-    part: FloatArray, places: Sequence[tuple[FloatArray, float]], size: float, constants: OutlineConstants
+    segment: FloatArray, targets: Sequence[tuple[FloatArray, float]], size: float, constants: OutlineConstants
 ) -> FloatArray:
-    """Nodes (n, 2) along a part of a path, at most `size` px apart.
+    """Return the nodes (n, 2) along a part of a path, at most `size` px apart.
 
-    Each end moves to the nearest of the first `places` (points, reach in px) that is within reach.
+    Each end moves to the nearest of the first `targets` (points, reach in px) that is within reach.
     """
-    corners = cv2.approxPolyDP(part.astype(np.float32), constants.fine, False)[:, 0].astype(np.float64)
+    corners = cv2.approxPolyDP(segment.astype(np.float32), constants.path_tolerance, False)[:, 0].astype(np.float64)
     for end in (0, -1):
-        for points, reach in places:
+        for points, reach in targets:
             distance = np.hypot(*(points - corners[end]).T)
             if distance.min(initial=np.inf) <= reach:
                 corners[end] = points[np.argmin(distance)]
                 break
-    nodes = _subdivided(corners, size)
+    nodes = _subdivide(corners, size)
     ends_first = np.roll(nodes, 1, axis=0)
-    nodes = np.roll(ends_first[uncrowded(ends_first, constants.along * size)], -1, axis=0)
+    nodes = np.roll(ends_first[spacing_mask(ends_first, constants.min_path_spacing * size)], -1, axis=0)
     # a crack between two tips opens only if a node lies in between
-    return nodes if len(nodes) > 2 else _subdivided(nodes, float(np.hypot(*(nodes[1] - nodes[0]))) / 2)
+    return nodes if len(nodes) > 2 else _subdivide(nodes, float(np.hypot(*(nodes[1] - nodes[0]))) / 2)
 
 
 def _sharp_corners(polygons: Sequence[FloatArray], turn_deg: float) -> FloatArray:
-    """Corners (n, 2) at which polygons (M, 2) turn by more than `turn_deg`."""
+    """Return the corners (n, 2) at which polygons (M, 2) turn by more than `turn_deg`."""
     sharp = [np.empty((0, 2))]
     for corners in polygons:
         side = np.roll(corners, -1, axis=0) - corners
@@ -254,7 +260,7 @@ def _sharp_corners(polygons: Sequence[FloatArray], turn_deg: float) -> FloatArra
     return np.concatenate(sharp)
 
 
-def _subdivided(corners: FloatArray, longest: float) -> FloatArray:
+def _subdivide(corners: FloatArray, longest: float) -> FloatArray:
     """Return a path's corners (M, 2) and points between them, at most `longest` px apart."""
     points = [corners[:1]]
     for start, end in pairwise(corners):
@@ -286,12 +292,12 @@ def split_along(
 
 
 def edge_keys(edges: npt.NDArray[np.integer], nodes: int) -> npt.NDArray[np.int64]:
-    """One number for each edge (n, 2) of a mesh of so many nodes, whichever way it runs."""
+    """Return one number for each edge (n, 2) of a mesh of so many nodes, whichever way it runs."""
     return np.asarray(edges.min(axis=1).astype(np.int64) * nodes + edges.max(axis=1))
 
 
-def uncrowded(points: FloatArray, distance: float) -> BoolArray:
-    """Points (N,) to keep: without those that lie closer than `distance` to a kept one before them."""
+def spacing_mask(points: FloatArray, distance: float) -> BoolArray:
+    """Return the points (N,) to keep as a mask: without those closer than `distance` to a kept one before them."""
     keep = np.ones(len(points), dtype=bool)
     for i, j in sorted(cKDTree(points).query_pairs(distance)):
         if keep[i]:

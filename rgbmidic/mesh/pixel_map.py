@@ -82,8 +82,8 @@ class PixelMap:
         element, row, column, length = _owned_rows(owner)
         if not element.size:
             raise RegionError("no pixel of the region of interest lies in the mesh")
-        top, left = int(row.min()), int(column.min())
-        size = int(row.max()) - top + 1, int((column + length).max()) - left
+        first_row, first_column = int(row.min()), int(column.min())
+        size = int(row.max()) - first_row + 1, int((column + length).max()) - first_column
         corners = mesh.nodes[mesh.elements]
         origin = np.round(corners.mean(axis=1)).astype(np.int64)
         first, local = np.cumsum(length) - length, (column - origin[element, 0], row - origin[element, 1])
@@ -104,8 +104,8 @@ class PixelMap:
             shape=region.mask.shape,
             runs=runs,
             run_offsets=run_offsets,
-            bounds=(top, left, *size),
-            lines=np.stack([first, length, row - top, column - left], axis=1).astype(np.int32),
+            bounds=(first_row, first_column, *size),
+            lines=np.stack([first, length, row - first_row, column - first_column], axis=1).astype(np.int32),
         )
 
     @property
@@ -116,21 +116,21 @@ class PixelMap:
     @property
     def rows(self) -> npt.NDArray[np.int64]:
         """Row of every owned pixel in the image (P,)."""
-        return self.of_elements(np.ones(len(self.origin), dtype=bool))[2]
+        return self.element_pixels(np.ones(len(self.origin), dtype=bool))[2]
 
     @property
     def columns(self) -> npt.NDArray[np.int64]:
         """Column of every owned pixel in the image (P,)."""
-        return self.of_elements(np.ones(len(self.origin), dtype=bool))[1]
+        return self.element_pixels(np.ones(len(self.origin), dtype=bool))[1]
 
-    def of_elements(
-        self, chosen: BoolArray
+    def element_pixels(
+        self, selected: BoolArray
     ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Slots, columns and rows (n,) of the pixels of the chosen elements (E,).
+        """Return the slots, columns and rows (n,) of the pixels of the chosen elements (E,).
 
         Parameters
         ----------
-        chosen : ndarray, shape (E,), bool
+        selected : ndarray, shape (E,), bool
             The elements.
 
         Returns
@@ -138,12 +138,12 @@ class PixelMap:
         slots, columns, rows : ndarray, shape (n,), int64
         """
         counts = np.diff(self.offsets)
-        slots = np.flatnonzero(np.repeat(chosen, counts))
-        x, y = np.repeat(self.origin[chosen].T, counts[chosen], axis=1)
+        slots = np.flatnonzero(np.repeat(selected, counts))
+        x, y = np.repeat(self.origin[selected].T, counts[selected], axis=1)
         return slots, self.local_x[slots].astype(np.int64) + x, self.local_y[slots].astype(np.int64) + y
 
     def gather(self, image: FloatImage) -> FloatImage:
-        """Values of an image (..., H, W) at the owned pixels, shape (..., P).
+        """Return the values of an image (..., H, W) at the owned pixels, shape (..., P).
 
         Parameters
         ----------
@@ -160,7 +160,7 @@ class PixelMap:
         return out
 
     def grid(self, side: int) -> tuple[int, int]:
-        """Rows and columns of the blocks of `side` px that cover `bounds`.
+        """Return the rows and columns of the blocks of `side` px that cover `bounds`.
 
         Parameters
         ----------
@@ -214,7 +214,7 @@ class PixelMap:
         return out
 
     def scatter(self, values: FloatImage, fill: float = 0.0) -> FloatImage:
-        """Image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere.
+        """Return the image (H, W) with `values` (P,) at the owned pixels and `fill` elsewhere.
 
         Parameters
         ----------

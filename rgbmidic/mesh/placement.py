@@ -52,6 +52,15 @@ class Placement:
         Lens and plane; None: the image is similar to the mesh (rotated, shifted and scaled).
     pairs : ndarray, shape (n, 4)
         The pairs (x_mm, y_mm, x_px, y_px) that it was fitted to.
+
+    Examples
+    --------
+    >>> from rgbmidic import Placement
+    >>> placement = Placement.fit([(0, 0, 100, 300), (10, 0, 200, 300), (0, 20, 100, 100)])
+    >>> placement.to_px(np.array([[5.0, 5.0]])).round(6).tolist()
+    [[150.0, 250.0]]
+    >>> round(placement.mm_per_pixel, 6)
+    0.1
     """
 
     matrix: FloatArray
@@ -60,7 +69,7 @@ class Placement:
     pairs: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
 
     @classmethod
-    def fit(cls, pairs: npt.ArrayLike, camera: Plane | None = None, *, where: str = "mesh.points") -> Self:
+    def fit(cls, pairs: npt.ArrayLike, camera: Plane | None = None, *, label: str = "mesh.points") -> Self:
         """Fit a placement to pairs of points by least squares.
 
         Without a camera it is a similarity: shift, rotation and scale. With one it is a rigid motion, for both have mm.
@@ -74,7 +83,7 @@ class Placement:
             (x_mm, y_mm, x_px, y_px), two or more.
         camera
             Lens and plane.
-        where
+        label
             Name of the pairs in messages.
 
         Returns
@@ -86,37 +95,39 @@ class Placement:
         InputError
             Fewer than two pairs, or two at one place.
         """
-        needed = f"{where} is two or more pairs [x_mm, y_mm, x_px, y_px] of finite numbers"
-        given = as_numbers(pairs, needed, (None, 4))
-        if len(given) < 2:
-            raise InputError(f"{needed}; given is {pairs!r}")
-        for part, what in ((given[:, :2], "on the mesh"), (given[:, 2:], "on the image")):
-            same = np.argwhere(np.triu((part[:, None] == part).all(axis=2), 1))
+        requirement = f"{label} is two or more pairs [x_mm, y_mm, x_px, y_px] of finite numbers"
+        pair_array = as_numbers(pairs, requirement, (None, 4))
+        if len(pair_array) < 2:
+            raise InputError(f"{requirement}; given is {pairs!r}")
+        for positions, surface in ((pair_array[:, :2], "on the mesh"), (pair_array[:, 2:], "on the image")):
+            same = np.argwhere(np.triu((positions[:, None] == positions).all(axis=2), 1))
             if len(same):
-                raise InputError(f"{where}: pairs {same[0].tolist()} are one point {what}")
+                raise InputError(f"{label}: pairs {same[0].tolist()} are one point {surface}")
         if camera is not None:
-            on_plane, on_mesh = (part - part.mean(axis=0) for part in (camera.to_mm(given[:, 2:]), given[:, :2]))
+            on_plane, on_mesh = (
+                positions - positions.mean(axis=0) for positions in (camera.to_mm(pair_array[:, 2:]), pair_array[:, :2])
+            )
             stretch = np.linalg.norm(on_plane) / np.linalg.norm(on_mesh)
             # a wrong unit is 25 or more, a scale that is known to 5 % is no calibration (chosen)
             if not 1 / 1.05 < stretch < 1.05:
                 raise InputError(
-                    f"the pairs of {where} lie {stretch:.4g} times as far apart on the camera's plane as on the mesh, "
+                    f"the pairs of {label} lie {stretch:.4g} times as far apart on the camera's plane as on the mesh, "
                     "where both are in mm: look at mesh.unit, the points and the calibration"
                 )
-        best, other = (cls._fitted(given, camera, reflected) for reflected in (True, False))
+        best, alternative = (cls._fitted(pair_array, camera, reflected) for reflected in (True, False))
         # a point set by hand is a click on a whole pixel; three times as much is beyond any scatter (both chosen)
-        pointing_px, decided = 0.5, 3.0
-        if len(given) > 2:
-            small, large = sorted((best.rms, other.rms))
-            if large < decided * max(small, pointing_px):
+        pointing_px, decisive_ratio = 0.5, 3.0
+        if len(pair_array) > 2:
+            small, large = sorted((best.rms, alternative.rms))
+            if large < decisive_ratio * max(small, pointing_px):
                 text = "%s does not decide whether the image shows the mesh or its mirror image: up is taken"
-                logger.warning(text, where)
-            elif other.rms < best.rms:
-                best = other
-        if best.rms > decided * pointing_px:
-            off = np.hypot(*best.residuals.T)
+                logger.warning(text, label)
+            elif alternative.rms < best.rms:
+                best = alternative
+        if best.rms > decisive_ratio * pointing_px:
+            distance = np.hypot(*best.residuals.T)
             text = "%s leaves residuals of %.1f px rms, the largest, %.1f px, at %s[%d]: check the pairs"
-            logger.warning(text, where, best.rms, off.max(), where, off.argmax())
+            logger.warning(text, label, best.rms, distance.max(), label, distance.argmax())
         return best
 
     @classmethod
@@ -133,7 +144,7 @@ class Placement:
 
     @property
     def reflected(self) -> bool:
-        """Whether a counter-clockwise turn of the mesh (x right, y up) is one on the screen, where y points down."""
+        """True if a counter-clockwise turn of the mesh (x right, y up) is one on the screen, where y points down."""
         return bool(np.linalg.det(self.matrix) < 0)
 
     @property
@@ -173,8 +184,8 @@ class Placement:
         ndarray, shape (N, 2)
             Points (x, y) of the image, px.
         """
-        places = points @ self.matrix.T + self.shift
-        return places if self.camera is None else self.camera.to_px(places)
+        positions = points @ self.matrix.T + self.shift
+        return positions if self.camera is None else self.camera.to_px(positions)
 
     def to_mm(self, points: FloatArray) -> FloatArray:
         """Return points (N, 2) of the image, in px, in mm in the mesh's axes.
@@ -189,11 +200,11 @@ class Placement:
         ndarray, shape (N, 2)
             In mm.
         """
-        places = points if self.camera is None else self.camera.to_mm(points)
-        return np.asarray((places - self.shift) @ np.linalg.inv(self.matrix).T)
+        positions = points if self.camera is None else self.camera.to_mm(points)
+        return np.asarray((positions - self.shift) @ np.linalg.inv(self.matrix).T)
 
     def jacobian(self, points: FloatArray) -> FloatArray:
-        """Derivative (N, 2, 2) of `to_mm` at points (N, 2) in px: ``[n, mesh axis, px axis]``, mm per px.
+        """Return the derivative (N, 2, 2) of `to_mm` at points (N, 2) in px: ``[n, mesh axis, px axis]``, mm per px.
 
         Parameters
         ----------
@@ -205,13 +216,13 @@ class Placement:
         ndarray, shape (N, 2, 2)
             In mm per px.
         """
-        back = np.linalg.inv(self.matrix)
+        inverse = np.linalg.inv(self.matrix)
         if self.camera is None:
-            return np.broadcast_to(back, (len(points), 2, 2)).copy()
-        return np.asarray(back @ self.camera.jacobian(points))
+            return np.broadcast_to(inverse, (len(points), 2, 2)).copy()
+        return np.asarray(inverse @ self.camera.jacobian(points))
 
     def vectors_to_mm(self, points: FloatArray, vectors: FloatArray) -> FloatArray:
-        """Displacements (N, 2) in mm in the mesh's axes, of `vectors` (N, 2) in px from `points` (N, 2) in px.
+        """Return displacements (N, 2) in mm in the mesh's axes, of `vectors` (N, 2) in px from `points` (N, 2) in px.
 
         Parameters
         ----------
@@ -226,7 +237,7 @@ class Placement:
         return self.to_mm(points + vectors) - self.to_mm(points)
 
     def vectors_to_px(self, points: FloatArray, vectors: FloatArray) -> FloatArray:
-        """Displacements (N, 2) in px, of `vectors` (N, 2) in mm from `points` (N, 2) in mm, in the mesh's axes.
+        """Return displacements (N, 2) in px, of `vectors` (N, 2) in mm from `points` (N, 2) in mm, in the mesh's axes.
 
         Parameters
         ----------
@@ -274,14 +285,14 @@ class Placement:
         -------
         str
         """
-        turned = np.degrees(np.arctan2(self.matrix[1, 0], self.matrix[0, 0]))
+        angle_deg = np.degrees(np.arctan2(self.matrix[1, 0], self.matrix[0, 0]))
         scale = f"{uncertain(self.mm_per_pixel, self.mm_per_pixel_std, 'mm per px')}, " if self.mm_per_pixel else ""
         fit = f"{len(self.pairs)} pairs, residuals {self.rms:.2g} px rms"
-        return f"{scale}x axis at {turned:.2f} degrees, y axis {'up' if self.reflected else 'down'}; {fit}"
+        return f"{scale}x axis at {angle_deg:.2f} degrees, y axis {'up' if self.reflected else 'down'}; {fit}"
 
 
-def on_image(
-    finite_elements: FiniteElementMesh, placement: Placement, shape: tuple[int, int], inside: Region | None = None
+def place_on_image(
+    finite_elements: FiniteElementMesh, placement: Placement, shape: tuple[int, int], region: Region | None = None
 ) -> tuple[FiniteElementMesh, Tri3Mesh, Region]:
     """Place a mesh on images of `shape` (H, W); the log states how much of it is left out.
 
@@ -291,7 +302,7 @@ def on_image(
         The mesh, and where it lies.
     shape
         Rows and columns of the images.
-    inside
+    region
         Only triangles whose centre lies in it.
 
     Returns
@@ -305,25 +316,30 @@ def on_image(
         No element is left.
     """
     corners = placement.to_px(finite_elements.points)[finite_elements.elements]
-    last = np.array([shape[1] - 1, shape[0] - 1])
-    within = np.asarray(((corners >= 0) & (corners <= last)).all(axis=(1, 2)), dtype=bool).reshape(-1)
-    kept = within.copy()
-    if inside is not None:
-        column, row = np.clip(np.round(corners[within].mean(axis=1)).astype(int), 0, last).T
-        kept[within] = inside.mask[row, column]
-    if not kept.any():
+    last_pixel = np.array([shape[1] - 1, shape[0] - 1])
+    within = np.asarray(((corners >= 0) & (corners <= last_pixel)).all(axis=(1, 2)), dtype=bool).reshape(-1)
+    selected = within.copy()
+    if region is not None:
+        column, row = np.clip(np.round(corners[within].mean(axis=1)).astype(int), 0, last_pixel).T
+        selected[within] = region.mask[row, column]
+    if not selected.any():
         low, high = np.nanmin(corners, axis=(0, 1)), np.nanmax(corners, axis=(0, 1))
         raise RegionError(
             f"no element of {finite_elements.name} lies in the {'region' if within.any() else 'image'}: mesh.points "
             f"place it at x {low[0]:.0f} to {high[0]:.0f}, y {low[1]:.0f} to {high[1]:.0f} px of an image of "
             f"{shape[1]} x {shape[0]} px"
         )
-    every = len(kept)
-    for count, where in ((every - int(within.sum()), "the image"), (int((within & ~kept).sum()), "the region")):
+    n_triangles = len(selected)
+    for count, boundary in (
+        (n_triangles - int(within.sum()), "the image"),
+        (int((within & ~selected).sum()), "the region"),
+    ):
         if count:
-            logger.warning("%s: %d of %d triangles lie outside %s: left out", finite_elements.name, count, every, where)
-    part = finite_elements.part(kept)
-    mesh = Tri3Mesh(nodes=placement.to_px(part.points), elements=part.elements)
+            logger.warning(
+                "%s: %d of %d triangles lie outside %s: left out", finite_elements.name, count, n_triangles, boundary
+            )
+    subset = finite_elements.subset(selected)
+    mesh = Tri3Mesh(nodes=placement.to_px(subset.points), elements=subset.elements)
     owner = np.full(shape, -1, dtype=np.int32)
     claim_pixels(mesh.nodes, mesh.elements, owner)
-    return part, mesh, Region.from_mask(owner >= 0)
+    return subset, mesh, Region.from_mask(owner >= 0)

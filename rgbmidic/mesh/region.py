@@ -6,18 +6,18 @@ import logging
 import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import RegionError
+from rgbmidic.errors import RegionError, renamed_attributes
 from rgbmidic.typing import BoolArray, FloatArray, as_numbers
 
 logger = logging.getLogger(__name__)
 
-FARTHEST = 1_000_000
+MAX_COORDINATE = 1_000_000
 """Coordinates of images are within so many px: OpenCV's fixed-point ones end at 8 million."""
 
 
@@ -32,11 +32,23 @@ class Region:
         Stated if the region is a rectangle with sides along the axes; it includes the pixels whose centres lie on it.
     origin : tuple of int
         Column and row of the first pixel of the mask in the frame.
+
+    Examples
+    --------
+    >>> from rgbmidic import Region
+    >>> region = Region.from_rectangle((10, 10, 90, 70), shape=(80, 120))
+    >>> region.width, int(region.mask.sum())
+    (61, 4941)
+    >>> int(region.without([[(20, 20), (40, 20), (40, 40)]]).mask.sum())
+    4710
     """
 
     mask: BoolArray
     rectangle: tuple[float, float, float, float] | None = None
     origin: tuple[int, int] = (0, 0)
+
+    if not TYPE_CHECKING:  # mypy would accept any name
+        __getattr__ = renamed_attributes("Region", part="crop")
 
     def __post_init__(self) -> None:
         """Check the mask."""
@@ -58,7 +70,7 @@ class Region:
 
     @classmethod
     def from_rectangle(cls, rectangle: Sequence[float], shape: tuple[int, int]) -> Region:
-        """Rectangle (x0, y0, x1, y1) in px, clipped to the image of `shape` (H, W).
+        """Return the rectangle (x0, y0, x1, y1) in px, clipped to the image of `shape` (H, W).
 
         Parameters
         ----------
@@ -76,8 +88,8 @@ class Region:
         RegionError
             Not four finite numbers with x0 < x1 and y0 < y1, or no overlap with the image.
         """
-        needed = "a rectangle is four finite numbers (x0, y0, x1, y1) in px"
-        corners = as_numbers(rectangle, needed, (4,), error=RegionError)
+        requirement = "a rectangle is four finite numbers (x0, y0, x1, y1) in px"
+        corners = as_numbers(rectangle, requirement, (4,), error=RegionError)
         x0, y0, x1, y1 = corners.tolist()
         height, width = shape = _image_shape(shape)
         if not (x0 < x1 and y0 < y1):
@@ -89,13 +101,13 @@ class Region:
             )
         _warn_clipped("rectangle", corners.reshape(2, 2), shape)
         mask = np.zeros(shape, dtype=bool)
-        left, top = (int(np.ceil(value)) for value in clipped[:2])
-        mask[top : int(clipped[3]) + 1, left : int(clipped[2]) + 1] = True
+        first_column, first_row = (int(np.ceil(value)) for value in clipped[:2])
+        mask[first_row : int(clipped[3]) + 1, first_column : int(clipped[2]) + 1] = True
         return cls(mask=mask, rectangle=clipped)
 
     @classmethod
     def from_polygon(cls, corners: npt.ArrayLike, shape: tuple[int, int]) -> Region:
-        """Polygon with corners (x, y) in px, shape (M, 2), on an image of `shape` (H, W).
+        """Return the polygon with corners (x, y) in px, shape (M, 2), on an image of `shape` (H, W).
 
         Parameters
         ----------
@@ -114,7 +126,7 @@ class Region:
             Fewer than three finite corners, or no overlap with the image.
         """
         points, shape = _polygon(corners), _image_shape(shape)
-        mask = _filled(points, shape)
+        mask = _fill_polygon(points, shape)
         if not mask.any():
             raise RegionError(
                 f"the region's polygon {points.tolist()} does not overlap the image of {shape[1]} x {shape[0]} px"
@@ -141,10 +153,10 @@ class Region:
         """
         if not len(holes):
             return self
-        inside = [_filled(_polygon(corners), self.mask.shape) for corners in holes]
+        inside = [_fill_polygon(_polygon(corners), self.mask.shape) for corners in holes]
         return Region(mask=self.mask & ~np.logical_or.reduce(inside))
 
-    def part(self, rows: slice, columns: slice) -> Region:
+    def crop(self, rows: slice, columns: slice) -> Region:
         """Return the same region on a part of the image that holds it.
 
         Parameters
@@ -165,7 +177,7 @@ class Region:
 
     @classmethod
     def from_mask(cls, mask: npt.ArrayLike, shape: tuple[int, int] | None = None) -> Region:
-        """Non-zero pixels of a mask image (H, W); `shape`, where given, is the size it must have.
+        """Return the non-zero pixels of a mask image (H, W); `shape`, where given, is the size it must have.
 
         Parameters
         ----------
@@ -197,23 +209,23 @@ def _polygon(corners: npt.ArrayLike) -> FloatArray:
     RegionError
         They are not three or more, or beyond what fixed-point coordinates hold.
     """
-    needed = f"a polygon is at least three finite corners (x, y) in px, within {FARTHEST} px"
-    points = as_numbers(corners, needed, (None, 2), error=RegionError)
-    if len(points) < 3 or np.abs(points).max() > FARTHEST:
-        raise RegionError(f"{needed}; given is {reprlib.repr(corners)}")
+    requirement = f"a polygon is at least three finite corners (x, y) in px, within {MAX_COORDINATE} px"
+    points = as_numbers(corners, requirement, (None, 2), error=RegionError)
+    if len(points) < 3 or np.abs(points).max() > MAX_COORDINATE:
+        raise RegionError(f"{requirement}; given is {reprlib.repr(corners)}")
     return points
 
 
 def _image_shape(shape: tuple[int, ...]) -> tuple[int, int]:
     """Return the shape (H, W) of an image as integers; one that is none is a `RegionError`."""
-    needed = "the shape of an image is its numbers of rows and columns"
-    height, width = as_numbers(cast(Any, shape), needed, (2,), dtype=np.int64, error=RegionError).tolist()
-    if not (0 < height <= FARTHEST and 0 < width <= FARTHEST):
-        raise RegionError(f"{needed}; given is {shape!r}")
+    requirement = "the shape of an image is its numbers of rows and columns"
+    height, width = as_numbers(cast(Any, shape), requirement, (2,), dtype=np.int64, error=RegionError).tolist()
+    if not (0 < height <= MAX_COORDINATE and 0 < width <= MAX_COORDINATE):
+        raise RegionError(f"{requirement}; given is {shape!r}")
     return height, width
 
 
-def _filled(points: FloatArray, shape: tuple[int, ...]) -> BoolArray:
+def _fill_polygon(points: FloatArray, shape: tuple[int, ...]) -> BoolArray:
     """Return the pixels (H, W) of a polygon with corners (M, 2)."""
     mask = np.zeros(shape, dtype=np.uint8)
     shift = 8  # fixed-point bits of OpenCV's coordinates
@@ -221,8 +233,10 @@ def _filled(points: FloatArray, shape: tuple[int, ...]) -> BoolArray:
     return mask.astype(bool)
 
 
-def _warn_clipped(what: str, points: FloatArray, shape: tuple[int, int]) -> None:
+def _warn_clipped(outline_name: str, points: FloatArray, shape: tuple[int, int]) -> None:
     """Warn of corners (M, 2) that lie more than a pixel outside an image."""
     last = np.array(shape[::-1]) - 1
     if (points < -1).any() or (points > last + 1).any():
-        logger.warning("the %s %s reaches outside the image of %d x %d px: clipped", what, points.tolist(), *(last + 1))
+        logger.warning(
+            "the %s %s reaches outside the image of %d x %d px: clipped", outline_name, points.tolist(), *(last + 1)
+        )

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +17,8 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.mesh import colour_nodes
-from rgbmidic.errors import InputError, RegionError
-from rgbmidic.mesh.finite_elements import oriented
+from rgbmidic.errors import InputError, RegionError, renamed_attributes
+from rgbmidic.mesh.finite_elements import orient_elements
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, outline_mesh
 from rgbmidic.mesh.region import Region
 from rgbmidic.typing import BoolArray, FloatArray
@@ -45,6 +45,14 @@ class Tri3Mesh:
         graded.
     is_graded : bool
         Whether the elements around one node in ten are more than twice as large as those around another one in ten.
+
+    Examples
+    --------
+    >>> from rgbmidic import Region, Tri3Mesh
+    >>> region = Region.from_rectangle((10, 10, 90, 70), shape=(80, 120))
+    >>> mesh = Tri3Mesh.from_region(region, element_size=20)
+    >>> mesh.nodes.shape, mesh.elements.shape, float(mesh.areas.sum())
+    ((20, 2), (24, 3), 4800.0)
     """
 
     nodes: FloatArray
@@ -54,9 +62,19 @@ class Tri3Mesh:
     sizes: FloatArray = field(init=False)
     is_graded: bool = field(init=False)
 
+    if not TYPE_CHECKING:  # mypy would accept any name
+        __getattr__ = renamed_attributes(
+            "Tri3Mesh",
+            part="submesh",
+            places="observation_points",
+            nearest="nearest_nodes",
+            beside="adjacent_nodes",
+            one_of_copies="merged_index",
+        )
+
     def __post_init__(self) -> None:
         """Check nodes and elements, order the corners and derive the areas."""
-        nodes, elements, twice_areas = oriented(self.nodes, self.elements, "a TRI3 mesh")
+        nodes, elements, twice_areas = orient_elements(self.nodes, self.elements, "a TRI3 mesh")
         if not twice_areas.all():
             raise InputError(f"element {int(np.argmin(twice_areas))} of the mesh has no area")
         for name, values in (("nodes", nodes), ("elements", elements), ("areas", twice_areas / 2)):
@@ -107,10 +125,10 @@ class Tri3Mesh:
         RegionError
             The region is too small for one element, or a crack misses it.
         """
-        given: Any = element_size
-        if not (isinstance(given, int | float | np.number) and math.isfinite(given) and given >= 4):
-            chosen = ': "auto" is for rgbmidic.measure' if isinstance(given, str) and given == "auto" else ""
-            raise InputError(f"element_size must be a number of at least 4 px; given is {given!r}{chosen}")
+        size: Any = element_size
+        if not (isinstance(size, int | float | np.number) and math.isfinite(size) and size >= 4):
+            hint = ': "auto" is for rgbmidic.measure' if isinstance(size, str) and size == "auto" else ""
+            raise InputError(f"element_size must be a number of at least 4 px; given is {size!r}{hint}")
         # speckles are 3 to 5 px wide, and a pixel or two at each border serve the filters only
         if (width := region.width) < 10:
             logger.warning("the region is %d px across: two or three speckles, hardly enough to measure", width)
@@ -134,7 +152,7 @@ class Tri3Mesh:
         """Search tree of the `centres`."""
         return cKDTree(self.centres)
 
-    def part(self, nodes: BoolArray) -> Tri3Mesh:
+    def submesh(self, nodes: BoolArray) -> Tri3Mesh:
         """Return the mesh of some nodes (N,) and of the elements between them, with their `sizes` in the whole.
 
         Parameters
@@ -146,10 +164,10 @@ class Tri3Mesh:
         -------
         Tri3Mesh
         """
-        number, kept = np.cumsum(nodes, dtype=np.int32) - 1, nodes[self.elements].all(axis=1)
-        part = Tri3Mesh(nodes=self.nodes[nodes], elements=number[self.elements[kept]])
-        vars(part).update(size=self.size, sizes=self.sizes[nodes], is_graded=self.is_graded)
-        return part
+        node_index, is_inside = np.cumsum(nodes, dtype=np.int32) - 1, nodes[self.elements].all(axis=1)
+        submesh = Tri3Mesh(nodes=self.nodes[nodes], elements=node_index[self.elements[is_inside]])
+        vars(submesh).update(size=self.size, sizes=self.sizes[nodes], is_graded=self.is_graded)
+        return submesh
 
     @cached_property
     def copies(self) -> npt.NDArray[np.int32]:
@@ -159,25 +177,25 @@ class Tri3Mesh:
         return pairs
 
     @property
-    def places(self) -> FloatArray:
+    def observation_points(self) -> FloatArray:
         """Positions (N, 2) at which the images show what moves with each node.
 
         They are the nodes; for a node on a side of a crack, the middle of the elements around it.
         """
         moments = (self.centres * self.areas[:, None]).T
-        middle = np.stack([self.to_nodes(part) for part in moments], axis=1) / self.to_nodes(self.areas)[:, None]
-        places, split = self.nodes.copy(), self.copies.ravel()
-        places[split] = middle[split]
-        return places
+        middle = np.stack([self.to_nodes(moment) for moment in moments], axis=1) / self.to_nodes(self.areas)[:, None]
+        points, crack_nodes = self.nodes.copy(), self.copies.ravel()
+        points[crack_nodes] = middle[crack_nodes]
+        return points
 
-    def nearest(self, chosen: BoolArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-        """Distance (N,) in px and index (N,) of the nearest of the `chosen` nodes (N,), along the edges of the mesh.
+    def nearest_nodes(self, targets: BoolArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+        """Distance (N,) in px and index (N,) of the nearest of the `targets` nodes (N,), along the edges of the mesh.
 
         The way is not across a crack or a hole; a part without any takes the nearest of another, infinitely far.
 
         Parameters
         ----------
-        chosen : ndarray, shape (N,), bool
+        targets : ndarray, shape (N,), bool
             The nodes that are looked for, one at least.
 
         Returns
@@ -185,19 +203,19 @@ class Tri3Mesh:
         distance : ndarray, shape (N,)
         index : ndarray, shape (N,), int64
         """
-        if chosen.all():
+        if targets.all():
             return np.zeros(len(self.nodes)), np.arange(len(self.nodes))
-        (i, j), count, sources = self.neighbours.T, len(self.nodes), np.flatnonzero(chosen)
+        (i, j), count, sources = self.neighbours.T, len(self.nodes), np.flatnonzero(targets)
         graph = sp.coo_matrix((np.hypot(*(self.nodes[i] - self.nodes[j]).T), (i, j)), shape=(count, count))
         distance, _, index = sp.csgraph.dijkstra(
             graph, directed=False, indices=sources, min_only=True, return_predecessors=True
         )
-        apart = ~np.isfinite(distance)
-        index[apart] = sources[cKDTree(self.nodes[sources]).query(self.nodes[apart])[1]]
+        is_unreachable = ~np.isfinite(distance)
+        index[is_unreachable] = sources[cKDTree(self.nodes[sources]).query(self.nodes[is_unreachable])[1]]
         return distance, index.astype(np.int64)
 
     def to_nodes(self, per_element: FloatArray) -> FloatArray:
-        """Sum of a value per element (E,) over the elements around each node, shape (N,).
+        """Return the sum of a value per element (E,) over the elements around each node, shape (N,).
 
         Parameters
         ----------
@@ -211,8 +229,8 @@ class Tri3Mesh:
         sums = np.bincount(self.elements.ravel(), weights=np.repeat(per_element, 3), minlength=len(self.nodes))
         return np.asarray(sums, dtype=np.float64)
 
-    def beside(self, nodes: BoolArray) -> BoolArray:
-        """Nodes (N,) that share an element with one of `nodes` (N,), these included.
+    def adjacent_nodes(self, nodes: BoolArray) -> BoolArray:
+        """Return the nodes (N,) that share an element with one of `nodes` (N,), these included.
 
         Parameters
         ----------
@@ -223,12 +241,12 @@ class Tri3Mesh:
         -------
         ndarray, shape (N,), bool
         """
-        near = np.zeros(len(self.nodes), dtype=bool)
-        near[self.elements[nodes[self.elements].any(axis=1)]] = True
-        return near
+        is_adjacent = np.zeros(len(self.nodes), dtype=bool)
+        is_adjacent[self.elements[nodes[self.elements].any(axis=1)]] = True
+        return is_adjacent
 
     def element_gradient(self, values: FloatArray) -> FloatArray:
-        """Gradient of the linear interpolant of nodal values (N, C) in every element, shape (E, C, 2).
+        """Return the gradient of the linear interpolant of nodal values (N, C) in every element, shape (E, C, 2).
 
         Parameters
         ----------
@@ -246,7 +264,7 @@ class Tri3Mesh:
         return slopes.swapaxes(0, 1)
 
     def shape_gradients(self) -> FloatArray:
-        """Gradient of the three shape functions of every element, shape (E, 3, 2), per px.
+        """Return the gradient of the three shape functions of every element, shape (E, 3, 2), per px.
 
         Returns
         -------
@@ -273,7 +291,7 @@ class Tri3Mesh:
         """
         gradient = self.element_gradient(values) * self.areas[:, None, None]
         flat = gradient.reshape(len(gradient), -1).T
-        sums = np.stack([self.to_nodes(np.ascontiguousarray(part)) for part in flat], axis=-1)
+        sums = np.stack([self.to_nodes(np.ascontiguousarray(component)) for component in flat], axis=-1)
         return np.asarray((sums / self.to_nodes(self.areas)[:, None]).reshape(-1, *gradient.shape[1:]))
 
     @property
@@ -284,7 +302,7 @@ class Tri3Mesh:
         return boundary
 
     def _boundary_edges(self) -> npt.NDArray[np.int32]:
-        """Edges (B, 2) that belong to one element only."""
+        """Return the edges (B, 2) that belong to one element only."""
         edges, count = self._edges
         return np.asarray(edges[count == 1])
 
@@ -301,16 +319,16 @@ class Tri3Mesh:
     def crack_edges(self) -> npt.NDArray[np.int32]:
         """Edges of both sides of the cracks, shape (C, 2): those at one place that belong to one element each."""
         edges = self._boundary_edges()
-        keys = edge_keys(self.one_of_copies[edges], len(self.nodes))
+        keys = edge_keys(self.merged_index[edges], len(self.nodes))
         _, index, count = np.unique(keys, return_inverse=True, return_counts=True)
         return np.asarray(edges[count[index] > 1])
 
     @property
-    def one_of_copies(self) -> npt.NDArray[np.intp]:
+    def merged_index(self) -> npt.NDArray[np.intp]:
         """Index (N,) of the same node for those at one place, on both sides of a crack; of others their own."""
-        place, copies = np.arange(len(self.nodes)), self.copies
-        np.minimum.at(place, copies[:, 1], copies[:, 0])
-        return place
+        index, copies = np.arange(len(self.nodes)), self.copies
+        np.minimum.at(index, copies[:, 1], copies[:, 0])
+        return index
 
     @property
     def neighbours(self) -> npt.NDArray[np.int32]:
@@ -326,21 +344,21 @@ class Tri3Mesh:
 
     @cached_property
     def linear_fit_offset(self) -> FloatArray:
-        """What the best linear fit has at the nodes beyond a field with second derivative xx, xy or yy of 1, (N, 3).
+        """Offset (N, 3), square px, of the best linear fit at the nodes from a field of unit curvature xx, xy or yy.
 
-        In square px. The texture counts alike in all places and directions on average, so the fit is that of the mass
-        matrix M. A field with the second derivative H has ``-1/2 sum phi_a phi_b d^T H d`` over its linear interpolant,
-        d being the edges of an element of area A. The offset solves ``M x = b``, where b sums over the elements around
-        a node ``-A/120 (2 sum d^T H d - d^T H d of the opposite edge)``.
+        Curvature is the second derivative. The texture counts alike in all places and directions on average, so the fit
+        is that of the mass matrix M. A field with the second derivative H has ``-1/2 sum phi_a phi_b d^T H d`` over its
+        linear interpolant, d being the edges of an element of area A. The offset solves ``M x = b``, where b sums over
+        the elements around a node ``-A/120 (2 sum d^T H d - d^T H d of the opposite edge)``.
         """
         corners = self.nodes[self.elements]
         edge = np.roll(corners, -1, axis=1) - corners
         squares = np.stack([edge[..., 0] ** 2, 2 * edge[..., 0] * edge[..., 1], edge[..., 1] ** 2], axis=-1)
         opposite = np.roll(squares, -1, axis=1)  # edge a joins the corners a and a + 1
-        parts = -(2 * squares.sum(axis=1, keepdims=True) - opposite) * self.areas[:, None, None] / 120
+        contributions = -(2 * squares.sum(axis=1, keepdims=True) - opposite) * self.areas[:, None, None] / 120
         sums = [
-            np.bincount(self.elements.ravel(), weights=part.ravel(), minlength=len(self.nodes))
-            for part in np.moveaxis(parts, -1, 0)
+            np.bincount(self.elements.ravel(), weights=contribution.ravel(), minlength=len(self.nodes))
+            for contribution in np.moveaxis(contributions, -1, 0)
         ]
         options = {"SymmetricMode": True}
         factors = splu(self.mass_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
@@ -361,12 +379,15 @@ class Tri3Mesh:
         reach = near @ near
         colour = np.empty(count, dtype=np.int64)
         colour_nodes(near.indptr, near.indices, np.zeros((count, np.diff(reach.indptr).max()), dtype=bool), colour)
-        node, other = np.repeat(np.arange(count), np.diff(reach.indptr)), reach.indices
-        place, distance = colour[other] * count + node, sum((axis[node] - axis[other]) ** 2 for axis in self.nodes.T)
-        least = np.full((colour.max() + 1) * count, np.inf)
-        np.minimum.at(least, place, distance)
-        nearest, own = np.full(least.size, count), distance == least[place]
-        nearest[place[own]] = other[own]
+        node, neighbour = np.repeat(np.arange(count), np.diff(reach.indptr)), reach.indices
+        slot, distance = (
+            colour[neighbour] * count + node,
+            sum((axis[node] - axis[neighbour]) ** 2 for axis in self.nodes.T),
+        )
+        min_distance = np.full((colour.max() + 1) * count, np.inf)
+        np.minimum.at(min_distance, slot, distance)
+        nearest, is_nearest = np.full(min_distance.size, count), distance == min_distance[slot]
+        nearest[slot[is_nearest]] = neighbour[is_nearest]
         return colour, nearest.reshape(-1, count)
 
 
@@ -389,14 +410,14 @@ def _rectangle_mesh(
     a = row * (nx + 1) + column
     b, c, d = a + 1, a + nx + 2, a + nx + 1
     # alternating diagonals: no preferred direction in the noise
-    even = ((row + column) % 2 == 0)[:, None]
-    first = np.where(even, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
-    second = np.where(even, np.stack([a, c, d], 1), np.stack([b, c, d], 1))
+    is_even = ((row + column) % 2 == 0)[:, None]
+    first = np.where(is_even, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
+    second = np.where(is_even, np.stack([a, c, d], 1), np.stack([b, c, d], 1))
     elements = np.stack([first, second], 1).reshape(-1, 3).astype(np.int32)
     return np.stack([x.ravel(), y.ravel()], 1), elements
 
 
-def refined(mesh: Tri3Mesh, marked: BoolArray, least: float) -> Tri3Mesh:
+def refine_elements(mesh: Tri3Mesh, marked: BoolArray, min_leg: float) -> Tri3Mesh:
     """Bisect elements at their longest edges, and those beside as far as no node then hangs on an edge.
 
     No angle gets smaller than half the smallest of the mesh (Rosenberg and Stenger, SIAM J. Numer. Anal. 12, 1975;
@@ -408,7 +429,7 @@ def refined(mesh: Tri3Mesh, marked: BoolArray, least: float) -> Tri3Mesh:
         What is refined; its nodes stay, with their numbers.
     marked
         Elements (E,) that are to be bisected.
-    least
+    min_leg
         Smallest leg in px that a part may have, as that of a right isosceles triangle of its area: what would give
         smaller ones stays whole.
 
@@ -419,7 +440,7 @@ def refined(mesh: Tri3Mesh, marked: BoolArray, least: float) -> Tri3Mesh:
     """
     corners, count = mesh.elements.astype(np.int64), len(mesh.nodes)
     # edges by place: what is cut on one side of a crack is cut on the other
-    keys, edge = np.unique(edge_keys(mesh.one_of_copies[corners][:, EDGES].reshape(-1, 2), count), return_inverse=True)
+    keys, edge = np.unique(edge_keys(mesh.merged_index[corners][:, EDGES].reshape(-1, 2), count), return_inverse=True)
     edge = edge.reshape(-1, 3)
     start, end = mesh.nodes[np.stack(np.divmod(keys, count))]
     rank = np.empty(len(keys), dtype=np.int64)
@@ -427,36 +448,39 @@ def refined(mesh: Tri3Mesh, marked: BoolArray, least: float) -> Tri3Mesh:
     shuffled = np.random.default_rng(0).permutation(len(keys))
     rank[np.lexsort((shuffled, np.round(np.hypot(*(end - start).T), 6)))] = np.arange(len(keys))
     turn = (np.argmax(rank[edge], axis=1)[:, None] + np.arange(3)) % 3  # the longest edge first
-    corners, edge = (np.take_along_axis(one, turn, axis=1) for one in (corners, edge))
-    whole = mesh.areas < least**2
+    corners, edge = (np.take_along_axis(values, turn, axis=1) for values in (corners, edge))
+    is_final = mesh.areas < min_leg**2
     while True:
         free, cut = np.ones(len(keys), dtype=bool), np.zeros(len(keys), dtype=bool)
-        while (held := (whole | ~free[edge[:, 0]]) & free[edge].any(axis=1)).any():
-            free[edge[held]] = False
+        while (is_blocked := (is_final | ~free[edge[:, 0]]) & free[edge].any(axis=1)).any():
+            free[edge[is_blocked]] = False
         cut[edge[marked & free[edge[:, 0]], 0]] = True
-        while (forced := cut[edge].any(axis=1) & ~cut[edge[:, 0]]).any():
-            cut[edge[forced, 0]] = True
-        number = cut[edge].sum(axis=1)
+        while (is_forced := cut[edge].any(axis=1) & ~cut[edge[:, 0]]).any():
+            cut[edge[is_forced, 0]] = True
+        n_cuts = cut[edge].sum(axis=1)
         # a part between two edges that are cut is a quarter
-        small = (number > 1) & (mesh.areas / 2 < least**2)
+        small = (n_cuts > 1) & (mesh.areas / 2 < min_leg**2)
         if not small.any():
             break
-        whole |= small
-    return _bisected(mesh, corners, cut[edge]) if cut.any() else mesh
+        is_final |= small
+    return _bisect(mesh, corners, cut[edge]) if cut.any() else mesh
 
 
-def _bisected(mesh: Tri3Mesh, corners: npt.NDArray[np.int64], cut: BoolArray) -> Tri3Mesh:
+def _bisect(mesh: Tri3Mesh, corners: npt.NDArray[np.int64], cut: BoolArray) -> Tri3Mesh:
     """Cut edges (E, 3) of elements, the first edge of each before the others; edge i joins corners i and i + 1."""
     count = len(mesh.nodes)
     keys, middle = np.unique(edge_keys(corners[:, EDGES][cut], count), return_inverse=True)
-    at = np.full(cut.shape, -1)
-    at[cut] = count + middle
+    midpoint = np.full(cut.shape, -1)
+    midpoint[cut] = count + middle
     a, b, c = corners.T
-    one, ab, bc, ca = cut[:, 0], *at.T
-    halves = [corners[~one]]
-    for side, parts in ((1, ((ab, b, c), (ab, b, bc), (ab, bc, c))), (2, ((ab, c, a), (ab, c, ca), (ab, ca, a)))):
-        also = one & cut[:, side]
-        halves += [np.stack(parts[0], 1)[one & ~also], *(np.stack(part, 1)[also] for part in parts[1:])]
+    first_cut, ab, bc, ca = cut[:, 0], *midpoint.T
+    halves = [corners[~first_cut]]
+    for side, corner_sets in ((1, ((ab, b, c), (ab, b, bc), (ab, bc, c))), (2, ((ab, c, a), (ab, c, ca), (ab, ca, a)))):
+        second_cut = first_cut & cut[:, side]
+        halves += [
+            np.stack(corner_sets[0], 1)[first_cut & ~second_cut],
+            *(np.stack(corner_set, 1)[second_cut] for corner_set in corner_sets[1:]),
+        ]
     nodes = np.concatenate([mesh.nodes, mesh.nodes[np.stack(np.divmod(keys, count))].mean(axis=0)])
     return Tri3Mesh(nodes=nodes, elements=np.concatenate(halves))
 

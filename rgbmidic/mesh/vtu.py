@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.mesh.content import CORNERS, MOST_BYTES, MeshContent, sized
+from rgbmidic.mesh.mesh_file import CORNERS, MAX_BYTES, MeshContent, limit_size
 from rgbmidic.typing import AnyArray, IntArray
 
 NUMBERS = ("GlobalNodeId", "node_number", "node_id", "NodeId", "GlobalElementId", "element_number", "element_id")
@@ -35,13 +35,13 @@ _THIN = {1, 2, 3, 4, 21, 35}
 """Points and lines."""
 _UNPACK: Mapping[str, Any] = {
     "vtkZLibDataCompressor": zlib.decompressobj,
-    "vtkLZMADataCompressor": partial(lzma.LZMADecompressor, memlimit=MOST_BYTES),
+    "vtkLZMADataCompressor": partial(lzma.LZMADecompressor, memlimit=MAX_BYTES),
 }
 
 
 def read_vtu(path: Path) -> MeshContent:
     """Read the one piece of a file."""
-    head, mark, tail = sized(path).read_bytes().partition(b"<AppendedData")
+    head, mark, tail = limit_size(path).read_bytes().partition(b"<AppendedData")
     encoding, _, appended = tail.partition(b"_")
     root = ElementTree.fromstring(head + b"</VTKFile>" if mark else head)
     arrays = _Arrays(root, appended, b"raw" in encoding)
@@ -61,17 +61,17 @@ def read_vtu(path: Path) -> MeshContent:
     width = np.diff(ends.astype(np.int64), prepend=0)
     if (width < 0).any() or width.sum() != len(nodes):
         raise InputError("the offsets of its cells are not those of its connectivity")
-    numbers, labels, numbering = labels_of(point_data, cell_data, counts, 0)
+    numbers, labels, numbering = entity_labels(point_data, cell_data, counts, 0)
     blocks, unread = [], set[str]()
     for kind in dict.fromkeys(types.tolist()):
-        chosen = np.flatnonzero(types == kind)
+        cell_indices = np.flatnonzero(types == kind)
         if (shape := _SHAPES.get(kind)) is None:
             unread |= set() if kind in _THIN else {f"type {kind}"}
             continue
-        if (width[chosen] < CORNERS[shape]).any():
+        if (width[cell_indices] < CORNERS[shape]).any():
             raise InputError(f"a {shape} has fewer nodes than corners")
-        first = (ends[chosen].astype(np.int64) - width[chosen])[:, None]
-        blocks.append((shape, nodes[first + np.arange(CORNERS[shape])].astype(np.int64), labels[chosen]))
+        first = (ends[cell_indices].astype(np.int64) - width[cell_indices])[:, None]
+        blocks.append((shape, nodes[first + np.arange(CORNERS[shape])].astype(np.int64), labels[cell_indices]))
     return MeshContent(
         points=points.astype(np.float64),
         numbers=numbers,
@@ -83,26 +83,26 @@ def read_vtu(path: Path) -> MeshContent:
     )
 
 
-def labels_of(
+def entity_labels(
     point_data: Mapping[str, Any], cell_data: Mapping[str, Any], counts: tuple[int, int], first: int
 ) -> tuple[IntArray, IntArray, str]:
     """Return the labels of points and cells among their data, else counted from `first`, and where they are from."""
     numbers, labels = (np.arange(first, first + count) for count in counts)
-    stated = f"counted from {first} in the order of the file, which has no labels that can be read"
+    numbering = f"counted from {first} in the order of the file, which has no labels that can be read"
     for name in NUMBERS:
         if name in point_data:
-            numbers, stated = _whole(name, point_data[name], counts[0]), f'point data "{name}"'
+            numbers, numbering = _as_labels(name, point_data[name], counts[0]), f'point data "{name}"'
         if name in cell_data:
-            labels = _whole(name, cell_data[name], counts[1])
-    return numbers, labels, stated
+            labels = _as_labels(name, cell_data[name], counts[1])
+    return numbers, labels, numbering
 
 
-def _whole(name: str, values: Any, count: int) -> IntArray:
-    """Labels, of which some converters make real numbers."""
-    given = np.asarray(values, dtype=np.float64).ravel()
-    if len(given) != count or not (np.abs(given) < 2**53).all() or (given % 1 != 0).any():
+def _as_labels(name: str, values: Any, count: int) -> IntArray:
+    """Return the labels, of which some converters make real numbers."""
+    numbers = np.asarray(values, dtype=np.float64).ravel()
+    if len(numbers) != count or not (np.abs(numbers) < 2**53).all() or (numbers % 1 != 0).any():
         raise InputError(f'the numbers "{name}" are not {count} whole ones')
-    return given.astype(np.int64)
+    return numbers.astype(np.int64)
 
 
 class _Arrays:
@@ -131,23 +131,27 @@ class _Arrays:
     def _bytes(self, stream: bytes, raw: bool) -> bytes:
         """Content at the beginning of a stream, which is preceded by its size, or by the sizes of its packed blocks."""
 
-        def take(at: int, size: int) -> tuple[bytes, int]:
-            end = at + (size if raw else -(-size // 3) * 4)
-            taken = stream[at:end] if raw else b64decode(stream[at:end])[:size]
-            if len(taken) < size:
+        def take(offset: int, size: int) -> tuple[bytes, int]:
+            end = offset + (size if raw else -(-size // 3) * 4)
+            content = stream[offset:end] if raw else b64decode(stream[offset:end])[:size]
+            if len(content) < size:
                 raise EOFError
-            return taken, end
+            return content, end
 
-        wide = self._header.itemsize
-        first, at = take(0, wide)
+        header_size = self._header.itemsize
+        first, offset = take(0, header_size)
         count = int(np.frombuffer(first, self._header)[0])
         if self._packing is None:  # in base64 the size is a stream of its own, or of one with the content
-            return take(at, count)[0] if raw or stream[at - 1 : at] == b"=" else take(0, wide + count)[0][wide:]
-        sizes, at = take(0, wide * (3 + count))
+            return (
+                take(offset, count)[0]
+                if raw or stream[offset - 1 : offset] == b"="
+                else take(0, header_size + count)[0][header_size:]
+            )
+        sizes, offset = take(0, header_size * (3 + count))
         _, largest, _, *lengths = np.frombuffer(sizes, self._header).tolist()
-        if count * largest > MOST_BYTES:
-            raise InputError(f"an array has {count * largest} bytes; up to {MOST_BYTES} are read")
-        packed, _ = take(at, sum(lengths))
+        if count * largest > MAX_BYTES:
+            raise InputError(f"an array has {count * largest} bytes; up to {MAX_BYTES} are read")
+        packed, _ = take(offset, sum(lengths))
         blocks, start = [], 0
         for length in lengths:
             unpacking = _UNPACK[self._packing]()

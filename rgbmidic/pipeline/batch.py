@@ -29,7 +29,7 @@ from rgbmidic.results import Histories, Maps, Result, shared_part
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.provenance import is_result
-from rgbmidic.settings import TestSettings, read_test, read_toml, regular
+from rgbmidic.settings import TestSettings, read_test, read_toml, require_regular_file
 
 logger = logging.getLogger(__name__)
 
@@ -111,7 +111,11 @@ def read_table(template: Path, table: Path) -> Tests:
     """
     document = read_toml(template, "settings file")
     try:
-        rows = [row for row in csv.reader(io.StringIO(regular(table).read_text(encoding="utf-8-sig"))) if any(row)]
+        rows = [
+            row
+            for row in csv.reader(io.StringIO(require_regular_file(table).read_text(encoding="utf-8-sig")))
+            if any(row)
+        ]
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(f"the table {table} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     head = [name.strip() for name in rows[0]] if rows else []
@@ -251,7 +255,7 @@ def _peaks(result: Result, settings: TestSettings) -> Iterator[tuple[str, float]
 
 def _probed(result: Result, settings: TestSettings, elastic: tuple[float, float]) -> Iterator[tuple[str, float]]:
     """Yield the peak of every quantity of the probes and channels, and the modulus where a stress is known."""
-    if not settings.probes.places and settings.probes.rigid_motion == "none":
+    if not settings.probes.kind_coordinates and settings.probes.rigid_motion == "none":
         return
     read = read_histories(result, settings.probes, scale=settings.scale, channels=settings.channels)
     for quantity in read.quantities:

@@ -99,10 +99,10 @@ class Schedule:
                 updated = self._sink.updated(start.reference_updates[-2:])  # all that the reference depends on
                 # a key frame looks for what has been lost; frames between key frames follow what there is
                 own = replace(start, unmeasured=0.0) if is_key(place) else start
-                running[workers.submit(self._plan.series.chosen[place], own, updated)] = place, start
+                running[workers.submit(self._plan.series.selected[place], own, updated)] = place, start
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 place, start = running.pop(future)
-                self._take(place, start, self._outcome(future, self._plan.series.chosen[place]))
+                self._take(place, start, self._outcome(future, self._plan.series.selected[place]))
 
     def _next(self, slots: int) -> tuple[int, Start]:
         """Take the frame that is to be measured next out of those that can be.
@@ -130,7 +130,7 @@ class Schedule:
 
     def _take(self, place: int, start: Start, found: Measured) -> None:
         """Keep a frame, or have it measured again, and release what waits for it."""
-        if found.record.unread and (gone := self._plan.series.gone()):
+        if found.record.unread and (gone := self._plan.series.missing_lights()):
             raise FrameError(f"the frames are gone: {gone}; go on with --resume when they are there again")
         first = self._first_tries.pop(place, None)
         lost = found.record.status != Status.CONVERGED or rank_of(found.record)[1] > start.unmeasured + 0.01

@@ -173,11 +173,11 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         The frame cannot be read or is not what the settings say.
     """
     settings, reference, name = plan.settings, plan.reference, plan.series.name(index)
-    place = plan.series.chosen.index(index)
+    place = plan.series.selected.index(index)
     if index in settings.frames.reference:
         start = replace(start, displacement=np.zeros_like(reference.mesh.nodes))
     window = plan.window_of(start.displacement, reference_update.displacement)
-    here = plan.window.part_of(window)
+    here = plan.window.slices_in(window)
     with stage("reading"):
         state, inputs = read_state(plan, index, window)
     there = state
@@ -202,7 +202,7 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
         solution = replace(solution, reason="; ".join(causes))
     if solution.disagreement:
         warnings.append(solution.disagreement)
-    key = place % STRIDE == 0 or place == len(plan.series.chosen) - 1
+    key = place % STRIDE == 0 or place == len(plan.series.selected) - 1
     if (settings.mesh.error is True or (settings.mesh.error == "key" and key)) and solution.measured.any():
         with stage("conclusion"):
             solution = discretisation_error(reference, deformed, solution, plan.solver, plan.method)
@@ -271,7 +271,7 @@ def next_reference(plan: Plan, before: ReferenceUpdate, index: int, solution: So
     RgbmidicError
         The frame cannot be read, or no element of it is measured.
     """
-    window = plan.window_of(solution.displacement[plan.reference.mesh.nearest(solution.measured)[1]])
+    window = plan.window_of(solution.displacement[plan.reference.mesh.nearest_nodes(solution.measured)[1]])
     return before.updated(solution, *prepared_frame(plan, index, window), window.origin)
 
 
@@ -292,7 +292,7 @@ def _compared(
     best = float(np.fmax(start.best_match, np.float32(median)))
     if index in plan.settings.frames.reference or not reference_update.is_due(match, best):
         return median, best, start.reference_updates
-    return median, 0.0, (*start.reference_updates, plan.series.chosen.index(index))
+    return median, 0.0, (*start.reference_updates, plan.series.selected.index(index))
 
 
 def _dark(lights: Sequence[str], brightness: FloatArray) -> list[tuple[str, float]]:
@@ -318,10 +318,10 @@ def exposure_warnings(plan: Plan, state: RawState) -> list[str]:
 
 def _blur_warning(plan: Plan, index: int, start: Start, solution: Solution) -> list[str]:
     """Warn of motion blur: of a frame that starts from the one before it, which is known to be exposed for how long."""
-    place = plan.series.chosen.index(index)
+    place = plan.series.selected.index(index)
     if parent(place) != place - 1 or start.displacement is None or not solution.measured.any() or not plan.exposure:
         return []
-    before = plan.series.chosen[place - 1]
+    before = plan.series.selected[place - 1]
     times = [plan.series.time_ns(number) for number in (before, index)]
     rate = plan.settings.scale.frame_rate or plan.series.recording.frame_rate
     if None not in times:

@@ -42,7 +42,7 @@ from rgbmidic.illumination.separation import (
     reference_images,
 )
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
-from rgbmidic.mesh.placement import on_image
+from rgbmidic.mesh.placement import place_on_image
 from rgbmidic.pipeline import suitability
 from rgbmidic.pipeline.objects import check_given
 from rgbmidic.pipeline.source import FrameSequence, Series, open_frames
@@ -209,10 +209,10 @@ class Plan:
         finite_elements, placement = None, None
         if settings.mesh.file is not None:
             finite_elements, placement, mesh, region = finite_elements_of(settings, frame)
-        region, window = region or read_region(settings.region, frame), Window.whole(frame)
+        region, window = region or read_region(settings.region, frame), Window.of_frame(frame)
         if not given and isinstance(separate, WindowedSeparation):
             window = window_of_reference(region, settings, frame)
-            region = region.part(*window.part_of(Window.whole(frame)))
+            region = region.crop(*window.slices_in(Window.of_frame(frame)))
         state, images, separate, motion = _read_reference(settings, series, separate, window, region, calibration)
         if separation is not None and isinstance(state, IlluminationImages):
             raise ConfigurationError("the source gives images of the lights, which need no separation: give only one")
@@ -425,7 +425,7 @@ def finite_elements_of(
     placement = Placement.fit(settings.mesh.points or (), camera)
     logger.info("mesh.points: %s", placement.summary())
     every = read_mesh(settings.mesh.file, unit=settings.mesh.unit or "mm", part=settings.mesh.part)
-    part, mesh, region = on_image(every, placement, frame, read_region(settings.region, frame))
+    part, mesh, region = place_on_image(every, placement, frame, read_region(settings.region, frame))
     return part, placement, mesh, region
 
 
@@ -434,7 +434,7 @@ def window_of_reference(region: Region, settings: TestSettings, frame: tuple[int
     spans = [np.flatnonzero(region.mask.any(axis=axis)) for axis in (0, 1)]
     corners = np.array([[span[0], span[-1]] for span in spans], dtype=np.float64).T
     window = window_around(corners, search_reach(corners), settings, frame)
-    return Window.whole(frame) if np.prod(window.shape) > _WORTH * np.prod(frame) else window
+    return Window.of_frame(frame) if np.prod(window.shape) > _WORTH * np.prod(frame) else window
 
 
 def window_around(points: FloatArray, reach: float, settings: TestSettings, frame: tuple[int, int]) -> Window:
@@ -445,7 +445,7 @@ def window_around(points: FloatArray, reach: float, settings: TestSettings, fram
     """
     may_crack = bool(settings.mesh.cracks) or settings.mesh.file is not None
     sigma, _ = grey_levels(settings.illumination.normalise, settings.solver, cracked=may_crack)
-    return Window.around(points, reach + max(96.0, 3 * max(sigma, settings.weights.blur)), frame)
+    return Window.around_points(points, reach + max(96.0, 3 * max(sigma, settings.weights.blur)), frame)
 
 
 def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:

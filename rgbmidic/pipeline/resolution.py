@@ -20,7 +20,7 @@ from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionEr
 from rgbmidic.fields import NodalCovariance, Places, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.tri3 import refined
+from rgbmidic.mesh.tri3 import refine_elements
 from rgbmidic.pipeline.frame import prepared_frame
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.size_figures import CONSTANTS, Choice, ErrorFigures, GaugeFigures, ResolutionStudy, SizeFigures
@@ -301,7 +301,7 @@ def refine(plan: Plan, frame: int | bool = True) -> Plan:
             np.nan_to_num(part[mesh.elements] ** 2).sum(axis=(1, 2)) for part in (known.strain_error, known.strain_std)
         )
         unresolved = missed > CONSTANTS.worth**2 * noise
-        finer = refined(mesh, unresolved, least)
+        finer = refine_elements(mesh, unresolved, least)
         if finer is mesh:
             if unresolved.any():
                 worst = int(np.argmax(np.where(unresolved, missed, 0)))
@@ -342,7 +342,7 @@ class _KeyFrame:
     @classmethod
     def find(cls, plan: Plan, frames: Sequence[int]) -> _KeyFrame:
         """Measure some frames, and keep the one whose displacement departs most from an affine one."""
-        chosen, reference = plan.series.chosen, plan.settings.frames.reference
+        chosen, reference = plan.series.selected, plan.settings.frames.reference
         for index in frames:
             if index not in chosen or index in reference:
                 what = "of the reference" if index in reference else f"not among {chosen[0]} to {chosen[-1]}"
@@ -372,8 +372,8 @@ class _KeyFrame:
 
     def start(self, mesh: Tri3Mesh) -> FloatArray:
         """The displacement (N, 2) at the nodes of another mesh of the region."""
-        found = Places.of(self.mesh, mesh.places)
-        whole = self.solution.displacement[self.mesh.nearest(self.solution.measured)[1]]
+        found = Places.of(self.mesh, mesh.observation_points)
+        whole = self.solution.displacement[self.mesh.nearest_nodes(self.solution.measured)[1]]
         corners = whole[self.mesh.elements[found.element]]
         return np.asarray(np.einsum("nc,nci->ni", found.barycentric, corners))
 

@@ -130,7 +130,7 @@ def measure(
     objects = {name: describe(one) for name, one in given.items() if one is not None and name != "source"}
     if settings.weights.method == "images":  # the masks, whatever their files are called
         objects["weights"] = describe(plan.weights)
-    places = _places(plan.series.chosen, frames)
+    places = _places(plan.series.selected, frames)
     if workers is None:
         workers = threads() if separation is None and weights is None else 1
     origin = _origin(plan, objects, kept.get("unread_files", ()))
@@ -208,7 +208,7 @@ class _Folder:
         """Indices and solutions of the frames that became the reference, as the folder holds them."""
         if not places:
             return ()
-        mesh, lights, chosen = self._plan.reference.mesh, len(self._plan.images.names), self._plan.series.chosen
+        mesh, lights, chosen = self._plan.reference.mesh, len(self._plan.images.names), self._plan.series.selected
         blank, found = Solution.failed(mesh, lights, "", np.zeros(0)), []
         names = [*chain(*_OF_NODES.values()), "node_status", "rigid"]
         for place, kept in zip(places, self._store.table().each(names, places), strict=True):
@@ -229,7 +229,7 @@ class _Folder:
         line = f"{status.name.lower().replace('_', ' ')}: {record.reason}"
         if status is Status.CONVERGED:
             line = f"converged in {record.iterations} iterations, {1 - rank_of(record)[1]:.0%} of the nodes measured"
-        self._progress(done, len(places), f"{self._plan.series.name(self._plan.series.chosen[place])}: {line}")
+        self._progress(done, len(places), f"{self._plan.series.name(self._plan.series.selected[place])}: {line}")
 
 
 def _take_back(plan: Plan, store: ResultStore, names: Sequence[str], *, retry_failed: bool) -> None:
@@ -249,7 +249,7 @@ def _take_back(plan: Plan, store: ResultStore, names: Sequence[str], *, retry_fa
         tries[place] = kept["tries"]
         if kept["unread"]:
             with suppress(FrameError):
-                read_state(plan, plan.series.chosen[place])
+                read_state(plan, plan.series.selected[place])
                 readable.append(place)
                 continue
         if retry_failed and kept["status"] == Status.FAILED:
@@ -267,7 +267,7 @@ def _tell_repeated(plan: Plan, store: ResultStore, places: range, names: Sequenc
     sums = [kept["checksum"] for kept in store.table().each(["checksum"], places)]
     pairs = zip(places[1:], sums[1:], sums, strict=False)
     repeated = [place for place, mine, before in pairs if mine == before != NO_CHECKSUM]
-    chosen, references = plan.series.chosen, plan.settings.frames.reference
+    chosen, references = plan.series.selected, plan.settings.frames.reference
     measured = dict(zip(chosen[places.start : places.stop], sums, strict=True))
     with suppress(FrameError):
         of_reference = {measured.get(one) or checksum(read_state(plan, one, plan.window)[0]) for one in references}
@@ -312,14 +312,14 @@ def _origin(plan: Plan, objects: Mapping[str, str], unread_before: Collection[st
     return Origin(
         nodes=plan.reference.mesh.nodes + plan.window.origin,
         elements=plan.reference.mesh.elements,
-        names=[series.name(index) for index in series.chosen],
+        names=[series.name(index) for index in series.selected],
         finite_elements=plan.finite_elements,
         placement=plan.placement,
         lights=plan.images.names,
         settings=plan.settings,
         inputs={" + ".join(plan.settings.frames.path) or "source": fingerprint, **objects},
         readers=getattr(series, "packages", ()),
-        references=[place for place, index in enumerate(series.chosen) if index in plan.settings.frames.reference],
+        references=[place for place, index in enumerate(series.selected) if index in plan.settings.frames.reference],
         reference=plan.images.values,
         notes={
             **getattr(plan.weights, "notes", {}),
@@ -327,7 +327,7 @@ def _origin(plan: Plan, objects: Mapping[str, str], unread_before: Collection[st
             "grey_levels": {"normalise": plan.normalise, "brightness": plan.solver.brightness},
             "frame_rate": recording.frame_rate,
             "exposure_ns": recording.exposure_ns,
-            "lost_frames": series.lost,
+            "lost_frames": series.n_lost,
             "unread_files": list(unread),
             "frame_shape": list(plan.window.frame),
             "reference_origin": list(plan.window.origin),

@@ -336,7 +336,7 @@ class _Live:
         checksum = record.values["checksum"]
         if checksum == self._checksum != NO_CHECKSUM:
             logger.warning("state %d repeats the one before, bit for bit", place)
-        elif plan.series.chosen[place] in plan.settings.frames.reference:
+        elif plan.series.selected[place] in plan.settings.frames.reference:
             self._of_reference.add(checksum)
         elif checksum in self._of_reference - {NO_CHECKSUM}:
             logger.warning("state %d is the reference, bit for bit: its displacement of 0 is not measured", place)
@@ -346,7 +346,7 @@ class _Live:
         self._starts[place] = after
         if (frames := after.reference_updates)[-2:] not in self._updates:
             before = self._updates[frames[:-1][-2:]]
-            self._updates[frames[-2:]] = next_reference(plan, before, plan.series.chosen[place], self.solution)
+            self._updates[frames[-2:]] = next_reference(plan, before, plan.series.selected[place], self.solution)
         # a later state starts from this one, from the first, or from the last at a multiple of a power of STRIDE
         needed = {place // STRIDE**power * STRIDE**power for power in range(20)}
         self._starts = {one: start for one, start in self._starts.items() if one in needed}

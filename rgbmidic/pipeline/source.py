@@ -20,8 +20,8 @@ import numpy as np
 from rgbmidic.correlation.images import unmasked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RgbmidicError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
-from rgbmidic.frames.series import FrameSeries, chosen_frames, open_series
-from rgbmidic.frames.stored import Camera, StoredFrame, raw_frame
+from rgbmidic.frames.metadata import CameraMetadata, StoredFrame, raw_frame
+from rgbmidic.frames.series import FrameSeries, open_series, selected_frames
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState
 from rgbmidic.pipeline.objects import class_name, describe
@@ -74,9 +74,9 @@ class SourceSeries:
         What ``[frames]`` says of them.
     camera
         What a calibration knows of them.
-    chosen
+    selected
         The frames that are to be measured.
-    lost
+    n_lost
         A source has all the frames that it counts.
     shape
         Rows and columns, of the reference's first frame.
@@ -87,9 +87,9 @@ class SourceSeries:
 
     source: FrameSequence
     stated: FrameSettings
-    camera: Camera | None = field(default=None, compare=False, repr=False)
-    chosen: range = range(0)
-    lost: ClassVar[int] = 0
+    camera: CameraMetadata | None = field(default=None, compare=False, repr=False)
+    selected: range = range(0)
+    n_lost: ClassVar[int] = 0
     shape: tuple[int, int] = (0, 0)
     full_scale: float = 1.0
 
@@ -130,7 +130,7 @@ class SourceSeries:
             raise FrameError(f"{self.name(index)} cannot be read from {class_name(self.source)}: {told}") from error
         return self._state(state, self.name(index))
 
-    def gone(self) -> str:
+    def missing_lights(self) -> str:
         """A source that is there stays there."""
         return ""
 
@@ -157,7 +157,7 @@ class SourceSeries:
         if hasattr(self.source, "describe"):
             return describe(self.source), ()
         told, without = f"{class_name(self.source)} of {len(self)} frames", []
-        for index in (self.stated.reference[0], self.chosen[-1]):
+        for index in (self.stated.reference[0], self.selected[-1]):
             name, content = self.name(index), "unread"
             if name not in unread:
                 with suppress(FrameError):
@@ -194,7 +194,9 @@ class SourceSeries:
                 raise FrameError(f"{where} has grey levels outside 0 to 65535")
             samples = values if values.dtype == np.uint8 else values.astype(np.uint16, copy=False)
             channels_last = np.ascontiguousarray(np.moveaxis(samples, 0, -1))
-            return (raw_frame(StoredFrame.plain(channels_last, Path(name)), self.stated, Path(name), self.camera),)
+            return (
+                raw_frame(StoredFrame.from_samples(channels_last, Path(name)), self.stated, Path(name), self.camera),
+            )
         stated = {"frames.kind": self.stated.kind, "frames.cfa": self.stated.cfa, "calibration.file": self.camera}
         of_raw = [key for key, value in stated.items() if value not in (None, "monochrome")]
         if of_raw:
@@ -213,7 +215,7 @@ Series = FrameSeries | SourceSeries
 itself, such as read parts of frames."""
 
 
-def open_frames(settings: TestSettings, source: FrameSequence | Series | None, camera: Camera | None) -> Series:
+def open_frames(settings: TestSettings, source: FrameSequence | Series | None, camera: CameraMetadata | None) -> Series:
     """The series that the pipeline reads: of files, or of a source, checked on the first frame of the reference.
 
     Raises
@@ -229,7 +231,7 @@ def open_frames(settings: TestSettings, source: FrameSequence | Series | None, c
     return series
 
 
-def _opened(settings: TestSettings, source: FrameSequence | Series | None, camera: Camera | None) -> Series:
+def _opened(settings: TestSettings, source: FrameSequence | Series | None, camera: CameraMetadata | None) -> Series:
     stated = settings.frames
     if source is None:
         return open_series(stated, settings.base, camera)
@@ -245,8 +247,8 @@ def _opened(settings: TestSettings, source: FrameSequence | Series | None, camer
         told = getattr(source, name, None)
         if told is not None and len(told) != len(source):
             raise InputError(f"{name} of {class_name(source)} has {len(told)} entries for {len(source)} frames")
-    chosen, start = chosen_frames(stated, len(source)), stated.reference[0]
-    series = SourceSeries(source=cast(FrameSequence, source), stated=stated, camera=camera, chosen=chosen)
+    chosen, start = selected_frames(stated, len(source)), stated.reference[0]
+    series = SourceSeries(source=cast(FrameSequence, source), stated=stated, camera=camera, selected=chosen)
     state = series.read(start)
     if not isinstance(state, IlluminationImages):
         return replace(series, shape=state[0].values.shape[-2:])

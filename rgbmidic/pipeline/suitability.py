@@ -103,7 +103,7 @@ def light_levels(images: IlluminationImages, region: Region) -> dict[str, float]
 def tell_small(mesh: Tri3Mesh, speckle: float | None, finite_elements: FiniteElementMesh) -> None:
     """Warn of finite elements that are small for the speckle, with the uncertainty to expect.
 
-    It goes with the inverse of the element's side (`rgbmidic.scene.forecast.node_constant`).
+    It goes with the inverse of the element's side (`rgbmidic.scene.forecast.nodal_variance_factor`).
     """
     sides = np.sqrt(2 * mesh.areas)
     few = SPECKLES * (speckle or 0.0)

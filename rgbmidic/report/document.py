@@ -149,7 +149,9 @@ def write_report(
         history=history,
         measured=history.fractions[:, 0],
         floor=noise_floor(physical),
-        histories=read_histories(result, probes, scale=physical.scale, channels=channels) if probes.places else None,
+        histories=read_histories(result, probes, scale=physical.scale, channels=channels)
+        if probes.kind_coordinates
+        else None,
         lines=_lines(maps.maps, probes, constants),
         when=partial(_when, physical),
         rate=_frame_rate(physical),
@@ -182,7 +184,7 @@ def _lines(maps: Maps, probes: ProbeSettings, constants: ReportConstants) -> Ite
     middle, (wide, tall) = (nodes.min(axis=0) + nodes.max(axis=0)) / 2, np.ptp(nodes, axis=0) / 2
     reach = np.array([wide, 0.0] if wide >= tall else [0.0, tall])
     lines = {"the longer side of the region, through its middle": (*(middle - reach), *(middle + reach))}
-    if stated := [place for kind, place in probes.places if kind == "line"]:
+    if stated := [place for kind, place in probes.kind_coordinates if kind == "line"]:
         lines = {f"line_{number}": place for number, place in enumerate(stated, 1)}
     frames = figures.spread(measured, constants.histories)
     for name, place in lines.items():

@@ -16,7 +16,7 @@ import numpy as np
 
 from rgbmidic.errors import InputError
 from rgbmidic.results.alignment import MIN_CORRELATION, MIN_FRAMES, Alignment
-from rgbmidic.settings import regular
+from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import FloatArray
 
 logger = logging.getLogger(__name__)
@@ -76,7 +76,7 @@ class Channels:
         """
         path = Path(path)
         try:
-            lines = regular(path).read_text(encoding="utf-8-sig").splitlines()
+            lines = require_regular_file(path).read_text(encoding="utf-8-sig").splitlines()
         except OSError as error:
             raise InputError(f"the channels {path} cannot be read: {error.strerror or error}") from None
         except ValueError:

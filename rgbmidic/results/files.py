@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import ResultError, disk_faults
-from rgbmidic.settings import regular
+from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import AnyArray
 
 
@@ -38,7 +38,7 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, AnyArray]:
         The file is missing or damaged, or holds more than its size on disk.
     """
     try:
-        with zipfile.ZipFile(regular(path)) as archive:
+        with zipfile.ZipFile(require_regular_file(path)) as archive:
             entries = {name: archive.getinfo(f"{name}.npy") for name in names}
             if packed := [name for name, entry in entries.items() if entry.compress_type != zipfile.ZIP_STORED]:
                 raise ValueError(f"{packed[0]} is compressed")
@@ -107,7 +107,7 @@ def read_json(path: Path) -> Any:
         It is damaged.
     """
     try:
-        return json.loads(regular(path).read_text(encoding="utf-8"))
+        return json.loads(require_regular_file(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise
     except (OSError, ValueError, RecursionError) as error:

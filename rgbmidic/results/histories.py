@@ -165,7 +165,7 @@ def read_histories(
         A probe is outside the region, or measured in no frame; too few frames for rates; the times of the
         frames are not known, or have none in common with those of the channels; the channels are not usable.
     """
-    if not probes.places and probes.rigid_motion == "none":
+    if not probes.kind_coordinates and probes.rigid_motion == "none":
         raise InputError("no probe is stated: give one on the command line, such as --point X,Y, or in [probes]")
     physical = Physical.untimed(result, scale)
     alone = frames_alone(result, physical)
@@ -174,7 +174,7 @@ def read_histories(
         raise InputError(f"no frame of {result.path} is measured yet")
     window = probes.window and rate_frames(probes.window, len(there))
     counts, made = Counter[str](), list[Probe]()
-    for kind, place in probes.places:
+    for kind, place in probes.kind_coordinates:
         counts[kind] += 1
         made.append(make_probe(physical.covariance, kind, counts[kind], place, probes, rectified))
     clock = alone.numbers.astype(np.float64) if alone.times is None else alone.times

@@ -26,7 +26,7 @@ from rgbmidic.errors import AnotherTestError, InputError, ResultError, disk_faul
 from rgbmidic.results.files import npy_array, npy_bytes, write_complete
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
 from rgbmidic.results.quantities import QUANTITIES
-from rgbmidic.settings import regular
+from rgbmidic.settings import require_regular_file
 from rgbmidic.text import Described
 from rgbmidic.typing import BoolArray, IntArray
 
@@ -284,7 +284,7 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes, chec
 def _read_record(path: Path, frame: int, names: Iterable[str], run: bytes) -> dict[str, Any]:
     """Read some quantities of a frame and verify their checksums; what is of this run has its shapes."""
     files, directory, read = _layout(tuple(QUANTITIES))
-    with regular(path).open("rb") as file:
+    with require_regular_file(path).open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - directory.size - _CHECK.size, 0))
         tail = file.read()

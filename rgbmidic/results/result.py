@@ -19,7 +19,7 @@ from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED
 from rgbmidic.results.records import FrameRecord, FrameTable, Quantities
 from rgbmidic.results.warnings import of_frames
 from rgbmidic.settings import read_section
-from rgbmidic.settings.schema import section_kinds
+from rgbmidic.settings.schema import section_types
 from rgbmidic.text import Described
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
@@ -229,7 +229,7 @@ class Result(Portable, Quantities, Described):
         ConfigurationError
             None was kept, and one of its keys has no default.
         """
-        names = {known: name for name, known in section_kinds().items()}
+        names = {known: name for name, known in section_types().items()}
         if kind not in names:
             raise InputError(f"{kind!r} is no section of a TEST.toml; these are {', '.join(k.__name__ for k in names)}")
         name = names[kind]

@@ -27,7 +27,7 @@ from rgbmidic.frames.names import NamedFiles
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh, read_mesh
 from rgbmidic.results.physical import placement_of, rectification_of
 from rgbmidic.results.result import Result
-from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, regular
+from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, require_regular_file
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
@@ -145,7 +145,7 @@ def _listed(path: Path, interval: float | None) -> list[tuple[float | None, Path
     if path.suffix.lower() != ".pvd":
         return [(None, path)]
     try:
-        sets = list(ElementTree.fromstring(regular(path).read_bytes()).iter("DataSet"))
+        sets = list(ElementTree.fromstring(require_regular_file(path).read_bytes()).iter("DataSet"))
         states: list[tuple[float | None, Path]] = [
             (float(one.attrib["timestep"]), path.parent / one.attrib["file"]) for one in sets
         ]
@@ -158,7 +158,7 @@ def _listed(path: Path, interval: float | None) -> list[tuple[float | None, Path
 
 def _numbered(path: Path, interval: float | None) -> list[tuple[float | None, Path]]:
     """Return the files of a folder by the last number in their names, times the `interval`."""
-    files = NamedFiles.ordered([file for file in path.iterdir() if file.suffix.lower() in (".vtu", ".vtk")])
+    files = NamedFiles.from_files([file for file in path.iterdir() if file.suffix.lower() in (".vtu", ".vtk")])
     if not files.paths or not all(files.numbers):
         raise InputError(f"{path} must hold one .pvd file, or .vtu or .vtk files with a number in their names")
     if interval is None or not interval > 0:
@@ -185,7 +185,7 @@ def _displacement(mesh: FiniteElementMesh, field: str | None) -> FloatArray:
 def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatArray, FloatArray | None]:
     """Read a table of node numbers, displacements and times onto a mesh."""
     try:
-        lines = regular(path).read_text(encoding="utf-8-sig").splitlines()
+        lines = require_regular_file(path).read_text(encoding="utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read: {error}") from None
     names = [name.strip() for name in next(csv.reader(lines[:1]), [])]
@@ -254,7 +254,7 @@ def place(result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence
             f"where the simulation's mesh lies on the image of {result.path} is not known: state two points or more, "
             "--points X_MM,Y_MM:X_PX,Y_PX each"
         )
-    found = Placement.fit(known, rectification_of(result, scale, "mm").camera, where=where)
+    found = Placement.fit(known, rectification_of(result, scale, "mm").camera, label=where)
     stated = (scale or result.section(ScaleSettings)).mm_per_pixel  # half a pixel at each end of 100 px is .7 % of it
     if found.mm_per_pixel is not None and stated is not None and abs(found.mm_per_pixel / stated - 1) > 0.01:
         text = "%s state %.6g mm per px, scale.mm_per_pixel %.6g: the former is taken"

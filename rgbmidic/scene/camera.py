@@ -19,7 +19,7 @@ from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities, spectral_response
 from rgbmidic.illumination.images import PARAMETERS, Registration, frame_geometry
 from rgbmidic.illumination.linear import NoiseModel
-from rgbmidic.scene.checked import PartOfScene
+from rgbmidic.scene import SceneSection
 from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
@@ -35,7 +35,7 @@ Floating = TypeVar("Floating", bound=np.floating)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Light(PartOfScene):
+class Light(SceneSection):
     """A point light; the irradiance falls with the square of the distance.
 
     Attributes
@@ -99,7 +99,7 @@ class Light(PartOfScene):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Polarisers(PartOfScene):
+class Polarisers(SceneSection):
     """Crossed linear polarisers, one before every lamp and one before the camera.
 
     Diffuse light counts as depolarised, the reflection as polarised like the lamp but for a small fraction.
@@ -132,7 +132,7 @@ class Polarisers(PartOfScene):
 
 
 def rotation(angle_deg: float, axis: Vector) -> FloatArray:
-    """Rotation matrix by an angle about an axis (Rodrigues)."""
+    """Return the rotation matrix by an angle about an axis (Rodrigues)."""
     length = math.hypot(*axis)
     if length == 0:
         raise InputError("a rotation axis must not be the null vector")
@@ -144,9 +144,9 @@ def rotation(angle_deg: float, axis: Vector) -> FloatArray:
 
 
 def three_lights(target: Vector = (0.0, 0.0, NOMINAL_DISTANCE)) -> tuple[Light, ...]:
-    """Red, green and blue lamps left, right and above the camera, all equally bright at the target."""
-    places = {"red": (-190.0, -12.0, 90.0), "green": (200.0, 15.0, 90.0), "blue": (10.0, -220.0, 60.0)}
-    return tuple(Light(name=name, position=position).aimed(target) for name, position in places.items())
+    """Return the red, green and blue lamps left, right and above the camera, all equally bright at the target."""
+    positions = {"red": (-190.0, -12.0, 90.0), "green": (200.0, 15.0, 90.0), "blue": (10.0, -220.0, 60.0)}
+    return tuple(Light(name=name, position=position).aimed(target) for name, position in positions.items())
 
 
 REFERENCE_CROSSTALK = ((1.0, 0.10, 0.02), (0.14, 1.0, 0.16), (0.03, 0.12, 1.0))
@@ -160,7 +160,7 @@ al., J. Opt. Soc. Am. A 32, 2015) and shipped by colour-science (BSD-3-Clause). 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Camera(PartOfScene):
+class Camera(SceneSection):
     """A camera at the origin that looks along +z, x to the right and y downwards.
 
     Attributes
@@ -204,7 +204,7 @@ class Camera(PartOfScene):
         Standard deviation in electrons.
     samples
         Rays per pixel and direction: ``samples**2`` rays per pixel. None: as many as the paint needs
-        (`rgbmidic.lab.virtual.rendering.samples_needed`).
+        (`rgbmidic.lab.virtual.rendering.rays_per_pixel`).
     exposure_time
         Seconds; a body with a velocity is blurred over it.
     """
@@ -261,7 +261,7 @@ class Camera(PartOfScene):
         return NoiseModel(gain=self.gain, read_noise=self.read_noise / self.gain)
 
     def response(self, lights: tuple[Light, ...]) -> FloatArray:
-        """Response (C, k) of each channel to each light; its largest entry is 1.
+        """Return the response (C, k) of each channel to each light; its largest entry is 1.
 
         Parameters
         ----------
@@ -351,9 +351,11 @@ class Camera(PartOfScene):
         """
         step = 0.0 if self.kind == "monochrome" else self.lateral_colour / math.hypot(*self.centre)
         steps = np.arange(len(lights)) * step
-        growth = [one if li.magnification is None else li.magnification for li, one in zip(lights, steps, strict=True)]
+        magnifications = [
+            lateral if li.magnification is None else li.magnification for li, lateral in zip(lights, steps, strict=True)
+        ]
         centres = np.array([light.shift for light in lights]) + self.centre
-        return np.column_stack([self.focal_px * (1 + np.array(growth)), centres])
+        return np.column_stack([self.focal_px * (1 + np.array(magnifications)), centres])
 
     def true_registration(self, lights: tuple[Light, ...]) -> Registration | None:
         """Return the registration that a perfect calibration would find; None: the lens images all colours alike.
@@ -379,7 +381,7 @@ class Camera(PartOfScene):
 
 
 def reference_camera(shape: tuple[int, int], **changes: object) -> Camera:
-    """RGGB, 12 bit, 4 e-/DN, read noise 12 e-, lens blur 0.45 px, 0.055 mm per px; `changes` to any setting.
+    """Return RGGB, 12 bit, 4 e-/DN, read noise 12 e-, lens blur 0.45 px, 0.055 mm per px; `changes` to any setting.
 
     Its lens has no lateral colour unless `changes` state it, so that a scene shows one cause at a time; a camera of a
     SCENE.toml has. A monochrome camera has no crosstalk of its own.

@@ -2,10 +2,10 @@
 
 The covariance of the nodes is ``M^-1 S M^-1`` with M the Hessian of the weighted sum over the lights and S the
 covariance of its right-hand side; with equal white noise it is the well-known ``2 sigma^2 M^-1``. Per pixel, M has the
-density `information` = energy of the speckle's gradient x pull x contrast, with the pull of a light its contrast over
-the variance of its residual (`light_pull`, as the main job weights by default); S has the density `score` of the errors
-of the images times the pulls. From the two densities follows the uncertainty of an inner node of a regular mesh
-(`node_constant`), or of every node of a mesh over which they vary (`expected_std`).
+density `information` = energy of the speckle's gradient x precision x contrast, with the precision of a light its
+contrast over the variance of its residual (`light_precision`, as the main job weights by default); S has the density
+`score` of the errors of the images times the precisions. From the two densities follows the uncertainty of an inner
+node of a regular mesh (`nodal_variance_factor`), or of every node of a mesh over which they vary (`expected_std`).
 
 The densities come from a scene (`Instrument`, here) or from a frame (`rgbmidic.lab.inspection.prediction`). Those of a
 scene are integrals of the speckle's gradient spectrum: of the texture alone for M, of its product with the spectrum of
@@ -44,8 +44,8 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
 @cache
-def node_constant() -> float:
-    """Variance of an inner node's value per unit of white noise density and element area: about 1.1.
+def nodal_variance_factor() -> float:
+    """Return the variance of an inner node's value per unit of white noise density and element area: about 1.1.
 
     `expected_std` of a regular mesh: the linear fit has the inverse of the consistent mass matrix (2.6 on its
     diagonal); the recovery of the nodal values reduces it.
@@ -58,8 +58,8 @@ def node_constant() -> float:
     return float((std[inner] ** 2).mean() * mesh.size**2)
 
 
-def light_pull(contrast: npt.NDArray[Floating], residual: npt.NDArray[Floating]) -> npt.NDArray[Floating]:
-    """Contrast of each light over the variance of its residual: its pull on the displacement.
+def light_precision(contrast: npt.NDArray[Floating], residual: npt.NDArray[Floating]) -> npt.NDArray[Floating]:
+    """Return the contrast of each light over the variance of its residual: its weight in the displacement.
 
     Parameters
     ----------
@@ -86,23 +86,23 @@ def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -
     """
     area = mesh.to_nodes(mesh.areas)
     density = mesh.to_nodes(information * mesh.areas) / area
-    known = density[density > 0]
-    seen = density > USUAL.seen * np.median(known) if known.size else np.zeros(len(density), bool)
-    if not seen.any():
+    positive = density[density > 0]
+    is_visible = density > USUAL.seen * np.median(positive) if positive.size else np.zeros(len(density), bool)
+    if not is_visible.any():
         return np.full((len(scores), len(density)), np.nan)
     assembly = Assembly.from_mesh(mesh)
     mass = ((1 + np.eye(3)) / 12)[..., None] * np.array([1.0, 0.0, 1.0])
 
-    def assembled(values: FloatArray) -> sp.csc_matrix:
+    def assemble(values: FloatArray) -> sp.csc_matrix:
         return assembly.matrix((values * mesh.areas)[:, None, None, None] * mass)
 
     # elements that no light sees must not make the system singular
-    solve = assembly.factorise(assembled(np.maximum(information, 1e-3 * USUAL.seen * np.median(density[seen]))))
-    used = np.asarray(seen[mesh.elements].all(axis=1))
-    recovery = Recovery.over(mesh, used, density)
-    along_x = [((recovery.value, None), seen)]
-    std = np.stack([functional_std(solve, assembled(score), mesh, along_x)[:, 0] for score in scores])
-    return np.where(seen & (std < USUAL.lost), std, np.nan)
+    solve = assembly.factorise(assemble(np.maximum(information, 1e-3 * USUAL.seen * np.median(density[is_visible]))))
+    is_used = np.asarray(is_visible[mesh.elements].all(axis=1))
+    recovery = Recovery.over(mesh, is_used, density)
+    along_x = [((recovery.value, None), is_visible)]
+    std = np.stack([functional_std(solve, assemble(score), mesh, along_x)[:, 0] for score in scores])
+    return np.where(is_visible & (std < USUAL.lost), std, np.nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,7 +162,7 @@ class Instrument:
         Mean square of the speckle's gradient along x, px^-2.
     residual, score
         Of a pixel, and of the right-hand side per pixel.
-    dome_pull
+    dome_gradient_product
         Mean product of the gradients of texture and domes, px^-1.
     wrinkle_area
         Area over which the erratic part of a reflection is correlated, in units of the wrinkles' spacing squared
@@ -176,7 +176,7 @@ class Instrument:
     energy: float
     residual: Energies
     score: Energies
-    dome_pull: float
+    dome_gradient_product: float
     wrinkle_area: float = 0.085
     saturation: float = 0.98
 
@@ -227,15 +227,15 @@ class Instrument:
             energy=spectrum.energy,
             residual=energies(spectrum.residual, spectrum.variance),
             score=energies(spectrum.score, spectrum.contrast_score(element_size)),
-            dome_pull=spectrum.pull(relief[0, 1]),
+            dome_gradient_product=spectrum.gradient_product(relief[0, 1]),
         )
 
-    def forecast(self, before: Zones, after: Zones, change: FloatArray) -> Forecast:
-        """Uncertainty between two states, at the points at which their zones were predicted.
+    def forecast(self, reference: Zones, deformed: Zones, change: FloatArray) -> Forecast:
+        """Return the uncertainty between two states, at the points at which their zones were predicted.
 
         Parameters
         ----------
-        before, after
+        reference, deformed
             Predictions at the same material points.
         change : ndarray, shape (3, ...)
             Of the mosaic's trace between them (`trace_change`), as a mean over the elements of a node.
@@ -245,28 +245,34 @@ class Instrument:
         Forecast
             At these points.
         """
-        residual, score = (self._covariance(one, before, after, change) for one in (self.residual, self.score))
+        residual, score = (
+            self._covariance(energies, reference, deformed, change) for energies in (self.residual, self.score)
+        )
         variance = np.einsum("jj...->j...", residual)
-        contrast = np.where(self._seen(variance, before, after), 1 - (before.fraction + after.fraction) / 2, 0.0)
-        pull = light_pull(contrast, variance)
-        total = (self.energy * pull * contrast).sum(axis=0)
-        drag = np.nan_to_num((self._dome_factor(after) - self._dome_factor(before)) * pull[:, None]).sum(axis=0)
-        square = np.einsum("jk...,j...,k...->...", np.nan_to_num(score), pull, pull)
+        contrast = np.where(
+            self._is_visible(variance, reference, deformed), 1 - (reference.fraction + deformed.fraction) / 2, 0.0
+        )
+        precision = light_precision(contrast, variance)
+        total = (self.energy * precision * contrast).sum(axis=0)
+        dome_offset = np.nan_to_num(
+            (self._dome_factor(deformed) - self._dome_factor(reference)) * precision[:, None]
+        ).sum(axis=0)
+        square = np.einsum("jk...,j...,k...->...", np.nan_to_num(score), precision, precision)
         with np.errstate(invalid="ignore", divide="ignore"):
-            std = np.sqrt(node_constant() * square) / (self.element_size * total)
-            bias = self.dome_pull * np.sqrt((drag**2).sum(axis=0) / 2) / total
+            std = np.sqrt(nodal_variance_factor() * square) / (self.element_size * total)
+            bias = self.dome_gradient_product * np.sqrt((dome_offset**2).sum(axis=0) / 2) / total
         return Forecast(std=np.where(total > 0, std, np.nan), bias=np.where(total > 0, bias, np.nan))
 
-    def weights(self, before: Zones, after: Zones, *, known: bool = True) -> FloatImage:
-        """Weights in [0, 1] for the solve: inverse variance of the pull of each light on the displacement.
+    def weights(self, reference: Zones, deformed: Zones, *, motion_known: bool = True) -> FloatImage:
+        """Return weights in [0, 1] for the solve: the inverse variance of each light's part in the displacement.
 
         The best light at the best point has 1; a light that does not see or saturates has 0.
 
         Parameters
         ----------
-        before, after
+        reference, deformed
             Predictions at the same material points.
-        known
+        motion_known
             Whether the motion between the states is known to them. If not, the reflections are taken to have changed
             wholly.
 
@@ -274,21 +280,21 @@ class Instrument:
         -------
         ndarray, shape (k, ...), float32
         """
-        change = np.full((3, *before.fraction.shape[1:]), 2.0)
-        covariance = self._covariance(self.score, before, after, change, common=float(known))
+        change = np.full((3, *reference.fraction.shape[1:]), 2.0)
+        covariance = self._covariance(self.score, reference, deformed, change, common=float(motion_known))
         variance = np.einsum("jj...->j...", covariance)
-        seen = self._seen(variance, before, after)
-        inverse = np.where(seen, 1 / np.where(seen, variance, 1.0), 0.0)
+        is_visible = self._is_visible(variance, reference, deformed)
+        inverse = np.where(is_visible, 1 / np.where(is_visible, variance, 1.0), 0.0)
         return (inverse / max(float(inverse.max()), 1e-30)).astype(np.float32)
 
-    def light_variance(self, light: int, before: Zones, after: Zones, brightness: FloatArray) -> FloatArray:
-        """Variance of the pull (n, ...) of one light that is tried in n places, the others as bright as they are.
+    def light_variance(self, light: int, reference: Zones, deformed: Zones, brightness: FloatArray) -> FloatArray:
+        """Return the variance (n, ...) of one light's part that is tried in n places, the others as bright as they are.
 
         Parameters
         ----------
         light
             Its index.
-        before, after
+        reference, deformed
             Predictions of this light alone in its n places.
         brightness : ndarray, shape (k,)
             Mean grey level of every light, for the noise that crosstalk brings.
@@ -298,55 +304,57 @@ class Instrument:
         ndarray, shape (n, ...)
             In units of the local mean.
         """
-        variance = self._reflections(self.score, before, after, 1.0) + 2 * self.score.mosaic[:, light, light].sum()
+        variance = (
+            self._reflections(self.score, reference, deformed, 1.0) + 2 * self.score.mosaic[:, light, light].sum()
+        )
         mixing = _channel_mixing(self.scene)
-        others = mixing @ np.where(np.arange(len(brightness)) == light, 0.0, brightness)
-        for zones in (before, after):
+        other_levels = mixing @ np.where(np.arange(len(brightness)) == light, 0.0, brightness)
+        for zones in (reference, deformed):
             for colour, factor in enumerate(self.score.noise[:, light, light]):
-                samples = self.scene.camera.noise.variance(others[colour] + mixing[colour, light] * zones.level)
+                samples = self.scene.camera.noise.variance(other_levels[colour] + mixing[colour, light] * zones.level)
                 variance += factor * (samples + QUANTISATION) / zones.level**2
         return np.asarray(variance)
 
     def _covariance(
-        self, energies: Energies, before: Zones, after: Zones, change: FloatArray, common: float = 1.0
+        self, energies: Energies, reference: Zones, deformed: Zones, change: FloatArray, common: float = 1.0
     ) -> FloatArray:
-        """Covariance (k, k, ...) of the changes of the lights' images, in units of their local means.
+        """Return the covariance (k, k, ...) of the changes of the lights' images, in units of their local means.
 
         `common` is 1 where the two states share their reflections as predicted, 0 where they have nothing in common.
         """
         covariance = np.einsum("cjk,c...->jk...", energies.mosaic, change)
-        for zones in (before, after):
-            levels = _channels(_channel_mixing(self.scene), zones.level)
+        for zones in (reference, deformed):
+            levels = _channel_levels(_channel_mixing(self.scene), zones.level)
             samples = self.scene.camera.noise.variance(levels) + QUANTISATION  # of each colour at the mean, DN squared
             covariance += np.einsum("cjk,c...->jk...", energies.noise, samples) / (zones.level[:, None] * zones.level)
         lights = range(len(covariance))
-        covariance[lights, lights] += self._reflections(energies, before, after, common)
+        covariance[lights, lights] += self._reflections(energies, reference, deformed, common)
         return np.asarray(covariance)
 
-    def _reflections(self, energies: Energies, before: Zones, after: Zones, common: float) -> FloatArray:
+    def _reflections(self, energies: Energies, reference: Zones, deformed: Zones, common: float) -> FloatArray:
         """Variance (k, ...) that comes from a change of the reflections; between the lights it is independent."""
-        first, second = self._dome_factor(before), self._dome_factor(after)
+        first, second = self._dome_factor(reference), self._dome_factor(deformed)
         domes = (first**2 + second**2 - 2 * common * first * second).sum(axis=1)
-        contrast = before.fraction**2 + after.fraction**2 - 2 * common * before.fraction * after.fraction
-        erratic = self._erratic(before, after, common)
+        contrast = reference.fraction**2 + deformed.fraction**2 - 2 * common * reference.fraction * deformed.fraction
+        erratic = self._erratic(reference, deformed, common)
         return np.asarray(energies.erratic * erratic + energies.dome * domes + energies.contrast * contrast)
 
-    def _erratic(self, before: Zones, after: Zones, common: float) -> FloatArray:
+    def _erratic(self, reference: Zones, deformed: Zones, common: float) -> FloatArray:
         """Spectrum (px^2) of the erratic part of the change of each light's image (k, ...), in units of its mean.
 
         Facets with Gaussian slopes of variance a^2 per axis reflect ``q = exp(-|s - h|^2/(2 b^2))``; the covariance of
         q between the half-way slopes h of two states is an integral of Gaussians. The part linear in the slopes is
         finer than the pixel and is left out: wrinkles have no slope on average.
         """
-        parts = [
-            _facet_covariance(one.slopes, other.slopes, *self._roughness) * one.fraction * other.fraction
-            for one, other in ((before, before), (after, after), (before, after))
+        covariances = [
+            _facet_covariance(first.slopes, second.slopes, *self._roughness) * first.fraction * second.fraction
+            for first, second in ((reference, reference), (deformed, deformed), (reference, deformed))
         ]
         area = self.wrinkle_area * (self.scene.surface.white.spacing / self.scene.pixel) ** 2
-        return np.asarray(area * np.maximum(parts[0] + parts[1] - 2 * common * parts[2], 0))
+        return np.asarray(area * np.maximum(covariances[0] + covariances[1] - 2 * common * covariances[2], 0))
 
     def _dome_factor(self, zones: Zones) -> FloatArray:
-        """Effect (k, 3, ...) of a unit slope of a droplet's dome on the light's image, in units of its mean.
+        """Return the effect (k, 3, ...) of a unit slope of a droplet's dome on the light's image, in units of its mean.
 
         A slope s changes the reflection at the half-way slope h by the factor exp(h.s/(a^2 + b^2)); its linear part is
         taken.
@@ -360,25 +368,25 @@ class Instrument:
         slope = (1 - cover) * slope_variance(surface.white) + cover * slope_variance(surface.black)
         return slope, (1 - cover) * facet_variance(surface.white) + cover * facet_variance(surface.black)
 
-    def _seen(self, variance: FloatArray, before: Zones, after: Zones) -> BoolArray:
-        """Where each light (k, ...) reaches the surface and saturates nothing in both states."""
-        return np.isfinite(variance) & ~self.saturated(before) & ~self.saturated(after)
+    def _is_visible(self, variance: FloatArray, reference: Zones, deformed: Zones) -> BoolArray:
+        """Return True (k, ...) where a light reaches the surface and saturates nothing in both states."""
+        return np.isfinite(variance) & ~self.is_saturated(reference) & ~self.is_saturated(deformed)
 
-    def saturated(self, zones: Zones) -> BoolArray:
-        """Where white paint is expected to saturate a channel that the light needs, (k, ...)."""
+    def is_saturated(self, zones: Zones) -> BoolArray:
+        """Return True (k, ...) where white paint is expected to saturate a channel that the light needs."""
         mixing = _channel_mixing(self.scene)
-        full = _channels(mixing, self.white_level(zones)) > self.saturation * self.scene.camera.full_scale
+        is_full = _channel_levels(mixing, self.white_level(zones)) > self.saturation * self.scene.camera.full_scale
         unmixing = np.abs(np.linalg.pinv(mixing))
-        needed = unmixing > NEGLIGIBLE * unmixing.max(axis=1, keepdims=True)
-        return np.asarray(np.einsum("jc,c...->j...", needed.astype(float), full.astype(float)) > 0)
+        is_needed = unmixing > NEGLIGIBLE * unmixing.max(axis=1, keepdims=True)
+        return np.asarray(np.einsum("jc,c...->j...", is_needed.astype(float), is_full.astype(float)) > 0)
 
     def white_level(self, zones: Zones) -> FloatArray:
-        """Grey level (k, ...) of the white paint under each light, DN above black."""
+        """Return the grey level (k, ...) of the white paint under each light, DN above black."""
         return zones.irradiance * (self.scene.surface.white.albedo * zones.lambert + zones.specular)
 
 
 def trace_change(displacement: FloatArray) -> FloatArray:
-    """Mean square change (3, ...) of the three carriers of the mosaic under a displacement (2, ...) in px.
+    """Return the mean square change (3, ...) of the three carriers of the mosaic under a displacement (2, ...) in px.
 
     The trace stays with the sensor: it differs most where the texture has moved by an odd number of pixels.
     """
@@ -387,14 +395,14 @@ def trace_change(displacement: FloatArray) -> FloatArray:
 
 
 def _channel_mixing(scene: Scene) -> FloatArray:
-    """Camera samples from lights, (C, k); before a monochrome camera every light has a frame of its own."""
+    """Return the camera samples from lights, (C, k); before a monochrome camera every light has a frame of its own."""
     if scene.camera.kind == "monochrome":
         return np.eye(len(scene.lights))
     return scene.camera.mixing(scene.lights)
 
 
-def _channels(mixing: FloatArray, levels: FloatArray) -> FloatArray:
-    """Levels (C, ...) of the channels; a light that does not reach a point adds nothing."""
+def _channel_levels(mixing: FloatArray, levels: FloatArray) -> FloatArray:
+    """Return the levels (C, ...) of the channels; a light that does not reach a point adds nothing."""
     return np.asarray(np.einsum("cj,j...->c...", mixing, np.nan_to_num(levels)))
 
 
@@ -405,6 +413,6 @@ def _facet_covariance(first: FloatArray, second: FloatArray, a2: float, b2: floa
     """
     squares, product = (first**2 + second**2).sum(axis=1), (first * second).sum(axis=1)
     means = 2 * math.log(b2 / (a2 + b2)) - squares / (2 * (a2 + b2))
-    apart, middle = squares - 2 * product, (squares + 2 * product) / 4
-    together = math.log(b2 / (2 * a2 + b2)) - apart / (4 * b2) - middle / (2 * a2 + b2)
-    return np.asarray(np.exp(np.minimum(together - means, 50.0)) - 1 - product * a2 / (a2 + b2) ** 2)
+    difference_square, mean_square = squares - 2 * product, (squares + 2 * product) / 4
+    log_product = math.log(b2 / (2 * a2 + b2)) - difference_square / (4 * b2) - mean_square / (2 * a2 + b2)
+    return np.asarray(np.exp(np.minimum(log_product - means, 50.0)) - 1 - product * a2 / (a2 + b2) ** 2)

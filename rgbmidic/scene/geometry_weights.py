@@ -15,8 +15,8 @@ from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.scene.forecast import Instrument
 from rgbmidic.scene.scene import Scene, State, read_scene
-from rgbmidic.scene.zones import Zones, material_points, predict_zones, unit, zones_on_surface
-from rgbmidic.settings import TestSettings, regular
+from rgbmidic.scene.zones import Zones, material_points, predict_zones, unit_vectors, zones_on_surface
+from rgbmidic.settings import TestSettings, require_regular_file
 from rgbmidic.typing import FloatArray, FloatImage
 
 _STEP = 4
@@ -104,51 +104,54 @@ class GeometryWeights:
         )
 
     def reference(self, images: IlluminationImages) -> FloatImage:
-        """Weights (k, H, W) of the reference: binary ones, or 1 where an image is valid.
+        """Return the weights (k, H, W) of the reference: binary ones, or 1 where an image is valid.
 
         Soft weights belong to a pair of states and are given to the deformed one.
         """
         valid = images.valid.astype(np.float32)
         if self.limit_deg is None:
             return valid
-        each = [self._binary(self._state(index), images, self.limit_deg) for index in self.reference_frames]
-        return np.asarray(valid * np.min(each, axis=0))
+        frame_weights = [self._binary(self._state(index), images, self.limit_deg) for index in self.reference_frames]
+        return np.asarray(valid * np.min(frame_weights, axis=0))
 
     def deformed(self, images: IlluminationImages, index: int) -> FloatImage:
-        """Weights (k, H, W) of frame `index` compared with the first reference frame."""
+        """Return the weights (k, H, W) of frame `index` compared with the first reference frame."""
         state = self._state(index)
         if self.limit_deg is not None:
             return np.asarray(images.valid * self._binary(state, images, self.limit_deg))
-        before, after = self._zones(self._state(self.reference_frames[0]), state), self._zones(state, state)
-        weights = self.instrument.weights(before, after, known=bool(self.states))
+        reference_zones, deformed_zones = (
+            self._zones(self._state(self.reference_frames[0]), state),
+            self._zones(state, state),
+        )
+        weights = self.instrument.weights(reference_zones, deformed_zones, motion_known=bool(self.states))
         return np.asarray(images.valid * self._at_pixels(weights, images))
 
     def _binary(self, state: State, images: IlluminationImages, limit_deg: float) -> FloatImage:
         deviation = self._zones(state, state).deviation_deg
-        seen = self._at_pixels(np.isfinite(deviation).astype(np.float32), images) > 0.5
+        is_visible = self._at_pixels(np.isfinite(deviation).astype(np.float32), images) > 0.5
         smooth = self._at_pixels(np.nan_to_num(deviation, nan=180.0).astype(np.float32), images)
-        return angle_weights(np.where(seen, smooth, np.nan), limit_deg)
+        return angle_weights(np.where(is_visible, smooth, np.nan), limit_deg)
 
     def _state(self, index: int) -> State:
         return self.states[index] if self.states else State()
 
-    def _zones(self, state: State, seen: State) -> Zones:
-        """Zones in a state at the material points that the grid's pixels see in another one."""
+    def _zones(self, state: State, viewed_state: State) -> Zones:
+        """Return the zones in a state at the material points that the grid's pixels see in another one."""
         if self.surface is not None:
             return zones_on_surface(self.scene, *self.surface)
-        material = material_points(self.scene, seen, _grid(self.scene.camera.shape))
+        material = material_points(self.scene, viewed_state, _grid(self.scene.camera.shape))
         return predict_zones(self.scene, state, material=material)
 
     def _at_pixels(self, coarse: FloatImage, images: IlluminationImages) -> FloatImage:
-        """Values (k, h, w) on the grid at the pixels of images (k, H, W), in the order of the test's lights."""
-        (left, top), (height, width) = images.origin, images.shape
-        x, y = np.meshgrid(*(np.arange(a, a + n, dtype=np.float32) for a, n in ((left, width), (top, height))))
-        place = x / _STEP, y / _STEP
-        return np.stack([cv2.remap(coarse[light], *place, cv2.INTER_LINEAR) for light in self.order])
+        """Return values (k, h, w) on the grid at the pixels of images (k, H, W), in the order of the test's lights."""
+        (x_origin, y_origin), (height, width) = images.origin, images.shape
+        x, y = np.meshgrid(*(np.arange(a, a + n, dtype=np.float32) for a, n in ((x_origin, width), (y_origin, height))))
+        grid_coordinates = x / _STEP, y / _STEP
+        return np.stack([cv2.remap(coarse[light], *grid_coordinates, cv2.INTER_LINEAR) for light in self.order])
 
 
 def _grid(shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Image points (x, y) of the prediction, up to beyond the last pixel."""
+    """Return the image points (x, y) of the prediction, up to beyond the last pixel."""
     rows, columns = (np.arange(0, size + _STEP, _STEP, dtype=np.float64) for size in shape)
     x, y = np.meshgrid(columns, rows)
     return x, y
@@ -164,10 +167,10 @@ def _order(scene: Scene, lights: Sequence[str], file: Path) -> tuple[int, ...]:
 
 
 def _read_surface(path: Path, scene: Scene) -> tuple[FloatArray, FloatArray]:
-    """Points and normals on the grid, from a height map on disk."""
+    """Return the points and normals on the grid, from a height map on disk."""
     camera = scene.camera
     try:
-        heights = np.load(regular(path), allow_pickle=False)
+        heights = np.load(require_regular_file(path), allow_pickle=False)
     except FileNotFoundError:
         raise ConfigurationError(f"weights.height_map not found: {path}") from None
     except (OSError, ValueError) as error:
@@ -183,13 +186,14 @@ def _read_surface(path: Path, scene: Scene) -> tuple[FloatArray, FloatArray]:
         raise ConfigurationError(f"weights.height_map {path}: {error}") from None
     limits = camera.shape[1] - 1, camera.shape[0] - 1
     columns, rows = (
-        np.minimum(place, limit).astype(int) for place, limit in zip(_grid(camera.shape), limits, strict=True)
+        np.minimum(coordinates, limit).astype(int)
+        for coordinates, limit in zip(_grid(camera.shape), limits, strict=True)
     )
     return points[:, rows, columns], normals[:, rows, columns]
 
 
 def angle_weights(deviation_deg: FloatArray, limit_deg: float = 15.0) -> FloatImage:
-    """Binary weights: 0 within `limit_deg` of the mirror direction and where the deviation is NaN, 1 elsewhere.
+    """Return binary weights: 0 within `limit_deg` of the mirror direction and where the deviation is NaN, 1 elsewhere.
 
     By default the limit is that within which the reflection corrupts the image (paper, Fig. 9).
 
@@ -204,7 +208,7 @@ def angle_weights(deviation_deg: FloatArray, limit_deg: float = 15.0) -> FloatIm
 
 
 def surface_from_heights(heights: npt.ArrayLike, scene: Scene) -> tuple[FloatArray, FloatArray]:
-    """Points and normals of a surface given as a height map over the pixels of the reference image.
+    """Return the points and normals of a surface given as a height map over the pixels of the reference image.
 
     Parameters
     ----------
@@ -231,4 +235,4 @@ def surface_from_heights(heights: npt.ArrayLike, scene: Scene) -> tuple[FloatArr
     focal, x0, y0 = camera.lenses(scene.lights)[0]
     points = np.stack([depth * (columns - x0) / focal, depth * (rows - y0) / focal, depth])
     down, right = np.gradient(points, axis=(1, 2))
-    return points, unit(np.cross(down, right, axis=0))
+    return points, unit_vectors(np.cross(down, right, axis=0))

@@ -15,16 +15,24 @@ import numpy as np
 from rgbmidic._kernels import render as kernels
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Led, Sensitivities
+from rgbmidic.scene import SceneSection
 from rgbmidic.scene.camera import PIXEL, REFERENCE_CROSSTALK, Camera, Light, Polarisers, Vector, rotation, three_lights
-from rgbmidic.scene.checked import PartOfScene
 from rgbmidic.scene.surface import AffineField, InPlaneField, MeshField, Surface
-from rgbmidic.settings import ELEMENT_SIZE, check_names, convert_value, read_section, read_table, read_toml, regular
+from rgbmidic.settings import (
+    ELEMENT_SIZE,
+    check_names,
+    convert_value,
+    read_section,
+    read_table,
+    read_toml,
+    require_regular_file,
+)
 from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
 
-class _Body(PartOfScene):
-    """What bodies have in common."""
+class _Body(SceneSection):
+    """Common properties of bodies."""
 
     __slots__ = ()
     centre: Vector
@@ -36,7 +44,7 @@ class _Body(PartOfScene):
         return x, y, z - float(self.parameters()[1])
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels.
+        """Return [kind, radius, half width, half height] for the kernels.
 
         Returns
         -------
@@ -70,7 +78,7 @@ class Sphere(_Body):
         return np.eye(3)
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels.
+        """Return [kind, radius, half width, half height] for the kernels.
 
         Returns
         -------
@@ -104,7 +112,7 @@ class Cylinder(_Body):
         return rotation(self.tilt_deg, (0.0, 0.0, 1.0))
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels.
+        """Return [kind, radius, half width, half height] for the kernels.
 
         Returns
         -------
@@ -138,7 +146,7 @@ class Plate(_Body):
         return rotation(self.tilt_deg[1], (1.0, 0.0, 0.0)) @ rotation(self.tilt_deg[0], (0.0, 1.0, 0.0))
 
     def parameters(self) -> FloatArray:
-        """[kind, radius, half width, half height] for the kernels.
+        """Return [kind, radius, half width, half height] for the kernels.
 
         Returns
         -------
@@ -152,7 +160,7 @@ Body = Sphere | Cylinder | Plate
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class State:
-    """Where the body is: in-plane displacement of a plate, then rotation about a pivot, then translation.
+    """Pose of the body: in-plane displacement of a plate, then rotation about a pivot, then translation.
 
     Attributes
     ----------
@@ -180,7 +188,7 @@ class State:
     velocity: Vector = (0.0, 0.0, 0.0)
     spin_deg: float = 0.0
 
-    def after(self, seconds: float) -> State:
+    def at_time(self, seconds: float) -> State:
         """Return the state some time later, at rest.
 
         Parameters
@@ -197,7 +205,7 @@ class State:
         return replace(self, angle_deg=angle, translation=(x, y, z), velocity=(0.0, 0.0, 0.0), spin_deg=0.0)
 
     def pose(self, body: Body) -> tuple[FloatArray, FloatArray]:
-        """Rotation R (3, 3) and origin t (3,): camera point = R . body point + t.
+        """Return the rotation R (3, 3) and origin t (3,): camera point = R . body point + t.
 
         Parameters
         ----------
@@ -296,7 +304,7 @@ class Scene:
         return replace(self, lights=lights, surface=replace(self.surface, white=white, black=black))
 
     def mirror_position(self, distance: float) -> Vector:
-        """Where a lamp must stand for its reflection to cover the body's front point, seen from the camera.
+        """Return the position of a lamp whose reflection covers the body's front point, seen from the camera.
 
         On a flat plate it covers the whole field. `distance` from the front point in mm.
 
@@ -322,7 +330,7 @@ _FIELD_KEYS = ("displacement_gradient", "displacement_offset", "displacement_fil
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DatasetSettings(PartOfScene):
+class DatasetSettings(SceneSection):
     """Settings of the output (``[output]``).
 
     Attributes
@@ -421,51 +429,51 @@ def _light(table: dict[str, Any], body: Body, base: Path) -> Light:
 
 
 def _camera(table: dict[str, Any], body: Body, base: Path) -> Camera:
-    ready: dict[str, Any] = {}
+    derived: dict[str, Any] = {}
 
-    def stated(key: str, kind: Any, default: Any = None) -> Any:
+    def read_key(key: str, kind: Any, default: Any = None) -> Any:
         return convert_value(table.pop(key, default), kind, f"camera.{key}", base)
 
     if "crosstalk" in table:
-        rows = stated("crosstalk", tuple[tuple[float, ...], ...])
+        rows = read_key("crosstalk", tuple[tuple[float, ...], ...])
         if len({len(row) for row in rows}) != 1:
             raise ConfigurationError("camera.crosstalk must be rows of the same length")
-        ready["crosstalk"] = np.array(rows)
+        derived["crosstalk"] = np.array(rows)
     if "sensitivities" in table:
-        ready["sensitivities"] = Sensitivities.read(stated("sensitivities", Path))
+        derived["sensitivities"] = Sensitivities.read(read_key("sensitivities", Path))
     if "model" in table:
-        ready["sensitivities"] = Sensitivities.from_colour(stated("model", str))
-    if not ready and table.get("kind") != "monochrome":
-        ready["crosstalk"] = np.array(REFERENCE_CROSSTALK)
-    pixel = stated("mm_per_pixel", float, PIXEL)
+        derived["sensitivities"] = Sensitivities.from_colour(read_key("model", str))
+    if not derived and table.get("kind") != "monochrome":
+        derived["crosstalk"] = np.array(REFERENCE_CROSSTALK)
+    pixel = read_key("mm_per_pixel", float, PIXEL)
     if not pixel > 0:
         raise ConfigurationError(f"camera.mm_per_pixel must be positive, not {pixel}")
     table.setdefault("shape", [640, 640])
     table.setdefault("focal_px", body.front[2] / pixel)
-    return read_section(Camera, "camera", table, base, **ready)
+    return read_section(Camera, "camera", table, base, **derived)
 
 
 def _state(table: dict[str, Any], body: Body, base: Path) -> State:
-    given = {key: table.pop(key) for key in _FIELD_KEYS if key in table}
-    return read_section(State, "states", table, base, displacement=_field(given, body, base))
+    field_keys = {key: table.pop(key) for key in _FIELD_KEYS if key in table}
+    return read_section(State, "states", table, base, displacement=_field(field_keys, body, base))
 
 
-def _field(given: Mapping[str, Any], body: Body, base: Path) -> InPlaneField | None:
-    if not given:
+def _field(field_keys: Mapping[str, Any], body: Body, base: Path) -> InPlaneField | None:
+    if not field_keys:
         return None
     if not isinstance(body, Plate):
-        raise ConfigurationError(f"states.{next(iter(given))} is for a plate only")
-    if "displacement_file" not in given:
+        raise ConfigurationError(f"states.{next(iter(field_keys))} is for a plate only")
+    if "displacement_file" not in field_keys:
         types = {"gradient": tuple[tuple[float, float], tuple[float, float]], "offset": tuple[float, float]}
-        values = {key.removeprefix("displacement_"): value for key, value in given.items()}
+        values = {key.removeprefix("displacement_"): value for key, value in field_keys.items()}
         return AffineField(
             **{k: convert_value(v, types[k], f"states.displacement_{k}", base) for k, v in values.items()}
         )
-    if len(given) > 1:
+    if len(field_keys) > 1:
         raise ConfigurationError("states.displacement_file excludes displacement_gradient and displacement_offset")
-    path = convert_value(given["displacement_file"], Path, "states.displacement_file", base)
+    path = convert_value(field_keys["displacement_file"], Path, "states.displacement_file", base)
     try:
-        with np.load(regular(path)) as file:
+        with np.load(require_regular_file(path)) as file:
             arrays = {name: file[name] for name in ("nodes", "elements", "displacement")}
     except (OSError, KeyError, ValueError) as error:
         raise ConfigurationError(f"{path} is not an npz with nodes, elements and displacement: {error}") from None

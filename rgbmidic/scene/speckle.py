@@ -47,22 +47,24 @@ class SpecklePatch:
         """Return a piece of `size` x `size` px of a scene's paint, faced at the distance of the body's front point."""
         camera, surface = scene.camera, scene.surface
         white, black = (replace(paint, slope_deg=0.0) for paint in (surface.white, surface.black))
-        place = (np.arange(size * subsamples) + 0.5) / subsamples * scene.pixel
-        cover, height = replace(surface, white=white, black=black).on_plate(place, place)
+        coordinates = (np.arange(size * subsamples) + 0.5) / subsamples * scene.pixel
+        cover, height = replace(surface, white=white, black=black).on_plate(coordinates, coordinates)
         albedo = surface.white.albedo + cover * (surface.black.albedo - surface.white.albedo)
-        texture = _seen(albedo, size, camera.lens_blur)
-        return cls(texture=texture / texture.mean(), domes=_seen(height / scene.pixel, size, camera.lens_blur))
+        texture = _image_fine_samples(albedo, size, camera.lens_blur)
+        return cls(
+            texture=texture / texture.mean(), domes=_image_fine_samples(height / scene.pixel, size, camera.lens_blur)
+        )
 
 
-def _seen(fine: FloatArray, size: int, blur: float) -> FloatArray:
-    """Fine samples averaged over the pixels and blurred by the lens."""
-    whole = fine.reshape(size, len(fine) // size, size, -1).mean(axis=(1, 3))
+def _image_fine_samples(fine: FloatArray, size: int, blur: float) -> FloatArray:
+    """Return the fine samples averaged over the pixels and blurred by the lens."""
+    pixel_means = fine.reshape(size, len(fine) // size, size, -1).mean(axis=(1, 3))
     line = np.exp(-2 * (np.pi * blur * np.fft.fftfreq(size)) ** 2)
-    return np.asarray(np.fft.ifft2(np.fft.fft2(whole) * np.outer(line, line)).real)
+    return np.asarray(np.fft.ifft2(np.fft.fft2(pixel_means) * np.outer(line, line)).real)
 
 
 def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tuple[FloatArray, FloatArray]:
-    """Cross spectra of the errors that demosaicing and unmixing leave in the lights' images.
+    """Return the cross spectra of the errors that demosaicing and unmixing leave in the lights' images.
 
     Parameters
     ----------
@@ -95,7 +97,7 @@ def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tupl
         )
         return separate(mosaic, crosstalk, demosaic).values.astype(np.float64)
 
-    phases = separated_phases(channels, camera.cfa, lights)
+    phases = separate_phases(channels, camera.cfa, lights)
     samples, colours = mosaic_samples(channels, camera.cfa), sampled_channels(camera.cfa, texture.shape)
     random, noise = np.random.default_rng(0), []
     for colour in range(3):
@@ -107,12 +109,12 @@ def separation_spectra(scene: Scene, texture: FloatArray, demosaic: str) -> tupl
     return np.stack(noise), np.stack([cross_spectra(carrier) for carrier in carriers])
 
 
-def separated_phases(
+def separate_phases(
     channels: npt.NDArray[Floating],
     cfa: str,
     lights: Callable[[npt.NDArray[Floating], str], npt.NDArray[Floating]],
 ) -> npt.NDArray[Floating]:
-    """Lights separated from a state behind the four phases of a colour filter array.
+    """Return the lights separated from a state behind the four phases of a colour filter array.
 
     What is the same in all four moves with the specimen; the rest stays with the sensor.
 
@@ -146,7 +148,7 @@ def cross_spectra(fields: FloatArray, rim: int = 8) -> FloatArray:
 
 
 def cover_covariance(surface: Surface, distance: FloatArray) -> FloatArray:
-    """Covariance of the black cover (0 or 1) at two points, by their distance (mm).
+    """Return the covariance of the black cover (0 or 1) at two points, by their distance (mm).
 
     Boolean model of discs of random radius R and number density n: ``(1 - coverage)^2 (exp(n E[overlap]) - 1)``, with
     the overlap of two equal discs at that distance.
@@ -184,7 +186,7 @@ class SpeckleSpectrum:
 
     @classmethod
     def of(cls, surface: Surface, *, pixel: float, blur: float, prefilter: str, samples: int = 4) -> SpeckleSpectrum:
-        """Spectrum of a painted surface; `pixel` in mm, `blur` the lens blur in px.
+        """Return the spectrum of a painted surface; `pixel` in mm, `blur` the lens blur in px.
 
         The droplets' covariance is tabulated on so many `samples` per pixel.
         """
@@ -227,7 +229,7 @@ class SpeckleSpectrum:
         return float((self.texture * self.prefilter).mean())
 
     def contrast_score(self, element_size: float) -> float:
-        """Variance density of the right-hand side under a unit change of the texture's contrast.
+        """Return the variance density of the right-hand side under a unit change of the texture's contrast.
 
         The integral of ``phi t dt/dx = phi/2 d(t^2)/dx`` is ``-1/2 integral t^2 dphi/dx``: with the spectrum of t^2 at
         zero frequency, ``2 integral C^2`` for a Gaussian texture, and ``integral (dphi/dx)^2 = 4/h^2 integral phi^2``.
@@ -239,24 +241,24 @@ class SpeckleSpectrum:
         return np.asarray((self._gradient * self.prefilter**2 * errors).mean(axis=(-2, -1)))
 
     def residual(self, errors: FloatArray) -> FloatArray:
-        """Variance at a pixel, after the prefilter, of errors with power spectra (..., n, n)."""
+        """Return the variance at a pixel, after the prefilter, of errors with power spectra (..., n, n)."""
         return np.asarray((self.prefilter * errors).mean(axis=(-2, -1)))
 
-    def pull(self, cross: FloatArray) -> float:
-        """Mean product of the gradients along x, after the prefilter, of the texture and of another field.
+    def gradient_product(self, cross: FloatArray) -> float:
+        """Return the mean product of the gradients along x, after the prefilter, of the texture and of another field.
 
         `cross` (n, n) is their cross spectrum.
         """
         return float(((2 * np.pi * self.frequency) ** 2 * self.prefilter * cross).mean())
 
     def score_kernel(self, reach: int) -> FloatImage:
-        """Kernel (2 reach + 1, 2 reach + 1) that filters errors, before the prefilter, into the right-hand side.
+        """Return kernel (2 reach + 1, 2 reach + 1) that filters errors, before the prefilter, into the right-hand side.
 
         The mean square of the filtered image is `score` of the spectrum of the errors.
         """
-        whole = np.fft.fftshift(np.fft.ifft2(np.sqrt(self.slope * self.texture) * self.prefilter).real)
-        near = slice(len(whole) // 2 - reach, len(whole) // 2 + reach + 1)
-        return whole[near, near].astype(np.float32)
+        kernel = np.fft.fftshift(np.fft.ifft2(np.sqrt(self.slope * self.texture) * self.prefilter).real)
+        central = slice(len(kernel) // 2 - reach, len(kernel) // 2 + reach + 1)
+        return kernel[central, central].astype(np.float32)
 
     @property
     def slope(self) -> FloatArray:
@@ -270,14 +272,14 @@ class SpeckleSpectrum:
 
 
 def _optics(frequency: FloatArray, blur: float) -> FloatArray:
-    return _outer(np.sinc(frequency) ** 2 * np.exp(-4 * (np.pi * blur * frequency) ** 2))
+    return _outer_square(np.sinc(frequency) ** 2 * np.exp(-4 * (np.pi * blur * frequency) ** 2))
 
 
 def _prefilter_transfer(name: str, frequency: FloatArray) -> FloatArray:
     taps = PREFILTERS[name]
-    place = np.arange(len(taps)) - len(taps) // 2
-    return _outer((taps @ np.cos(2 * np.pi * place[:, None] * frequency)) ** 2)
+    tap_offset = np.arange(len(taps)) - len(taps) // 2
+    return _outer_square((taps @ np.cos(2 * np.pi * tap_offset[:, None] * frequency)) ** 2)
 
 
-def _outer(line: FloatArray) -> FloatArray:
+def _outer_square(line: FloatArray) -> FloatArray:
     return np.outer(line, line)

@@ -16,7 +16,7 @@ from scipy.special import pdtr
 from rgbmidic._kernels.mesh import interpolate_at_points
 from rgbmidic._kernels.render import PLATE, sample_paint
 from rgbmidic.errors import InputError
-from rgbmidic.scene.checked import PartOfScene
+from rgbmidic.scene import SceneSection
 from rgbmidic.settings.conversion import bounded
 from rgbmidic.typing import FloatArray
 
@@ -29,8 +29,8 @@ BOUND = math.sqrt(6.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finish(PartOfScene):
-    """How one paint reflects.
+class Finish(SceneSection):
+    """Reflectance of one paint.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Finish(PartOfScene):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Surface(PartOfScene):
+class Surface(SceneSection):
     """White paint under a spray of black droplets, thrown at random (Boolean model).
 
     Attributes
@@ -114,7 +114,7 @@ class Surface(PartOfScene):
         return -math.log(1 - self.coverage) / (math.pi / 4 * self.droplet**2 * mean_square)
 
     def parameters(self) -> tuple[FloatArray, FloatArray, np.uint32]:
-        """Paint, counts and seed, as the kernels of `rgbmidic._kernels.render` take them.
+        """Return the paint, counts and seed, as the kernels of `rgbmidic._kernels.render` take them.
 
         Returns
         -------
@@ -134,7 +134,7 @@ class Surface(PartOfScene):
         return paint, counts, np.uint32(np.random.SeedSequence(self.seed).generate_state(1)[0])
 
     def sample(self, points: FloatArray, body: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Cover by black paint (0 to 1), height (mm) and slope vector at material points.
+        """Return the cover by black paint (0 to 1), height (mm) and slope vector at material points.
 
         Parameters
         ----------
@@ -177,7 +177,7 @@ class Surface(PartOfScene):
 def height_map(
     surface: Surface, *, size: float, pitch: float, corner: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[FloatArray, FloatArray]:
-    """Topography of a painted plate, as a profilometer would scan it (paper, Fig. 10).
+    """Return the topography of a painted plate, as a profilometer would scan it (paper, Fig. 10).
 
     Parameters
     ----------
@@ -233,12 +233,12 @@ class AffineField:
             raise InputError(f"a displacement gradient must not turn the plate inside out: {self.gradient}")
 
     def __call__(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Displacement (mm) of the material points."""
+        """Return the displacement (mm) of the material points."""
         (xx, xy), (yx, yy) = self.gradient
         return xx * x + xy * y + self.offset[0], yx * x + yy * y + self.offset[1]
 
     def inverse(self) -> FloatArray:
-        """[m00, m01, m10, m11, t0, t1]: spatial to material point.
+        """Return [m00, m01, m10, m11, t0, t1]: spatial to material point.
 
         Returns
         -------
@@ -248,7 +248,7 @@ class AffineField:
         return np.concatenate([matrix.ravel(), -matrix @ np.array(self.offset)])
 
     def material(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Material points of spatial ones.
+        """Return the material points of spatial ones.
 
         Parameters
         ----------
@@ -297,21 +297,22 @@ class MeshField:
             raise InputError("the elements of a mesh field must name existing nodes, and there must be one")
         if not (np.isfinite(nodes).all() and np.isfinite(values).all()):
             raise InputError("nodes and displacement of a mesh field must be finite")
-        before, after = _areas(nodes, elements), _areas(nodes + values, elements)
-        if not (before * after > 0).all():
+        reference_areas, deformed_areas = _areas(nodes, elements), _areas(nodes + values, elements)
+        if not (reference_areas * deformed_areas > 0).all():
             raise InputError(
-                f"element {int(np.argmin(before * after))} of the mesh field has no area or is turned over"
+                f"element {int(np.argmin(reference_areas * deformed_areas))} of the mesh field has no area or is "
+                "turned over"
             )
         object.__setattr__(self, "nodes", nodes)
         object.__setattr__(self, "displacement", values)
         object.__setattr__(self, "elements", elements)
 
     def __call__(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Displacement (mm) of the material points; NaN off the mesh."""
+        """Return the displacement (mm) of the material points; NaN off the mesh."""
         return _interpolate(x, y, self.nodes, self.elements, self.displacement)
 
     def material(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Material points of spatial ones: linear in the deformed triangles, hence exact; NaN off the mesh.
+        """Return the material points of spatial ones: linear in the deformed triangles, hence exact; NaN off the mesh.
 
         Parameters
         ----------
@@ -329,7 +330,7 @@ class MeshField:
 def material_from_spatial(
     field: InPlaneField | None, x: FloatArray, y: FloatArray, accuracy: float = 1e-8
 ) -> tuple[FloatArray, FloatArray]:
-    """Material points X of spatial points x = X + u(X).
+    """Return the material points X of spatial points x = X + u(X).
 
     A general function is inverted to an `accuracy` (mm) by the iteration X <- x - u(X), which converges where its
     gradient is below 1.
@@ -371,7 +372,7 @@ def _interpolate(
 def _bins(
     nodes: FloatArray, elements: npt.NDArray[np.int64]
 ) -> tuple[FloatArray, npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Square bins over the mesh, two elements each, and for each the elements whose bounding box meets it."""
+    """Return square bins over the mesh, two elements each, and for each the elements whose bounding box meets it."""
     corners = nodes[elements]
     low, high = corners.min(axis=1), corners.max(axis=1)
     origin, span = low.min(axis=0), high.max(axis=0) - low.min(axis=0)
@@ -380,9 +381,11 @@ def _bins(
     start = ((low - origin) / side).astype(np.int64)
     count = ((high - origin) / side).astype(np.int64) - start + 1
     pairs = np.repeat(np.arange(len(elements)), count.prod(axis=1))
-    place = np.arange(pairs.size) - np.repeat(np.cumsum(count.prod(axis=1)) - count.prod(axis=1), count.prod(axis=1))
-    i = np.minimum(start[pairs, 0] + place % count[pairs, 0], columns - 1)
-    j = np.minimum(start[pairs, 1] + place // count[pairs, 0], rows - 1)
+    index_in_element = np.arange(pairs.size) - np.repeat(
+        np.cumsum(count.prod(axis=1)) - count.prod(axis=1), count.prod(axis=1)
+    )
+    i = np.minimum(start[pairs, 0] + index_in_element % count[pairs, 0], columns - 1)
+    j = np.minimum(start[pairs, 1] + index_in_element // count[pairs, 0], rows - 1)
     bins = j * columns + i
     first = np.searchsorted(np.sort(bins), np.arange(columns * rows + 1))
     return np.array([*origin, side, columns, rows]), first, pairs[np.argsort(bins, kind="stable")]

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.scene import SceneSection
 from rgbmidic.scene.camera import NOMINAL_DISTANCE, Light
-from rgbmidic.scene.checked import PartOfScene
 from rgbmidic.scene.scene import Cylinder, Plate, Scene, Sphere, State
 from rgbmidic.scene.surface import Finish, Surface, material_from_spatial
 from rgbmidic.settings.conversion import bounded
@@ -33,7 +33,7 @@ REFLECTS = 0.2
 def material_points(
     scene: Scene, state: State | None = None, pixels: tuple[FloatArray, FloatArray] | None = None
 ) -> FloatArray:
-    """Material point (mm, body axes) seen at every pixel centre of the first light's image; NaN off the body.
+    """Return material point (mm, body axes) seen at every pixel centre of the first light's image; NaN off the body.
 
     `pixels`: image points (x, y) in px, two arrays of one shape, instead of the pixel centres.
 
@@ -66,8 +66,8 @@ def material_points(
     return spatial
 
 
-def placed(scene: Scene, material: FloatArray, state: State | None = None) -> tuple[FloatArray, FloatArray]:
-    """Where material points (3, ...) are in a state, and which way the surface faces there.
+def points_and_normals(scene: Scene, material: FloatArray, state: State | None = None) -> tuple[FloatArray, FloatArray]:
+    """Return the positions of material points (3, ...) in a state, and the surface's normals there.
 
     Returns
     -------
@@ -116,15 +116,15 @@ def truth(
         (u, v) in px; NaN where the pixel is not on the body or the point is hidden in `state`. Points that leave the
         frame keep their displacement.
     """
-    point, normal = placed(scene, material_points(scene, reference, pixels), state)
-    hidden = ~((normal * point).sum(axis=0) < 0)
+    point, normal = points_and_normals(scene, material_points(scene, reference, pixels), state)
+    is_hidden = ~((normal * point).sum(axis=0) < 0)
     camera = scene.camera
     if pixels is None:
         pixels = np.arange(camera.shape[1], dtype=float), np.arange(camera.shape[0], dtype=float)[:, None]
     focal, *centre = camera.lenses(scene.lights)[0]
     x = focal * point[0] / point[2] + centre[0] - pixels[0]
     y = focal * point[1] / point[2] + centre[1] - pixels[1]
-    return np.where(hidden, np.nan, np.stack([x, y]))
+    return np.where(is_hidden, np.nan, np.stack([x, y]))
 
 
 def intersect(scene: Scene, state: State, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -180,21 +180,21 @@ def region_in_view(
         There is none; the user must state one.
     """
     height, width = shape
-    seen = np.asarray(np.isfinite(displacement[:, 0]).all(axis=0))
-    largest = np.abs(displacement[:, :, seen]).max(axis=(0, 2)) if seen.any() else np.zeros(2)
-    left, top = (float(np.ceil(value)) + margin for value in largest)
+    on_body = np.asarray(np.isfinite(displacement[:, 0]).all(axis=0))
+    largest = np.abs(displacement[:, :, on_body]).max(axis=(0, 2)) if on_body.any() else np.zeros(2)
+    x_margin, y_margin = (float(np.ceil(value)) + margin for value in largest)
     middle = (width - 1) / 2, (height - 1) / 2
-    while 2 * left < width - 8 and 2 * top < height - 8:
-        inside = (abs(x - middle[0]) <= middle[0] - left) & (abs(y - middle[1]) <= middle[1] - top)
-        if inside.any() and seen[inside].all():
-            return left, top, width - 1 - left, height - 1 - top
-        left, top = left + 4, top + 4
+    while 2 * x_margin < width - 8 and 2 * y_margin < height - 8:
+        inside = (abs(x - middle[0]) <= middle[0] - x_margin) & (abs(y - middle[1]) <= middle[1] - y_margin)
+        if inside.any() and on_body[inside].all():
+            return x_margin, y_margin, width - 1 - x_margin, height - 1 - y_margin
+        x_margin, y_margin = x_margin + 4, y_margin + 4
     raise InputError("the body leaves the middle of the frame: state output.region = [x0, y0, x1, y1]")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reflectance(PartOfScene):
-    """How a painted surface reflects, at the scale of the speckle.
+class Reflectance(SceneSection):
+    """Reflectance of a painted surface at the scale of the speckle.
 
     Radiance under unit irradiance: ``diffuse n.l + specular exp(-t^2/(2 width^2)) / (v.h)``, with t the tangent of the
     angle between the surface's normal n and the half-way vector h of the light's and the camera's directions l and v.
@@ -214,36 +214,36 @@ class Reflectance(PartOfScene):
     width_deg: float = bounded(above=0, below=45)
 
 
-def unit(vectors: FloatArray, axis: int = 0) -> FloatArray:
-    """Vectors of length 1 in the same directions; the components are along an axis."""
+def unit_vectors(vectors: FloatArray, axis: int = 0) -> FloatArray:
+    """Return the vectors of length 1 in the same directions; the components are along an axis."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(vectors / np.linalg.norm(vectors, axis=axis, keepdims=True))
 
 
-def macroscopic(surface: Surface) -> Reflectance:
-    """Reflectance of a painted surface at the scale of the speckle, averaged over white and black paint.
+def macroscopic_reflectance(surface: Surface) -> Reflectance:
+    """Return the reflectance of a painted surface at the scale of the speckle, averaged over white and black paint.
 
     A facet's Gaussian lobe of variance b^2 convolved with slopes of variance a^2 per axis is a Gaussian of variance
     ``a^2 + b^2`` whose peak is lower by ``b^2/(a^2 + b^2)``. Where the paints differ the lobe keeps peak and volume.
     """
     # per axis, half of the mean square slope of the dome h (1 - r^2/R^2)^2 over its disc: 4/3 (h/R)^2, its integral
     dome = 4 / 3 * (surface.dome / (surface.droplet / 2)) ** 2 / 2
-    parts = ((surface.white, 0.0, 1 - surface.coverage), (surface.black, dome, surface.coverage))
-    diffuse = sum(paint.albedo * area for paint, _, area in parts)
-    volume = sum(paint.gloss * facet_variance(paint) * area for paint, _, area in parts)
-    lobes = [(facet_variance(paint), slope_variance(paint) + more) for paint, more, _ in parts]
-    peak = sum(p.gloss * b / (a + b) * area for (p, _, area), (b, a) in zip(parts, lobes, strict=True))
+    paints = ((surface.white, 0.0, 1 - surface.coverage), (surface.black, dome, surface.coverage))
+    diffuse = sum(paint.albedo * area for paint, _, area in paints)
+    volume = sum(paint.gloss * facet_variance(paint) * area for paint, _, area in paints)
+    lobes = [(facet_variance(paint), slope_variance(paint) + dome_variance) for paint, dome_variance, _ in paints]
+    peak = sum(p.gloss * b / (a + b) * area for (p, _, area), (b, a) in zip(paints, lobes, strict=True))
     width = math.sqrt(volume / peak) if peak > 0 else math.sqrt(sum(lobes[0]))
     return Reflectance(diffuse=max(diffuse, 1e-9), specular=peak, width_deg=math.degrees(width))
 
 
 def facet_variance(paint: Finish) -> float:
-    """Variance (rad^2, per axis) of the specular lobe of one facet."""
+    """Return the variance (rad^2, per axis) of the specular lobe of one facet."""
     return math.radians(paint.lobe_deg) ** 2
 
 
 def slope_variance(paint: Finish) -> float:
-    """Variance per axis of the slopes of the wrinkles."""
+    """Return the variance per axis of the slopes of the wrinkles."""
     return math.tan(math.radians(paint.slope_deg)) ** 2 / 2
 
 
@@ -312,9 +312,9 @@ def predict_zones(
     lights
         Instead of the scene's, in the same colours.
     """
-    where = material_points(scene, state) if material is None else material
+    points = material_points(scene, state) if material is None else material
     turn, _ = (state or State()).pose(scene.body)
-    return zones_on_surface(scene, *placed(scene, where, state), lights, turn)
+    return zones_on_surface(scene, *points_and_normals(scene, points, state), lights, turn)
 
 
 def zones_on_surface(
@@ -329,26 +329,32 @@ def zones_on_surface(
     `points` (mm) and outward unit `normals` of shape (3, ...), NaN off the surface, are in camera axes; the slopes are
     in those which the rotation `axes` turns into the camera's, None: the same; `lights` as in `predict_zones`.
     """
-    chosen, camera, paint = scene.lights if lights is None else lights, scene.camera, macroscopic(scene.surface)
-    rest = (1,) * (points.ndim - 1)
-    rays = np.array([light.position for light in chosen]).reshape(-1, 3, *rest) - points
-    view, light = unit(-points), unit(rays, axis=1)
-    halfway = unit(light + view, axis=1)
+    lamps, camera, paint = (
+        scene.lights if lights is None else lights,
+        scene.camera,
+        macroscopic_reflectance(scene.surface),
+    )
+    trailing_axes = (1,) * (points.ndim - 1)
+    rays = np.array([light.position for light in lamps]).reshape(-1, 3, *trailing_axes) - points
+    view, light = unit_vectors(-points), unit_vectors(rays, axis=1)
+    halfway = unit_vectors(light + view, axis=1)
     lambert, facing = (normals * light).sum(axis=1), (normals * view).sum(axis=0)
-    seen = (lambert > 0) & (facing > 0)
+    is_visible = (lambert > 0) & (facing > 0)
     mirror = 2 * facing * normals - view
     with np.errstate(invalid="ignore", divide="ignore"):
-        slopes = np.where(seen[:, None], halfway / (normals * halfway).sum(axis=1, keepdims=True) - normals, np.nan)
+        slopes = np.where(
+            is_visible[:, None], halfway / (normals * halfway).sum(axis=1, keepdims=True) - normals, np.nan
+        )
     if axes is not None:
         slopes = np.einsum("ji,kj...->ki...", axes, slopes)
     lobe = np.exp(-(slopes**2).sum(axis=1) / (2 * math.radians(paint.width_deg) ** 2))
     levels = camera.full_scale * camera.exposure * camera.response(scene.lights).max(axis=0)
-    powers = np.array([light.power for light in chosen]) * NOMINAL_DISTANCE**2 * levels
+    powers = np.array([light.power for light in lamps]) * NOMINAL_DISTANCE**2 * levels
     return Zones(
         slopes=slopes,
-        deviation_deg=np.where(seen, np.degrees(np.arccos(np.clip((mirror * light).sum(axis=1), -1, 1))), np.nan),
-        lambert=np.where(seen, lambert, np.nan),
+        deviation_deg=np.where(is_visible, np.degrees(np.arccos(np.clip((mirror * light).sum(axis=1), -1, 1))), np.nan),
+        lambert=np.where(is_visible, lambert, np.nan),
         specular=paint.specular * lobe / (view * halfway).sum(axis=1),
-        irradiance=np.asarray(powers.reshape(-1, *rest) / (rays**2).sum(axis=1)),
+        irradiance=np.asarray(powers.reshape(-1, *trailing_axes) / (rays**2).sum(axis=1)),
         albedo=paint.diffuse,
     )

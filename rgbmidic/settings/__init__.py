@@ -1,15 +1,15 @@
-"""What a TEST.toml says: its schema, the conversion of its values, reading it."""
+"""Settings of a test, as TEST.toml states them: their schema, the conversion of its values, reading it."""
 
 from rgbmidic.settings.conversion import (
     bounded,
     check_names,
     convert_value,
-    plain,
     read_range,
     read_section,
     read_table,
     read_toml,
-    regular,
+    require_regular_file,
+    to_plain,
     unique_keys,
 )
 from rgbmidic.settings.schema import (
@@ -66,12 +66,12 @@ __all__ = [
     "check_names",
     "convert_value",
     "grey_levels",
-    "plain",
     "read_range",
     "read_section",
     "read_table",
     "read_test",
     "read_toml",
-    "regular",
+    "require_regular_file",
+    "to_plain",
     "unique_keys",
 ]

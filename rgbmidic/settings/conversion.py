@@ -20,7 +20,7 @@ _Section = TypeVar("_Section")
 
 
 def read_table(document: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Keys and values of a section of a file; empty where the section is not there.
+    """Return the keys and values of a section of a file; empty where the section is not there.
 
     Parameters
     ----------
@@ -44,8 +44,8 @@ def read_table(document: Mapping[str, Any], name: str) -> dict[str, Any]:
     return dict(table)
 
 
-def regular(path: Path) -> Path:
-    """The path itself, unless a pipe, a socket or a device is there: to open one may wait, and to read it never end.
+def require_regular_file(path: Path) -> Path:
+    """Return path itself, unless a pipe, a socket or a device is there: to open one may wait, and to read it never end.
 
     Every file that is read is opened as this gives it. One that is missing is left for the opening to report.
 
@@ -70,14 +70,14 @@ def regular(path: Path) -> Path:
     return path
 
 
-def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """The sections of a TOML file.
+def read_toml(path: Path, description: str) -> dict[str, Any]:
+    """Return the sections of a TOML file.
 
     Parameters
     ----------
     path
         The file.
-    what
+    description
         The file in words, for messages.
 
     Returns
@@ -87,42 +87,42 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     Raises
     ------
     ConfigurationError
-        The file, `what` in words, is missing or not TOML.
+        The file, `description` in words, is missing or not TOML.
     """
     try:
-        return tomllib.loads(regular(path).read_text(encoding="utf-8-sig"))
+        return tomllib.loads(require_regular_file(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
-        raise ConfigurationError(f"{what} not found: {path}") from None
+        raise ConfigurationError(f"{description} not found: {path}") from None
     except (OSError, ValueError) as error:  # text that is no UTF-8 or no TOML, a number of too many digits
-        raise ConfigurationError(f"{path} is not a readable {what} (TOML): {error}") from None
+        raise ConfigurationError(f"{path} is not a readable {description} (TOML): {error}") from None
     except RecursionError:
-        raise ConfigurationError(f"{path} is not a readable {what} (TOML): nested too deeply") from None
+        raise ConfigurationError(f"{path} is not a readable {description} (TOML): nested too deeply") from None
 
 
-def check_names(given: Iterable[str], allowed: Iterable[str], what: str, where: str) -> None:
+def check_names(names: Iterable[str], allowed: Iterable[str], noun: str, location: str) -> None:
     """Refuse a name that is not allowed.
 
     Parameters
     ----------
-    given, allowed
+    names, allowed
         Names.
-    what, where
+    noun, location
         Noun for the names, and the place where they stand, for the message.
 
     Raises
     ------
     ConfigurationError
-        A given name is not allowed; the message holds the closest one that is.
+        A name is not allowed; the message holds the closest one that is.
     """
     allowed = list(allowed)
-    for name in given:
+    for name in names:
         if name not in allowed:
             close = difflib.get_close_matches(name, allowed, n=1)
             hint = f' (did you mean "{close[0]}"?)' if close else ""
-            raise ConfigurationError(f'unknown {what} "{name}" in {where}{hint}; allowed are {", ".join(allowed)}')
+            raise ConfigurationError(f'unknown {noun} "{name}" in {location}{hint}; allowed are {", ".join(allowed)}')
 
 
-_WORDS = {
+_TYPE_NAMES = {
     bool: "true or false",
     float: "a number",
     int: "a whole number",
@@ -131,8 +131,8 @@ _WORDS = {
 }
 
 
-def convert_value(value: Any, hint: Any, where: str, base: Path | str = "") -> Any:
-    """A value converted to the type of a field.
+def convert_value(value: Any, hint: Any, key: str, base: Path | str = "") -> Any:
+    """Return a value converted to the type of a field.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def convert_value(value: Any, hint: Any, where: str, base: Path | str = "") -> A
         As TOML or Python gives it; numpy's scalars and arrays count as Python's.
     hint
         Type of the field.
-    where
+    key
         Section and key, for messages.
     base
         Folder that relative paths start from.
@@ -155,7 +155,7 @@ def convert_value(value: Any, hint: Any, where: str, base: Path | str = "") -> A
     ConfigurationError
         The value cannot be converted without a loss.
     """
-    value, origin, kinds = _python(value), get_origin(hint), get_args(hint)
+    value, origin, kinds = _to_python(value), get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):  # X | None; a number | a word
         if value is None and NoneType in kinds:
             return None
@@ -163,42 +163,42 @@ def convert_value(value: Any, hint: Any, where: str, base: Path | str = "") -> A
         if (type(value), value) in ((type(word), word) for word in words):  # 1 is no True
             return value
         if words and isinstance(value, str):
-            known = ", ".join(_quoted(word) if isinstance(word, str) else str(word).lower() for word in words)
-            raise ConfigurationError(f"{where} must be {_WORDS[kinds[0]]} or {known}, not {_quoted(value)}")
-        return convert_value(value, kinds[0], where, base)
+            alternatives = ", ".join(_quoted(word) if isinstance(word, str) else str(word).lower() for word in words)
+            raise ConfigurationError(f"{key} must be {_TYPE_NAMES[kinds[0]]} or {alternatives}, not {_quoted(value)}")
+        return convert_value(value, kinds[0], key, base)
     if origin is tuple:
-        return _convert_list(value, kinds, where, base)
+        return _convert_list(value, kinds, key, base)
     # ndarray; from numpy 2.5 on the alias NDArray itself. The class checks the shape of its arrays
     if str(getattr(origin, "__module__", "")).partition(".")[0] == "numpy":
         return value
     if origin is Literal:
         if value in kinds:
             return value
-        raise ConfigurationError(f"{where} must be one of {', '.join(map(_quoted, kinds))}, not {_quoted(value)}")
+        raise ConfigurationError(f"{key} must be one of {', '.join(map(_quoted, kinds))}, not {_quoted(value)}")
     if isinstance(value, str | PurePath) and hint in (str, Path):
         return str(value) if hint is str else Path(base) / value
     if isinstance(value, int) and abs(value) >= 2**63:
-        raise ConfigurationError(f"{where} is a number of {len(str(abs(value)))} digits: TOML has up to 2**63")
+        raise ConfigurationError(f"{key} is a number of {len(str(abs(value)))} digits: TOML has up to 2**63")
     if isinstance(value, int | float if hint is float else hint) and isinstance(value, bool) == (hint is bool):
         return value if is_dataclass(hint) else hint(value)
-    raise ConfigurationError(f"{where} must be {_WORDS.get(hint) or hint.__name__}, not {_quoted(value)}")
+    raise ConfigurationError(f"{key} must be {_TYPE_NAMES.get(hint) or hint.__name__}, not {_quoted(value)}")
 
 
-def _python(value: Any) -> Any:
-    """Scalars and arrays of numpy as Python's, at any depth."""
+def _to_python(value: Any) -> Any:
+    """Return the scalars and arrays of numpy as Python's, at any depth."""
     if type(value).__module__ == "numpy":
         value = value.tolist()
-    return tuple(map(_python, value)) if isinstance(value, list | tuple) else value
+    return tuple(map(_to_python, value)) if isinstance(value, list | tuple) else value
 
 
-def read_range(text: str, where: str) -> range:
-    """The whole numbers that ``"a:b"`` stands for: a and all up to b, without b.
+def read_range(text: str, key: str) -> range:
+    """Return the whole numbers that ``"a:b"`` stands for: a and all up to b, without b.
 
     Parameters
     ----------
     text
         Such as ``"0:20"``.
-    where
+    key
         Section and key, or option, for messages.
 
     Returns
@@ -210,32 +210,32 @@ def read_range(text: str, where: str) -> range:
     ConfigurationError
         It is something else, or nothing is in it.
     """
-    found = re.fullmatch(r"\s*(\d{1,18})\s*:\s*(\d{1,18})\s*", text)
-    if not found or int(found[1]) >= int(found[2]):
-        raise ConfigurationError(f'{where} must be a range such as "0:20" (0 to 19), not {_quoted(text)}')
-    return range(int(found[1]), int(found[2]))
+    match = re.fullmatch(r"\s*(\d{1,18})\s*:\s*(\d{1,18})\s*", text)
+    if not match or int(match[1]) >= int(match[2]):
+        raise ConfigurationError(f'{key} must be a range such as "0:20" (0 to 19), not {_quoted(text)}')
+    return range(int(match[1]), int(match[2]))
 
 
-def _convert_list(value: Any, kinds: tuple[Any, ...], where: str, base: Path | str) -> tuple[Any, ...]:
+def _convert_list(value: Any, kinds: tuple[Any, ...], key: str, base: Path | str) -> tuple[Any, ...]:
     if kinds == (int, Ellipsis) and isinstance(value, str):
-        value = read_range(value, where)
+        value = read_range(value, key)
     if isinstance(value, range):
         # a reference of n frames adds 1/n to a frame's variance: 100 are enough, and a longer range than this is a slip
         # that took a minute and 3 GB until the frames refused it
-        most = 100_000
-        if len(value) > most:
-            raise ConfigurationError(f"{where} names {len(value)} frames; at most {most} are allowed")
+        max_count = 100_000
+        if len(value) > max_count:
+            raise ConfigurationError(f"{key} names {len(value)} frames; at most {max_count} are allowed")
         value = tuple(value)
     if len(kinds) == 2 and kinds[1] is Ellipsis:
         entries = value if _depth(value) > _hint_depth(kinds[0]) else [value]  # a single one needs no brackets
-        return tuple(convert_value(entry, kinds[0], where, base) for entry in entries)
+        return tuple(convert_value(entry, kinds[0], key, base) for entry in entries)
     if not isinstance(value, tuple) or len(value) != len(kinds):
-        raise ConfigurationError(f"{where} must be {len(kinds)} values in brackets, not {_quoted(value)}")
-    return tuple(convert_value(entry, kind, where, base) for entry, kind in zip(value, kinds, strict=True))
+        raise ConfigurationError(f"{key} must be {len(kinds)} values in brackets, not {_quoted(value)}")
+    return tuple(convert_value(entry, kind, key, base) for entry, kind in zip(value, kinds, strict=True))
 
 
 def _depth(value: Any) -> int:
-    """How deep lists are nested in a value; an empty one may be of any depth."""
+    """Return the depth to which lists are nested in a value; an empty one may be of any depth."""
     return 1 + min(map(_depth, value), default=9) if isinstance(value, tuple) else 0
 
 
@@ -244,10 +244,10 @@ def _hint_depth(hint: Any) -> int:
 
 
 def _quoted(value: Any) -> str:
-    return f'"{value}"' if isinstance(value, str) else repr(plain(value))
+    return f'"{value}"' if isinstance(value, str) else repr(to_plain(value))
 
 
-def plain(value: Any) -> Any:
+def to_plain(value: Any) -> Any:
     """Value as TOML and JSON hold it: a dataclass as a dict, an array or a tuple as a list, what is not finite as None.
 
     Parameters
@@ -260,25 +260,25 @@ def plain(value: Any) -> Any:
     dict, list, str, number or None
     """
     if is_dataclass(value):
-        return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
+        return {entry.name: to_plain(getattr(value, entry.name)) for entry in fields(value)}
     if isinstance(value, Mapping):
-        return {key: plain(part) for key, part in value.items()}
-    value = _python(value)
+        return {key: to_plain(item) for key, item in value.items()}
+    value = _to_python(value)
     if isinstance(value, tuple):
-        return [plain(entry) for entry in value]
+        return [to_plain(entry) for entry in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
 
 
 @cache
-def hints_of(settings: Any) -> dict[str, Any]:
-    """Types of the fields of a class of settings, which take a while to resolve."""
+def type_hints(settings: Any) -> dict[str, Any]:
+    """Return the types of the fields of a class of settings, which take a while to resolve."""
     return get_type_hints(settings)
 
 
 def bounded(default: Any = MISSING, **bounds: float) -> Any:
-    """A field whose number, or every number of it, keeps the bounds `above`, `at_least`, `at_most`, `below`.
+    """Return a field whose number, or every number of it, keeps the bounds `above`, `at_least`, `at_most`, `below`.
 
     Parameters
     ----------
@@ -297,15 +297,15 @@ def bounded(default: Any = MISSING, **bounds: float) -> Any:
 _BOUNDS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le, "below": operator.lt}
 
 
-def converted(entry: Field[Any], value: Any, hint: Any, where: str, base: Path | str = "") -> Any:
-    """A value in the type of a field, every number of it finite and within the field's bounds."""
-    value = convert_value(value, hint, where, base)
+def convert_field(entry: Field[Any], value: Any, hint: Any, key: str, base: Path | str = "") -> Any:
+    """Return a value in the type of a field, every number of it finite and within the field's bounds."""
+    value = convert_value(value, hint, key, base)
     for number in _numbers(value):
         if not math.isfinite(number):
-            raise ConfigurationError(f"{where} must be finite, not {number}")
+            raise ConfigurationError(f"{key} must be finite, not {number}")
         for bound, limit in entry.metadata.get("bounds", {}).items():
             if not _BOUNDS[bound](number, limit):
-                raise ConfigurationError(f"{where} must be {bound.replace('_', ' ')} {limit:g}, not {number:g}")
+                raise ConfigurationError(f"{key} must be {bound.replace('_', ' ')} {limit:g}, not {number:g}")
     return value
 
 
@@ -315,17 +315,17 @@ def _numbers(value: Any) -> list[float]:
     return [value] if isinstance(value, int | float) else []
 
 
-class Checked:
+class CheckedSettings:
     """Settings that are checked when they are made: every field by its type and bounds, then what keys must keep."""
 
     __slots__ = ()
     section = ""
 
     def __post_init__(self) -> None:
-        hints = hints_of(cast(Any, self.__class__))
+        hints = type_hints(cast(Any, self.__class__))
         for entry in fields(cast(Any, self)):
-            where = f"{self.section}.{entry.name}".lstrip(".")
-            value = converted(entry, getattr(self, entry.name), hints[entry.name], where)
+            key = f"{self.section}.{entry.name}".lstrip(".")
+            value = convert_field(entry, getattr(self, entry.name), hints[entry.name], key)
             object.__setattr__(self, entry.name, value)
         for problem in self._problems():
             raise ConfigurationError(problem)
@@ -336,7 +336,7 @@ class Checked:
 
 
 def read_section(
-    kind: type[_Section], name: str, content: Mapping[str, Any], base: Path | str = ".", /, **ready: Any
+    kind: type[_Section], name: str, content: Mapping[str, Any], base: Path | str = ".", /, **values: Any
 ) -> _Section:
     """Object of a dataclass from the keys and plain values of a section: of TEST.toml, SCENE.toml or a calibration.
 
@@ -350,7 +350,7 @@ def read_section(
         Its keys and values.
     base
         Folder that relative paths start from.
-    **ready
+    **values
         Fields that are no keys of the section.
 
     Returns
@@ -362,18 +362,18 @@ def read_section(
     ConfigurationError
         A key is unknown, missing, of the wrong type, out of range, or contradicts another.
     """
-    hints = {key: hint for key, hint in hints_of(cast(Any, kind)).items() if key not in ready}
+    hints = {key: hint for key, hint in type_hints(cast(Any, kind)).items() if key not in values}
     check_names(content, hints, "key", f"[{name}]")
     for entry in fields(cast(Any, kind)):
         if entry.name in content:
-            value, hint, where = content[entry.name], hints[entry.name], f"{name}.{entry.name}"
-            inner = next((part for part in (hint, *get_args(hint)) if is_dataclass(part)), None)
+            value, hint, full_key = content[entry.name], hints[entry.name], f"{name}.{entry.name}"
+            inner = next((candidate for candidate in (hint, *get_args(hint)) if is_dataclass(candidate)), None)
             if inner is not None and isinstance(value, Mapping):
-                value = read_section(cast(Any, inner), where, value, base)
-            ready[entry.name] = converted(entry, value, hint, where, base)
-        elif entry.default is entry.default_factory is MISSING and entry.name not in ready:
+                value = read_section(cast(Any, inner), full_key, value, base)
+            values[entry.name] = convert_field(entry, value, hint, full_key, base)
+        elif entry.default is entry.default_factory is MISSING and entry.name not in values:
             raise ConfigurationError(f"{name}.{entry.name} is missing")
-    return kind(**ready)
+    return kind(**values)
 
 
 def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -394,6 +394,6 @@ def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         A key is stated twice.
     """
     keys = [key for key, _ in pairs]
-    if len(found := dict(pairs)) < len(keys):
-        raise ValueError(f'the key "{next(key for key in found if keys.count(key) > 1)[:40]}" is stated twice')
-    return found
+    if len(document := dict(pairs)) < len(keys):
+        raise ValueError(f'the key "{next(key for key in document if keys.count(key) > 1)[:40]}" is stated twice')
+    return document

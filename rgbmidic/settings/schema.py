@@ -15,14 +15,14 @@ from typing import Any, Literal
 
 from rgbmidic.errors import ConfigurationError
 from rgbmidic.settings.conversion import (
-    Checked,
+    CheckedSettings,
     bounded,
     check_names,
-    hints_of,
-    plain,
     read_section,
     read_table,
     read_toml,
+    to_plain,
+    type_hints,
 )
 from rgbmidic.settings.sections import (
     CalibrationSettings,
@@ -36,7 +36,7 @@ from rgbmidic.settings.sections import (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScaleSettings(Checked):
+class ScaleSettings(CheckedSettings):
     """Physical units (``[scale]``): they decide in which units results are reported, not what is measured.
 
     Attributes
@@ -68,9 +68,9 @@ class ScaleSettings(Checked):
             yield "scale.mm_per_pixel_std is the uncertainty of scale.mm_per_pixel, which is missing"
 
 
-_Place2 = tuple[tuple[float, float], ...]
-_Place3 = tuple[tuple[float, float, float], ...]
-_Place4 = tuple[tuple[float, float, float, float], ...]
+_Coordinates2 = tuple[tuple[float, float], ...]
+_Coordinates3 = tuple[tuple[float, float, float], ...]
+_Coordinates4 = tuple[tuple[float, float, float, float], ...]
 
 
 PROBE_NAME = re.compile(r"[^\W_](?:[^\W_]|[ .-]){0,59}")
@@ -78,7 +78,7 @@ PROBE_NAME = re.compile(r"[^\W_](?:[^\W_]|[ .-]){0,59}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ProbeSettings(Checked):
+class ProbeSettings(CheckedSettings):
     """Probes that `rgbmidic history` evaluates on a result (``[probes]``); the measurement does not depend on them.
 
     All places and lengths are in px on the reference.
@@ -120,15 +120,15 @@ class ProbeSettings(Checked):
 
     section = "probes"
 
-    points: _Place2 = ()
-    lines: _Place4 = ()
-    circles: _Place3 = ()
-    regions: _Place4 = ()
-    gauges: _Place4 = ()
-    straight_gauges: _Place4 = ()
-    strain_gauges: _Place3 = ()
-    cracks: _Place4 = ()
-    tips: _Place4 = ()
+    points: _Coordinates2 = ()
+    lines: _Coordinates4 = ()
+    circles: _Coordinates3 = ()
+    regions: _Coordinates4 = ()
+    gauges: _Coordinates4 = ()
+    straight_gauges: _Coordinates4 = ()
+    strain_gauges: _Coordinates3 = ()
+    cracks: _Coordinates4 = ()
+    tips: _Coordinates4 = ()
     youngs_modulus: float | None = bounded(None, above=0)
     poissons_ratio: float | None = bounded(None, above=-1, at_most=0.5)
     plane: Literal["stress", "strain"] | None = None
@@ -160,32 +160,32 @@ class ProbeSettings(Checked):
             )
         if self.terms == 1:
             yield "probes.terms must be 0 (chosen by a test) or at least 2, not 1"
-        check_names((probe for probe, _ in self.names), self.numbered, "probe", "probes.names")
-        given = [name for _, name in self.names]
-        for name in given:
-            if not PROBE_NAME.fullmatch(name) or given.count(name) > 1:
+        check_names((probe for probe, _ in self.names), self.labels, "probe", "probes.names")
+        names = [name for _, name in self.names]
+        for name in names:
+            if not PROBE_NAME.fullmatch(name) or names.count(name) > 1:
                 allowed = 'different, of letters, digits, spaces, "." and "-" (60 at most)'
                 yield f'probes.names must be {allowed}, not "{name}"'
 
     @property
-    def numbered(self) -> list[str]:
+    def labels(self) -> list[str]:
         """Kind and number of every probe, such as ``"straight_gauge_1"``."""
-        kinds = [kind for kind, _ in self.places]
-        return [f"{kind}_{kinds[: at + 1].count(kind)}" for at, kind in enumerate(kinds)]
+        kinds = [kind for kind, _ in self.kind_coordinates]
+        return [f"{kind}_{kinds[: i + 1].count(kind)}" for i, kind in enumerate(kinds)]
 
     @property
-    def places(self) -> list[tuple[str, tuple[float, ...]]]:
+    def kind_coordinates(self) -> list[tuple[str, tuple[float, ...]]]:
         """Kind, such as ``"straight_gauge"``, and place of every probe."""
         return [
-            (entry.name[:-1], place)
+            (entry.name[:-1], coordinates)
             for entry in fields(self)
             if isinstance(getattr(self, entry.name), tuple) and entry.name != "names"
-            for place in getattr(self, entry.name)
+            for coordinates in getattr(self, entry.name)
         ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ChannelSettings(Checked):
+class ChannelSettings(CheckedSettings):
     """Analog channels recorded beside a test (``[channels]``), such as a force; nothing measured depends on them.
 
     At most one of `offset`, `trigger` and `align` relates the clock of the recorder to that of the frames.
@@ -216,16 +216,16 @@ class ChannelSettings(Checked):
     force: str | None = None
 
     def _problems(self) -> Iterator[str]:
-        stated = [name for name in ("offset", "trigger", "align") if getattr(self, name)]
-        if len(stated) > 1:
-            yield f"channels.{' and channels.'.join(stated)} both relate the clocks: state one of them"
-        others = [entry.name for entry in fields(self) if getattr(self, entry.name) and entry.name != "file"]
-        if self.file is None and others:
-            yield f"channels.{others[0]} is of channels, whose file (channels.file) is not stated"
+        clock_keys = [name for name in ("offset", "trigger", "align") if getattr(self, name)]
+        if len(clock_keys) > 1:
+            yield f"channels.{' and channels.'.join(clock_keys)} both relate the clocks: state one of them"
+        other_keys = [entry.name for entry in fields(self) if getattr(self, entry.name) and entry.name != "file"]
+        if self.file is None and other_keys:
+            yield f"channels.{other_keys[0]} is of channels, whose file (channels.file) is not stated"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SetupSettings(Checked):
+class SetupSettings(CheckedSettings):
     """Description of the experiment for `rgbmidic report` (``[setup]``), which no file holds; None: not stated.
 
     The good-practice guide of the International Digital Image Correlation Society asks for these (section 5 and
@@ -266,7 +266,7 @@ class SetupSettings(Checked):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TestSettings(Checked):
+class TestSettings(CheckedSettings):
     """All settings of a test, as `rgbmidic.pipeline.measure` takes them.
 
     Attributes
@@ -275,6 +275,14 @@ class TestSettings(Checked):
         The sections of the same name.
     base
         Folder that relative paths start from.
+
+    Examples
+    --------
+    >>> from rgbmidic import TestSettings
+    >>> frames = {"path": "frames/*.tif", "kind": "monochrome"}
+    >>> settings = TestSettings.from_mapping({"frames": frames, "region": {"rectangle": [10, 10, 90, 70]}})
+    >>> settings.mesh.element_size, settings.frames.reference
+    (25.0, (0,))
     """
 
     __test__ = False
@@ -320,7 +328,7 @@ class TestSettings(Checked):
         ConfigurationError
             A section or key is unknown, missing, of the wrong type, out of range, or contradicts another.
         """
-        base, kinds = Path(base).resolve(), section_kinds()
+        base, kinds = Path(base).resolve(), section_types()
         check_names(document, kinds, "section", "the file")
         if "frames" not in document:
             raise ConfigurationError("the section [frames] is missing")
@@ -328,7 +336,7 @@ class TestSettings(Checked):
         return cls(base=base, **sections)
 
     def to_mapping(self) -> dict[str, dict[str, Any]]:
-        """The settings as sections of plain values, defaults included, without `base` and what is not known.
+        """Return the settings as sections of plain values, defaults included, without `base` and what is not known.
 
         ``TestSettings.from_mapping(settings.to_mapping(), settings.base)`` gives the settings back.
 
@@ -337,18 +345,18 @@ class TestSettings(Checked):
         dict of str to dict
         """
         return {
-            name: {key: value for key, value in plain(getattr(self, name)).items() if value is not None}
-            for name in section_kinds()
+            name: {key: value for key, value in to_plain(getattr(self, name)).items() if value is not None}
+            for name in section_types()
         }
 
 
-def section_kinds() -> dict[str, Any]:
-    """Names of the sections of a TEST.toml, and the classes that hold their keys."""
-    return {name: kind for name, kind in hints_of(TestSettings).items() if is_dataclass(kind)}
+def section_types() -> dict[str, Any]:
+    """Return the names of the sections of a TEST.toml, and the classes that hold their keys."""
+    return {name: kind for name, kind in type_hints(TestSettings).items() if is_dataclass(kind)}
 
 
 def read_test(path: Path | str) -> TestSettings:
-    """Read the settings of a test from a TOML file; paths in it are relative to it.
+    r"""Read the settings of a test from a TOML file; paths in it are relative to it.
 
     Parameters
     ----------
@@ -363,6 +371,16 @@ def read_test(path: Path | str) -> TestSettings:
     ------
     ConfigurationError
         The file is missing, not TOML, or has an entry that `TestSettings.from_mapping` refuses; the file is named.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from rgbmidic import read_test
+    >>> text = "[frames]\npath = 'frames/*.dng'\n[region]\nrectangle = [10, 10, 90, 70]\n[mesh]\nelement_size = 20\n"
+    >>> _ = Path("test.toml").write_text(text)
+    >>> settings = read_test("test.toml")
+    >>> settings.mesh.element_size, settings.region.rectangle
+    (20.0, (10.0, 10.0, 90.0, 70.0))
     """
     path = Path(path)
     document = read_toml(path, "settings file")

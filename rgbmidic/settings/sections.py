@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypedDict
 
-from rgbmidic.settings.conversion import Checked, bounded
+from rgbmidic.settings.conversion import CheckedSettings, bounded
 
 FrameKind = Literal["bayer", "rgb", "monochrome"]
 
@@ -17,8 +17,8 @@ BAYER_PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FrameSettings(Checked):
-    """Where the frames are, and what the files do not state (``[frames]``).
+class FrameSettings(CheckedSettings):
+    """Frame files, and what they do not state themselves (``[frames]``).
 
     Attributes
     ----------
@@ -95,8 +95,8 @@ LOCAL_MEAN = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IlluminationSettings(Checked):
-    """How the frame is separated into one image per light (``[illumination]``).
+class IlluminationSettings(CheckedSettings):
+    """Separation of the frame into one image per light (``[illumination]``).
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ LENGTH_UNITS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "inch": 25.4}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CalibrationSettings(Checked):
+class CalibrationSettings(CheckedSettings):
     """Calibration of the camera and the lights (``[calibration]``).
 
     Attributes
@@ -148,7 +148,7 @@ class CalibrationSettings(Checked):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MeshSettings(Checked):
+class MeshSettings(CheckedSettings):
     """The mesh that is measured on (``[mesh]``): made here, or of finite elements from a file.
 
     Attributes
@@ -186,14 +186,14 @@ class MeshSettings(Checked):
     refine: int | Literal[True, False] = False
 
     def _problems(self) -> Iterator[str]:
-        refining = self.refine is not False
-        for key, asked in (("error", self.error), ("refine", refining)):
-            if asked and self.file is None and self.side < SMALLEST_HALVED:
+        is_refined = self.refine is not False
+        for key, is_requested in (("error", self.error), ("refine", is_refined)):
+            if is_requested and self.file is None and self.side < SMALLEST_HALVED:
                 yield (
                     f"mesh.{key} halves the elements: mesh.element_size must be {SMALLEST_HALVED:g} px or more for it, "
                     f"not {self.side:g}"
                 )
-        if refining and self.element_size == "auto":
+        if is_refined and self.element_size == "auto":
             yield 'mesh.refine and mesh.element_size = "auto" both choose the elements: state a number or leave one out'
         for number, crack in enumerate(self.cracks):
             yield from _few_corners(f"mesh.cracks[{number}]", crack, 2, "two")
@@ -204,7 +204,7 @@ class MeshSettings(Checked):
             if self.element_size is None:
                 object.__setattr__(self, "element_size", ELEMENT_SIZE)
             return
-        for key, value in {"element_size": self.element_size, "cracks": self.cracks, "refine": refining}.items():
+        for key, value in {"element_size": self.element_size, "cracks": self.cracks, "refine": is_refined}.items():
             if value:
                 yield f"mesh.{key} is for a mesh made here, and mesh.file names one: leave one out"
         if (count := len(self.points or ())) < 2:
@@ -217,7 +217,7 @@ class MeshSettings(Checked):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RegionSettings(Checked):
+class RegionSettings(CheckedSettings):
     """The region of interest (``[region]``): exactly one of rectangle, polygon and mask, without the holes.
 
     With ``mesh.file`` the region is the mesh's area, and these, if stated, restrict it.
@@ -242,9 +242,9 @@ class RegionSettings(Checked):
     holes: tuple[tuple[tuple[float, float], ...], ...] = ()
 
     def _problems(self) -> Iterator[str]:
-        stated = sum(getattr(self, kind) is not None for kind in ("rectangle", "polygon", "mask"))
-        if stated > 1:
-            yield f"[region] needs exactly one of rectangle, polygon, mask; given are {stated}"
+        count = sum(getattr(self, kind) is not None for kind in ("rectangle", "polygon", "mask"))
+        if count > 1:
+            yield f"[region] needs exactly one of rectangle, polygon, mask; given are {count}"
         if self.rectangle is not None:
             x0, y0, x1, y1 = self.rectangle
             if x0 >= x1 or y0 >= y1:
@@ -256,20 +256,21 @@ class RegionSettings(Checked):
 
     @property
     def is_stated(self) -> bool:
-        """Whether there is a rectangle, polygon or mask."""
+        """True if there is a rectangle, polygon or mask."""
         return any(getattr(self, kind) is not None for kind in ("rectangle", "polygon", "mask"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WeightSettings(Checked):
-    """How each light is weighted (``[weights]``).
+class WeightSettings(CheckedSettings):
+    """Weighting of the lights (``[weights]``).
 
     Attributes
     ----------
     method
-        ``"statistics"``: inverse variance of each light's own residual around each pixel, robust; ``"threshold"``: the
-        paper's second method, 0 where the blurred image exceeds `threshold`, 1 elsewhere; ``"geometry"``: the paper's
-        first method, from lamps, camera and specimen; ``"images"``: masks made by hand; ``"none"``: 1 everywhere.
+        ``"statistics"``: by the inverse covariance of the lights' residuals around each pixel, robust;
+        ``"threshold"``: the paper's second method, 0 where the blurred image exceeds `threshold`, 1 elsewhere;
+        ``"geometry"``: the paper's first method, from lamps, camera and specimen; ``"images"``: masks made by hand;
+        ``"none"``: 1 everywhere.
     threshold
         Fraction of the camera's dynamic range (the paper: 2/3); ``"auto"``: found as in the paper, section 3.2, on the
         first deformed frame.
@@ -310,7 +311,7 @@ class WeightSettings(Checked):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SolverSettings(Checked):
+class SolverSettings(CheckedSettings):
     """The MIDIC minimisation (``[solver]``), and the options of `rgbmidic.correlate`.
 
     Attributes
@@ -332,6 +333,16 @@ class SolverSettings(Checked):
         The iteration stops when no node moves by more than this (px).
     max_iterations
         Iterations before the frame counts as not converged.
+
+    Examples
+    --------
+    >>> from rgbmidic import SolverSettings
+    >>> SolverSettings(fill=3).fill
+    3.0
+    >>> SolverSettings(tolerance=0)
+    Traceback (most recent call last):
+        ...
+    rgbmidic.errors.ConfigurationError: solver.tolerance must be above 0, not 0
     """
 
     section = "solver"
@@ -388,7 +399,7 @@ def grey_levels(
     return normalise, solver
 
 
-def _few_corners(where: str, corners: tuple[Any, ...], least: int, words: str) -> Iterator[str]:
-    """What is wrong with a path or polygon of too few corners."""
-    if len(corners) < least:
-        yield f"{where} needs at least {words} corners [x, y], not {len(corners)}"
+def _few_corners(key: str, corners: tuple[Any, ...], min_count: int, count_name: str) -> Iterator[str]:
+    """Report a path or polygon of too few corners."""
+    if len(corners) < min_count:
+        yield f"{key} needs at least {count_name} corners [x, y], not {len(corners)}"

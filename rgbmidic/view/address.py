@@ -131,7 +131,7 @@ def probes(marks: Sequence[Mark], gauge: float, stated: ProbeSettings, measure: 
 def marks_of(stated: ProbeSettings) -> tuple[Mark, ...]:
     """Return the marks of the probes stated, of those kinds that can be set with the pointer."""
     marks, names = [], dict(stated.names)
-    for numbered, (kind, place) in zip(stated.numbered, stated.places, strict=True):
+    for numbered, (kind, place) in zip(stated.labels, stated.kind_coordinates, strict=True):
         if kind not in KINDS:
             continue
         x, y, *end = place

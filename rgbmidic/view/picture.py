@@ -203,7 +203,7 @@ class RawPictures:
 
     def __call__(self, index: int) -> Picture:
         """Read the frame of an index in the result; errors as those of the frames' reader."""
-        return grey_picture(self._series.read(self._series.chosen[index])[0])
+        return grey_picture(self._series.read(self._series.selected[index])[0])
 
 
 def reference_picture(result: Result) -> Picture:

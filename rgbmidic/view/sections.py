@@ -16,7 +16,7 @@ from typing import Any
 from rgbmidic.errors import ConfigurationError, InputError, RgbmidicError
 from rgbmidic.report import Movie, write_movie
 from rgbmidic.results import Maps
-from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, ScaleSettings, plain, read_section
+from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, ScaleSettings, read_section, to_plain
 from rgbmidic.view.address import KINDS, SCALE, Mark, common_gauge, marks_of, probe_marks, probes
 from rgbmidic.view.draft import Confirmation, Draft
 from rgbmidic.view.models import WRITTEN, ResultControls, warning
@@ -111,7 +111,9 @@ class FileButtons:
             raise InputError(f"the strain gauges of {draft.file} have different lengths; the page has one for all")
         if gauge:
             self._parts.of["gauge"].value = gauge
-        self._parts.written.text = f"{len(stated.places)} probes are read from {html.escape(str(draft.file))}."
+        self._parts.written.text = (
+            f"{len(stated.kind_coordinates)} probes are read from {html.escape(str(draft.file))}."
+        )
         return (*marks_of(stated), *(mark for mark in self._shown.view.marks if mark.kind == SCALE))
 
 
@@ -135,7 +137,7 @@ def channel_section(draft: Draft, stated: ChannelSettings) -> dict[str, Any]:
     """
     if stated.file is None:
         raise ConfigurationError("state the channels' file first (channels.file)")
-    keys = {**plain(stated), "file": _path(draft, stated.file)}
+    keys = {**to_plain(stated), "file": _path(draft, stated.file)}
     return {key: value or None for key, value in keys.items()}
 
 

@@ -77,7 +77,7 @@ class DraftFrames:
         for part in (known.crosstalk, known.registration):
             if part is not None:
                 return tuple(part.lights)
-        count = max(self.series.turn, len(self.series.lights))
+        count = max(self.series.n_lights, len(self.series.lights))
         return ("light",) if count == 1 else tuple(f"light {number + 1}" for number in range(count))
 
     def raw(self, index: int) -> tuple[Picture, npt.NDArray[np.bool_]]:

@@ -398,8 +398,8 @@ ALONG = (25, 40, 95, 45)
 @pytest.fixture(scope="module")
 def wave(tmp_path_factory):
     """Twelve frames, 1 ms apart, of which the fourth failed."""
-    parts = {"frames": FrameSettings(path=("a",)), "region": RegionSettings(rectangle=(0, 0, 9, 9))}
-    settings = TestSettings(**parts, scale=ScaleSettings(mm_per_pixel=0.5, frame_rate=1000.0))
+    sections = {"frames": FrameSettings(path=("a",)), "region": RegionSettings(rectangle=(0, 0, 9, 9))}
+    settings = TestSettings(**sections, scale=ScaleSettings(mm_per_pixel=0.5, frame_rate=1000.0))
     store = ResultStore.create(tmp_path_factory.mktemp("wave") / "result", make_origin(12, settings=settings))
     for index in range(12):
         failed = FrameRecord.failed("no start", nodes=NODES, lights=3, number=index)

@@ -27,7 +27,7 @@ BORDER = 30
 def from_captures(scene):
     target, camera, lights = render(target_scene(scene, "speckled")), scene.camera, scene.lights
     singles = {
-        light.name: [record(target, camera, lights, seed=100 * i + k, on=(light.name,)) for k in range(4)]
+        light.name: [record(target, camera, lights, seed=100 * i + k, shining=(light.name,)) for k in range(4)]
         for i, light in enumerate(lights)
     }
     dark = dark_frames(scene, count=4, seed=9)
@@ -39,7 +39,7 @@ def from_captures(scene):
     stacks = {name: stack_frames(frames) for name, frames in singles.items()}
     dimmed = [target * np.float32(share) for share in (0.3, 0.6)]
     flats = [
-        [record(image, camera, lights, seed=500 + 10 * i + k, on=("green",)) for k in range(2)]
+        [record(image, camera, lights, seed=500 + 10 * i + k, shining=("green",)) for k in range(2)]
         for i, image in enumerate(dimmed)
     ]
     noise = photon_transfer(dark_stack, [*(stack_frames(frames) for frames in flats), stacks["green"]]).camera_noise

@@ -47,7 +47,7 @@ def measured(opening, cracks=()):
 
 
 def places(solution):
-    return Tri3Mesh(nodes=solution.nodes, elements=solution.elements).places
+    return Tri3Mesh(nodes=solution.nodes, elements=solution.elements).observation_points
 
 
 def near(solution):
@@ -82,8 +82,10 @@ def test_without_the_path_nodes_at_the_crack_are_lost_for_their_reason():
 def test_filled_nodes_take_their_uncertainty_from_their_own_side():
     split = measured(5.0, [PATH])
     mesh = Tri3Mesh(nodes=split.nodes, elements=split.elements)
-    above = mesh.places[:, 1] < PATH[0][1]
-    hole = above & (np.hypot(*(mesh.places - (60, 105)).T) < 40)  # the nearest measured nodes are below the crack
+    above = mesh.observation_points[:, 1] < PATH[0][1]
+    hole = above & (
+        np.hypot(*(mesh.observation_points - (60, 105)).T) < 40
+    )  # the nearest measured nodes are below the crack
     status = np.where(hole, NodeStatus.DECORRELATED, split.node_status).astype(np.uint8)
     std = np.broadcast_to(np.where(above[:, None], 0.01, 10.0), split.displacement.shape)
     gaps = replace(

@@ -20,7 +20,7 @@ from rgbmidic.errors import CalibrationError, FrameError
 from rgbmidic.frames import open_series
 from rgbmidic.frames.data import Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
-from rgbmidic.frames.stored import StoredFrame, raw_frame
+from rgbmidic.frames.metadata import StoredFrame, raw_frame
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.images import Registration
 from rgbmidic.lab.inspection import inspect_files, state_frames

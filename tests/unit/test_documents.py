@@ -15,7 +15,7 @@ from rgbmidic import NodeStatus, Status, cli
 from rgbmidic.command import execute
 from rgbmidic.results import QUANTITIES
 from rgbmidic.results.quantities import SHARED
-from rgbmidic.settings.schema import section_kinds
+from rgbmidic.settings.schema import section_types
 from rgbmidic_calibration import cli as calibrate
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,7 +37,7 @@ def documented() -> dict[str, dict[str, str]]:
 
 def defaults() -> dict[str, dict[str, object]]:
     """Section, key and default of the code; MISSING where the key is needed."""
-    return {name: {entry.name: entry.default for entry in fields(kind)} for name, kind in section_kinds().items()}
+    return {name: {entry.name: entry.default for entry in fields(kind)} for name, kind in section_types().items()}
 
 
 def as_written(default: object) -> str:
@@ -61,7 +61,7 @@ def test_every_key_of_the_test_file_is_documented_with_its_default():
 
 def test_every_choice_of_a_key_is_named():
     text = (DOCS / "reference/test-file.md").read_text(encoding="utf-8")
-    for section, kind in section_kinds().items():
+    for section, kind in section_types().items():
         rows = text.split(f"\n## [{section}]")[1].split("\n## ")[0].splitlines()
         for key, hint in get_type_hints(kind).items():
             row = next(line for line in rows if line.startswith(f"| `{key}` |"))
@@ -104,7 +104,7 @@ def test_every_term_of_the_glossary_is_defined_in_a_sentence():
 
 def test_the_identifiers_of_the_glossary_exist():
     """Names in code quotes are keys of TEST.toml, quantities of a result, or names in the package."""
-    keys = {entry.name for kind in section_kinds().values() for entry in fields(kind)} | {*QUANTITIES, *SHARED}
+    keys = {entry.name for kind in section_types().values() for entry in fields(kind)} | {*QUANTITIES, *SHARED}
     source = "\n".join(file.read_text(encoding="utf-8") for file in (ROOT / "rgbmidic").rglob("*.py"))
     source += "\n".join(file.read_text(encoding="utf-8") for file in (ROOT / "calibration").rglob("*.py"))
     for _, names, *_ in glossary():

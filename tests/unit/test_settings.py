@@ -35,7 +35,7 @@ from rgbmidic.settings import (
     WeightSettings,
     grey_levels,
     read_test,
-    regular,
+    require_regular_file,
     unique_keys,
 )
 
@@ -467,7 +467,7 @@ def test_a_key_stated_twice_in_json_and_a_nul_in_a_name_are_errors() -> None:
     with pytest.raises(ValueError, match='the key "a" is stated twice'):
         json.loads('{"b": {"a": 1, "a": 2}}', object_pairs_hook=unique_keys)
     with pytest.raises(OSError, match="holds a NUL"):
-        regular(Path("a\0b"))
+        require_regular_file(Path("a\0b"))
 
 
 def test_names_of_the_package_are_there() -> None:

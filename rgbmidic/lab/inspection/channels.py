@@ -26,54 +26,54 @@ class InspectionConstants:
     Attributes
     ----------
     margin
-        Surroundings (px) of the region that are looked at with it: three times `settled`.
+        Surroundings (px) of the region that are looked at with it: three times `smoothing_width`.
     mean_width
         Standard deviation (px) of the local mean that the speckle's contrast is taken against; wide, so as to keep
         coarse speckle.
-    farthest
+    max_lag
         Largest distance (px) of the autocorrelation: speckle of up to half of it is found.
-    narrowest, ratio, widths
+    min_width, width_ratio, n_widths
         Standard deviation (px) of the narrowest of the Gaussians that are fitted to it, of each to the one before, and
         their number.
-    regressed, flattest
+    max_samples, flat_fraction
         Samples that are looked at, and the fraction of them, with the flattest surroundings, for the regression that
         finds unknown noise; chosen.
-    settled
+    smoothing_width
         Standard deviation (px) of the window over which the model of the frame is averaged once more.
-    typical
+    median_window
         Side (blocks) of the square over which the channel-specific variance is taken by its median.
-    frequencies, reach
+    n_frequencies, kernel_reach
         Frequencies on which the kernel of the speckle's gradient is computed, and the distance (px) to which it is
         kept: gradients are correlated over a speckle or two.
-    too_fine
+    min_agreement
         Agreement of neighbouring colours below which the speckle is too fine for the colour lattice (docs: inspect).
-    finest
+    min_speckle
         Size (px) of speckle whose colours agree so.
-    negative
+    max_negative
         Fraction of the pixels where a light is negative from which a warning is given; chosen, as the next two.
-    dark
+    min_level
         Fraction of the full scale that the 95 % quantile of a channel must reach.
-    greens
+    max_green_difference
         Largest difference between the two greens of a mosaic, as a fraction of their mean.
     """
 
     margin: int = 96
     mean_width: float = 20.0
-    farthest: int = 24
-    narrowest: float = 0.5
-    ratio: float = 1.25
-    widths: int = 17
-    regressed: int = 20_000
-    flattest: float = 0.05
-    settled: float = 32.0
-    typical: int = 9
-    frequencies: int = 64
-    reach: int = 16
-    too_fine: float = 0.75
-    finest: float = 2.0
-    negative: float = 0.01
-    dark: float = 0.1
-    greens: float = 0.05
+    max_lag: int = 24
+    min_width: float = 0.5
+    width_ratio: float = 1.25
+    n_widths: int = 17
+    max_samples: int = 20_000
+    flat_fraction: float = 0.05
+    smoothing_width: float = 32.0
+    median_window: int = 9
+    n_frequencies: int = 64
+    kernel_reach: int = 16
+    min_agreement: float = 0.75
+    min_speckle: float = 2.0
+    max_negative: float = 0.01
+    min_level: float = 0.1
+    max_green_difference: float = 0.05
 
 
 CONSTANTS = InspectionConstants()
@@ -99,7 +99,7 @@ class Channel:
     step: int
 
 
-def channels_of(frames: list[LinearMosaic | LinearChannels]) -> list[Channel]:
+def frame_channels(frames: list[LinearMosaic | LinearChannels]) -> list[Channel]:
     """Return the channels of a frame, or of the frames of lights fired in succession."""
     channels: list[Channel] = []
     for number, frame in enumerate(frames, start=1):
@@ -136,18 +136,18 @@ def speckle_texture(channel: Channel, inside: BoolArray, noise: NoiseModel | Non
         return None
     contrast = np.where(usable, channel.values / np.where(usable, mean, np.float32(1)) - 1, np.float32(0))
     distance, product, count = _autocorrelation(contrast, usable)
-    at_zero = distance == 0
+    is_zero_lag = distance == 0
     if noise is not None:
-        product[at_zero] -= float((noise.variance(mean[usable]) / mean[usable] ** 2).mean())
-    kept = (count > 0.05 * count.max()) & (~at_zero if noise is None else True)
+        product[is_zero_lag] -= float((noise.variance(mean[usable]) / mean[usable] ** 2).mean())
+    is_used = (count > 0.05 * count.max()) & (~is_zero_lag if noise is None else True)
     narrowest = 0.0 if noise is not None else channel.step / 2  # narrower ones cannot be distinguished from noise
-    widths = CONSTANTS.narrowest * CONSTANTS.ratio ** np.arange(CONSTANTS.widths, dtype=np.float64)
-    return _fitted(distance[kept], product[kept], widths[narrowest < widths])
+    widths = CONSTANTS.min_width * CONSTANTS.width_ratio ** np.arange(CONSTANTS.n_widths, dtype=np.float64)
+    return _fit_gaussians(distance[is_used], product[is_used], widths[narrowest < widths])
 
 
 def _autocorrelation(contrast: FloatImage, usable: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Distances (px) up to the farthest, the mean product of samples so far apart, and how many there are."""
-    farthest = CONSTANTS.farthest
+    """Return distances (px) up to the farthest, the mean product of samples so far apart, and how many there are."""
+    farthest = CONSTANTS.max_lag
     size = [next_fast_len(side + farthest + 1, real=True) for side in contrast.shape]
     sums, pairs = (
         irfft2(np.abs(rfft2(image, s=size)) ** 2, s=size)
@@ -158,26 +158,30 @@ def _autocorrelation(contrast: FloatImage, usable: BoolArray) -> tuple[FloatArra
     totals, counts = (
         np.bincount(square.ravel(), weights=image[np.ix_(lag, lag)].ravel())[:-1] for image in (sums, np.round(pairs))
     )
-    met = np.flatnonzero(counts > 0)
-    return np.sqrt(met.astype(np.float64)), np.asarray(totals[met] / counts[met]), counts[met].astype(np.float64)
+    lags_present = np.flatnonzero(counts > 0)
+    return (
+        np.sqrt(lags_present.astype(np.float64)),
+        np.asarray(totals[lags_present] / counts[lags_present]),
+        counts[lags_present].astype(np.float64),
+    )
 
 
-def _fitted(distance: FloatArray, product: FloatArray, widths: FloatArray) -> TextureModel | None:
-    """``sum w exp(-r^2/2s^2) - c`` with w, c >= 0, fitted to the products."""
+def _fit_gaussians(distance: FloatArray, product: FloatArray, widths: FloatArray) -> TextureModel | None:
+    """Return ``sum w exp(-r^2/2s^2) - c`` with w, c >= 0, fitted to the products."""
     importance = 1 / (1 + distance)
     system = np.column_stack([np.exp(-0.5 * (distance[:, None] / widths) ** 2), -np.ones(distance.size)])
     scale = float(np.abs(product).max()) or 1.0
     solution = nnls(system * importance[:, None], product / scale * importance)[0]
-    total, kept = solution[:-1].sum() - solution[-1], solution[:-1] > 0
+    total, is_positive = solution[:-1].sum() - solution[-1], solution[:-1] > 0
     if not total > 0:
         return None
-    weights = solution[:-1][kept] / total
+    weights = solution[:-1][is_positive] / total
     offset = min(1 - float(weights.sum()), 0.0)
-    model = TextureModel(weights=tuple(weights.tolist()), widths=tuple(widths[kept].tolist()), offset=offset)
-    return model if model.diameter < 2 * CONSTANTS.farthest else None
+    model = TextureModel(weights=tuple(weights.tolist()), widths=tuple(widths[is_positive].tolist()), offset=offset)
+    return model if model.diameter < 2 * CONSTANTS.max_lag else None
 
 
-def noise_estimate(channels: list[Channel], inside: BoolArray) -> list[float]:
+def estimate_noise(channels: list[Channel], inside: BoolArray) -> list[float]:
     """Return the standard deviation (DN) of the noise of a sample of each channel, estimated from a single frame.
 
     Where its surroundings are bright and flattest, a sample's contrast is predicted from the 24 samples around it, of
@@ -194,10 +198,12 @@ def noise_estimate(channels: list[Channel], inside: BoolArray) -> list[float]:
     for channel, mean, image in zip(channels, means, images, strict=True):
         lattice = inside & np.isfinite(channel.values) & ~channel.saturated
         phases = [(p, q) for p in range(channel.step) for q in range(channel.step)]
-        left = [_unpredicted(image, lattice, phase, channel.step) for phase in phases]
-        rest = np.concatenate([part for part in left if part.size] or [np.full(1, np.nan)])
+        residuals = [_regression_residual(image, lattice, phase, channel.step) for phase in phases]
+        residual = np.concatenate(
+            [values_part for values_part in residuals if values_part.size] or [np.full(1, np.nan)]
+        )
         level = float(np.nanmean(mean[lattice])) if lattice.any() else float("nan")
-        estimates.append(1.4826 * float(np.median(np.abs(rest))) * level)
+        estimates.append(1.4826 * float(np.median(np.abs(residual))) * level)
     return estimates
 
 
@@ -206,29 +212,29 @@ def _mean(channel: Channel) -> FloatImage:
     return np.where(mean > 0, mean, np.float32(np.nan))
 
 
-def _unpredicted(image: FloatImage, lattice: BoolArray, phase: tuple[int, int], step: int) -> FloatImage:
-    """Residual (flat) of the samples of one phase after a regression on the 5 x 5 samples around each."""
+def _regression_residual(image: FloatImage, lattice: BoolArray, phase: tuple[int, int], step: int) -> FloatImage:
+    """Return the residual (flat) of the samples of one phase after a regression on the 5 x 5 samples around each."""
     rows, columns = np.nonzero(lattice[2:-2, 2:-2])
-    kept = ((rows + 2) % step == phase[0]) & ((columns + 2) % step == phase[1])
-    rows, columns = rows[kept], columns[kept]
-    every = max(1, rows.size // CONSTANTS.regressed)
-    patches = np.lib.stride_tricks.sliding_window_view(image, (5, 5))[rows[::every], columns[::every]].reshape(-1, 25)
+    in_phase = ((rows + 2) % step == phase[0]) & ((columns + 2) % step == phase[1])
+    rows, columns = rows[in_phase], columns[in_phase]
+    stride = max(1, rows.size // CONSTANTS.max_samples)
+    patches = np.lib.stride_tricks.sliding_window_view(image, (5, 5))[rows[::stride], columns[::stride]].reshape(-1, 25)
     patches = patches[np.isfinite(patches).all(axis=1)].astype(np.float64)
     # the sample itself takes no part in the choice; dark places would be flattest, but have less photon noise
     patches = patches[np.delete(patches, 12, axis=1).mean(axis=1) >= 0]
     if len(patches) < 100:
         return np.empty(0, dtype=np.float32)
     spread = np.delete(patches, 12, axis=1).std(axis=1)
-    flattest = min(max(CONSTANTS.flattest, 250 / len(patches)), 1.0)
+    flattest = min(max(CONSTANTS.flat_fraction, 250 / len(patches)), 1.0)
     patches = patches[spread <= np.quantile(spread, flattest)]
-    around = np.delete(patches, 12, axis=1)
-    system = np.column_stack([around, np.ones(len(around))])
+    neighbours = np.delete(patches, 12, axis=1)
+    system = np.column_stack([neighbours, np.ones(len(neighbours))])
     coefficients = np.linalg.lstsq(system, patches[:, 12], rcond=None)[0]
     freedom = np.sqrt(len(patches) / max(len(patches) - system.shape[1], 1))
     return np.asarray((patches[:, 12] - system @ coefficients) * freedom, dtype=np.float32)
 
 
-def surroundings(region: Region) -> Window:
+def roi_window(region: Region) -> Window:
     """Return the part of the frame that is looked at: the region and a margin around.
 
     It begins at an even column and row, so that the pattern of a mosaic stays the same.

@@ -22,13 +22,13 @@ from rgbmidic.illumination.linear import LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.channels import (
     Channel,
-    channels_of,
-    noise_estimate,
+    estimate_noise,
+    frame_channels,
+    roi_window,
     speckle_texture,
-    surroundings,
 )
 from rgbmidic.lab.inspection.lamps import LampBalance
-from rgbmidic.lab.inspection.prediction import Prediction, predict, separated
+from rgbmidic.lab.inspection.prediction import Prediction, predict, separate_with_errors
 from rgbmidic.lab.inspection.results import ChannelSummary, Inspection, LightSummary, Spread
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import finite_elements_of, read_region
@@ -72,36 +72,36 @@ def inspect_files(
     RgbmidicError
         A file is missing, damaged or contradicts what is stated; the frame cannot be inspected.
     """
-    stated = frame or (test.frames if test else FrameSettings(path=("frame",)))
+    user_metadata = frame or (test.frames if test else FrameSettings(path=("frame",)))
     calibrated = calibration or (test.calibration.file if test else None)
-    known = None if calibrated is None else Calibration.read(calibrated)
+    read_calibration = None if calibrated is None else Calibration.read(calibrated)
     if files:
         paths = [Path(file) for file in files]
-        frames = tuple(open_source(path, stated, known).read(0) for path in paths)
-        name, where = " + ".join(legible(path.name) for path in paths), " + ".join(map(str, paths))
+        frames = tuple(open_source(path, user_metadata, read_calibration).read(0) for path in paths)
+        name, file_names = " + ".join(legible(path.name) for path in paths), " + ".join(map(str, paths))
     elif test is not None:
-        series, index = open_series(stated, test.base, known), stated.reference[0]
+        series, index = open_series(user_metadata, test.base, read_calibration), user_metadata.reference[0]
         frames = series.read(index)
-        name = where = series.name(index)
+        name = file_names = series.name(index)
     else:
         raise InputError("there is nothing to inspect: neither a frame nor a test is given")
     shape = frames[0].values.shape[-2], frames[0].values.shape[-1]
-    known = known and known.cropped(stated.crop_origin, shape)
-    place = Region.from_rectangle(region, shape) if region is not None else None
-    how: dict[str, Any] = {"name": name}
+    read_calibration = read_calibration and read_calibration.cropped(user_metadata.crop_origin, shape)
+    roi = Region.from_rectangle(region, shape) if region is not None else None
+    inspection_options: dict[str, Any] = {"name": name}
     if test is not None:
-        how |= {"element_size": test.mesh.side, "accept": test.calibration.accept}
-        how |= {"demosaic": test.illumination.demosaic, "prefilter": test.solver.prefilter}
-        if place is None and test.mesh.file is None:
-            place = read_region(test.region, shape)
-        elif place is None:
-            _, _, mesh, place = finite_elements_of(test, shape)
-            how["element_size"] = mesh.size
-    how |= {key: value for key, value in options.items() if value is not None}
+        inspection_options |= {"element_size": test.mesh.side, "accept": test.calibration.accept}
+        inspection_options |= {"demosaic": test.illumination.demosaic, "prefilter": test.solver.prefilter}
+        if roi is None and test.mesh.file is None:
+            roi = read_region(test.region, shape)
+        elif roi is None:
+            _, _, mesh, roi = finite_elements_of(test, shape)
+            inspection_options["element_size"] = mesh.size
+    inspection_options |= {key: value for key, value in options.items() if value is not None}
     try:
-        return inspect_frame(frames, calibration=known, region=place, **how)
+        return inspect_frame(frames, calibration=read_calibration, region=roi, **inspection_options)
     except InputError as error:
-        raise FrameError(f"{where}: {error}") from None
+        raise FrameError(f"{file_names}: {error}") from None
 
 
 def inspect_frame(
@@ -158,71 +158,89 @@ def inspect_frame(
         The calibration varies over frames of another size.
     RegionError
         The region is empty, outside the frame or too small for one element.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic import inspect_frame
+    >>> from rgbmidic.frames import ChannelFrame
+    >>> speckle = gaussian_filter(np.random.default_rng(0).normal(size=(1, 64, 64)), (0, 2, 2))
+    >>> frame = ChannelFrame(values=1500 + 4000 * speckle, black_level=np.zeros(1), white_level=4095.0)
+    >>> inspection = inspect_frame(frame)
+    >>> inspection.kind, inspection.channels[0].mean > 0.3, inspection.unmeasured_fraction
+    ('monochrome', True, 0.0)
     """
     frames = (frame,) if isinstance(frame, Mosaic | ChannelFrame) else tuple(frame)
-    shape = _checked_shape(frames)
-    known = (calibration or Calibration()).cropped(None, shape)
+    shape = _require_shape(frames)
+    cropped_calibration = (calibration or Calibration()).cropped(None, shape)
     if not isinstance(region, Region):
         region = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1) if region is None else region, shape)
     report = progress or (lambda done, total, line: None)
-    contradictions = check_state(frames, known, region.mask, name, accept=accept)
-    mesh, window = Tri3Mesh.from_region(region, element_size), surroundings(region)
-    part = window.part_of(Window.whole(shape))
-    region, known = region.part(*part), known.cropped(window.origin, window.shape)
-    cut = [replace(shot, values=np.ascontiguousarray(shot.values[..., *part])) for shot in frames]
+    contradictions = check_state(frames, cropped_calibration, region.mask, name, accept=accept)
+    mesh, window = Tri3Mesh.from_region(region, element_size), roi_window(region)
+    roi_slices = window.slices_in(Window.of_frame(shape))
+    region, cropped_calibration = region.crop(*roi_slices), cropped_calibration.cropped(window.origin, window.shape)
+    cropped_frames = [replace(shot, values=np.ascontiguousarray(shot.values[..., *roi_slices])) for shot in frames]
     if clipped := clipping(frames):
-        cut = [replace(shot, white_level=clipped[0]) for shot in cut]
-    linear = [linearise(shot, known.noise) for shot in cut]
+        cropped_frames = [replace(shot, white_level=clipped[0]) for shot in cropped_frames]
+    linear = [linearise(shot, cropped_calibration.noise) for shot in cropped_frames]
     report(0, 3, "exposure, speckle and noise")
-    channels = channels_of(linear)
-    summaries, noise, speckle = _summarised(channels, region.mask, known.noise, linear[0].full_scale)
+    channels = frame_channels(linear)
+    summaries, noise, speckle = _summarise(channels, region.mask, cropped_calibration.noise, linear[0].full_scale)
     report(1, 3, "lights, and the errors of their separation")
-    state, draw = separated(linear, known, demosaic, noise)
-    state = replace(state, registration=known.registration)
+    state, draw = separate_with_errors(linear, cropped_calibration, demosaic, noise)
+    state = replace(state, registration=cropped_calibration.registration)
     images = align(state)
     report(2, 3, "uncertainty to expect")
-    shown = LocalContrast.of(images, [channel.speckle_px for channel in summaries], region.mask, noise)
+    contrasts = LocalContrast.of(images, [channel.speckle_px for channel in summaries], region.mask, noise)
     index = state.reflection_index()
     if index is None and len(images.names) > 1:  # the contrast that a light lacks to the best one
-        best = np.maximum(shown.contrast.max(axis=0), 1e-6)
-        index = np.asarray(1 - shown.contrast / best, dtype=np.float32)
+        best = np.maximum(contrasts.contrast.max(axis=0), 1e-6)
+        index = np.asarray(1 - contrasts.contrast / best, dtype=np.float32)
     texture, local = state.texture or speckle, replace(mesh, nodes=mesh.nodes - window.origin)
 
     def expected(strength: FloatArray) -> Prediction:
-        """With the lights so many times as strong."""
-        lights = replace(shown, level=shown.level * strength[:, None, None].astype(np.float32))
+        """Predict the uncertainty with the lights so many times as strong."""
+        lights = replace(contrasts, level=contrasts.level * strength[:, None, None].astype(np.float32))
         errors = draw(np.random.default_rng(seed), strength)
         return predict(local, region, lights, errors, texture=texture, prefilter=prefilter)
 
     prediction = expected(np.ones(len(images.names)))
     doubts = separation_doubts(state, region)
     coloured = texture is not None and texture.specific >= COLOURED  # of one light more than of another
-    if known.crosstalk is not None and len(known.crosstalk.matrix) == len(channels) and not coloured:
-        balance = LampBalance.of(shown, channels, known.crosstalk.matrix, region.mask)
-        doubts += balance.advice(images.names, prediction, expected, noise_calibrated=known.noise is not None)
+    if (
+        cropped_calibration.crosstalk is not None
+        and len(cropped_calibration.crosstalk.matrix) == len(channels)
+        and not coloured
+    ):
+        balance = LampBalance.of(contrasts, channels, cropped_calibration.crosstalk.matrix, region.mask)
+        doubts += balance.advice(
+            images.names, prediction, expected, noise_calibrated=cropped_calibration.noise is not None
+        )
     report(3, 3, "done")
     first, greens = linear[0], 0.0
     single = not isinstance(first, LinearMosaic) and len(first.values) == 1
     if isinstance(first, LinearMosaic):
-        greens = _unexpected_green_difference(first, state, known.crosstalk)
+        greens = _unexpected_green_difference(first, state, cropped_calibration.crosstalk)
     return Inspection(
         name=name,
         kind="bayer" if isinstance(first, LinearMosaic) else "monochrome" if single else "rgb",
         channels=summaries,
-        lights=_light_summaries(images, shown.contrast, index, prediction, region.mask),
+        lights=_light_summaries(images, contrasts.contrast, index, prediction, region.mask),
         frame_shape=shape,
         origin=window.origin,
         images=images,
         reflection_index=index,
         saturated=np.logical_or.reduce([channel.saturated for channel in channels]),
         region=region.mask,
-        hidden=shown.hidden(region.mask),
-        background=shown.background(region.mask),
+        lacks_contrast=contrasts.hidden(region.mask),
+        background=contrasts.background(region.mask),
         texture=state.texture,
         noise=noise,
-        noise_known=known.noise is not None,
+        noise_known=cropped_calibration.noise is not None,
         contradictions=contradictions,
-        crosstalk_known=single or known.crosstalk is not None,
+        crosstalk_known=single or cropped_calibration.crosstalk is not None,
         element_size=element_size,
         mesh=mesh,
         prediction=prediction,
@@ -236,7 +254,7 @@ def inspect_frame(
 def _unexpected_green_difference(
     mosaic: LinearMosaic, lights: IlluminationImages, crosstalk: Crosstalk | None
 ) -> float:
-    """Difference of the means of the greens beyond the calibrated one, over their mean."""
+    """Return the difference of the means of the greens beyond the calibrated one, over their mean."""
     channel = sampled_channels(mosaic.cfa, mosaic.values.shape)
     with_red = int((channel[1] == 0).any())  # row
     red, blue = (float(mosaic.values[row::2][channel[row::2] == 1].mean()) for row in (with_red, 1 - with_red))
@@ -267,18 +285,20 @@ def state_frames(test: TestSettings | None, *, count: int = 1, **stated: Any) ->
     ConfigurationError
         Something stated is not allowed or not what the test states, or several frames that are not monochrome.
     """
-    given = {key: value for key, value in stated.items() if value is not None}
+    properties = {key: value for key, value in stated.items() if value is not None}
     if test is not None:
-        joined = replace(test.frames, **given)
-        for key in given:
-            if (before := getattr(test.frames, key)) not in (None, now := getattr(joined, key)):
-                raise ConfigurationError(f"frames.{key} is {before} in TEST.toml, but the option states {now}")
-        return joined
-    return FrameSettings(path=("frame",) * (count if given.get("kind") == "monochrome" else 1), **given)
+        combined = replace(test.frames, **properties)
+        for key in properties:
+            if (test_value := getattr(test.frames, key)) not in (None, new_value := getattr(combined, key)):
+                raise ConfigurationError(
+                    f"frames.{key} is {test_value} in TEST.toml, but the option states {new_value}"
+                )
+        return combined
+    return FrameSettings(path=("frame",) * (count if properties.get("kind") == "monochrome" else 1), **properties)
 
 
-def _checked_shape(frames: Sequence[Frame]) -> tuple[int, int]:
-    """Rows and columns of frames that can be inspected."""
+def _require_shape(frames: Sequence[Frame]) -> tuple[int, int]:
+    """Return the rows and columns of frames that can be inspected."""
     first, shapes = frames[0], {frame.values.shape for frame in frames}
     if len(shapes) > 1:
         raise InputError(f"frames of lights in succession must have one shape; given are {sorted(shapes)}")
@@ -292,7 +312,7 @@ def _checked_shape(frames: Sequence[Frame]) -> tuple[int, int]:
     return rows, columns
 
 
-def _summarised(
+def _summarise(
     channels: list[Channel], inside: BoolArray, calibrated: NoiseModel | None, full_scale: float
 ) -> tuple[tuple[ChannelSummary, ...], NoiseModel, TextureModel | None]:
     """Figures of the channels' samples inside the region, the camera noise, and the autocorrelation of the speckle.
@@ -311,9 +331,9 @@ def _summarised(
     if all(float(np.ptp(values)) == 0 for values in samples):
         raise InputError("every channel of the region is constant: there is nothing to inspect")
     textures = [speckle_texture(channel, inside, calibrated) for channel in channels]
-    estimates = noise_estimate(channels, inside) if calibrated is None else []
-    known = [estimate for estimate in estimates if np.isfinite(estimate)]
-    typical = float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
+    estimates = estimate_noise(channels, inside) if calibrated is None else []
+    finite = [estimate for estimate in estimates if np.isfinite(estimate)]
+    typical = float(np.sqrt(np.mean(np.square(finite)))) if finite else 0.0
     noise = calibrated or NoiseModel(gain=float("inf"), read_noise=typical)
     summaries = []
     for number, (channel, texture) in enumerate(zip(channels, textures, strict=True)):
@@ -334,7 +354,7 @@ def _light_summaries(
     prediction: Prediction,
     inside: BoolArray,
 ) -> tuple[LightSummary, ...]:
-    """Figures of each light in the region, from its contrast, its reflection index and its uncertainty alone."""
+    """Return figures of each light in the region, from its contrast, its reflection index and its uncertainty alone."""
     summaries = []
     for j, light in enumerate(images.names):
         values, valid = images.values[j][inside], images.valid[j][inside]
@@ -347,7 +367,7 @@ def _light_summaries(
                 reflecting=None if index is None else float((index[j][inside] > REFLECTING).mean()),
                 valid=float(valid.mean()),
                 negative=float((mean < -0.002 * images.full_scale).mean()),
-                alone=Spread.of(prediction.alone[j]),
+                std_alone=Spread.of(prediction.single_light[j]),
             )
         )
     return tuple(summaries)

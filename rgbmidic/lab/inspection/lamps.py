@@ -13,11 +13,11 @@ from rgbmidic.lab.inspection.channels import Channel
 from rgbmidic.lab.inspection.prediction import Prediction
 from rgbmidic.typing import BoolArray, FloatArray
 
-UNEQUAL = 1.25
+MIN_STRENGTH_RATIO = 1.25
 """Strength of a light over that of the weakest one from which dimming its lamp is tried; chosen."""
-DARKEST = 0.01
+MIN_RELATIVE_STRENGTH = 0.01
 """Least strength relative to the strongest light: a lamp that is off is another matter."""
-WORTHWHILE = 1.1
+MIN_GAIN = 1.1
 """Gain from which it is reported; chosen."""
 
 
@@ -59,7 +59,7 @@ class LampBalance:
         LampBalance
         """
         contrast = np.median((lights.level * lights.contrast)[:, inside], axis=1).astype(np.float64)
-        strength = contrast / max(float(contrast.min()), DARKEST * float(contrast.max()), 1e-9)
+        strength = contrast / max(float(contrast.min()), MIN_RELATIVE_STRENGTH * float(contrast.max()), 1e-9)
         level = lights.level[:, inside].mean(axis=1, dtype=np.float64)
         brightest = np.array([np.nanquantile(channel.values[inside], 0.999) for channel in channels])
         dimmed = brightest * (mixing @ (level / np.maximum(strength, 1))) / np.maximum(mixing @ level, 1e-9)
@@ -68,7 +68,7 @@ class LampBalance:
     def advice(
         self,
         names: Sequence[str],
-        now: Prediction,
+        present: Prediction,
         expected: Callable[[FloatArray], Prediction],
         *,
         noise_calibrated: bool,
@@ -79,7 +79,7 @@ class LampBalance:
         ----------
         names
             Of the lights.
-        now
+        present
             Uncertainty expected of the frame.
         expected
             Uncertainty with the lights so many times as strong.
@@ -91,23 +91,25 @@ class LampBalance:
         list of Check
             One or none.
         """
-        strong = [light for light in range(len(names)) if self.strength[light] > UNEQUAL]
+        strong = [light for light in range(len(names)) if self.strength[light] > MIN_STRENGTH_RATIO]
         if not strong or self.strength.min() < 1:
             return []
-        before, after = (float(np.nanmedian(one.std)) for one in (now, expected(self.exposure / self.strength)))
-        if not before > WORTHWHILE * after:
+        present_std, balanced_std = (
+            float(np.nanmedian(prediction.std)) for prediction in (present, expected(self.exposure / self.strength))
+        )
+        if not present_std > MIN_GAIN * balanced_std:
             return []
         ratio = " : ".join(f"{value:.1f}" for value in self.strength)
-        how = " and ".join(f"{names[light]} dimmed to {1 / self.strength[light]:.0%}" for light in strong)
-        gain = f"{after:.4f} px instead of {before:.4f} px are to be expected"
+        instructions = " and ".join(f"{names[light]} dimmed to {1 / self.strength[light]:.0%}" for light in strong)
+        gain = f"{balanced_std:.4f} px instead of {present_std:.4f} px are to be expected"
         if not noise_calibrated:
-            gain = f"down to {after:.4f} px instead of {before:.4f} px may be expected (noise estimated)"
+            gain = f"down to {balanced_std:.4f} px instead of {present_std:.4f} px may be expected (noise estimated)"
         return [
             Check(
                 "unequal lamps",
-                f"the lights are as strong as {ratio} ({' : '.join(names)}): with {how} and {self.exposure:.1f} times "
-                f"the exposure, or as much more light of the others, {gain}",
-                before / after,
-                WORTHWHILE,
+                f"the lights are as strong as {ratio} ({' : '.join(names)}): with {instructions} and "
+                f"{self.exposure:.1f} times the exposure, or as much more light of the others, {gain}",
+                present_std / balanced_std,
+                MIN_GAIN,
             )
         ]

@@ -1,6 +1,6 @@
 """Displacement uncertainty expected from one frame: `rgbmidic.scene.forecast` with images of the frame's errors.
 
-Contrast and energy of the speckle's gradient follow from the frame; the errors are drawn (`separated`). The
+Contrast and energy of the speckle's gradient follow from the frame; the errors are drawn (`separate_with_errors`). The
 reflection-aware model of the frame (local means, slope of each light on the common texture, light-specific
 component, autocorrelation of the speckle) describes a random frame with the statistics of the one given. Such a frame
 is drawn with all its channels at every pixel and separated as the test does, behind the four phases of the colour
@@ -37,8 +37,8 @@ from rgbmidic.illumination.texture import COLOURED, TextureModel
 from rgbmidic.lab.inspection.channels import CONSTANTS
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.scene.camera import mosaic_samples
-from rgbmidic.scene.forecast import expected_std, light_pull
-from rgbmidic.scene.speckle import SpeckleSpectrum, separated_phases
+from rgbmidic.scene.forecast import expected_std, light_precision
+from rgbmidic.scene.speckle import SpeckleSpectrum, separate_phases
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
@@ -64,9 +64,9 @@ class ErrorDraw(Protocol):
         ...
 
 
-def separated(
+def separate_with_errors(
     frames: Sequence[LinearMosaic | LinearChannels],
-    known: Calibration,
+    test_calibration: Calibration,
     method: str,
     noise: NoiseModel,
 ) -> tuple[IlluminationImages, ErrorDraw]:
@@ -78,7 +78,7 @@ def separated(
     ----------
     frames
         Of one state: one, or one per light in succession; with the noise that the separation reckons with.
-    known
+    test_calibration
         The calibration; without crosstalk the channels are used as lights.
     method
         How the test separates its mosaics (`rgbmidic.illumination.separation`).
@@ -92,45 +92,47 @@ def separated(
     draw
         See `ErrorDraw`.
     """
-    first, crosstalk = frames[0], known.crosstalk or Crosstalk.identity(("red", "green", "blue"))
+    first, crosstalk = frames[0], test_calibration.crosstalk or Crosstalk.identity(("red", "green", "blue"))
     if isinstance(first, LinearMosaic):
-        calibration = replace(known, crosstalk=crosstalk)
-        model = reconstruct(first, crosstalk, registration=known.registration)
+        calibration = replace(test_calibration, crosstalk=crosstalk)
+        model = reconstruct(first, crosstalk, registration=test_calibration.registration)
         images = reconstructed_lights(model, crosstalk)
         if method not in ("auto", DEFAULT_METHOD):
-            other = separate(first, crosstalk, method)
-            images = replace(images, values=other.values, valid=other.valid)
+            separated_lights = separate(first, crosstalk, method)
+            images = replace(images, values=separated_lights.values, valid=separated_lights.valid)
 
-        def lights_of(values: FloatImage, cfa: str) -> FloatImage:
-            drawn = replace(first, values=values, cfa=cfa, saturated=np.zeros(values.shape, dtype=bool))
-            return np.nan_to_num(separate(drawn, calibration, method, texture=model.texture).values)
+        def separate_values(values: FloatImage, cfa: str) -> FloatImage:
+            draw_channels = replace(first, values=values, cfa=cfa, saturated=np.zeros(values.shape, dtype=bool))
+            return np.nan_to_num(separate(draw_channels, calibration, method, texture=model.texture).values)
 
-        def drawn_mosaic(random: np.random.Generator, strength: FloatArray) -> tuple[FloatImage, FloatImage]:
-            sites = _drawn_sites(model, strength if model.texture.specific < COLOURED else np.ones(3), random)
-            phases = separated_phases(sites, first.cfa, lights_of)
-            noisy = lights_of(_noisy(mosaic_samples(sites, first.cfa), noise, random), first.cfa)
+        def draw_mosaic(random: np.random.Generator, strength: FloatArray) -> tuple[FloatImage, FloatImage]:
+            sites = _draw_sites(model, strength if model.texture.specific < COLOURED else np.ones(3), random)
+            phases = separate_phases(sites, first.cfa, separate_values)
+            noisy = separate_values(_add_noise(mosaic_samples(sites, first.cfa), noise, random), first.cfa)
             return (noisy - phases[0])[None], phases - phases.mean(axis=0)
 
-        return images, drawn_mosaic
+        return images, draw_mosaic
     full = [frame for frame in frames if isinstance(frame, LinearChannels)]
-    names = known.registration.lights if known.registration else ()
+    names = test_calibration.registration.lights if test_calibration.registration else ()
 
-    def lights(state: Sequence[LinearChannels]) -> IlluminationImages:
+    def separate_state(state: Sequence[LinearChannels]) -> IlluminationImages:
         single = len(state[0].values) == 1
         return IlluminationImages.in_succession(state, names) if single else unmix(state[0], crosstalk)
 
-    images = lights(full)
+    images = separate_state(full)
 
-    def drawn(random: np.random.Generator, strength: FloatArray) -> tuple[FloatImage, FloatImage]:
-        more = (strength[:, None, None] - 1) * np.nan_to_num(images.values)
+    def draw_channels(random: np.random.Generator, strength: FloatArray) -> tuple[FloatImage, FloatImage]:
+        added = (strength[:, None, None] - 1) * np.nan_to_num(images.values)
         if len(full) == 1 and len(images.names) > 1:
-            more = np.tensordot(crosstalk.matrix, more, axes=1)[None]
-        state = [replace(frame, values=frame.values + part) for frame, part in zip(full, more, strict=True)]
-        noisy = lights([replace(frame, values=_noisy(frame.values, noise, random)) for frame in state]).values
-        change = np.nan_to_num(noisy - lights(state).values)[None]
+            added = np.tensordot(crosstalk.matrix, added, axes=1)[None]
+        state = [replace(frame, values=frame.values + addition) for frame, addition in zip(full, added, strict=True)]
+        noisy = separate_state(
+            [replace(frame, values=_add_noise(frame.values, noise, random)) for frame in state]
+        ).values
+        change = np.nan_to_num(noisy - separate_state(state).values)[None]
         return change, change[:0]
 
-    return images, drawn
+    return images, draw_channels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,14 +145,14 @@ class Prediction:
         Of all lights together.
     noise, mosaic
         The parts of it from camera noise, and from samples that the mosaic lacks.
-    alone : tuple of ndarray
+    single_light : tuple of ndarray
         Of every light alone.
     """
 
     std: FloatArray
     noise: FloatArray
     mosaic: FloatArray
-    alone: tuple[FloatArray, ...]
+    single_light: tuple[FloatArray, ...]
 
 
 def predict(
@@ -184,10 +186,10 @@ def predict(
     level, contrast = lights.level, np.where(lights.background(region.mask), np.float32(0), lights.contrast)
     if texture is None:
         unknown = np.full(len(mesh.nodes), np.nan)
-        return Prediction(std=unknown, noise=unknown, mosaic=unknown, alone=(unknown,) * len(contrast))
+        return Prediction(std=unknown, noise=unknown, mosaic=unknown, single_light=(unknown,) * len(contrast))
     light = contrast > 0
-    spectrum = SpeckleSpectrum.of_texture(texture, size=CONSTANTS.frequencies, prefilter=prefilter)
-    kernel = spectrum.score_kernel(CONSTANTS.reach)
+    spectrum = SpeckleSpectrum.of_texture(texture, size=CONSTANTS.n_frequencies, prefilter=prefilter)
+    kernel = spectrum.score_kernel(CONSTANTS.kernel_reach)
 
     def filtered(draws: FloatImage, change: Callable[[FloatImage], FloatImage]) -> Iterator[FloatImage]:
         """Draws (n, k, H, W) relative to the level of the light, one (k, H, W) after the other, every image changed."""
@@ -196,7 +198,7 @@ def predict(
             yield np.stack([change(image) for image in relative])
 
     def variance(change: Callable[[FloatImage], FloatImage]) -> FloatImage:
-        """Local mean square (k, H, W) of all errors of one state."""
+        """Return the local mean square (k, H, W) of all errors of one state."""
         total = np.zeros_like(contrast)
         for draws in errors:
             for images in filtered(draws, change):
@@ -205,23 +207,25 @@ def predict(
 
     texture_contrast = np.sqrt(np.maximum(contrast**2 - variance(lambda image: image), 0) * light)
     residual = variance(lambda image: apply_prefilter(image, prefilter))
-    pull = light_pull(texture_contrast, residual)
+    precision = light_precision(texture_contrast, residual)
     pixels = PixelMap.from_mesh(mesh, region)
 
     def scores(draws: FloatImage) -> FloatArray:
-        """Score (1 + k, E) of all lights together and of each alone, between two states."""
-        total = np.zeros((1 + len(pull), *pull.shape[1:]), dtype=np.float32)
+        """Return the score (1 + k, E) of all lights together and of each alone, between two states."""
+        total = np.zeros((1 + len(precision), *precision.shape[1:]), dtype=np.float32)
         for images in filtered(draws, lambda image: np.asarray(cv2.filter2D(image, -1, kernel), dtype=np.float32)):
-            images *= pull
+            images *= precision
             total[0] += images.sum(axis=0) ** 2 / np.float32(len(draws))
             total[1:] += images**2 / np.float32(len(draws))
         return 2 * _element_means(_smooth(total, region.mask, mesh.size), pixels)
 
     noise, mosaic = (scores(draws) for draws in errors)
-    information = spectrum.energy * _element_means(pull * texture_contrast, pixels)
-    together = expected_std(mesh, information.sum(axis=0), noise[0] + mosaic[0], noise[0], mosaic[0])
-    alone = [expected_std(mesh, info, score)[0] for info, score in zip(information, (noise + mosaic)[1:], strict=True)]
-    return Prediction(std=together[0], noise=together[1], mosaic=together[2], alone=tuple(alone))
+    information = spectrum.energy * _element_means(precision * texture_contrast, pixels)
+    combined = expected_std(mesh, information.sum(axis=0), noise[0] + mosaic[0], noise[0], mosaic[0])
+    single_light = [
+        expected_std(mesh, info, score)[0] for info, score in zip(information, (noise + mosaic)[1:], strict=True)
+    ]
+    return Prediction(std=combined[0], noise=combined[1], mosaic=combined[2], single_light=tuple(single_light))
 
 
 def gaussian_field(texture: TextureModel, shape: tuple[int, ...], random: np.random.Generator) -> FloatImage:
@@ -234,29 +238,29 @@ def gaussian_field(texture: TextureModel, shape: tuple[int, ...], random: np.ran
     return np.asarray(irfft2(spectrum, s=(rows, columns))[: shape[0], : shape[1]], dtype=np.float32)
 
 
-def _drawn_sites(model: Reconstruction, strength: FloatArray, random: np.random.Generator) -> FloatImage:
+def _draw_sites(model: Reconstruction, strength: FloatArray, random: np.random.Generator) -> FloatImage:
     """Samples (4, H, W) that each kind of site would take everywhere of a random state with the frame's statistics.
 
     Every light shows the texture where the registration says that it does, and a component of its own.
     """
     factors, texture, sites = model.factors, model.texture, model.model
     shape = model.channels.values.shape[1:]
-    place = enlarged(sites.displacement.reshape(-1, *sites.displacement.shape[2:]), BLOCK, shape)
-    margin = int(np.ceil(np.abs(place).max())) + 2
+    displacement = enlarged(sites.displacement.reshape(-1, *sites.displacement.shape[2:]), BLOCK, shape)
+    margin = int(np.ceil(np.abs(displacement).max())) + 2
     common = gaussian_field(texture, (shape[0] + 2 * margin, shape[1] + 2 * margin), random)
     sparkle = TextureModel(weights=(1.0,), widths=(float(np.sqrt(2 * SPARKLE_VARIANCE)),))
     # by the median around: variances are cut off at zero, so that a mean would be too large
-    size = 1, CONSTANTS.typical, CONSTANTS.typical
+    size = 1, CONSTANTS.median_window, CONSTANTS.median_window
     typical = median_filter(factors.light_specific - LEAST, size=size, mode="reflect")
     deviation = np.sqrt(enlarged(np.maximum(typical, 0), BLOCK, shape))
-    slope = enlarged(_settled(factors.light_slope, BLOCK), BLOCK, shape)
-    mean = enlarged(_settled(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
+    slope = enlarged(_smooth_blocks(factors.light_slope, BLOCK), BLOCK, shape)
+    mean = enlarged(_smooth_blocks(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
     response = sites.sites * strength
     # each green sees the lights' means in its own proportion
-    beyond = (response - sites.matrix[list(CHANNEL)]) @ np.linalg.pinv(sites.matrix)
-    samples = mean[list(CHANNEL)] + np.tensordot(beyond.astype(np.float32), mean, axes=1)
-    for light, (x, y) in enumerate(place.reshape(-1, 2, *shape)):
-        contrast = _displaced(common, x, y, margin)
+    response_beyond = (response - sites.matrix[list(CHANNEL)]) @ np.linalg.pinv(sites.matrix)
+    samples = mean[list(CHANNEL)] + np.tensordot(response_beyond.astype(np.float32), mean, axes=1)
+    for light, (x, y) in enumerate(displacement.reshape(-1, 2, *shape)):
+        contrast = _displace(common, x, y, margin)
         if deviation[light].any():
             coarse, fine = (gaussian_field(kind, shape, random) for kind in (texture, sparkle))
             specific = np.sqrt(texture.specific) * coarse + np.sqrt(1 - texture.specific) * fine
@@ -265,7 +269,7 @@ def _drawn_sites(model: Reconstruction, strength: FloatArray, random: np.random.
     return np.asarray(samples, dtype=np.float32)
 
 
-def _displaced(image: FloatImage, x: FloatImage, y: FloatImage, margin: int) -> FloatImage:
+def _displace(image: FloatImage, x: FloatImage, y: FloatImage, margin: int) -> FloatImage:
     """Return the image less a margin, displaced by fields x and y (H, W)."""
     rows, columns = x.shape
     if not (x.any() or y.any()):
@@ -278,27 +282,29 @@ def _displaced(image: FloatImage, x: FloatImage, y: FloatImage, margin: int) -> 
     return np.asarray(sampled[0].reshape(x.shape))
 
 
-def _settled(grid: npt.NDArray[np.floating], block: int) -> FloatArray:
+def _smooth_blocks(grid: npt.NDArray[np.floating], block: int) -> FloatArray:
     """Return a grid (n, h, w) of blocks smoothed once more, without the scatter of few speckles per window.
 
     The scatter differs from channel to channel, and a frame with a ratio of the channels that scatters would be harder
     to separate than a real one.
     """
-    return np.stack([cv2.GaussianBlur(layer.astype(np.float64), (0, 0), CONSTANTS.settled / block) for layer in grid])
+    return np.stack(
+        [cv2.GaussianBlur(layer.astype(np.float64), (0, 0), CONSTANTS.smoothing_width / block) for layer in grid]
+    )
 
 
-def _noisy(values: FloatImage, noise: NoiseModel, random: np.random.Generator) -> FloatImage:
+def _add_noise(values: FloatImage, noise: NoiseModel, random: np.random.Generator) -> FloatImage:
     white = random.standard_normal(values.shape, dtype=np.float32)
     return np.asarray(values + white * np.sqrt(noise.variance(values)), dtype=np.float32)
 
 
 def _smooth(images: FloatImage, inside: BoolArray, width: float) -> FloatImage:
-    """Local means of images (n, H, W) inside the region, over about an element and its neighbours."""
+    """Return the local means of images (n, H, W) inside the region, over about an element and its neighbours."""
     return np.stack([np.nan_to_num(local_mean(np.where(inside, image, np.float32(np.nan)), width)) for image in images])
 
 
 def _element_means(images: FloatImage, pixels: PixelMap) -> FloatArray:
-    """Means (n, E) of images (n, H, W) over the pixels of each element; 0 for one without pixels."""
+    """Return the means (n, E) of images (n, H, W) over the pixels of each element; 0 for one without pixels."""
     total = np.cumsum(pixels.gather(images), axis=1, dtype=np.float64)
     ends = np.pad(total, ((0, 0), (1, 0)))[:, pixels.offsets]
     return np.asarray(np.diff(ends, axis=1) / np.maximum(np.diff(pixels.offsets), 1))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic.illumination.images import REFLECTING
-from rgbmidic.lab import document, number, write_findings
+from rgbmidic.lab import format_number, schema_document, write_findings
 from rgbmidic.lab.inspection import Inspection, Spread
 from rgbmidic.report.style import STYLE, colour_range, finish_picture, literal, shade, show_image
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FILES = ("inspection.json", "inspection.png")
-"""What `write_inspection` writes."""
-_UNKNOWN = "#e8590c"
+"""Files that `write_inspection` writes."""
+_UNKNOWN_COLOUR = "#e8590c"
 """Colour of what is not known of a light's image."""
 
 
@@ -37,17 +37,17 @@ def write_inspection(inspection: Inspection, out: Path, *, overwrite: bool = Fal
 
 
 def channel_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
-    """Headings and one row per camera channel."""
+    """Return the headings and one row per camera channel."""
     rows = []
     for channel in inspection.channels:
         noise = f"{channel.noise_dn:.1f}" if inspection.noise_known else f"~ {channel.noise_dn:.0f}"
         fractions = [f"{value:.1%}" for value in (channel.mean, channel.low, channel.high, channel.saturated)]
-        rows.append([channel.name, *fractions, number(channel.speckle_px, ".1f"), noise])
+        rows.append([channel.name, *fractions, format_number(channel.speckle_px, ".1f"), noise])
     return ["channel", "mean", "5 %", "95 %", "saturated", "speckle (px)", "noise (DN)"], rows
 
 
 def light_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
-    """Headings and one row per light."""
+    """Return the headings and one row per light."""
     rows = []
     for light in inspection.lights:
         reflecting = "-" if light.reflecting is None else f"{light.reflecting:.1%}"
@@ -56,14 +56,17 @@ def light_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
 
 
 def uncertainty_rows(inspection: Inspection) -> tuple[list[str], list[list[str]]]:
-    """Headings and rows: all lights together, its parts, each light alone."""
+    """Return the headings and rows: all lights together, its parts, each light alone."""
     expected = inspection.prediction
-    parts = {"all lights": Spread.of(expected.std)}
+    spreads = {"all lights": Spread.of(expected.std)}
     if inspection.kind == "bayer":
-        parts |= {"  from noise": Spread.of(expected.noise), "  from the mosaic": Spread.of(expected.mosaic)}
+        spreads |= {"  from noise": Spread.of(expected.noise), "  from the mosaic": Spread.of(expected.mosaic)}
     if len(inspection.lights) > 1:
-        parts |= {f"{light.name} alone": light.alone for light in inspection.lights}
-    rows = [[name, number(spread.median, ".4f"), number(spread.q95, ".4f")] for name, spread in parts.items()]
+        spreads |= {f"{light.name} alone": light.std_alone for light in inspection.lights}
+    rows = [
+        [name, format_number(spread.median, ".4f"), format_number(spread.q95, ".4f")]
+        for name, spread in spreads.items()
+    ]
     return ["", "median", "95 %"], rows
 
 
@@ -87,16 +90,16 @@ def inspection_document(inspection: Inspection) -> dict[str, Any]:
         "reflects_from_index": REFLECTING,
         "channels": inspection.channels,
         "lights": [
-            {("alone_std_px" if name == "alone" else name): value for name, value in asdict(light).items()}
+            {("alone_std_px" if name == "std_alone" else name): value for name, value in asdict(light).items()}
             for light in inspection.lights
         ],
         "std_px": Spread.of(expected.std),
         "std_from_noise_px": Spread.of(expected.noise),
         "std_from_mosaic_px": Spread.of(expected.mosaic),
-        "nodes_not_measured": inspection.unmeasured,
-        "warnings": [{"code": found.name, "text": found.text} for found in inspection.findings],
+        "nodes_not_measured": inspection.unmeasured_fraction,
+        "warnings": [{"code": finding.name, "text": finding.text} for finding in inspection.findings],
     }
-    return document("inspection", figures)
+    return schema_document("inspection", figures)
 
 
 def _inspection_figure(inspection: Inspection) -> Figure:
@@ -113,16 +116,16 @@ def _inspection_figure(inspection: Inspection) -> Figure:
         figure.set_layout_engine("constrained", w_pad=0.02, h_pad=0.06)
         grid = figure.add_gridspec(rows, columns + 1, width_ratios=[*[1.0] * columns, 0.05])
         for column, (light, image) in enumerate(zip(inspection.lights, inspection.images.values, strict=True)):
-            axis = figure.add_subplot(grid[0, column], facecolor=_UNKNOWN)
+            axis = figure.add_subplot(grid[0, column], facecolor=_UNKNOWN_COLOUR)
             show_image(axis, image, inspection.origin)
             _finish(axis, inspection, f"light {literal(light.name)}" if lights > 1 else "image")
         if inspection.reflection_index is not None:
             for column, (light, index) in enumerate(zip(inspection.lights, inspection.reflection_index, strict=True)):
-                axis = figure.add_subplot(grid[1, column], facecolor=_UNKNOWN)
+                axis = figure.add_subplot(grid[1, column], facecolor=_UNKNOWN_COLOUR)
                 extent = _extent(inspection)
-                shown = axis.imshow(index, cmap="inferno", vmin=0, vmax=1, interpolation="auto", extent=extent)
+                image_artist = axis.imshow(index, cmap="inferno", vmin=0, vmax=1, interpolation="auto", extent=extent)
                 _finish(axis, inspection, f"{literal(light.name)} reflects on {light.reflecting:.0%}")
-            figure.colorbar(shown, cax=figure.add_subplot(grid[1, -1]), label="reflection index")
+            figure.colorbar(image_artist, cax=figure.add_subplot(grid[1, -1]), label="reflection index")
         _draw_trouble(figure.add_subplot(grid[-1, 0]), inspection)
         _draw_std(figure, figure.add_subplot(grid[-1, columns - 1]), figure.add_subplot(grid[-1, -1]), inspection)
         _write_summary(figure.add_subplot(grid[0, 1] if columns == 2 else grid[-1, 1]), inspection)
@@ -132,18 +135,18 @@ def _inspection_figure(inspection: Inspection) -> Figure:
 
 
 def _draw_trouble(axis: Axes, inspection: Inspection) -> None:
-    """Saturated samples, and where no light shows the texture, over the mean of the lights."""
+    """Draw the saturated samples, and where no light shows the texture, over the mean of the lights."""
     from scipy.ndimage import maximum_filter
 
     show_image(axis, np.nan_to_num(inspection.images.values).mean(axis=0), inspection.origin)
     inside, step = inspection.region, max(1, max(inspection.region.shape) // 700)
     # grown by a pixel and more, so that single samples stay visible in a reduced picture
     grown = maximum_filter(inspection.saturated, size=2 * step + 1)
-    for label, mask, drawn, colour in (
+    for label, mask, shown_mask, colour in (
         ("saturated", inspection.saturated, grown, "#c8102e"),
-        ("no light shows it", inspection.hidden, inspection.hidden, "#1f5fbf"),
+        ("no light shows it", inspection.lacks_contrast, inspection.lacks_contrast, "#1f5fbf"),
     ):
-        cover = (drawn & inside)[::step, ::step].astype(np.float32)
+        cover = (shown_mask & inside)[::step, ::step].astype(np.float32)
         shade(axis, cover, step, inspection.origin, colour)
         axis.plot([], [], "s", color=colour, markersize=5, label=f"{label}: {mask[inside].mean():.1%}")
     box: dict[str, Any] = {"frameon": True, "framealpha": 0.85, "edgecolor": "none", "borderpad": 0.3}
@@ -152,22 +155,22 @@ def _draw_trouble(axis: Axes, inspection: Inspection) -> None:
 
 
 def _draw_std(figure: Figure, axis: Axes, bar: Axes, inspection: Inspection) -> None:
-    """Predicted uncertainty of u and v, linear inside each element."""
+    """Draw the predicted uncertainty of u and v, linear inside each element."""
     from matplotlib.tri import Triangulation
 
     std, mesh = inspection.prediction.std, inspection.mesh
-    known = np.isfinite(std)
+    has_std = np.isfinite(std)
     axis.set_facecolor("0.85")
     _finish(axis, inspection, "predicted uncertainty")
-    if not known.any():
+    if not has_std.any():
         axis.text(0.5, 0.5, "nothing can be measured", transform=axis.transAxes, ha="center", va="center")
         bar.axis("off")
         return
-    blank = ~known[mesh.elements].all(axis=1)
-    grid = Triangulation(mesh.nodes[:, 0], mesh.nodes[:, 1], triangles=mesh.elements, mask=blank)
-    low, high = colour_range(std[known])
+    is_masked = ~has_std[mesh.elements].all(axis=1)
+    grid = Triangulation(mesh.nodes[:, 0], mesh.nodes[:, 1], triangles=mesh.elements, mask=is_masked)
+    low, high = colour_range(std[has_std])
     picture = axis.tripcolor(grid, np.nan_to_num(std), shading="gouraud", cmap="viridis", vmin=low, vmax=high)
-    extend = "max" if std[known].max() > high else "neither"
+    extend = "max" if std[has_std].max() > high else "neither"
     figure.colorbar(picture, cax=bar, label="px (one sigma)", extend=extend)
 
 
@@ -176,11 +179,11 @@ def _write_summary(axis: Axes, inspection: Inspection) -> None:
     spread = Spread.of(inspection.prediction.std)
     lines = [
         "uncertainty of u and v:",
-        f"  median {number(spread.median, '.4f')} px",
-        f"  95 %    {number(spread.q95, '.4f')} px",
-        f"elements {inspection.element_size:g} px, speckle {number(inspection.speckle_px, '.1f')} px",
+        f"  median {format_number(spread.median, '.4f')} px",
+        f"  95 %    {format_number(spread.q95, '.4f')} px",
+        f"elements {inspection.element_size:g} px, speckle {format_number(inspection.speckle_px, '.1f')} px",
         *(
-            f"{light.name} alone {number(light.alone.median, '.4f')} px"
+            f"{light.name} alone {format_number(light.std_alone.median, '.4f')} px"
             for light in inspection.lights[: 9 if len(inspection.lights) > 1 else 0]
         ),
     ]
@@ -200,10 +203,10 @@ def _extent(inspection: Inspection) -> tuple[float, float, float, float]:
 
 
 def _finish(axis: Axes, inspection: Inspection, title: str) -> None:
-    """Title, pixel axes, and the outline of the region where it is not the whole frame."""
+    """Draw title, pixel axes, and the outline of the region where it is not the whole frame."""
     axis.set_title(title)
-    left, right, bottom, top = _extent(inspection)
+    x_low, x_high, y_high, y_low = _extent(inspection)
     if not inspection.region.all():
-        places = np.arange(left + 0.5, right), np.arange(top + 0.5, bottom)
-        axis.contour(*places, inspection.region, [0.5], colors=["#f2c037"], linewidths=0.8)
-    finish_picture(axis, (left, right), (top, bottom), first=axis.get_subplotspec().is_first_col())  # type: ignore[union-attr]
+        axes_coordinates = np.arange(x_low + 0.5, x_high), np.arange(y_low + 0.5, y_high)
+        axis.contour(*axes_coordinates, inspection.region, [0.5], colors=["#f2c037"], linewidths=0.8)
+    finish_picture(axis, (x_low, x_high), (y_low, y_high), first=axis.get_subplotspec().is_first_col())  # type: ignore[union-attr]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rgbmidic.errors import renamed_attributes
 from rgbmidic.illumination.checks import Check, reported
 from rgbmidic.illumination.contrast import CONTRAST
 from rgbmidic.illumination.images import IlluminationImages
@@ -28,7 +30,7 @@ class Spread:
 
     @classmethod
     def of(cls, std: FloatArray) -> Spread:
-        """Of standard uncertainties (N,).
+        """Return the spread of standard uncertainties (N,).
 
         Parameters
         ----------
@@ -90,7 +92,7 @@ class LightSummary:
         Fraction of the region where the light is known.
     negative : float
         Fraction of the region where the light's local mean is negative, which no light can be.
-    alone : Spread
+    std_alone : Spread
         Predicted standard uncertainty with this light alone, px.
     """
 
@@ -100,7 +102,7 @@ class LightSummary:
     reflecting: float | None
     valid: float
     negative: float
-    alone: Spread
+    std_alone: Spread
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,10 +127,10 @@ class Inspection:
         Fraction of a light's image that is not diffuse, 0 to 1; relative to the light with the most contrast at each
         place. None for a single light.
     saturated, region : ndarray, shape (H, W), bool
-    hidden : ndarray, shape (H, W), bool
+    lacks_contrast : ndarray, shape (H, W), bool
         Where no light reaches half the usual contrast: all of them reflect, or there is no paint.
     background : ndarray, shape (H, W), bool
-        Part of `hidden` that is dark too.
+        Part of `lacks_contrast` that is dark too.
     texture : TextureModel or None
         The texture that the colours of a mosaic have in common; None for cameras without a mosaic.
     noise : NoiseModel
@@ -153,6 +155,20 @@ class Inspection:
     doubts : tuple of Check
         Lights that lie apart or show no common texture (`rgbmidic.pipeline.suitability.separation_doubts`), lamps of
         unequal strength.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.ndimage import gaussian_filter
+    >>> from rgbmidic import inspect_frame
+    >>> from rgbmidic.frames import ChannelFrame
+    >>> speckle = gaussian_filter(np.random.default_rng(0).normal(size=(1, 64, 64)), (0, 2, 2))
+    >>> frame = ChannelFrame(values=1500 + 4000 * speckle, black_level=np.zeros(1), white_level=4095.0)
+    >>> inspection = inspect_frame(frame, element_size=20)
+    >>> [finding.name for finding in inspection.findings]
+    ['noise unknown']
+    >>> 5 < inspection.speckle_px < 7
+    True
     """
 
     name: str
@@ -165,7 +181,7 @@ class Inspection:
     reflection_index: FloatImage | None
     saturated: BoolArray
     region: BoolArray
-    hidden: BoolArray
+    lacks_contrast: BoolArray
     background: BoolArray
     texture: TextureModel | None
     noise: NoiseModel
@@ -180,15 +196,20 @@ class Inspection:
     repetition: str
     doubts: tuple[Check, ...]
 
+    if not TYPE_CHECKING:  # mypy would accept any name
+        __getattr__ = renamed_attributes("Inspection", hidden="lacks_contrast", unmeasured="unmeasured_fraction")
+
     @property
-    def unmeasured(self) -> float:
+    def unmeasured_fraction(self) -> float:
         """Fraction of the nodes that cannot be measured."""
         return float(np.isnan(self.prediction.std).mean())
 
     @property
     def findings(self) -> tuple[Check, ...]:
         """The warnings, the gravest first."""
-        return tuple(reported([*_of_set_up(self), *_of_exposure(self), *_of_speckle(self), *_of_region(self)]))
+        return tuple(
+            reported([*_set_up_checks(self), *_exposure_checks(self), *_speckle_checks(self), *_region_checks(self)])
+        )
 
     @property
     def speckle_px(self) -> float:
@@ -197,27 +218,32 @@ class Inspection:
         return float(np.median(sizes)) if sizes else float("nan")
 
 
-def _of_set_up(inspection: Inspection) -> Iterator[Check]:
-    for found in inspection.contradictions:
-        yield Check(f"not calibrated: {found.name}", found.text)
+def _set_up_checks(inspection: Inspection) -> Iterator[Check]:
+    for contradiction in inspection.contradictions:
+        yield Check(f"not calibrated: {contradiction.name}", contradiction.text)
     differ = f"the two greens of the pattern differ by {inspection.greens:.0%} more than calibrated: check cfa"
-    yield Check("pattern", differ, inspection.greens, CONSTANTS.greens)
+    yield Check("pattern", differ, inspection.greens, CONSTANTS.max_green_difference)
     if not inspection.crosstalk_known:
-        why = "the camera's channels stand for the lights, and a reflection of one light shows in the others too"
-        yield Check("crosstalk unknown", f"no crosstalk calibration: {why}; rgbmidic-calibrate crosstalk")
+        consequence = (
+            "the camera's channels stand for the lights, and a reflection of one light shows in the others too"
+        )
+        yield Check("crosstalk unknown", f"no crosstalk calibration: {consequence}; rgbmidic-calibrate crosstalk")
     if not inspection.noise_known:
-        why = "noise and the uncertainty from it are estimated from the frame, up to a few times too high for speckle"
+        consequence = (
+            "noise and the uncertainty from it are estimated from the frame, up to a few times too high for speckle"
+        )
         yield Check(
-            "noise unknown", f"no noise calibration: {why} under 4 px and in reflections; rgbmidic-calibrate noise"
+            "noise unknown",
+            f"no noise calibration: {consequence} under 4 px and in reflections; rgbmidic-calibrate noise",
         )
     yield from inspection.doubts
     for light in inspection.lights:
         negative = f"light {light.name} is negative on {light.negative:.0%} of the region"
         text = f"{negative}: crosstalk, pattern or black level are not those of this frame"
-        yield Check("negative light", text, light.negative, CONSTANTS.negative)
+        yield Check("negative light", text, light.negative, CONSTANTS.max_negative)
 
 
-def _of_exposure(inspection: Inspection) -> Iterator[Check]:
+def _exposure_checks(inspection: Inspection) -> Iterator[Check]:
     if inspection.clipping:
         yield Check("white level", f"{inspection.clipping}, as the figures here assume")
     for channel in inspection.channels:
@@ -227,15 +253,17 @@ def _of_exposure(inspection: Inspection) -> Iterator[Check]:
         text = f"{bright}; less exposure, or another place of the lamp"
         yield Check("saturated", text, channel.saturated, SUITABILITY.clipped)
         dark = f"channel {channel.name} is dark: 95 % of its samples are below {channel.high:.1%} of the full scale"
-        yield Check("dark", f"{dark}; more light or exposure", max(CONSTANTS.dark - channel.high, 0.0))
+        yield Check("dark", f"{dark}; more light or exposure", max(CONSTANTS.min_level - channel.high, 0.0))
 
 
-def _of_speckle(inspection: Inspection) -> Iterator[Check]:
+def _speckle_checks(inspection: Inspection) -> Iterator[Check]:
     texture, size = inspection.texture, inspection.speckle_px
-    least = CONSTANTS.too_fine if size > 2 * CONSTANTS.finest else COLOURED  # coarse speckle is not too fine
+    min_agreement = (
+        CONSTANTS.min_agreement if size > 2 * CONSTANTS.min_speckle else COLOURED
+    )  # coarse speckle is not too fine
     if any(doubt.name == "lights apart" for doubt in inspection.doubts):
         pass  # a texture of displaced lights is not that of the specimen
-    elif texture is not None and (texture.specific > 0.5 or texture.correlation < least):
+    elif texture is not None and (texture.specific > 0.5 or texture.correlation < min_agreement):
         yield Check(
             "coloured",
             f"the colours do not show one texture (agreement {texture.correlation:.2f}; of what each shows alone, "
@@ -246,9 +274,10 @@ def _of_speckle(inspection: Inspection) -> Iterator[Check]:
         yield Check(
             "fine speckle",
             f"the speckle is too fine for the colour lattice: neighbouring colours agree to {texture.correlation:.2f}, "
-            f"{CONSTANTS.too_fine} is needed (speckles of about {CONSTANTS.finest:.1f} px); displacements will be "
-            "pulled towards whole pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer lens",
-            max(CONSTANTS.too_fine - texture.correlation, 0.0),
+            f"{CONSTANTS.min_agreement} is needed (speckles of about {CONSTANTS.min_speckle:.1f} px); displacements "
+            "will be pulled towards whole pixels by 0.003 px and more: coarser speckle, a nearer camera or a softer "
+            "lens",
+            max(CONSTANTS.min_agreement - texture.correlation, 0.0),
         )
     if inspection.repetition:
         yield Check("repetition", inspection.repetition)
@@ -260,17 +289,19 @@ def _of_speckle(inspection: Inspection) -> Iterator[Check]:
         yield Check("coarse speckle", f"{coarse}: at least {SPECKLES:g} per side, so {better}")
 
 
-def _of_region(inspection: Inspection) -> Iterator[Check]:
-    hidden, dark = (float(where[inspection.region].mean()) for where in (inspection.hidden, inspection.background))
-    what, why = "the light does not show", "it reflects or saturates there"
+def _region_checks(inspection: Inspection) -> Iterator[Check]:
+    hidden_fraction, dark_fraction = (
+        float(mask[inspection.region].mean()) for mask in (inspection.lacks_contrast, inspection.background)
+    )
+    subject, cause = "the light does not show", "it reflects or saturates there"
     if len(inspection.lights) > 1:
-        what, why = "no light shows", "all lights reflect or saturate there"
+        subject, cause = "no light shows", "all lights reflect or saturate there"
     reasons = []
-    if dark > CONTRAST.hidden:
-        reasons.append(f"it holds dark background ({dark:.1%}), draw it inside the specimen")
-    if hidden - dark > CONTRAST.hidden or not reasons:
-        reasons.append(f"{why}, or there is no paint")
-    text = f"{what} the texture on {hidden:.1%} of the region: {'; '.join(reasons)}"
-    yield Check("hidden", text, hidden, CONTRAST.hidden)
-    lost = f"{inspection.unmeasured:.1%} of the nodes will not be measured"
-    yield Check("not measured", lost, inspection.unmeasured)
+    if dark_fraction > CONTRAST.hidden:
+        reasons.append(f"it holds dark background ({dark_fraction:.1%}), draw it inside the specimen")
+    if hidden_fraction - dark_fraction > CONTRAST.hidden or not reasons:
+        reasons.append(f"{cause}, or there is no paint")
+    text = f"{subject} the texture on {hidden_fraction:.1%} of the region: {'; '.join(reasons)}"
+    yield Check("hidden", text, hidden_fraction, CONTRAST.hidden)
+    lost_text = f"{inspection.unmeasured_fraction:.1%} of the nodes will not be measured"
+    yield Check("not measured", lost_text, inspection.unmeasured_fraction)

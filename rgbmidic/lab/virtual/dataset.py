@@ -74,15 +74,17 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: Progress | 
     at_rest = render(scene)
     for index, state in enumerate(states):
         images = render(scene, state) if index else at_rest
-        for (folder, on), seed in zip(_folders(scene).items(), frame_seeds[index], strict=False):
-            frame = record(images, scene.camera, scene.lights, seed=int(seed), on=on)
+        for (folder, shining), seed in zip(_folders(scene).items(), frame_seeds[index], strict=False):
+            frame = record(images, scene.camera, scene.lights, seed=int(seed), shining=shining)
             write_frame(out / folder, index, frame, settings)
         if settings.noise_free:
-            _save(out / "noise_free" / f"frame_{index:04d}.npz", images=images)
+            _save_arrays(out / "noise_free" / f"frame_{index:04d}.npz", images=images)
         if progress is not None:
             progress(index + 1, len(states), f"frame {index}: turned by {state.angle_deg:g} degrees")
     displacement = np.stack([truth(scene, state) for state in states])
-    _save(out / "truth.npz", displacement=displacement.astype(np.float32), angle_deg=[s.angle_deg for s in states])
+    _save_arrays(
+        out / "truth.npz", displacement=displacement.astype(np.float32), angle_deg=[s.angle_deg for s in states]
+    )
     _write_captures(out, scene, settings, at_rest, [int(seed.generate_state(1)[0]) for seed in seeds[1:]])
     true_calibration(scene).write(out / "calibration.json")
     test = out / "test.toml"
@@ -94,7 +96,7 @@ def write_dataset(scene_toml: Path | str, out: Path | str, progress: Progress | 
 
 
 def _check_output(scene: Scene, out: Path) -> None:
-    """Names of lights that can be names of folders, and an empty folder, which is made."""
+    """Require names of lights that can be names of folders, and make an empty folder."""
     for light in scene.lights:
         if not re.fullmatch(r"[A-Za-z0-9_-]+", light.name):
             raise InputError(f"a light's name becomes a folder's: letters, digits, - and _ only, not {light.name!r}")
@@ -102,8 +104,8 @@ def _check_output(scene: Scene, out: Path) -> None:
             raise InputError(f"a light cannot be called {light.name!r}: that is the name of a folder of captures")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-        taken = any(out.iterdir())
-    if taken:
+        has_files = any(out.iterdir())
+    if has_files:
         raise ResultError(f"{out} is not empty; nothing is overwritten: choose another folder")
 
 
@@ -166,7 +168,7 @@ def settings_text(scene: Scene, settings: DatasetSettings, region: tuple[float, 
     return "\n".join(lines)
 
 
-def _save(path: Path, **arrays: npt.ArrayLike) -> None:
+def _save_arrays(path: Path, **arrays: npt.ArrayLike) -> None:
     path.parent.mkdir(exist_ok=True)
     with path.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **arrays)
@@ -182,7 +184,7 @@ def target_scene(scene: Scene, target: Target = "white") -> Scene:
 
 
 def single_light_frames(scene: Scene, *, count: int = 3, seed: int, target: Target = "white") -> dict[str, list[Frame]]:
-    """Frames with one light on at a time, dimmed from frame to frame.
+    """Return the frames with one light on at a time, dimmed from frame to frame.
 
     Parameters
     ----------
@@ -202,42 +204,46 @@ def single_light_frames(scene: Scene, *, count: int = 3, seed: int, target: Targ
     """
     images, generator = render(target_scene(scene, target)), np.random.SeedSequence(seed)
     frames: dict[str, list[Frame]] = {light.name: [] for light in scene.lights}
-    for name, taken in frames.items():
+    for name, frames_of_light in frames.items():
         for step, child in enumerate(generator.spawn(count), start=1):
-            taken += _shots(scene, images * np.float32(step / count), child.generate_state(1), (name,))
+            frames_of_light += _record_frames(
+                scene, images * np.float32(step / count), child.generate_state(1), (name,)
+            )
     return frames
 
 
 def dark_frames(scene: Scene, *, count: int = 3, seed: int) -> list[Frame]:
-    """Frames with all lights off."""
+    """Return the frames with all lights off."""
     darkness = np.zeros((len(scene.lights), *scene.camera.shape), dtype=np.float32)
-    return _shots(scene, darkness, np.random.SeedSequence(seed).generate_state(count), ())
+    return _record_frames(scene, darkness, np.random.SeedSequence(seed).generate_state(count), ())
 
 
 def flat_frames(scene: Scene, *, count: int = 2, seed: int) -> list[list[Frame]]:
-    """Frames of a white card under all lights together: `count` at each of the `EXPOSURES`."""
+    """Return the frames of a white card under all lights together: `count` at each of the `EXPOSURES`."""
     images = render(target_scene(scene, "white"))
     brightest = float(np.einsum("cl,lyx->cyx", scene.camera.mixing(scene.lights), images).max())
     levels = [np.float32(fraction * scene.camera.full_scale / brightest) for fraction in EXPOSURES]
     seeds = [step.generate_state(count) for step in np.random.SeedSequence(seed).spawn(len(levels))]
-    return [_shots(scene, images * level, taken) for level, taken in zip(levels, seeds, strict=True)]
+    return [
+        _record_frames(scene, images * level, level_seeds) for level, level_seeds in zip(levels, seeds, strict=True)
+    ]
 
 
 def _check_frames(scene: Scene, images: FloatImage, *, count: int = 2, seed: int) -> dict[str, list[Frame]]:
-    """Frames of the specimen at rest, `images` (k, H, W): each light alone, all together ("all"), and "dark"."""
-    lit = {light.name: (light.name,) for light in scene.lights} | {"all": None}
-    *steps, last = np.random.SeedSequence(seed).spawn(len(lit) + 1)
+    """Return frames of the specimen at rest, `images` (k, H, W): each light alone, all together ("all"), and "dark"."""
+    shining_lights = {light.name: (light.name,) for light in scene.lights} | {"all": None}
+    *steps, last = np.random.SeedSequence(seed).spawn(len(shining_lights) + 1)
     frames = {
-        name: _shots(scene, images, step.generate_state(count), on)
-        for (name, on), step in zip(lit.items(), steps, strict=True)
+        name: _record_frames(scene, images, step.generate_state(count), on)
+        for (name, on), step in zip(shining_lights.items(), steps, strict=True)
     }
     return frames | {"dark": dark_frames(scene, count=count, seed=int(last.generate_state(1)[0]))}
 
 
-def _shots(
-    scene: Scene, images: FloatImage, seeds: Iterable[np.uint32], on: Collection[str] | None = None
+def _record_frames(
+    scene: Scene, images: FloatImage, seeds: Iterable[np.uint32], shining: Collection[str] | None = None
 ) -> list[Frame]:
-    return [record(images, scene.camera, scene.lights, seed=int(seed), on=on) for seed in seeds]
+    return [record(images, scene.camera, scene.lights, seed=int(seed), shining=shining) for seed in seeds]
 
 
 def record(
@@ -246,7 +252,7 @@ def record(
     lights: tuple[Light, ...],
     *,
     seed: int,
-    on: Collection[str] | None = None,
+    shining: Collection[str] | None = None,
 ) -> Frame:
     """Return the raw frame that the camera takes.
 
@@ -262,7 +268,7 @@ def record(
         The k lights of the images.
     seed
         Of the noise; the same seed gives the same frame.
-    on
+    shining
         Names of the lights that shine; None: all together, () a dark frame.
 
     Returns
@@ -278,10 +284,10 @@ def record(
     if signal.ndim != 3 or len(signal) != len(lights):
         raise InputError(f"{len(lights)} lights give as many images (k, H, W), not an array of shape {signal.shape}")
     names = [light.name for light in lights]
-    if on is not None:
-        if unknown := set(on) - set(names):
+    if shining is not None:
+        if unknown := set(shining) - set(names):
             raise InputError(f"no light {', '.join(sorted(unknown))}; there are {', '.join(names)}")
-        signal = signal * np.array([name in on for name in names], dtype=signal.dtype)[:, None, None]
+        signal = signal * np.array([name in shining for name in names], dtype=signal.dtype)[:, None, None]
     mixing = camera.mixing(lights).astype(np.float32)
     illumination = signal.astype(np.float32, copy=False)
     signal = np.einsum("cl,lyx->cyx", mixing, illumination)

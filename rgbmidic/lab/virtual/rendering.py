@@ -21,24 +21,24 @@ from rgbmidic.scene.zones import material_points, truth
 from rgbmidic.typing import FloatArray, FloatImage
 
 
-def samples_needed(scene: Scene) -> int:
-    """Rays per pixel and direction: the camera's, or so many that the sampling pattern leaves no trace.
+def rays_per_pixel(scene: Scene) -> int:
+    """Return how many rays per pixel and direction: the camera's, or so many that the sampling pattern leaves no trace.
 
     On a mat plate six rays per pixel of 2.2 wrinkles err by 1 DN rms of 2000. A reflection follows details finer than
     the wrinkles by the ratio of lobe to slope: twice as many rays at 6 and 4 degrees (measured; see the tests).
     """
     if scene.camera.samples is not None:
         return scene.camera.samples
-    needed = 6.0 if scene.surface.coverage else 1.0  # paint without droplets has no edges
+    n_samples = 6.0 if scene.surface.coverage else 1.0  # paint without droplets has no edges
     for paint in (scene.surface.white, scene.surface.black):
         if paint.slope_deg > 0:
             sharpness = 2 * max(1.0, 4 / paint.lobe_deg) ** 0.75 if paint.gloss > 0 else 1.0
-            needed = max(needed, 2.7 * scene.pixel / paint.spacing * sharpness)
-    return min(math.ceil(needed - 0.1), 24)
+            n_samples = max(n_samples, 2.7 * scene.pixel / paint.spacing * sharpness)
+    return min(math.ceil(n_samples - 0.1), 24)
 
 
 def render(scene: Scene, state: State | None = None) -> FloatImage:
-    """Images of each light alone, without noise.
+    """Return the images of each light alone, without noise.
 
     Parameters
     ----------
@@ -56,27 +56,27 @@ def render(scene: Scene, state: State | None = None) -> FloatImage:
     poses = [state]
     if duration > 0 and (any(state.velocity) or state.spin_deg):
         # the middles of equal parts of the exposure, each shorter in motion than a quarter of the pixel's own aperture
-        swept = np.hypot(*truth(scene, state.after(duration / 2), state.after(-duration / 2)))
-        parts = max(1, math.ceil(4 * float(np.nanmax(swept, initial=0.0))))
-        poses = [state.after(duration * ((i + 0.5) / parts - 0.5)) for i in range(parts)]
+        swept = np.hypot(*truth(scene, state.at_time(duration / 2), state.at_time(-duration / 2)))
+        n_parts = max(1, math.ceil(4 * float(np.nanmax(swept, initial=0.0))))
+        poses = [state.at_time(duration * ((i + 0.5) / n_parts - 0.5)) for i in range(n_parts)]
     return np.asarray(sum(_trace(scene, pose) for pose in poses) * np.float32(1 / len(poses)))
 
 
 def _trace(scene: Scene, state: State) -> FloatImage:
-    """One pose: lights that the lens images alike are traced together."""
+    """Trace one pose: lights that the lens images alike are traced together."""
     out = np.empty((len(scene.lights), *scene.camera.shape), dtype=np.float32)
     lenses, kinds = np.unique(scene.camera.lenses(scene.lights), axis=0, return_inverse=True)
     for number, lens in enumerate(lenses):
         indices = np.flatnonzero(kinds.ravel() == number)
-        out[indices] = _trace_together(scene, state, tuple(scene.lights[index] for index in indices), lens)
+        out[indices] = _trace_lens(scene, state, tuple(scene.lights[index] for index in indices), lens)
     camera = scene.camera
     levels = camera.full_scale * camera.exposure * camera.response(scene.lights).max(axis=0)
     out *= levels.astype(np.float32)[:, None, None]
     return out
 
 
-def _trace_together(scene: Scene, state: State, lights: tuple[Light, ...], lens: FloatArray) -> FloatImage:
-    camera, n = scene.camera, samples_needed(scene)
+def _trace_lens(scene: Scene, state: State, lights: tuple[Light, ...], lens: FloatArray) -> FloatImage:
+    camera, n = scene.camera, rays_per_pixel(scene)
     turn, origin = state.pose(scene.body)
     frame = np.concatenate([-turn.T @ origin, turn.T.ravel()])
     positions = np.array(
@@ -120,8 +120,8 @@ def _aperture(blur: float, samples: int) -> tuple[int, FloatArray]:
 def _subpixel_material(
     scene: Scene, state: State, lens: FloatArray, sample_rows: tuple[int, int], pad: int
 ) -> FloatArray:
-    """Material point (count, columns, 2) of the samples in so many rows from the first; NaN off the plate."""
-    n, (first, count) = samples_needed(scene), sample_rows
+    """Return material point (count, columns, 2) of the samples in so many rows from the first; NaN off the plate."""
+    n, (first, count) = rays_per_pixel(scene), sample_rows
     x = (np.arange(n * (scene.camera.shape[1] + 2 * pad)) + 0.5) / n - 0.5 - pad
     y = (np.arange(first, first + count) + 0.5) / n - 0.5
     focal, *centre = scene.camera.lenses(scene.lights)[0]
@@ -132,7 +132,7 @@ def _subpixel_material(
 
 
 def paint(*, gloss: float = 1.5, lobe_deg: float = 4.0, **settings: Any) -> Surface:
-    """Black droplets (albedo 0.10) on white paint (0.80), wrinkles 25 um apart with 6 degrees rms slope.
+    """Return black droplets (albedo 0.10) on white paint (0.80), wrinkles 25 um apart with 6 degrees rms slope.
 
     `settings` are those of `Surface`.
     """
@@ -245,14 +245,14 @@ def paper_scene(*, size: int = 1024, seed: int = 0, colour: bool = False, **came
     -------
     Scene
     """
-    places = {"left": _lamp_at(-48.0, -1.5), "right": _lamp_at(32.0, 1.5)}
+    positions = {"left": _lamp_at(-48.0, -1.5), "right": _lamp_at(32.0, 1.5)}
     if colour:
-        places = {"red": places["left"], "green": places["right"], "blue": (10.0, -220.0, 60.0)}
+        positions = {"red": positions["left"], "green": positions["right"], "blue": (10.0, -220.0, 60.0)}
     front = (0.0, 0.0, DISTANCE)
     settings: dict[str, object] = {"kind": "bayer" if colour else "monochrome", **camera}
     scene = Scene(
         body=Sphere(),
-        lights=tuple(Light(name=name, position=position).aimed(front) for name, position in places.items()),
+        lights=tuple(Light(name=name, position=position).aimed(front) for name, position in positions.items()),
         camera=reference_camera((size, size), **settings),
         surface=paint(seed=seed, dome=0.004),
     )
@@ -276,8 +276,8 @@ def expose(scene: Scene, state: State | None = None, level: float = 0.97) -> Sce
     Scene
     """
     images = render(scene, state)
-    together = np.einsum("cl,lyx->cyx", scene.camera.mixing(scene.lights), images)
-    brightest = float((images if scene.camera.kind == "monochrome" else together).max())
+    channel_images = np.einsum("cl,lyx->cyx", scene.camera.mixing(scene.lights), images)
+    brightest = float((images if scene.camera.kind == "monochrome" else channel_images).max())
     factor = level * scene.camera.full_scale / brightest
     return replace(scene, camera=replace(scene.camera, exposure=scene.camera.exposure * factor))
 

@@ -26,7 +26,7 @@ from rgbmidic.text import uncertain
 from rgbmidic_calibration.camera import estimate_lens, estimate_plane
 from rgbmidic_calibration.cli import app
 from rgbmidic_calibration.jobs import calibrate_camera
-from rgbmidic_calibration.target import Target, View, find_view, photograph, refined_corners
+from rgbmidic_calibration.target import Target, View, find_view, photograph, refine_corners
 
 
 def frame_of(image):
@@ -51,18 +51,18 @@ def test_parameters_are_within_their_stated_uncertainty(lens: np.ndarray) -> Non
         camera = estimate_lens(random_views(random, 8, lens=lens)).camera
         std = np.sqrt(np.diag(camera.covariance))
         off.append(((camera.lens - lens)[:3] / std[:3]).tolist())
-        where = pose(1.5, 0.7, 3.0, far=lens[0] / LENS[0])
-        plane = estimate_plane(view_of(where, random, lens=lens), camera).camera
+        target_pose = pose(1.5, 0.7, 3.0, far=lens[0] / LENS[0])
+        plane = estimate_plane(view_of(target_pose, random, lens=lens), camera).camera
         corners = np.array([[30.0, 40], [600, 50], [300, 440]])
-        true, seen = on_plane(corners, where, lens), plane.to_mm(corners)
+        true, points_mm = on_plane(corners, target_pose, lens), plane.to_mm(corners)
         slopes = plane.sensitivity(corners)
         for a, b in itertools.combinations(range(3), 2):
-            length = np.linalg.norm(seen[b] - seen[a])
-            slope = (seen[b] - seen[a]) / length @ (slopes[b] - slopes[a])
+            length = np.linalg.norm(points_mm[b] - points_mm[a])
+            slope = (points_mm[b] - points_mm[a]) / length @ (slopes[b] - slopes[a])
             error = length - np.linalg.norm(true[b] - true[a])
             off.append([error / np.sqrt(slope @ plane.correlation @ slope)])
         tilt, tilt_std = plane.tilt_deg
-        off.append([(tilt - np.degrees(np.arccos(where[0][2, 2]))) / tilt_std])
+        off.append([(tilt - np.degrees(np.arccos(target_pose[0][2, 2]))) / tilt_std])
     figures = np.concatenate([np.ravel(part) for part in off])
     assert 0.90 <= (np.abs(figures) < 1.96).mean() <= 0.99
     assert 0.75 <= np.sqrt((figures**2).mean()) <= 1.15
@@ -79,20 +79,20 @@ def test_the_test_takes_up_the_terms_there_are() -> None:
 
 
 def test_corners_of_a_photograph_are_found_to_a_two_hundredth_of_a_pixel() -> None:
-    where = pose(8, -5, 3)
-    found = find_view(frame_of(photo(where, np.random.default_rng(1))), TARGET, "photo")
-    true = imaged(found.points - TARGET.points.mean(axis=0), where)
-    if np.abs(true - found.pixels).max() > 5:  # the board may be found turned by 180 degrees
+    target_pose = pose(8, -5, 3)
+    view = find_view(frame_of(photo(target_pose, np.random.default_rng(1))), TARGET, "photo")
+    true = imaged(view.points - TARGET.points.mean(axis=0), target_pose)
+    if np.abs(true - view.pixels).max() > 5:  # the board may be found turned by 180 degrees
         true = true[::-1]
-    assert np.sqrt(((found.pixels - true) ** 2).mean()) < 0.006
+    assert np.sqrt(((view.pixels - true) ** 2).mean()) < 0.006
 
 
 def test_corners_that_opencv_finds_a_pixel_off_are_mended() -> None:
     """As in OpenCV's own pictures, in which some are (benchmarks/camera.py)."""
-    where = pose(8, -5, 3)
-    true = imaged(TARGET.points - TARGET.points.mean(axis=0), where)
-    found = refined_corners(photo(where).astype(np.float32), TARGET.points, true + np.array([1.1, -1.3]), 4.0)
-    assert np.abs(found - true).max() < 0.02
+    target_pose = pose(8, -5, 3)
+    true = imaged(TARGET.points - TARGET.points.mean(axis=0), target_pose)
+    view = refine_corners(photo(target_pose).astype(np.float32), TARGET.points, true + np.array([1.1, -1.3]), 4.0)
+    assert np.abs(view - true).max() < 0.02
 
 
 def discs(where, target, radius, random):
@@ -107,18 +107,18 @@ def discs(where, target, radius, random):
 
 @pytest.mark.parametrize(("text", "radius"), [("circles:9x7:5mm", 1.7), ("acircles:4x9:4mm", 2.2)])
 def test_the_middle_of_a_tilted_circle_is_not_that_of_its_image(text: str, radius: float) -> None:
-    where, target, camera = pose(30, 0, 3, far=1.1), Target.parse(text), CameraCalibration(shape=SHAPE, lens=LENS)
-    found = find_view(frame_of(discs(where, target, radius, np.random.default_rng(0))), target, "photo")
+    target_pose, target, camera = pose(30, 0, 3, far=1.1), Target.parse(text), CameraCalibration(shape=SHAPE, lens=LENS)
+    found = find_view(frame_of(discs(target_pose, target, radius, np.random.default_rng(0))), target, "photo")
     assert found.radius == pytest.approx(radius, rel=0.06)
-    true = imaged(found.points - target.points.mean(axis=0), where)
+    true = imaged(found.points - target.points.mean(axis=0), target_pose)
     true = true[::-1] if np.abs(found.pixels - true).max() > 5 else true
     assert np.abs((found.pixels - true).mean(axis=0)).max() > 0.04  # found 0.048 and 0.08
     ends = np.array([[320.0, 80], [320, 400]])
-    length = np.linalg.norm(np.diff(on_plane(ends, where), axis=0))
+    length = np.linalg.norm(np.diff(on_plane(ends, target_pose), axis=0))
     off = []
     for view in (replace(found, radius=0.0), found):
-        places = estimate_plane(view, camera).camera.to_mm(ends)
-        off.append(abs(np.linalg.norm(np.diff(places, axis=0)) / length - 1))
+        points_mm = estimate_plane(view, camera).camera.to_mm(ends)
+        off.append(abs(np.linalg.norm(np.diff(points_mm, axis=0)) / length - 1))
     assert off[1] < 2e-5 < 4e-5 < off[0], off
 
 
@@ -159,9 +159,9 @@ def test_a_mosaic_shows_the_target_without_a_lattice_nor_a_shift() -> None:
     assert not clipped.any()
     plain = cv2.sepFilter2D(image, -1, np.array([0.25, 0.5, 0.25]), np.array([0.25, 0.5, 0.25]))
     assert np.corrcoef(mean[5:-5, 5:-5].ravel(), plain[5:-5, 5:-5].ravel())[0, 1] > 0.999
-    found = find_view(mosaic, TARGET, "mosaic")
-    true = imaged(found.points - TARGET.points.mean(axis=0), pose(0, 0, 3))
-    off = np.minimum(np.abs(true - found.pixels).max(), np.abs(true[::-1] - found.pixels).max())
+    view = find_view(mosaic, TARGET, "mosaic")
+    true = imaged(view.points - TARGET.points.mean(axis=0), pose(0, 0, 3))
+    off = np.minimum(np.abs(true - view.pixels).max(), np.abs(true[::-1] - view.pixels).max())
     assert off < 0.05
 
 
@@ -180,11 +180,11 @@ def test_axes_of_the_plane_are_those_of_the_image() -> None:
 
 def test_four_corners_of_the_specimen_make_a_plane() -> None:
     corners = "100,80:540,90:530,400:110,390"
-    found = calibrate_camera(FrameSettings(path=("x",), shape=SHAPE), None, plane=(corners, "44x31mm", 0.5))
-    places = found.camera.to_mm(np.array([[100.0, 80], [540, 90], [530, 400], [110, 390]]))
-    sides = np.linalg.norm(np.roll(places, -1, axis=0) - places, axis=1)
+    result = calibrate_camera(FrameSettings(path=("x",), shape=SHAPE), None, plane=(corners, "44x31mm", 0.5))
+    points_mm = result.camera.to_mm(np.array([[100.0, 80], [540, 90], [530, 400], [110, 390]]))
+    sides = np.linalg.norm(np.roll(points_mm, -1, axis=0) - points_mm, axis=1)
     assert sides == pytest.approx([44, 31, 44, 31], abs=1e-6)
-    scale, std = found.camera.scale(found.camera.centre)
+    scale, std = result.camera.scale(result.camera.centre)
     assert scale == pytest.approx(0.1, rel=0.03)
     assert 1e-4 < std / scale < 5e-3
 
@@ -206,10 +206,10 @@ def test_a_plane_under_another_light_is_that_of_the_first_light_s_image() -> Non
     assert pixels == pytest.approx(red_view.pixels, abs=1e-9)
     lens = CameraCalibration(shape=SHAPE, lens=LENS)
     true = estimate_plane(red_view, lens).camera
-    found = estimate_plane(replace(seen, pixels=pixels, factor=factor), lens).camera
+    result = estimate_plane(replace(seen, pixels=pixels, factor=factor), lens).camera
     scale, std = true.scale(true.centre)
-    assert found.scale(found.centre)[0] == pytest.approx(scale, rel=1e-7)
-    assert found.scale(found.centre)[1] == pytest.approx(np.hypot(std, 2e-4 * scale), rel=0.02)
+    assert result.scale(result.centre)[0] == pytest.approx(scale, rel=1e-7)
+    assert result.scale(result.centre)[1] == pytest.approx(np.hypot(std, 2e-4 * scale), rel=0.02)
     assert estimate_plane(seen, lens).camera.scale(true.centre)[0] / scale == pytest.approx(1.006, abs=3e-4)
 
 
@@ -281,12 +281,12 @@ def test_other_targets_are_found(text: str) -> None:
         for point in there:
             away = np.hypot(x - point[0], y - point[1])
             image -= 180 * np.clip((0.27 * target.spacing * scale - away) + 0.5, 0, 1)
-    found = find_view(frame_of(cv2.GaussianBlur(image, (0, 0), 0.7)), target, "photo")
-    assert len(found.points) == len(target.points)
+    view = find_view(frame_of(cv2.GaussianBlur(image, (0, 0), 0.7)), target, "photo")
+    assert len(view.points) == len(target.points)
     if there is not None:
-        order = found.pixels if np.abs(found.pixels - there).max() < 5 else found.pixels[::-1]
+        order = view.pixels if np.abs(view.pixels - there).max() < 5 else view.pixels[::-1]
         assert np.abs(order - there).max() < 0.1
-    fit = estimate_plane(found, CameraCalibration(shape=found.shape))
+    fit = estimate_plane(view, CameraCalibration(shape=view.shape))
     assert fit.camera.details["plane"]["rms_px"] < 0.05
 
 
@@ -367,9 +367,9 @@ def test_the_command_writes_what_the_library_reads(tmp_path: Path, capsys: pytes
     picture.unlink()
     assert command.execute(app, ["show", str(out), "--picture", str(picture)]) == 0
     assert cv2.imread(str(picture)).shape[1] == pytest.approx(2 / 3 * width, abs=2)  # a file has no residuals to show
-    shown = " ".join(capsys.readouterr().out.split())
-    assert "6 views" in shown
-    assert f"tilt {uncertain(tilt, tilt_std)}" in shown
+    output = " ".join(capsys.readouterr().out.split())
+    assert "6 views" in output
+    assert f"tilt {uncertain(tilt, tilt_std)}" in output
     # the lens of this file with another photograph of the plane
     again = tmp_path / "again.json"
     assert command.execute(app, [*options[:-1], str(again), "--lens", str(out), "--plane", plane]) == 0
@@ -416,8 +416,8 @@ def test_the_pictures_of_opencv(real_data: RealData) -> None:
         for path in sorted(folder.glob("left*.jpg"))
     ]
     assert len(views) == 13
-    found = estimate_lens(views).camera
-    residual = found.details["lens"]["rms_px"]
+    result = estimate_lens(views).camera
+    residual = result.details["lens"]["rms_px"]
     assert residual < 0.12  # found 0.112; OpenCV's left_intrinsics.yml has 0.278
     points = [np.c_[view.points, np.zeros(len(view.points))].astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32)[:, None] for view in views]
@@ -426,9 +426,9 @@ def test_the_pictures_of_opencv(real_data: RealData) -> None:
         points, pixels, SHAPE[::-1], np.eye(3), None, flags=flags
     )
     assert residual == pytest.approx(rms / np.sqrt(2), rel=1e-3)
-    np.testing.assert_allclose(found.lens[:3], [matrix[0, 0], *matrix[:2, 2]], atol=0.02)
-    np.testing.assert_allclose(found.lens[3:7], terms.ravel()[:4], atol=2e-4)
-    ours = np.sqrt(np.diag(found.covariance))[1:7]
+    np.testing.assert_allclose(result.lens[:3], [matrix[0, 0], *matrix[:2, 2]], atol=0.02)
+    np.testing.assert_allclose(result.lens[3:7], terms.ravel()[:4], atol=2e-4)
+    ours = np.sqrt(np.diag(result.covariance))[1:7]
     np.testing.assert_allclose(ours, std.ravel()[2:8], rtol=0.02)
     # what OpenCV publishes of them
-    np.testing.assert_allclose(found.lens[:3], [535.916, 342.283, 235.571], atol=2)
+    np.testing.assert_allclose(result.lens[:3], [535.916, 342.283, 235.571], atol=2)

@@ -19,7 +19,14 @@ from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic_calibration.camera import estimate_lens, estimate_plane
 from rgbmidic_calibration.captures import block_means, stack_frames
 from rgbmidic_calibration.cli import app, read_limits
-from rgbmidic_calibration.verify import Limits, additivity, check_distances, leakage, noise_ratio, registration_left
+from rgbmidic_calibration.verify import (
+    Limits,
+    additivity,
+    check_distances,
+    leakage,
+    noise_ratio,
+    remaining_registration,
+)
 
 MATRIX = MATRICES[1.5]
 LIGHTS = ("red", "green", "blue")
@@ -33,19 +40,19 @@ def held_back():
 
 
 def test_true_matrix_leaves_nothing(held_back):
-    found = leakage(Crosstalk(matrix=MATRIX, lights=LIGHTS), *held_back)
-    assert len(found) == 9  # six of one light in another, three checkerboards
-    assert all(abs(check.value) < min(0.3, 5 * check.std) for check in found)
-    assert all(check.passed for check in found)
+    checks = leakage(Crosstalk(matrix=MATRIX, lights=LIGHTS), *held_back)
+    assert len(checks) == 9  # six of one light in another, three checkerboards
+    assert all(abs(check.value) < min(0.3, 5 * check.std) for check in checks)
+    assert all(check.passed for check in checks)
 
 
 def test_wrong_entry_shows_as_leakage(held_back):
     wrong = MATRIX.copy()
     wrong[1, 0] += 0.01
-    found = leakage(Crosstalk(matrix=wrong, lights=LIGHTS), *held_back)
+    checks = leakage(Crosstalk(matrix=wrong, lights=LIGHTS), *held_back)
     expected = -np.linalg.solve(wrong, [0, 0.01, 0])
-    assert [check.value for check in found[:2]] == pytest.approx(100 * expected[1:], abs=0.1)
-    assert [check.name for check in found if not check.passed] == ["red left in green"]
+    assert [check.value for check in checks[:2]] == pytest.approx(100 * expected[1:], abs=0.1)
+    assert [check.name for check in checks if not check.passed] == ["red left in green"]
 
 
 def test_greens_taken_as_equal_show_as_a_checkerboard():
@@ -53,8 +60,8 @@ def test_greens_taken_as_equal_show_as_a_checkerboard():
     lights, dark = captures(truth.sites, np.random.default_rng(22), target=speckle_target, shape=SHAPE, count=2)
     reduced = {n: [block_means(f) for f in frames] for n, frames in lights.items()}, [block_means(f) for f in dark]
     assert all(check.passed for check in leakage(truth, *reduced))
-    found = leakage(Crosstalk(matrix=MATRIX, lights=LIGHTS), *reduced)
-    (failed,) = [check for check in found if not check.passed]
+    checks = leakage(Crosstalk(matrix=MATRIX, lights=LIGHTS), *reduced)
+    (failed,) = [check for check in checks if not check.passed]
     assert failed.name == "checkerboard of red"
     expected = 100 * 0.01 * np.abs(truth.unmixing[:, 1]).max()
     assert failed.value == pytest.approx(expected, abs=4 * failed.std)
@@ -88,11 +95,11 @@ def difference(checks):
 
 
 def test_sum_of_lights_adds_up():
-    found = additivity(*scene_of_three(np.random.default_rng(2)))
-    mean, spread, noise, _ = difference(found)
+    checks = additivity(*scene_of_three(np.random.default_rng(2)))
+    mean, spread, noise, _ = difference(checks)
     assert mean == pytest.approx(0, abs=0.3)
     assert spread == pytest.approx(noise, rel=0.1)
-    assert all(item.passed for item in found)
+    assert all(item.passed for item in checks)
 
 
 def test_noise_of_the_sum_from_the_noise_model():
@@ -102,23 +109,23 @@ def test_noise_of_the_sum_from_the_noise_model():
 
 
 def test_changed_lamp_is_named():
-    found = additivity(*scene_of_three(np.random.default_rng(4), strengths=(1, 1.1, 1)))
-    failed = [item.name for item in found if not item.passed]
+    checks = additivity(*scene_of_three(np.random.default_rng(4), strengths=(1, 1.1, 1)))
+    failed = [item.name for item in checks if not item.passed]
     assert failed == ["strength of green in red+green+blue"]
-    assert found[2].value == pytest.approx(10, abs=1)
+    assert checks[2].value == pytest.approx(10, abs=1)
 
 
 def test_bent_camera_does_not_add_up():
-    found = additivity(*scene_of_three(np.random.default_rng(5), bend=2e-4))
-    assert not all(item.passed for item in found)
+    checks = additivity(*scene_of_three(np.random.default_rng(5), bend=2e-4))
+    assert not all(item.passed for item in checks)
 
 
 def test_offset_is_told_from_light():
     together, singles, _ = scene_of_three(np.random.default_rng(6))
     lifted = {n: stack_frames([lift(s) for s in two_frames(stack)]) for n, stack in singles.items()}
-    found = additivity(stack_frames([lift(f) for f in two_frames(together)]), lifted)
-    assert difference(found)[-1] == pytest.approx(2 * BLACK, abs=1)  # three black levels in the sum, one in the other
-    assert all(abs(change.value) < 1 for change in found[1:])
+    checks = additivity(stack_frames([lift(f) for f in two_frames(together)]), lifted)
+    assert difference(checks)[-1] == pytest.approx(2 * BLACK, abs=1)  # three black levels in the sum, one in the other
+    assert all(abs(change.value) < 1 for change in checks[1:])
 
 
 def two_frames(stack):
@@ -151,10 +158,10 @@ def test_registration_left():
         name: stack_frames([expose(3000 * picture, MATRIX[:, i], rng) for _ in range(2)])
         for i, (name, picture) in enumerate(zip(LIGHTS, registered_pictures(truth, shape, 3), strict=True))
     }
-    assert all(check.value < 0.02 + 3 * check.std for check in registration_left(truth, stacks))
+    assert all(check.value < 0.02 + 3 * check.std for check in remaining_registration(truth, stacks))
     none = Registration.identity(LIGHTS, shape)
-    assert [check.value > 0.1 for check in registration_left(none, stacks)] == [True, True]
-    two = registration_left(truth, {"green": stacks["green"], "blue": stacks["blue"]})
+    assert [check.value > 0.1 for check in remaining_registration(none, stacks)] == [True, True]
+    two = remaining_registration(truth, {"green": stacks["green"], "blue": stacks["blue"]})
     assert [check.name for check in two] == ["registration of blue"]
     assert two[0].value < 0.05
 
@@ -178,10 +185,10 @@ def test_coin_captures_add_up(real_data, together, single, mean, spread):
         middle = Mosaic(values=frame.values[600:2200, 1000:2600], cfa="RGGB", black_level=0, white_level=255)
         return stack_frames([middle])
 
-    found = additivity(stack(together), {number: stack(number) for number in single})
-    left, *changes = found
-    assert abs(difference(found)[0]) < 2.5 * mean
-    assert difference(found)[1] < 2 * spread
+    checks = additivity(stack(together), {number: stack(number) for number in single})
+    left, *changes = checks
+    assert abs(difference(checks)[0]) < 2.5 * mean
+    assert difference(checks)[1] < 2 * spread
     assert left.value < 3
     assert all(abs(change.value) < 5 for change in changes)
 
@@ -212,8 +219,8 @@ def test_a_distance_on_the_plane_is_compared_with_the_true_one(camera):
 def test_the_stated_uncertainty_of_a_distance_is_the_scatter_of_its_ends(camera):
     random, exact = np.random.default_rng(0), ends(30.0)
     (check,) = check_distances(camera, [(exact, 30.0)], corner_std=0.5)
-    drawn = camera.to_mm((exact + random.normal(0, 0.5, (2000, 2, 2))).reshape(-1, 2)).reshape(-1, 2, 2)
-    scatter = 100 * np.linalg.norm(drawn[:, 1] - drawn[:, 0], axis=1).std() / 30.0
+    points_mm = camera.to_mm((exact + random.normal(0, 0.5, (2000, 2, 2))).reshape(-1, 2)).reshape(-1, 2, 2)
+    scatter = 100 * np.linalg.norm(points_mm[:, 1] - points_mm[:, 0], axis=1).std() / 30.0
     assert scatter == pytest.approx(check.std, rel=4 / np.sqrt(2 * 2000) + 0.02)  # 2 %: lens and plane
 
 

@@ -46,17 +46,17 @@ def run(bench, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["rgbmidic-calibrate", *arguments])
         with pytest.raises(SystemExit) as stop:
             main()
-        shown = capsys.readouterr()
-        return stop.value.code or 0, shown.out, shown.err
+        output = capsys.readouterr()
+        return stop.value.code or 0, output.out, output.err
 
     return call
 
 
 def test_crosstalk_writes_a_file_with_provenance(run, tmp_path):
     out = tmp_path / "calibration.json"
-    code, shown, _ = run("crosstalk", "--dark", "dark/*.tif", *LIGHTS, *STATED, "--out", str(out))
+    code, output, _ = run("crosstalk", "--dark", "dark/*.tif", *LIGHTS, *STATED, "--out", str(out))
     assert code == 0
-    assert "condition number" in shown
+    assert "condition number" in output
     calibration = Calibration.read(out)
     assert calibration.crosstalk.matrix == pytest.approx(MATRIX, abs=2e-3)
     assert (calibration.cfa, calibration.black_level, calibration.white_level) == ("RGGB", 64, 4095)
@@ -79,8 +79,8 @@ def test_levels_that_nobody_states_are_not_held_against_a_test(run, tmp_path):
     for options, levels in [(["--cfa", "RGGB"], (None, None)), (STATED[:4], (64, None))]:
         out = tmp_path / f"{len(options)}.json"
         assert run("crosstalk", "--dark", "dark/*.tif", *LIGHTS, *options, "--out", str(out))[0] == 0
-        made = Calibration.read(out)
-        assert (made.kind, made.black_level, made.white_level) == ("bayer", *levels)
+        reread = Calibration.read(out)
+        assert (reread.kind, reread.black_level, reread.white_level) == ("bayer", *levels)
 
 
 def test_an_existing_file_is_kept_unless_told_otherwise(run, tmp_path):
@@ -118,18 +118,18 @@ def test_a_mistake_is_one_line_and_writes_nothing(run, tmp_path, arguments, mess
 
 def test_noise_then_merge_then_show(run, tmp_path):
     noise, matrix, merged = (str(tmp_path / f"{name}.json") for name in ("noise", "matrix", "merged"))
-    code, shown, _ = run("noise", "--dark", "dark/*.tif", "--flat", "flat_*/*.tif", *STATED, "--out", noise)
+    code, output, _ = run("noise", "--dark", "dark/*.tif", "--flat", "flat_*/*.tif", *STATED, "--out", noise)
     assert code == 0
-    assert "gain 1/K" in shown
+    assert "gain 1/K" in output
     assert Calibration.read(noise).noise.gain == pytest.approx(4, rel=0.05)
     assert run("crosstalk", "--dark", "dark/*.tif", *LIGHTS, *STATED, "--out", matrix)[0] == 0
-    code, shown, _ = run("merge", noise, matrix, "--out", merged)
+    code, output, _ = run("merge", noise, matrix, "--out", merged)
     assert code == 0
-    assert "sections: crosstalk, noise" in shown
-    code, shown, _ = run("show", merged, "--picture", str(tmp_path / "p.png"))
+    assert "sections: crosstalk, noise" in output
+    code, output, _ = run("show", merged, "--picture", str(tmp_path / "p.png"))
     assert code == 0
-    assert "condition number" in shown
-    assert "dark noise, e-" in shown
+    assert "condition number" in output
+    assert "dark noise, e-" in output
     assert (tmp_path / "p.png").is_file()
     assert run("show", merged, "--picture", str(tmp_path / "p.png"))[0] == 2
 
@@ -154,11 +154,11 @@ def test_show_of_a_file_that_is_none(run, tmp_path):
 
 def test_registration_of_speckled_captures(run, tmp_path):
     out = str(tmp_path / "r.json")
-    code, shown, error = run("registration", "--dark", "dark/*.tif", *LIGHTS, *STATED, "--out", out)
+    code, output, error = run("registration", "--dark", "dark/*.tif", *LIGHTS, *STATED, "--out", out)
     assert code == 0, error
-    assert "Registration against red" in shown
-    found = Calibration.read(out).registration
-    assert np.abs(found.parameters[:, :2]).max() < 0.05  # the bench's captures are registered
+    assert "Registration against red" in output
+    reread = Calibration.read(out).registration
+    assert np.abs(reread.parameters[:, :2]).max() < 0.05  # the bench's captures are registered
     code, _, error = run("registration", *LIGHTS, *STATED, "--out", out + "2", "--region", "here")
     assert code == 2
     assert "--region is X0,Y0,X1,Y1 in px" in error
@@ -176,18 +176,18 @@ def test_check_passes_on_held_back_captures_and_fails_on_a_wrong_matrix(run, ben
     assert run("crosstalk", "--dark", "dark/*.tif", *LIGHTS, *STATED, "--out", good)[0] == 0
     held_back = ["--dark", str(tmp_path / "dark")]
     held_back += [part for name in lights for part in ("--light", f"{name}={tmp_path / name}")]
-    code, shown, error = run("check", good, *held_back)
-    assert code == 0, error + shown
-    assert "PASSED" in shown
-    assert "noise was not checked" in shown
-    code, shown, _ = run("check", good, "--dark", "dark/*.tif", *LIGHTS)
-    assert "made the calibration" in " ".join(shown.split())
+    code, output, error = run("check", good, *held_back)
+    assert code == 0, error + output
+    assert "PASSED" in output
+    assert "noise was not checked" in output
+    code, output, _ = run("check", good, "--dark", "dark/*.tif", *LIGHTS)
+    assert "made the calibration" in " ".join(output.split())
     document = json.loads((tmp_path / "good.json").read_text())
     document["crosstalk"]["matrix"][1][0] += 0.02
     (tmp_path / "bad.json").write_text(json.dumps(document))
-    code, shown, _ = run("check", bad, *held_back)
+    code, output, _ = run("check", bad, *held_back)
     assert code == 1
-    assert "FAILED" in shown
+    assert "FAILED" in output
     assert run("check", bad, *held_back, "--limit", "leakage=5")[0] == 0
     assert run("check", good, *held_back, "--together", "red+violet=dark")[0] == 2
 
@@ -197,14 +197,14 @@ def test_design_lists_the_best_set(run, tmp_path):
     (tmp_path / "camera.csv").write_text("\n".join(["nm,R,G,B", *rows]))
     lamps = ["--light", "red=640:18", "--light", "green=540:30", "--light", "blue=460:20", "--light", "amber=600:18"]
     picture = str(tmp_path / "d.png")
-    code, shown, error = run("design", "--camera", str(tmp_path / "camera.csv"), *lamps, "--picture", picture)
+    code, output, error = run("design", "--camera", str(tmp_path / "camera.csv"), *lamps, "--picture", picture)
     assert code == 0, error
-    assert "red, green, blue" in shown
-    assert shown.index("red, green, blue") < shown.index("amber")
+    assert "red, green, blue" in output
+    assert output.index("red, green, blue") < output.index("amber")
     assert (tmp_path / "d.png").is_file()
-    code, shown, error = run("design", "--camera", "Nikon 5100 (NPL)", *lamps[:2], *lamps[6:])
+    code, output, error = run("design", "--camera", "Nikon 5100 (NPL)", *lamps[:2], *lamps[6:])
     assert code == 0, error
-    costs = next(line for line in shown.splitlines() if "noise amplification" in line)
+    costs = next(line for line in output.splitlines() if "noise amplification" in line)
     assert re.findall(r"\d+\.\d\d", costs) == ["5.79", "5.62"]
     code, _, error = run("design", "--camera", "no.json", *lamps)
     assert code == 2
@@ -227,9 +227,9 @@ def test_a_wrong_use_is_one_line_as_of_the_other_command(run, arguments, said):
 
 
 def test_without_arguments_it_shows_its_help(run):
-    code, shown, _ = run()
+    code, output, _ = run()
     assert code == 0
-    assert "crosstalk" in shown
+    assert "crosstalk" in output
 
 
 def test_a_camera_s_own_gain_on_blue_is_stated(run, bench, tmp_path):

@@ -59,21 +59,21 @@ def test_block_is_saturated_when_a_single_sample_of_it_is():
 @pytest.mark.parametrize("target", [white_target, speckle_target])
 def test_matrix_is_found_on_white_and_speckled_targets(cfa, target):
     lights, dark = captures(MATRIX, np.random.default_rng(3), target=target, cfa=cfa)
-    found = estimate(lights, dark)
-    assert np.linalg.norm(found.crosstalk.matrix - MATRIX) < 0.002 * np.linalg.norm(MATRIX)
-    assert found.warnings == ()
-    assert (found.crosstalk.matrix.max(axis=0) == 1).all()
+    result = estimate(lights, dark)
+    assert np.linalg.norm(result.crosstalk.matrix - MATRIX) < 0.002 * np.linalg.norm(MATRIX)
+    assert result.warnings == ()
+    assert (result.crosstalk.matrix.max(axis=0) == 1).all()
 
 
 @pytest.mark.parametrize("cfa", BAYER_PATTERNS)
 def test_difference_of_the_greens_is_found_within_its_uncertainty(cfa):
     truth = Crosstalk(matrix=MATRIX, lights=("red", "green", "blue"), green_difference=[0.03, 0.0, -0.02])
     lights, dark = captures(truth.sites, np.random.default_rng(8), target=speckle_target, cfa=cfa, shape=(160, 192))
-    found = estimate(lights, dark).crosstalk
-    error = np.abs(found.green_difference - truth.green_difference)
-    assert (error < 4 * found.green_difference_std).all()  # of twelve normal numbers none in a thousand runs
-    assert (found.green_difference_std < 0.0022).all()  # .0015, of the texture
-    assert np.abs(found.sites - truth.sites).max() < 0.002
+    result = estimate(lights, dark).crosstalk
+    error = np.abs(result.green_difference - truth.green_difference)
+    assert (error < 4 * result.green_difference_std).all()  # of twelve normal numbers none in a thousand runs
+    assert (result.green_difference_std < 0.0022).all()  # .0015, of the texture
+    assert np.abs(result.sites - truth.sites).max() < 0.002
 
 
 def test_difference_of_the_greens_that_varies_over_the_field_is_reported():
@@ -82,11 +82,11 @@ def test_difference_of_the_greens_that_varies_over_the_field_is_reported():
     slope = 0.05 * np.linspace(-1, 1, 192) * np.array([0, 1, -1, 0])[:, None, None]
     sites = (np.insert(MATRIX[:, 0], 1, MATRIX[1, 0])[:, None, None] + slope) * picture
     lights = {"red": [expose(sites, np.ones(4), rng) for _ in range(2)]}
-    found = estimate(lights, [expose(0 * picture, np.ones(3), rng) for _ in range(2)])
-    (said,) = [text for text in found.warnings if "greens" in text]
-    rms = 100 * 0.05 / np.sqrt(3) * np.abs(found.crosstalk.unmixing[:, 1]).max()  # half of their difference
+    result = estimate(lights, [expose(0 * picture, np.ones(3), rng) for _ in range(2)])
+    (said,) = [text for text in result.warnings if "greens" in text]
+    rms = 100 * 0.05 / np.sqrt(3) * np.abs(result.crosstalk.unmixing[:, 1]).max()  # half of their difference
     assert float(re.search(r"of ([\d.]+) %", said)[1]) == pytest.approx(rms, rel=0.1)
-    assert found.crosstalk.field is None
+    assert result.crosstalk.field is None
 
 
 def test_real_sensor_has_two_greens(real_data):
@@ -94,10 +94,10 @@ def test_real_sensor_has_two_greens(real_data):
     folder = real_data("real_disks_three_bands")
     files = {"red": "650nm_250ms", "green": "550nm_25ms", "blue": "450nm_50ms"}
     lights = {name: [read_frame(folder / f"disks_{file}.tif", cfa="GBRG")] for name, file in files.items()}
-    found = estimate(lights, [read_frame(folder / f"dark_250ms_{index}.tif", cfa="GBRG") for index in (0, 1)])
-    first, second = found.crosstalk.sites[[2, 1]]
+    result = estimate(lights, [read_frame(folder / f"dark_250ms_{index}.tif", cfa="GBRG") for index in (0, 1)])
+    first, second = result.crosstalk.sites[[2, 1]]
     ratio = first / second
-    std = found.crosstalk.green_difference_std / second
+    std = result.crosstalk.green_difference_std / second
     for light, name in enumerate(files):
         planes = lights[name][0].values.astype(float)
         exact = planes[0::2, 0::2].mean() / planes[1::2, 1::2].mean()
@@ -110,17 +110,17 @@ def test_matrix_of_a_three_chip_camera():
     picture = 2000 * speckle_target((128, 128), rng)
     lights = {n: [expose(picture, MATRIX[:, i], rng, kind="rgb")] for i, n in enumerate(("red", "green", "blue"))}
     dark = [expose(0 * picture, MATRIX[:, 0], rng, kind="rgb") for _ in range(2)]
-    found = estimate(lights, dark).crosstalk
-    assert np.abs(found.matrix - MATRIX).max() < 5 * found.std.max() < 0.002
-    assert found.green_difference is None
+    result = estimate(lights, dark).crosstalk
+    assert np.abs(result.matrix - MATRIX).max() < 5 * result.std.max() < 0.002
+    assert result.green_difference is None
 
 
 def test_two_lights_and_other_names():
     lights, dark = captures(MATRIX[:, [0, 2]], np.random.default_rng(5), shape=(128, 128))
-    found = estimate({"far red": lights["red"], "ultraviolet": lights["green"]}, dark)
-    assert found.crosstalk.lights == ("far red", "ultraviolet")
-    assert found.crosstalk.matrix == pytest.approx(MATRIX[:, [0, 2]], abs=1e-3)
-    assert "green" in found.warnings[0]
+    result = estimate({"far red": lights["red"], "ultraviolet": lights["green"]}, dark)
+    assert result.crosstalk.lights == ("far red", "ultraviolet")
+    assert result.crosstalk.matrix == pytest.approx(MATRIX[:, [0, 2]], abs=1e-3)
+    assert "green" in result.warnings[0]
 
 
 def test_noise_does_not_attenuate_the_ratio():
@@ -128,8 +128,8 @@ def test_noise_does_not_attenuate_the_ratio():
     picture = np.full((256, 256), 40.0)
     lights = {"red": [expose(picture, MATRIX[:, 0], rng, read=30.0) for _ in range(8)]}
     dark = [expose(0 * picture, MATRIX[:, 0], rng, read=30.0) for _ in range(8)]
-    found = estimate(lights, dark, allow=["weak"]).crosstalk
-    assert np.abs(found.matrix - MATRIX[:, :1]).max() < 4 * found.std.max() < 0.02
+    result = estimate(lights, dark, allow=["weak"]).crosstalk
+    assert np.abs(result.matrix - MATRIX[:, :1]).max() < 4 * result.std.max() < 0.02
     first = block_means(lights["red"][0]).channels
     slope = np.polyfit(first[0].ravel(), first[1].ravel(), 1)[0]
     assert abs(slope - MATRIX[1, 0]) > 0.05
@@ -140,9 +140,9 @@ def test_saturated_blocks_are_left_out(scene):
     rng = np.random.default_rng(2)
     picture = 3000 * speckle_target((160, 192), rng) / 0.8
     picture[:60, :80] *= 2.2
-    found = estimate({**lights, "red": [expose(picture, MATRIX[:, 0], rng) for _ in range(4)]}, dark)
-    assert found.lights[0].weights.mean() + found.lights[0].rejected < 0.9
-    assert np.abs(found.crosstalk.matrix - MATRIX).max() < 1.5e-3
+    result = estimate({**lights, "red": [expose(picture, MATRIX[:, 0], rng) for _ in range(4)]}, dark)
+    assert result.lights[0].weights.mean() + result.lights[0].rejected_fraction < 0.9
+    assert np.abs(result.crosstalk.matrix - MATRIX).max() < 1.5e-3
 
 
 def test_coloured_spots_on_the_target_are_rejected():
@@ -151,17 +151,17 @@ def test_coloured_spots_on_the_target_are_rejected():
     channels = MATRIX[:, 0, None, None] * picture
     channels[1, 40:80, 100:140] *= 2.5
     lights = {"red": [expose(channels, np.ones(3), rng) for _ in range(2)]}
-    found = estimate(lights, [expose(0 * picture, MATRIX[:, 0], rng) for _ in range(2)])
-    assert found.lights[0].rejected > 0.02
-    assert np.abs(found.crosstalk.matrix - MATRIX[:, :1]).max() < 2e-4
+    result = estimate(lights, [expose(0 * picture, MATRIX[:, 0], rng) for _ in range(2)])
+    assert result.lights[0].rejected_fraction > 0.02
+    assert np.abs(result.crosstalk.matrix - MATRIX[:, :1]).max() < 2e-4
 
 
 def test_without_dark_frames_the_black_level_is_used_and_said(scene):
     lights, _ = scene
-    found = estimate(lights)
-    assert "no dark frames" in found.warnings[0]
-    assert found.crosstalk.std[1, 0] > 2e-4
-    assert np.abs(found.crosstalk.matrix - MATRIX).max() < 2e-3
+    result = estimate(lights)
+    assert "no dark frames" in result.warnings[0]
+    assert result.crosstalk.std[1, 0] > 2e-4
+    assert np.abs(result.crosstalk.matrix - MATRIX).max() < 2e-3
 
 
 def test_ambient_light_is_taken_out_by_the_dark_frames():
@@ -169,9 +169,9 @@ def test_ambient_light_is_taken_out_by_the_dark_frames():
     lights, _ = captures(MATRIX, rng, shape=(160, 160), black=100.0)
     as_stated = {n: [relevel(f, 64.0) for f in fs] for n, fs in lights.items()}
     dark = [relevel(expose(np.zeros((160, 160)), MATRIX[:, 0], rng, black=100.0), 64.0) for _ in range(4)]
-    found = estimate(as_stated, dark)
-    assert np.abs(found.crosstalk.matrix - MATRIX).max() < 5e-4
-    assert "ambient" in found.warnings[0]
+    result = estimate(as_stated, dark)
+    assert np.abs(result.crosstalk.matrix - MATRIX).max() < 5e-4
+    assert "ambient" in result.warnings[0]
 
 
 def relevel(frame, black):
@@ -262,9 +262,9 @@ def test_a_blurred_capture_is_reported(scene):
     picture = 2000 * speckle_target((160, 192), rng)
     blurred = ndimage.gaussian_filter(picture, 3)
     frames = [expose(p, MATRIX[:, 0], rng) for p in (picture, picture, blurred)]
-    found = estimate({"red": frames}, scene[1])
-    assert any("capture 3 of light red is less sharp" in text for text in found.warnings)
-    assert np.abs(found.crosstalk.matrix - MATRIX[:, :1]).max() < 1e-3
+    result = estimate({"red": frames}, scene[1])
+    assert any("capture 3 of light red is less sharp" in text for text in result.warnings)
+    assert np.abs(result.crosstalk.matrix - MATRIX[:, :1]).max() < 1e-3
 
 
 def test_monochrome_and_unknown_checks_are_errors(scene):
@@ -280,21 +280,21 @@ def test_drifting_colour_is_covered_by_the_uncertainty():
     picture = 2000 * white_target((128, 128), rng)
     greens = MATRIX[1, 0] + rng.normal(0, 0.003, 4)
     frames = [expose(picture, (MATRIX[0, 0], green, MATRIX[2, 0]), rng) for green in greens]
-    found = estimate({"red": frames}, [expose(0 * picture, MATRIX[:, 0], rng) for _ in range(3)])
-    assert any("colour drifts" in text for text in found.warnings)
-    assert 5e-4 < found.crosstalk.std[1, 0] < 5e-3
+    result = estimate({"red": frames}, [expose(0 * picture, MATRIX[:, 0], rng) for _ in range(3)])
+    assert any("colour drifts" in text for text in result.warnings)
+    assert 5e-4 < result.crosstalk.std[1, 0] < 5e-3
 
 
 def test_file_keeps_matrix_and_covariance(scene, tmp_path):
     lights, dark = scene
-    found = estimate(lights, dark).crosstalk
-    Calibration(crosstalk=found).write(tmp_path / "c.json")
-    again = Calibration.read(tmp_path / "c.json").crosstalk
-    assert (again.matrix == found.matrix).all()
-    assert (again.covariance == found.covariance).all()
-    assert again.std == pytest.approx(found.std)
-    assert (again.sites == found.sites).all()
-    assert (again.green_difference_std == found.green_difference_std).all()
+    result = estimate(lights, dark).crosstalk
+    Calibration(crosstalk=result).write(tmp_path / "c.json")
+    reread = Calibration.read(tmp_path / "c.json").crosstalk
+    assert (reread.matrix == result.matrix).all()
+    assert (reread.covariance == result.covariance).all()
+    assert reread.std == pytest.approx(result.std)
+    assert (reread.sites == result.sites).all()
+    assert (reread.green_difference_std == result.green_difference_std).all()
 
 
 def test_file_of_three_rows_is_one_of_equal_greens(tmp_path):
@@ -330,18 +330,18 @@ def test_matrix_that_varies_over_the_field_is_found_where_the_data_ask_for_it(ta
     picture = 2500 * target((320, 320), rng)
     frames = [varying_capture(picture, rng)[0] for _ in range(4)]
     truth = varying_capture(picture, rng)[1]
-    found = estimate({"red": frames}, [expose(0 * picture, MATRIX[:, 0], rng) for _ in range(4)]).crosstalk
-    assert found.field.order == 2
+    result = estimate({"red": frames}, [expose(0 * picture, MATRIX[:, 0], rng) for _ in range(4)]).crosstalk
+    assert result.field.order == 2
     points = np.stack(np.meshgrid(np.arange(0, 320, 20), np.arange(0, 320, 20)), axis=-1)
-    assert np.abs(found.at(points)[..., 1, 0] - truth[::20, ::20]).max() < 2e-3
-    assert found.matrix[1, 0] == pytest.approx(truth.mean(), abs=3e-4)
+    assert np.abs(result.at(points)[..., 1, 0] - truth[::20, ::20]).max() < 2e-3
+    assert result.matrix[1, 0] == pytest.approx(truth.mean(), abs=3e-4)
 
 
 def test_constant_matrix_gets_no_field(scene):
     lights, dark = scene
-    found = estimate(lights, dark)
-    assert found.crosstalk.field is None
-    assert all(variation.p_value > 1e-4 for variation in found.variations)
+    result = estimate(lights, dark)
+    assert result.crosstalk.field is None
+    assert all(variation.p_value > 1e-4 for variation in result.variations)
     forced = estimate(lights, dark, order=2).crosstalk
     assert np.abs(forced.field.coefficients / np.where(forced.field.std > 0, forced.field.std, np.inf)).max() < 5
 
@@ -351,14 +351,14 @@ def test_dark_frames_of_other_settings_are_reported_on_a_textured_target(scene):
     rng = np.random.default_rng(6)
     dark = [expose(np.zeros((160, 192)), MATRIX[:, 0], rng, black=BLACK + 15) for _ in range(2)]
     dark = [relevel(frame, BLACK) for frame in dark]
-    found = estimate(lights, dark)
-    assert any("where the light is absent" in text for text in found.warnings)
+    result = estimate(lights, dark)
+    assert any("where the light is absent" in text for text in result.warnings)
 
 
 def test_field_survives_the_file(tmp_path):
     rng = np.random.default_rng(12)
     picture = 2500 * white_target((160, 160), rng)
-    found = estimate({"red": [varying_capture(picture, rng)[0] for _ in range(2)]}, order=1).crosstalk
-    Calibration(crosstalk=found).write(tmp_path / "c.json")
-    again = Calibration.read(tmp_path / "c.json").crosstalk
-    assert (again.at([[0, 0], [3, 99]]) == found.at([[0, 0], [3, 99]])).all()
+    result = estimate({"red": [varying_capture(picture, rng)[0] for _ in range(2)]}, order=1).crosstalk
+    Calibration(crosstalk=result).write(tmp_path / "c.json")
+    reread = Calibration.read(tmp_path / "c.json").crosstalk
+    assert (reread.at([[0, 0], [3, 99]]) == result.at([[0, 0], [3, 99]])).all()

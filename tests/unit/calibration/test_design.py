@@ -30,25 +30,25 @@ def boxes():
 
 def test_lamps_inside_the_boxes_have_no_crosstalk():
     lamps = {name: Led(centre=centre, width=15) for name, centre in (("red", 650), ("green", 550), ("blue", 450))}
-    found = design(boxes(), lamps)
-    assert found.crosstalk.matrix == pytest.approx(np.eye(3), abs=0.01)
-    assert found.crosstalk.condition_number == pytest.approx(1, abs=0.02)
-    assert found.power == pytest.approx(np.ones(3), abs=0.02)
-    assert found.headroom == pytest.approx(1, abs=0.02)
+    prediction = design(boxes(), lamps)
+    assert prediction.crosstalk.matrix == pytest.approx(np.eye(3), abs=0.01)
+    assert prediction.crosstalk.condition_number == pytest.approx(1, abs=0.02)
+    assert prediction.power == pytest.approx(np.ones(3), abs=0.02)
+    assert prediction.headroom == pytest.approx(1, abs=0.02)
 
 
 def test_lamp_on_the_border_of_two_boxes_is_shared():
-    found = design(boxes(), {"red": Led(centre=650, width=5), "amber": Led(centre=597.5, width=5)})
-    assert found.crosstalk.matrix[:2, 1] == pytest.approx(1, abs=0.02)
-    assert found.headroom == pytest.approx(0.5, abs=0.01)
+    prediction = design(boxes(), {"red": Led(centre=650, width=5), "amber": Led(centre=597.5, width=5)})
+    assert prediction.crosstalk.matrix[:2, 1] == pytest.approx(1, abs=0.02)
+    assert prediction.headroom == pytest.approx(0.5, abs=0.01)
 
 
 def test_best_set_of_candidates():
     lamps = {**LEDS, "amber": Led(centre=595, width=18), "cyan": Led(centre=500, width=30)}
-    found = best_sets(boxes(), lamps)
-    assert 6 <= len(found) <= 10
-    assert set(found[0].crosstalk.lights) == {"red", "green", "blue"}
-    assert [candidate.noise for candidate in found] == sorted(candidate.noise for candidate in found)
+    prediction = best_sets(boxes(), lamps)
+    assert 6 <= len(prediction) <= 10
+    assert set(prediction[0].crosstalk.lights) == {"red", "green", "blue"}
+    assert [candidate.noise for candidate in prediction] == sorted(candidate.noise for candidate in prediction)
 
 
 def test_what_cannot_be_told_apart():
@@ -114,16 +114,16 @@ def test_width_of_an_led_is_its_full_width_at_half_maximum(width):
 
 def rows_by_diagonal(camera):
     """Matrix for LEDs of equal peak power with every row divided by its diagonal."""
-    found = design(camera, OHNO)
+    prediction = design(camera, OHNO)
     peak = np.array([1 / lamp.power(camera.wavelengths).max() for lamp in OHNO.values()])
-    response = found.crosstalk.matrix / found.power * peak
+    response = prediction.crosstalk.matrix / prediction.power * peak
     return response / np.diag(response)[:, None]
 
 
 def test_measured_crosstalk_of_the_scenes_is_that_of_the_camera_and_lamps_it_names():
-    found = design(read_camera("Nikon 5100 (NPL)"), LEDS)
-    np.testing.assert_allclose(found.crosstalk.matrix, MEASURED_CROSSTALK, atol=0.005)
-    assert found.crosstalk.noise_amplification == pytest.approx([1.01, 1.18, 1.15], abs=0.005)
+    prediction = design(read_camera("Nikon 5100 (NPL)"), LEDS)
+    np.testing.assert_allclose(prediction.crosstalk.matrix, MEASURED_CROSSTALK, atol=0.005)
+    assert prediction.crosstalk.noise_amplification == pytest.approx([1.01, 1.18, 1.15], abs=0.005)
 
 
 @pytest.mark.parametrize(("width", "moved"), [(15.0, 0.05), (25.0, 0.02), (35.0, 0.04)])
@@ -140,9 +140,9 @@ def test_nine_real_cameras(real_data):
     for file in files:
         camera = read_camera(str(file))
         assert LOWEST < np.linalg.cond(rows_by_diagonal(camera)) < HIGHEST
-        found = design(camera, LEDS).crosstalk
-        assert 1.5 < found.condition_number < 2.6
-        assert (found.matrix.argmax(axis=0) == [0, 1, 2]).all()
+        prediction = design(camera, LEDS).crosstalk
+        assert 1.5 < prediction.condition_number < 2.6
+        assert (prediction.matrix.argmax(axis=0) == [0, 1, 2]).all()
 
 
 def test_nikon_5100_of_two_sources(real_data):

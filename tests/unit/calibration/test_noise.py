@@ -113,13 +113,13 @@ def test_linearity_needs_exposure_times_and_sees_a_bent_camera():
     dark = stack_frames(dark_frames(rng), drifts=False)
     times = LEVELS[1:]
     flats = [stack_frames(flat_frames(picture, x - 2e-5 * x**2, rng), exposure=x) for x in times]
-    found = photon_transfer(dark, flats)
-    bent = found.camera_noise.linearity_error.value[1]
+    result = photon_transfer(dark, flats)
+    bent = result.camera_noise.linearity_error.value[1]
     means = np.array([flat.strength[:, 1].mean() for flat in flats])
     line = np.polyfit(times, means, 1, w=1 / means)
     assert bent == pytest.approx(100 * np.abs(means / np.polyval(line, times) - 1).mean(), rel=0.02)
     assert bent > 0.5
-    assert "the linearity error is" in " ".join(found.warnings)
+    assert "the linearity error is" in " ".join(result.warnings)
 
 
 def test_a_drifting_lamp_does_not_count_as_noise():
@@ -130,9 +130,9 @@ def test_a_drifting_lamp_does_not_count_as_noise():
         stack_frames([expose(level * picture * strength, COLUMN, rng) for strength in (1, 1.04, 0.97)])
         for level in (800, 2000, 3000)
     ]
-    found = photon_transfer(dark, flats)
-    assert found.camera_noise.gain.value == pytest.approx(GAIN, rel=0.03)
-    assert any("strength differs" in text for text in found.warnings)
+    result = photon_transfer(dark, flats)
+    assert result.camera_noise.gain.value == pytest.approx(GAIN, rel=0.03)
+    assert any("strength differs" in text for text in result.warnings)
 
 
 def test_sensor_that_saturates_before_the_white_level_is_noticed():
@@ -147,14 +147,14 @@ def test_sensor_that_saturates_before_the_white_level_is_noticed():
 
     dark = stack_frames(dark_frames(rng), drifts=False)
     flats = [stack_frames([limited(level) for _ in range(2)]) for level in (500, 1000, 1500, 2000, 4000)]
-    found = photon_transfer(dark, flats)
-    assert any("variance breaks down" in text for text in found.warnings)
-    assert found.camera_noise.saturation.value == pytest.approx(full_well, rel=0.1)
+    result = photon_transfer(dark, flats)
+    assert any("variance breaks down" in text for text in result.warnings)
+    assert result.camera_noise.saturation.value == pytest.approx(full_well, rel=0.1)
 
 
 def test_black_level_cut_off_is_reported():
-    found = measure(white_target, np.random.default_rng(9), black=4.0)
-    assert any("cut off" in text for text in found.warnings)
+    result = measure(white_target, np.random.default_rng(9), black=4.0)
+    assert any("cut off" in text for text in result.warnings)
 
 
 def test_mistakes_are_errors():
@@ -189,7 +189,7 @@ def without_shot_noise(picture):
 def test_file_keeps_the_figures(tmp_path):
     noise = measure(speckle_target, np.random.default_rng(11)).camera_noise
     Calibration(camera_noise=noise).write(tmp_path / "n.json")
-    again = Calibration.read(tmp_path / "n.json")
-    assert again.camera_noise.gain.value == pytest.approx(noise.gain.value)
-    assert np.isnan(again.camera_noise.prnu.value).all()
-    assert again.noise == noise.model
+    reread = Calibration.read(tmp_path / "n.json")
+    assert reread.camera_noise.gain.value == pytest.approx(noise.gain.value)
+    assert np.isnan(reread.camera_noise.prnu.value).all()
+    assert reread.noise == noise.model

@@ -47,11 +47,11 @@ def grid(shape):
 @pytest.mark.parametrize("kind", ["bayer", "rgb"])
 def test_registration_is_found(pictures, kind):
     lights, dark = stacks(pictures, np.random.default_rng(2), kind=kind)
-    found = estimate_registration(lights, dark)
-    error = found.registration.displacement(grid(SHAPE)) - true_registration().displacement(grid(SHAPE))
+    result = estimate_registration(lights, dark)
+    error = result.registration.displacement(grid(SHAPE)) - true_registration().displacement(grid(SHAPE))
     assert np.sqrt((error[1:] ** 2).mean()) < 0.01
-    assert (np.abs(error) < 5 * found.registration.displacement_std(grid(SHAPE)) + 1e-12).all()
-    assert found.warnings == ()
+    assert (np.abs(error) < 5 * result.registration.displacement_std(grid(SHAPE)) + 1e-12).all()
+    assert result.warnings == ()
 
 
 def test_each_parameter_means_what_is_stated():
@@ -99,9 +99,9 @@ def test_motion_between_captures_is_seen_and_covered():
     stack = stack_frames([expose(3000 * picture, MATRIX[:, 0], rng) for picture in pictures])
     assert jitter(stack, light_picture(stack)) == pytest.approx(moves.std(axis=0, ddof=1), rel=0.2)
     still, dark = stacks([pictures[0]] * 2, rng)
-    found = estimate_registration({"red": still["red"], "green": stack}, dark)
-    assert any("the picture moves by" in text for text in found.warnings)
-    assert np.sqrt(found.registration.covariance[1, 0, 0]) > 0.03
+    result = estimate_registration({"red": still["red"], "green": stack}, dark)
+    assert any("the picture moves by" in text for text in result.warnings)
+    assert np.sqrt(result.registration.covariance[1, 0, 0]) > 0.03
 
 
 def test_region_restricts_the_comparison(pictures):
@@ -119,9 +119,9 @@ def test_printed_dots_take_larger_elements_and_are_not_a_period_off():
         away = np.hypot((x - dx + 20) % period - period / 2, (y - dy + 15) % period - period / 2)
         pictures.append(0.1 + 0.7 / (1 + np.exp(15 - away)))
     lights, dark = stacks(pictures, np.random.default_rng(8), count=1)
-    found = estimate_registration(lights, dark)
-    assert found.element_size > 25
-    error = np.abs(found.registration.parameters[1, :2] - truth[1, :2])
+    result = estimate_registration(lights, dark)
+    assert result.element_size > 25
+    error = np.abs(result.registration.parameters[1, :2] - truth[1, :2])
     assert (error < 0.03).all(), error
     with pytest.raises(CalibrationError, match=r"match in \d+ % of the field only"):
         estimate_registration(lights, dark, element_size=25)
@@ -134,10 +134,10 @@ def test_real_print_of_dots_is_registered(real_data):
         name: stack_frames([read_frame(folder / f"disks_{file}.tif", cfa="GBRG")]) for name, file in files.items()
     }
     darks = [read_frame(folder / f"dark_25ms_{index}.tif", cfa="GBRG") for index in (0, 1)]
-    found = estimate_registration(lights, stack_frames(darks, drifts=False))
-    assert found.element_size == 40
+    result = estimate_registration(lights, stack_frames(darks, drifts=False))
+    assert result.element_size == 40
     # with elements of 80 px -1.60 -1.38 and -2.72 -1.80, SOURCE.txt says -1.6 -1.2 and -2.8 -1.8
-    assert found.registration.parameters[1:, :2] == pytest.approx(np.array([[-1.6, -1.3], [-2.8, -1.8]]), abs=0.12)
+    assert result.registration.parameters[1:, :2] == pytest.approx(np.array([[-1.6, -1.3], [-2.8, -1.8]]), abs=0.12)
 
 
 def test_mistakes_are_errors(pictures):
@@ -169,14 +169,14 @@ def test_a_target_that_deformed_is_reported(pictures):
     bent = wave_texture(x + 0.3 * np.sin(y / 25), y, np.random.default_rng(1))
     straight = wave_texture(x, y, np.random.default_rng(1))
     lights, dark = stacks([straight, bent], rng)
-    found = estimate_registration(lights, dark)
-    assert any("smooth misfit" in text for text in found.warnings)
+    result = estimate_registration(lights, dark)
+    assert any("smooth misfit" in text for text in result.warnings)
 
 
 def test_file_keeps_registration_and_covariance(pictures, tmp_path):
     lights, dark = stacks(pictures, np.random.default_rng(9))
-    found = estimate_registration(lights, dark).registration
-    Calibration(registration=found).write(tmp_path / "r.json")
-    again = Calibration.read(tmp_path / "r.json").registration
-    assert (again.displacement(grid(SHAPE)) == found.displacement(grid(SHAPE))).all()
-    assert (again.displacement_std(grid(SHAPE)) == found.displacement_std(grid(SHAPE))).all()
+    result = estimate_registration(lights, dark).registration
+    Calibration(registration=result).write(tmp_path / "r.json")
+    reread = Calibration.read(tmp_path / "r.json").registration
+    assert (reread.displacement(grid(SHAPE)) == result.displacement(grid(SHAPE))).all()
+    assert (reread.displacement_std(grid(SHAPE)) == result.displacement_std(grid(SHAPE))).all()

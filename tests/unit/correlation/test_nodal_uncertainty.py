@@ -133,7 +133,7 @@ def test_strain_beside_a_hole_has_the_uncertainty_of_its_own_column():
     rest = np.zeros_like(mesh.nodes)
     pulled = Residual.at(reference, deformed, reference.values, [rest]).weights
     equations = Equations.build(reference, pulled, np.zeros((2 * len(mesh.nodes), 0)), np.zeros_like(mesh.nodes))
-    inner = equations.textured & ~mesh.beside(~equations.textured)
+    inner = equations.textured & ~mesh.adjacent_nodes(~equations.textured)
     assert 0 < inner.sum() < equations.textured.sum() < len(mesh.nodes)
     used = equations.textured[mesh.elements].all(axis=1)
     recovery = Recovery.over(mesh, used, equations.information(reference))

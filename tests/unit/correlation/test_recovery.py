@@ -82,7 +82,7 @@ def wave(period, degrees, phase):
 def test_short_waves_have_their_height_at_the_nodes(kind, elements):
     mesh, _ = meshed(kind)
     recovery = everywhere(mesh)
-    inner = ~mesh.beside(mesh.beside(mesh.on_boundary))
+    inner = ~mesh.adjacent_nodes(mesh.adjacent_nodes(mesh.on_boundary))
     found, true = [], []
     for degrees in (0, 45, 90, 120):
         for phase in (0, np.pi / 2):
@@ -97,7 +97,7 @@ def test_short_waves_have_their_height_at_the_nodes(kind, elements):
 def test_inner_nodes_scatter_less_than_those_of_the_linear_fit(kind):
     mesh, _ = meshed(kind)
     value, covariance = everywhere(mesh).value.toarray(), np.linalg.inv(mesh.mass_matrix.toarray())
-    inner = ~mesh.beside(mesh.on_boundary)
+    inner = ~mesh.adjacent_nodes(mesh.on_boundary)
     recovered = np.einsum("ij,ij->i", value @ covariance, value)[inner].mean()
     assert recovered < QUIETER**2 * np.diag(covariance)[inner].mean()
 

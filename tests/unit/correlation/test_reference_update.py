@@ -234,7 +234,7 @@ def test_both_sides_of_an_open_crack_are_followed_on_a_renewed_reference():
         reference_update = reference_update.updated(solution, stack(opened(width)))
         start = start.after(reference_update.first.mesh, solution.displacement, solution.measured)
     half = 8.0 * np.clip(1 - mesh.nodes[:, 0] / 110, 0, None) / 2
-    expected = np.where(mesh.places[:, 1] < middle, -half, half)
+    expected = np.where(mesh.observation_points[:, 1] < middle, -half, half)
     assert solution.measured.all()
     assert rms(solution.displacement[:, 1] - expected) < 0.042
 

@@ -44,7 +44,7 @@ def textbook(mesh, williams, k1=K1, k2=K2, t=T, tip=TIP, direction=(1.0, 0.0)):
     ahead = np.array(direction) / np.hypot(*direction)
     axes = np.array([ahead, [ahead[1], -ahead[0]]])  # the left side is up on the image, whose y is down
     x, y = ((mesh.nodes - tip) @ axes.T).T
-    above = ((mesh.places - tip) @ axes.T)[:, 1] > 0
+    above = ((mesh.observation_points - tip) @ axes.T)[:, 1] > 0
     r, angle = np.hypot(x, y), np.arctan2(y, x)
     angle = np.where((x < 0) & np.isin(np.arange(len(x)), mesh.copies), np.where(above, np.pi, -np.pi), angle)
     shear, kappa = williams.youngs_modulus / 2 / (1 + NU), KAPPA[williams.plane]
@@ -121,7 +121,9 @@ def test_a_rigid_motion_has_neither_jump_nor_factors():
 
 
 def test_the_jump_is_stated_in_the_axes_of_the_deformed_crack():
-    left = np.isin(np.arange(len(MESH.nodes)), MESH.copies) & (MESH.places[:, 1] < TIP[1])  # above: y is down
+    left = np.isin(np.arange(len(MESH.nodes)), MESH.copies) & (
+        MESH.observation_points[:, 1] < TIP[1]
+    )  # above: y is down
     field = np.where(left[:, None], (0.5, -2.0), 0.0)
     for degrees in (0, 40):
         jump = crack_jump(MESH.nodes, MESH.elements, fields(MESH, turned(MESH, field, degrees)), START, TIP)
@@ -137,7 +139,7 @@ def test_the_jump_is_stated_in_the_axes_of_the_deformed_crack():
 
 def test_the_stated_uncertainty_is_that_of_draws_of_the_nodes_noise():
     draws, random = 300, np.random.default_rng(1)
-    left = np.isin(np.arange(len(MESH.nodes)), MESH.copies) & (MESH.places[:, 1] < TIP[1])
+    left = np.isin(np.arange(len(MESH.nodes)), MESH.copies) & (MESH.observation_points[:, 1] < TIP[1])
     field = np.where(left[:, None], (0.0, -6.0), 0.0) + textbook(MESH, MATERIAL, 20.0, 5.0)
     root = np.linalg.cholesky(NodalCovariance.from_mesh(MESH).correlation.toarray())
     noise = STD * (root @ random.normal(size=(draws, *field.shape)))
@@ -164,7 +166,7 @@ def test_values_and_uncertainty_are_those_of_generalised_least_squares_with_the_
     x, y = (MESH.nodes - TIP).T
     used = (np.hypot(x, y) >= RADII[0]) & (np.hypot(x, y) <= RADII[1])
     face = np.isin(np.arange(count), MESH.copies)
-    angle = np.where(face, np.where(MESH.places[:, 1] < TIP[1], np.pi, -np.pi), np.arctan2(-y, x))
+    angle = np.where(face, np.where(MESH.observation_points[:, 1] < TIP[1], np.pi, -np.pi), np.arctan2(-y, x))
     series = williams_series(np.hypot(x, y)[used], angle[used], range(5), MATERIAL.kolosov)
     design = np.concatenate([series[:, 0], -series[:, 1]])
     correlation = NodalCovariance.from_mesh(MESH).correlation.toarray()[np.ix_(used, used)]

@@ -133,7 +133,7 @@ def test_parts_of_the_elements_cover_them() -> None:
 
 def test_a_part_of_a_mesh_has_the_sizes_of_the_whole() -> None:
     near = np.hypot(*GRADED.nodes.T) < 60
-    part = GRADED.part(near)
+    part = GRADED.submesh(near)
     np.testing.assert_array_equal(part.sizes, GRADED.sizes[near])
     assert (part.size, part.is_graded) == (GRADED.size, True)
     np.testing.assert_allclose(part.areas.sum(), GRADED.areas[near[GRADED.elements].all(axis=1)].sum())

@@ -84,7 +84,7 @@ def test_gauges_at_nodes_have_it_as_it_is_and_that_of_the_fit_by_its_inflation()
         np.testing.assert_allclose((found - fit)[:, row, column], exact, atol=0.03 * scale)
     missing = np.where(np.arange(len(STD)) == 40, np.nan, 0.0)
     _, beside = gauges.gradient(missing, still, STD, STD, BIAS, BIAS)
-    assert np.isfinite(beside).all(axis=(1, 2)).sum() == len(STD) - MESH.beside(np.isnan(missing)).sum()
+    assert np.isfinite(beside).all(axis=(1, 2)).sum() == len(STD) - MESH.adjacent_nodes(np.isnan(missing)).sum()
 
 
 def test_a_rigid_motion_is_covered() -> None:

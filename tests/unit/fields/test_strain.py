@@ -103,7 +103,7 @@ def test_nothing_is_told_beside_what_is_not_measured_and_the_rest_stays_right():
     strain = strain_of(
         MESH.nodes, MESH.elements, np.where(hole, np.nan, u), v, STILL, STILL, gauge=120, measure="engineering"
     )
-    beside = MESH.beside(hole)
+    beside = MESH.adjacent_nodes(hole)
     assert beside.sum() > hole.sum() > 0
     assert np.isnan(strain.components[beside]).all()
     np.testing.assert_allclose(strain.components[~beside], [[0.01, -0.003, 0.003]] * (~beside).sum(), atol=1e-12)
@@ -125,7 +125,7 @@ def test_the_shortest_gauges_have_a_strain_at_every_node_of_an_edge(rectangle, s
 def test_no_gauge_reaches_across_a_crack():
     region = Region.from_rectangle((5, 5, 155, 105), (110, 160))
     mesh = Tri3Mesh.from_region(region, 12, [[[0, 55], [160, 55]]])
-    opened = np.where(mesh.places[:, 1] < 55, 0.0, 3.0)
+    opened = np.where(mesh.observation_points[:, 1] < 55, 0.0, 3.0)
     still = np.zeros(len(mesh.nodes))
     strain = strain_of(mesh.nodes, mesh.elements, still, opened, still, still, gauge=80)
     assert np.abs(strain.components).max() < 1e-12

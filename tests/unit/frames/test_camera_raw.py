@@ -290,8 +290,8 @@ def test_damaged_header_never_gives_another_error(dng: Path, seed: int) -> None:
     try:
         read_frame(bad)
     except FrameError as error:
-        named = str(error)
-        assert "bad.dng" in named
+        message = str(error)
+        assert "bad.dng" in message
 
 
 @pytest.mark.parametrize(("black", "fill"), [(0, 0), (64, 0), (64, 64), (64, 128)])
@@ -309,9 +309,9 @@ def test_rows_without_noise_mean_that_nothing_was_decoded(black: int, fill: int)
         broken[damage] = fill
         if refused:
             with pytest.raises(FrameError, match="empty"):
-                camera_raw._check_filled(broken, level, 4095.0, stored_as_is=False, path=Path("x.rw2"))
+                camera_raw._refuse_filled_rows(broken, level, 4095.0, is_uncompressed=False, path=Path("x.rw2"))
         else:
-            camera_raw._check_filled(broken, level, 4095.0, stored_as_is=False, path=Path("x.rw2"))
+            camera_raw._refuse_filled_rows(broken, level, 4095.0, is_uncompressed=False, path=Path("x.rw2"))
 
 
 @pytest.mark.parametrize("fills_memory", [True, False], ids=["glibc", "another C library"])

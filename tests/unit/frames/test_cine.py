@@ -95,10 +95,10 @@ def test_when_frames_were_taken_and_which_are_lost(tmp_path: Path, version: int)
     assert recording.times_ns is not None
     assert recording.times_ns.dtype == np.int64
     np.testing.assert_allclose(recording.times_ns, times, atol=1)
-    assert (recording.trigger, recording.frame_rate, recording.exposure_ns, recording.lost) == (7, 1e6, 300, 3)
+    assert (recording.trigger, recording.frame_rate, recording.exposure_ns, recording.n_lost) == (7, 1e6, 300, 3)
     series = open_series(FrameSettings(path=("f.cine",)), tmp_path)
     assert list(series.numbers[2:5]) == [2, 5, 6]
-    assert series.lost == 3
+    assert series.n_lost == 3
 
 
 @pytest.mark.parametrize("length", [BEFORE_COLOURS, 900, BEFORE_NS, BEFORE_LEVELS, 10392, SETUP_LENGTH, 11000])
@@ -177,9 +177,9 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path: Path, place: int, val
     tracemalloc.start()
     with pytest.raises(FrameError, match=reason) as raised:
         open_source(path, ANY).read(0)
-    most = tracemalloc.get_traced_memory()[1]
+    peak_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert most < 2**20
+    assert peak_bytes < 2**20
     assert "\n" not in str(raised.value)
     assert "f.cine" in str(raised.value)
 
@@ -189,8 +189,8 @@ def test_a_truncated_movie_is_read_up_to_its_last_whole_frame(tmp_path: Path, an
     path = tmp_path / "f.cine"
     frames = _frames(16, depth=12, count=9)
     _movie(path, frames, annotation=annotation)
-    whole, size = path.read_bytes(), 12 * 16 * 2
-    path.write_bytes(whole[: -3 * (size + 8 + len(annotation)) - 100])
+    content, size = path.read_bytes(), 12 * 16 * 2
+    path.write_bytes(content[: -3 * (size + 8 + len(annotation)) - 100])
     source = open_source(path, ANY)
     assert len(source) == 9
     for index in range(5):
@@ -200,7 +200,7 @@ def test_a_truncated_movie_is_read_up_to_its_last_whole_frame(tmp_path: Path, an
             FrameError, match=r"f\.cine: the file ends after frame 4 of 9 \(0 to 8\): truncated or still being"
         ):
             source.read(index)
-    path.write_bytes(whole)  # the rest is written: nothing of the shorter file is remembered
+    path.write_bytes(content)  # the rest is written: nothing of the shorter file is remembered
     np.testing.assert_array_equal(source.read(8).values[0], frames[8])
 
 
@@ -223,9 +223,9 @@ def test_one_frame_of_a_large_movie_is_read_at_a_time(tmp_path: Path) -> None:
     source.read(0)
     tracemalloc.start()
     assert [int(source.read(index).values[0, 0, 0]) for index in range(0, frames, 37)] == list(range(0, frames, 37))
-    most = tracemalloc.get_traced_memory()[1]
+    peak_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert most < 20 * 64 * 64 * 2
+    assert peak_bytes < 20 * 64 * 64 * 2
 
 
 def _by_ffmpeg(path: Path, pixels: str) -> Any:
@@ -273,7 +273,7 @@ def test_real_grey_movies(real_data: RealData, name: str, pixels: str, numbers: 
     source = open_source(path, ANY)
     frames = [source.read(index) for index in range(len(source))]
     recording = source.recording
-    assert (len(source), source.shape, recording.lost) == (count(path.parent, 6), (128, 256), 0)
+    assert (len(source), source.shape, recording.n_lost) == (count(path.parent, 6), (128, 256), 0)
     depth, black, white, rate, exposure_ns, trigger, first_ns = numbers
     assert (recording.bit_depth, frames[0].black_level[0], frames[0].white_level) == (depth, black, white)
     assert (recording.frame_rate, recording.trigger) == (rate, trigger)

@@ -43,18 +43,18 @@ def _movie(path: Path, **options: Any) -> Any:
 
 def test_a_movie_tells_all(tmp_path: Path) -> None:
     _movie(tmp_path / "f.cine", cfa="GBRG")
-    seen = _seen(tmp_path / "f.cine")
+    description = _seen(tmp_path / "f.cine")
     values = ["Phantom .cine", 6, [12, 16], "GBRG", 12, 64, 4064, 2000, 0.00025, 2, 2]
-    assert [seen[key] for key in KEYS] == values
-    assert seen["kind"] == "bayer"
-    assert (seen["first_time_ns"], seen["last_time_ns"]) == pytest.approx((-1_000_000, 2_500_000), abs=1)
-    assert seen["warnings"] == []
+    assert [description[key] for key in KEYS] == values
+    assert description["kind"] == "bayer"
+    assert (description["first_time_ns"], description["last_time_ns"]) == pytest.approx((-1_000_000, 2_500_000), abs=1)
+    assert description["warnings"] == []
 
 
 def test_what_nobody_tells_is_null_and_what_is_stated_is_told(tmp_path: Path) -> None:
     write_tiff(tmp_path / "f.tif", noisy_mosaic((24, 30)))
-    seen = _seen(tmp_path / "f.tif")
-    assert [seen[key] for key in KEYS] == ["TIFF", 1, [24, 30], None, 16, 0.0, 65535.0, None, None, None, None]
+    description = _seen(tmp_path / "f.tif")
+    assert [description[key] for key in KEYS] == ["TIFF", 1, [24, 30], None, 16, 0.0, 65535.0, None, None, None, None]
     stated = _seen(tmp_path / "f.tif", cfa="BGGR", black_level=64.0, white_level=4000.0)
     assert (stated["cfa"], stated["kind"], stated["black_level"], stated["white_level"]) == ("BGGR", "bayer", 64, 4000)
     assert _seen(tmp_path / "f.tif", kind="monochrome")["kind"] == "monochrome"
@@ -64,9 +64,13 @@ def test_a_folder_and_a_pattern_are_counted_with_what_is_lost(tmp_path: Path) ->
     for number in (1, 2, 5):
         write_dng(tmp_path / f"f{number}.dng", noisy_mosaic((24, 30), black=np.array([[60, 61], [62, 63]])))
     for path in (tmp_path, tmp_path / "*.dng"):
-        seen = _seen(path)
-        assert (seen["count"], seen["shape"], seen["lost_frames"]) == (3, [24, 30], 2)
-        assert (seen["cfa"], seen["black_level"], seen["white_level"]) == ("RGGB", [60, 61, 62, 63], 4095)
+        description = _seen(path)
+        assert (description["count"], description["shape"], description["lost_frames"]) == (3, [24, 30], 2)
+        assert (description["cfa"], description["black_level"], description["white_level"]) == (
+            "RGGB",
+            [60, 61, 62, 63],
+            4095,
+        )
 
 
 def test_text_has_a_line_for_what_is_known(tmp_path: Path) -> None:
@@ -80,9 +84,9 @@ def test_a_truncated_movie_is_described_and_its_end_told(tmp_path: Path) -> None
     path = tmp_path / "f.cine"
     _movie(path)
     path.write_bytes(path.read_bytes()[:-400])
-    seen = _seen(path)
-    assert seen["count"] == 6
-    assert "ends after frame 3 of 6 (0 to 5): truncated or still being written" in seen["warnings"][0]
+    description = _seen(path)
+    assert description["count"] == 6
+    assert "ends after frame 3 of 6 (0 to 5): truncated or still being written" in description["warnings"][0]
 
 
 def test_what_is_stated_must_agree_with_the_file(tmp_path: Path) -> None:
@@ -155,7 +159,7 @@ def test_times_that_cannot_be_are_left_out_with_a_word(times: list[int], remark:
     recording = Recording(count=4, frame_rate=100.0, times_ns=stamps)
     assert recording.remarks == ((remark,) if remark else ())
     assert (recording.times_ns is None) == ("not used" in remark)
-    assert recording.numbered.tolist() == [0, 1, 2, 3]
+    assert recording.relative_numbers.tolist() == [0, 1, 2, 3]
 
 
 def test_movies_whose_times_do_not_rise_say_so_once(tmp_path: Path) -> None:
@@ -167,9 +171,9 @@ def test_movies_whose_times_do_not_rise_say_so_once(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "m.h5", "w") as file:
         file.create_dataset("d", data=frames).attrs["times_ns"] = np.array(stamps) * 10**6
     for name in ("m.cine", "m.seq", "m.ome.tif", "m.h5"):
-        seen = _seen(tmp_path / name, kind="monochrome")
-        assert seen["warnings"] == [f"{name}: its time stamps do not rise (at frame 3): they are not used"]
-        assert (seen["first_time_ns"], seen["last_time_ns"]) == (None, None)
+        description = _seen(tmp_path / name, kind="monochrome")
+        assert description["warnings"] == [f"{name}: its time stamps do not rise (at frame 3): they are not used"]
+        assert (description["first_time_ns"], description["last_time_ns"]) == (None, None)
 
 
 def test_a_frame_rate_that_is_not_that_of_the_time_stamps_is_reported(tmp_path: Path) -> None:
@@ -182,6 +186,6 @@ def test_a_frame_rate_that_is_not_that_of_the_time_stamps_is_reported(tmp_path: 
 def test_planes_of_one_time_are_described(tmp_path: Path) -> None:
     frames = np.random.default_rng(1).integers(0, 4096, (6, 2, 12, 16)).astype(np.uint16)
     tifffile.imwrite(tmp_path / "m.tif", frames, imagej=True, metadata={"axes": "TCYX", "finterval": 0.5})
-    seen = _seen(tmp_path / "m.tif")
-    assert (seen["count"], seen["last_time_ns"]) == (6, 2_500_000_000)
-    assert seen["warnings"] == ["it holds 2 channels of each time: frames.lights = 2"]
+    description = _seen(tmp_path / "m.tif")
+    assert (description["count"], description["last_time_ns"]) == (6, 2_500_000_000)
+    assert description["warnings"] == ["it holds 2 channels of each time: frames.lights = 2"]

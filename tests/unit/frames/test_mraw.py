@@ -17,8 +17,8 @@ from real_files import RealData, count
 from rgbmidic.errors import FrameError
 from rgbmidic.frames import FrameSeries, Mosaic, open_series, open_source
 from rgbmidic.frames import movies as mraw
+from rgbmidic.frames.metadata import unpack_bits
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.stored import unpack_bits
 from rgbmidic.settings import FrameSettings
 
 SHAPE = (12, 16)
@@ -115,7 +115,7 @@ def test_times_are_whole_nanoseconds_from_the_trigger(
     assert recording.times_ns is not None
     assert recording.times_ns.tolist() == [series.time_ns(index) for index in range(3)] == times
     assert (recording.trigger, recording.frame_rate, recording.exposure_ns) == (trigger, float(rate), 20000)
-    assert (recording.lost, list(series.numbers)) == (0, [0, 1, 2])
+    assert (recording.n_lost, list(series.numbers)) == (0, [0, 1, 2])
 
 
 def test_a_million_frames_a_second_stay_exact_after_hours(tmp_path: Path) -> None:

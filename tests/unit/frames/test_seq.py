@@ -70,7 +70,7 @@ def test_no_pattern_in_the_header_is_to_be_stated(tmp_path: Path) -> None:
 def test_a_gap_in_the_stamps_is_a_lost_frame(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_seq(tmp_path / "m.seq", FRAMES, bits=10, times_us=[0, 501, 999, 2000, 2500])
     series = open_series(FrameSettings(path=("m.seq",), kind="monochrome"), tmp_path)
-    assert (list(series.numbers), series.lost, series.recording.lost) == ([0, 1, 2, 4, 5], 1, 1)
+    assert (list(series.numbers), series.n_lost, series.recording.n_lost) == ([0, 1, 2, 4, 5], 1, 1)
     assert "1 in the numbering, 3;" in caplog.text
     assert series.time_ns(3) == 2_000_000
 

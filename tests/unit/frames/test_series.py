@@ -24,7 +24,7 @@ from rgbmidic.frames import FrameSeries, FrameSource, file_hash, formats, list_f
 from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.frames.formats import FrameFormat
 from rgbmidic.frames.images import write_dng, write_tiff
-from rgbmidic.frames.stored import StoredFrame
+from rgbmidic.frames.metadata import StoredFrame
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.settings import FrameSettings, TestSettings
 
@@ -185,8 +185,8 @@ def test_brackets_in_the_name_of_a_folder_are_no_pattern(tmp_path: Path, absolut
     _write(tmp_path / "run1" / "cam", ["other.tif"])
     start = str(tmp_path) + "/" if absolute else ""
     for pattern in ("run[1]/cam*/*.tif", "run[1]/cam*/a[12].tif", "run[1]/**/*.tif", "run[1]/cam*"):
-        found = list_frames(start + pattern, "elsewhere" if absolute else tmp_path)
-        assert found == (tmp_path / "run[1]/cam*/a1.tif", tmp_path / "run[1]/cam*/a2.tif")
+        files = list_frames(start + pattern, "elsewhere" if absolute else tmp_path)
+        assert files == (tmp_path / "run[1]/cam*/a1.tif", tmp_path / "run[1]/cam*/a2.tif")
 
 
 @pytest.mark.parametrize("pattern", ["*.tif", "."])
@@ -329,7 +329,7 @@ def _levels(series: FrameSeries) -> list[list[int]]:
 def test_lights_that_fire_in_turn_share_one_series(tmp_path: Path) -> None:
     series = _in_turn(tmp_path, lights=2)
     assert _levels(series) == GREYS.reshape(-1, 2).tolist()
-    assert (list(series.numbers), series.lost, list(series.chosen)) == ([0, 1, 2, 3, 4, 5], 0, [0, 1, 2, 3, 4, 5])
+    assert (list(series.numbers), series.n_lost, list(series.selected)) == ([0, 1, 2, 3, 4, 5], 0, [0, 1, 2, 3, 4, 5])
     assert (series.name(1), series.time_ns(1)) == ("m.seq frame 2 + m.seq frame 3", 500_000)
     assert _levels(_in_turn(tmp_path, lights=3)) == GREYS.reshape(-1, 3).tolist()
     assert len(_in_turn(tmp_path, lights=5)) == 2  # two frames are left over
@@ -351,12 +351,12 @@ def test_a_lost_frame_drops_its_state_and_shifts_no_light(
 ) -> None:
     series = _in_turn(tmp_path, lost, lights=2)
     assert (_levels(series), list(series.numbers)) == (levels, numbers)
-    assert series.lost == 6 - len(levels)
+    assert series.n_lost == 6 - len(levels)
 
 
 def test_with_lights_in_turn_all_keys_count_states(tmp_path: Path) -> None:
     series = _in_turn(tmp_path, lights=2, first=1, last=5, step=2, reference=(0, 5))
-    assert list(series.chosen) == [1, 3, 5]
+    assert list(series.selected) == [1, 3, 5]
     with pytest.raises(FrameError, match=r"frames\.last names frame 6, but there are 6 \(0 to 5\)"):
         _in_turn(tmp_path, lights=2, last=6)
     with pytest.raises(FrameError, match=r"frames\.reference names frame 5, but there are 5 \(0 to 4\)"):
@@ -364,12 +364,12 @@ def test_with_lights_in_turn_all_keys_count_states(tmp_path: Path) -> None:
 
 
 def test_first_last_and_step_choose_frames(tmp_path: Path) -> None:
-    assert list(_in_turn(tmp_path).chosen) == list(range(12))
+    assert list(_in_turn(tmp_path).selected) == list(range(12))
     chosen = _in_turn(tmp_path, first=3, last=9, step=3)
-    assert (list(chosen.chosen), len(chosen), chosen.lost) == ([3, 6, 9], 12, 0)
-    assert list(_in_turn(tmp_path, first=10).chosen) == [10, 11]
-    assert _in_turn(tmp_path, (7,), first=4).lost == 1
-    assert _in_turn(tmp_path, (7,), last=4).lost == 0
+    assert (list(chosen.selected), len(chosen), chosen.n_lost) == ([3, 6, 9], 12, 0)
+    assert list(_in_turn(tmp_path, first=10).selected) == [10, 11]
+    assert _in_turn(tmp_path, (7,), first=4).n_lost == 1
+    assert _in_turn(tmp_path, (7,), last=4).n_lost == 0
     for key in ("first", "last"):
         with pytest.raises(FrameError, match=rf"frames\.{key} names frame 12, but there are 12 \(0 to 11\)"):
             _in_turn(tmp_path, **{key: 12})
@@ -432,7 +432,7 @@ def test_the_frames_of_all_files_are_counted_once(tmp_path: Path) -> None:
     settings = FrameSettings(path=("frame",))
     for name in "ab":
         (tmp_path / name).write_bytes(bytes(10))
-    series = FrameSeries(lights=(tuple(_Film(path=tmp_path / name, stated=settings) for name in "ab"),))
+    series = FrameSeries(lights=(tuple(_Film(path=tmp_path / name, user_metadata=settings) for name in "ab"),))
     _Film.counted.clear()
     assert [series.name(index) for index in range(len(series))][9:11] == ["a:9", "b:0"]
     assert not _Film.counted
@@ -441,9 +441,9 @@ def test_the_frames_of_all_files_are_counted_once(tmp_path: Path) -> None:
 def test_a_series_goes_to_another_process_and_reads_the_same(tmp_path: Path) -> None:
     _write(tmp_path, ["f1.tif", "f2.tif"])
     series = open_series(FrameSettings(path=("*.tif",), cfa="RGGB"), tmp_path)
-    other = pickle.loads(pickle.dumps(series))
-    assert other == series
-    np.testing.assert_array_equal(other.read(1)[0].values, series.read(1)[0].values)
+    unpickled = pickle.loads(pickle.dumps(series))
+    assert unpickled == series
+    np.testing.assert_array_equal(unpickled.read(1)[0].values, series.read(1)[0].values)
 
 
 def test_a_file_is_hashed_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -223,7 +223,7 @@ def test_absurd_pages_are_refused_before_anything_is_allocated(tmp_path: Path) -
 def _check(path: Path) -> None:
     from rgbmidic.frames.tiff import TiffStack
 
-    len(TiffStack(path=path, stated=STATED))
+    len(TiffStack(path=path, user_metadata=STATED))
 
 
 def _write_pages(path: Path, count: int) -> None:
@@ -350,9 +350,9 @@ def test_a_stack_that_is_cut_anywhere_loses_no_frame_in_silence(
 ) -> None:
     for number in range(3):
         _write(tmp_path / f"{number}.tif", **options)
-    whole, opened = (tmp_path / "1.tif").read_bytes(), 0
-    for length in np.linspace(16, len(whole) - 1, 40).astype(int):
-        (tmp_path / "1.tif").write_bytes(whole[:length])
+    content, opened = (tmp_path / "1.tif").read_bytes(), 0
+    for length in np.linspace(16, len(content) - 1, 40).astype(int):
+        (tmp_path / "1.tif").write_bytes(content[:length])
         try:
             series = _series(tmp_path)
         except FrameError as error:
@@ -365,7 +365,7 @@ def test_a_stack_that_is_cut_anywhere_loses_no_frame_in_silence(
                 np.testing.assert_array_equal(series.read(index)[0].values[0], FRAMES[index % 6])
     assert opened > (0 if options.get("metadata", "") is None else 10)
     assert not [record for record in caplog.records if record.name.startswith("rgbmidic")]
-    (tmp_path / "1.tif").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "1.tif").write_bytes(content[: len(content) // 2])
     alone = _series(tmp_path / "1.tif")
     with pytest.raises(FrameError, match=r"1\.tif.* truncated"):
         alone.read(len(alone) - 1)

@@ -24,8 +24,8 @@ from rgbmidic.settings import FrameSettings
 SHAPE = (132, 150)
 FRAMES = np.random.default_rng(1).integers(0, 1024, (3, *SHAPE)).astype(np.uint16)
 COLOUR = np.random.default_rng(2).integers(0, 65536, (*SHAPE, 3)).astype(np.uint16)
-MIDDLE = Window.around(np.array([[50.0, 70.0], [60.0, 75.0]]), 5, SHAPE)
-CORNER = Window.around(np.array([[120.0, 110.0]]), 90, SHAPE)
+MIDDLE = Window.around_points(np.array([[50.0, 70.0], [60.0, 75.0]]), 5, SHAPE)
+CORNER = Window.around_points(np.array([[120.0, 110.0]]), 90, SHAPE)
 
 
 def _tiff(values: Any = FRAMES[0], **options: Any) -> Callable[[Path], object]:
@@ -86,9 +86,9 @@ def test_a_part_is_the_same_part_of_the_whole(tmp_path: Path, name: str) -> None
     write(tmp_path / name)
     series = open_series(FrameSettings(path=(str(tmp_path / name),), **stated))
     (whole,) = series.read(len(series) - 1)
-    for window in (MIDDLE, CORNER, Window.whole(SHAPE)):
+    for window in (MIDDLE, CORNER, Window.of_frame(SHAPE)):
         (part,) = series.read(len(series) - 1, window)
-        rows, columns = window.part_of(Window.whole(SHAPE))
+        rows, columns = window.slices_in(Window.of_frame(SHAPE))
         np.testing.assert_array_equal(part.values, whole.values[..., rows, columns])
         assert getattr(part, "cfa", "") == getattr(whole, "cfa", "")
         np.testing.assert_array_equal(part.black_level, whole.black_level)
@@ -99,7 +99,7 @@ def test_windows_begin_on_a_grid_and_hold_their_points_with_the_margin() -> None
     assert (MIDDLE.origin, MIDDLE.shape) == ((32, 64), (32, 64))
     assert (CORNER.origin, CORNER.shape) == ((0, 0), SHAPE)
     assert CORNER.is_whole
-    beside = Window.around(np.array([[-500.0, 300.0]]), 10, SHAPE)
+    beside = Window.around_points(np.array([[-500.0, 300.0]]), 10, SHAPE)
     assert (beside.origin, beside.shape) == ((0, 128), (4, 32))
 
 
@@ -115,7 +115,7 @@ def test_little_else_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, na
     writers.get(name, FORMATS[name][0])(path)
     stated = FORMATS[name][1] | ({"shape": shape} if name == "samples.raw" else {})
     series = open_series(FrameSettings(path=(str(path),), **stated))
-    window = Window.around(np.array([[500.0, 2000.0]]), 50, shape)
+    window = Window.around_points(np.array([[500.0, 2000.0]]), 50, shape)
     series.read(0, window)
     tracemalloc.start()
     series.read(0, window)

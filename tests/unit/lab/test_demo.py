@@ -47,7 +47,7 @@ def test_what_goes_wrong_meanwhile_ends_the_compilation(monkeypatch):
     monkeypatch.setattr(demo, "are_compiled", lambda: False)
     started = []
     monkeypatch.setattr(demo.subprocess, "Popen", _noting(started))
-    with pytest.raises(KeyboardInterrupt), demo.kernels_compiled_meanwhile():
+    with pytest.raises(KeyboardInterrupt), demo.compile_kernels_in_background():
         raise KeyboardInterrupt
     assert len(started) == 2
     assert [one.returncode for one in started] == [-signal.SIGKILL] * 2
@@ -56,7 +56,7 @@ def test_what_goes_wrong_meanwhile_ends_the_compilation(monkeypatch):
 def test_nothing_is_started_where_the_kernels_are_compiled(monkeypatch):
     monkeypatch.setattr(demo, "are_compiled", lambda: True)
     monkeypatch.setattr(demo.subprocess, "Popen", lambda *_, **__: pytest.fail("started"))
-    with demo.kernels_compiled_meanwhile():
+    with demo.compile_kernels_in_background():
         pass
 
 

@@ -31,13 +31,13 @@ from rgbmidic.illumination.linear import NoiseModel, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection import Inspection, inspect_files, inspect_frame
-from rgbmidic.lab.inspection.channels import Channel, channels_of, noise_estimate, speckle_texture
+from rgbmidic.lab.inspection.channels import Channel, estimate_noise, frame_channels, speckle_texture
 from rgbmidic.lab.inspection.prediction import gaussian_field
 from rgbmidic.lab.inspection.report import inspection_document, write_inspection
-from rgbmidic.lab.inspection.results import _of_speckle
+from rgbmidic.lab.inspection.results import _speckle_checks
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline import correlate
-from rgbmidic.scene.forecast import expected_std, node_constant
+from rgbmidic.scene.forecast import expected_std, nodal_variance_factor
 from rgbmidic.settings import FrameSettings
 
 Run = Callable[..., tuple[int, str, str]]
@@ -92,17 +92,17 @@ def codes(seen: Inspection) -> set[str]:
 
 
 def test_a_good_frame_has_no_warnings_and_its_figures_are_those_it_was_made_with():
-    seen = mat()
-    assert codes(seen) == set()
-    assert (seen.kind, [one.name for one in seen.channels]) == ("bayer", ["R", "G", "B"])
+    inspection = mat()
+    assert codes(inspection) == set()
+    assert (inspection.kind, [one.name for one in inspection.channels]) == ("bayer", ["R", "G", "B"])
     sampled = mosaic_of(mat_lights(), noise=None)
-    for one, channel in zip(seen.channels, channels_of([sampled]), strict=True):
+    for one, channel in zip(inspection.channels, frame_channels([sampled]), strict=True):
         mean = np.nanmean(channel.values)
         assert one.mean == pytest.approx(mean / FULL_SCALE, rel=0.01)
         assert one.low < one.mean < one.high
         assert one.noise_dn == pytest.approx(np.sqrt(NOISE.variance(mean)), rel=0.01)
         assert one.saturated == 0
-    for light in seen.lights:
+    for light in inspection.lights:
         assert light.mean == pytest.approx(mat_lights()[0].mean() / FULL_SCALE, rel=0.01)
         assert light.reflecting < 0.02
         assert light.valid == 1
@@ -122,7 +122,7 @@ def test_speckle_size_of_a_coarse_lattice_is_that_of_the_full_image(diameter):
     nowhere, inside = np.zeros(SHAPE, bool), np.ones(SHAPE, bool)
     whole = Channel(name="M", values=full, saturated=nowhere, step=1)
     true = speckle_texture(whole, inside, NoiseModel(gain=np.inf, read_noise=0.0)).diameter
-    for channel in channels_of([mosaic_of(mat_lights(diameter, seed=2))]):
+    for channel in frame_channels([mosaic_of(mat_lights(diameter, seed=2))]):
         assert speckle_texture(channel, inside, NOISE).diameter == pytest.approx(true, rel=0.06)
         assert speckle_texture(channel, inside, None).diameter == pytest.approx(true, rel=0.2)
 
@@ -152,7 +152,7 @@ def test_inner_nodes_of_an_even_field_follow_the_closed_form_of_plan():
     everywhere = np.ones(len(mesh.elements))
     (std,) = expected_std(mesh, information * everywhere, score * everywhere)
     inner = ((mesh.nodes > 60) & (mesh.nodes < 180)).all(axis=1)
-    closed = np.sqrt(node_constant() * score) / (side * information)
+    closed = np.sqrt(nodal_variance_factor() * score) / (side * information)
     assert np.sqrt(np.mean(std[inner] ** 2)) == pytest.approx(closed, rel=0.01)
     assert std[~inner].max() > 1.4 * closed
     blind = np.where((mesh.nodes[mesh.elements].mean(axis=1)[:, 0] < 100), 0.0, information)
@@ -163,8 +163,8 @@ def test_noise_is_estimated_from_a_flat_or_coarsely_painted_frame():
     inside = np.ones(SHAPE, bool)
     flat = np.full((3, *SHAPE), 800.0, dtype=np.float32)
     for lights, limits in ((flat, (0.8, 1.2)), (mat_lights(6.0), (0.8, 1.8))):
-        channels = channels_of([mosaic_of(lights)])
-        for channel, found in zip(channels, noise_estimate(channels, inside), strict=True):
+        channels = frame_channels([mosaic_of(lights)])
+        for channel, found in zip(channels, estimate_noise(channels, inside), strict=True):
             true = np.sqrt(NOISE.variance(np.nanmean(channel.values)))
             assert limits[0] < found / true < limits[1]
 
@@ -173,7 +173,7 @@ def test_noise_is_estimated_from_a_flat_or_coarsely_painted_frame():
 def test_predicted_uncertainty_is_the_scatter_of_repeated_frames(glare, size):
     """Frames of the paint moved by whole and half pixels of different phase; the truth is known."""
     lights = glaring_lights() if glare else mat_lights()
-    seen = inspect_frame(raw(lights), calibration=CALIBRATION, element_size=size)
+    inspection = inspect_frame(raw(lights), calibration=CALIBRATION, element_size=size)
     fine = _moved_lights(glare)
     errors = []
     first = _separated(fine((0.0, 0.0)), 10)
@@ -183,11 +183,11 @@ def test_predicted_uncertainty_is_the_scatter_of_repeated_frames(glare, size):
         inner = ((solution.nodes > 20) & (solution.nodes < SHAPE[0] - 21)).all(axis=1)
         errors.append((solution.displacement - motion)[inner])
     observed = np.sqrt(np.nanmean((np.array(errors) - np.nanmean(errors, axis=1, keepdims=True)) ** 2))
-    inner = ((seen.mesh.nodes > 20) & (seen.mesh.nodes < SHAPE[0] - 21)).all(axis=1)
-    predicted = np.sqrt(np.nanmean(seen.prediction.std[inner] ** 2))
+    inner = ((inspection.mesh.nodes > 20) & (inspection.mesh.nodes < SHAPE[0] - 21)).all(axis=1)
+    predicted = np.sqrt(np.nanmean(inspection.prediction.std[inner] ** 2))
     assert 0.75 < predicted / observed < 1.25
-    assert 0 < np.nanmedian(seen.prediction.noise) <= 1.1 * np.nanmedian(seen.prediction.std)
-    assert min(light.alone.median for light in seen.lights) > np.nanmedian(seen.prediction.std)
+    assert 0 < np.nanmedian(inspection.prediction.noise) <= 1.1 * np.nanmedian(inspection.prediction.std)
+    assert min(light.std_alone.median for light in inspection.lights) > np.nanmedian(inspection.prediction.std)
 
 
 def _moved_lights(glare):
@@ -234,27 +234,27 @@ def test_only_the_region_and_its_surroundings_are_looked_at_where_they_are():
         registration=Registration(lights=CROSSTALK.lights, parameters=parameters, centre=centre, radius=radius),
     )
     steps = []
-    part = inspect_frame(
+    inspection = inspect_frame(
         raw(lights), calibration=calibration, region=(251, 231, 330, 300), progress=lambda *step: steps.append(step)
     )
-    assert part.origin == (154, 134)
-    assert part.images.shape == (300 + 97 - 134, 330 + 97 - 154)
-    assert part.frame_shape == shape
-    assert part.mesh.nodes.min(axis=0) == pytest.approx((251, 231))
-    assert part.mesh.nodes.max(axis=0) == pytest.approx((330, 300))
+    assert inspection.origin == (154, 134)
+    assert inspection.images.shape == (300 + 97 - 134, 330 + 97 - 154)
+    assert inspection.frame_shape == shape
+    assert inspection.mesh.nodes.min(axis=0) == pytest.approx((251, 231))
+    assert inspection.mesh.nodes.max(axis=0) == pytest.approx((330, 300))
     assert [done for done, _, _ in steps] == [0, 1, 2, 3]
     whole = inspect_frame(raw(lights), calibration=calibration)
     inside = np.s_[:, 231:301, 251:331]
     moved = np.s_[:, 231 - 134 : 301 - 134, 251 - 154 : 331 - 154]
-    difference = part.images.values[moved] - whole.images.values[inside]
+    difference = inspection.images.values[moved] - whole.images.values[inside]
     # the texture is learnt from another part of the frame; half a pixel beside, it would be 30 % of the contrast
     assert np.sqrt(np.nanmean(difference**2)) < 0.02 * np.nanstd(whole.images.values[inside])
 
 
 def test_the_same_frame_gives_the_same_figures():
-    again = inspect_frame(raw(mat_lights()), calibration=CALIBRATION)
-    np.testing.assert_array_equal(again.prediction.std, mat().prediction.std)
-    assert inspection_document(again) == inspection_document(mat())
+    inspection = inspect_frame(raw(mat_lights()), calibration=CALIBRATION)
+    np.testing.assert_array_equal(inspection.prediction.std, mat().prediction.std)
+    assert inspection_document(inspection) == inspection_document(mat())
 
 
 def test_the_expected_uncertainty_knows_where_the_lights_lie():
@@ -285,15 +285,17 @@ def test_the_expected_uncertainty_knows_where_the_lights_lie():
 def test_what_dimming_a_lamp_gains_is_what_the_dimmed_frame_shows():
     strength = np.array([1.0, 1.0, 5.0])
     lights = mat_lights(level=400.0) * strength[:, None, None].astype(np.float32)
-    seen = inspect_frame(raw(lights), calibration=CALIBRATION)
-    (text,) = [finding.text for finding in seen.findings if finding.name == "unequal lamps"]
+    inspection = inspect_frame(raw(lights), calibration=CALIBRATION)
+    (text,) = [finding.text for finding in inspection.findings if finding.name == "unequal lamps"]
     assert "blue dimmed to 20%" in text
     exposure = float(re.search(r"([\d.]+) times the exposure", text)[1])
     after, before = map(float, re.search(r"([\d.]+) px instead of ([\d.]+) px", text).groups())
     dimmed = inspect_frame(raw(mat_lights(level=400.0 * exposure)), calibration=CALIBRATION)
-    assert max(channel.high for channel in dimmed.channels) < 1.05 * max(channel.high for channel in seen.channels)
+    assert max(channel.high for channel in dimmed.channels) < 1.05 * max(
+        channel.high for channel in inspection.channels
+    )
     assert codes(dimmed) == set()
-    assert before == pytest.approx(np.nanmedian(seen.prediction.std), rel=0.02)
+    assert before == pytest.approx(np.nanmedian(inspection.prediction.std), rel=0.02)
     assert after == pytest.approx(np.nanmedian(dimmed.prediction.std), rel=0.05)
     assert before > 1.2 * after
     rough = inspect_frame(raw(lights), calibration=replace(CALIBRATION, noise=None))
@@ -326,17 +328,17 @@ def _blind():
     ],
 )
 def test_troubles_are_told(lights, code):
-    seen = inspect_frame(raw(lights()), calibration=CALIBRATION)
-    assert code in codes(seen)
-    assert "lights apart" not in codes(seen)
-    assert all(finding.text for finding in seen.findings)
+    inspection = inspect_frame(raw(lights()), calibration=CALIBRATION)
+    assert code in codes(inspection)
+    assert "lights apart" not in codes(inspection)
+    assert all(finding.text for finding in inspection.findings)
 
 
 @pytest.mark.parametrize(("size", "code"), [(2.0, "fine speckle"), (26.0, "coloured")])
 def test_coarse_speckle_whose_colours_hardly_agree_is_not_called_too_fine(size, code):
     texture = SimpleNamespace(specific=0.2, correlation=0.74)
     seen = SimpleNamespace(texture=texture, speckle_px=size, element_size=100.0, repetition="", doubts=())
-    assert [check.name for check in _of_speckle(seen) if not check.passed] == [code]
+    assert [check.name for check in _speckle_checks(seen) if not check.passed] == [code]
 
 
 @pytest.mark.parametrize("region", [(26, 250, 285, 800), (60, 450, 280, 640), (100, 250, 280, 450)])
@@ -345,24 +347,27 @@ def test_edges_of_a_specimen_before_a_dark_background_hide_no_texture(real_data,
     file = real_data("dic_challenge_sample12") / "oht_cfrp_00.tiff"
     left, top = crop_origin(file)
     box = np.array(region) - (left, top, left, top)
-    seen = inspect_files([file], frame=FrameSettings(path=("f",), kind="monochrome"), region=tuple(box))
-    y, x = np.mgrid[: seen.region.shape[0], : seen.region.shape[1]] + np.array(seen.origin[::-1])[:, None, None]
+    inspection = inspect_files([file], frame=FrameSettings(path=("f",), kind="monochrome"), region=tuple(box))
+    y, x = (
+        np.mgrid[: inspection.region.shape[0], : inspection.region.shape[1]]
+        + np.array(inspection.origin[::-1])[:, None, None]
+    )
     x, y = x + left, y + top
     empty = (np.hypot(x - 192, y - 541) < 52) | (x < 38) | (x > 354)
-    inside = seen.region
-    assert (seen.hidden != empty)[inside].mean() < 0.01
-    np.testing.assert_array_equal(seen.background[inside], seen.hidden[inside])
-    text = next((finding.text for finding in seen.findings if finding.name == "hidden"), None)
+    inside = inspection.region
+    assert (inspection.lacks_contrast != empty)[inside].mean() < 0.01
+    np.testing.assert_array_equal(inspection.background[inside], inspection.lacks_contrast[inside])
+    text = next((finding.text for finding in inspection.findings if finding.name == "hidden"), None)
     if empty[inside].any():
         assert "draw it inside the specimen" in text
         assert "reflects" not in text
     else:
         assert text is None
-    nodes = seen.mesh.nodes + np.array([left, top])
+    nodes = inspection.mesh.nodes + np.array([left, top])
     hole = np.hypot(*(nodes - (192, 541)).T) < 52 - 25
-    assert np.isnan(seen.prediction.std[hole]).all()
+    assert np.isnan(inspection.prediction.std[hole]).all()
     specimen = (np.hypot(*(nodes - (192, 541)).T) > 52) & (abs(nodes[:, 0] - 196) < 158)
-    assert np.isfinite(seen.prediction.std[specimen]).all()
+    assert np.isfinite(inspection.prediction.std[specimen]).all()
 
 
 def crop_origin(file):
@@ -378,26 +383,26 @@ def test_three_lights_before_a_dark_background_and_with_a_dim_part():
     lights[:, :, :48] = 90
     lights[:, 120:, 120:] *= 0.2
     lights[:, 40:80, 100:140] = 600
-    seen = inspect_frame(raw(lights), calibration=CALIBRATION)
-    assert seen.background[:, :46].mean() > 0.98
-    assert seen.background[:, 50:].mean() < 0.01
-    assert seen.hidden[120:, 120:].mean() < 0.02
-    assert seen.hidden[55:65, 115:125].all()
-    text = next(finding.text for finding in seen.findings if finding.name == "hidden")
+    inspection = inspect_frame(raw(lights), calibration=CALIBRATION)
+    assert inspection.background[:, :46].mean() > 0.98
+    assert inspection.background[:, 50:].mean() < 0.01
+    assert inspection.lacks_contrast[120:, 120:].mean() < 0.02
+    assert inspection.lacks_contrast[55:65, 115:125].all()
+    text = next(finding.text for finding in inspection.findings if finding.name == "hidden")
     assert "draw it inside the specimen" in text
     assert "reflect" in text
-    assert np.isnan(seen.prediction.std[seen.mesh.nodes[:, 0] < 20]).all()
+    assert np.isnan(inspection.prediction.std[inspection.mesh.nodes[:, 0] < 20]).all()
 
 
 def test_without_calibration_the_channels_stand_for_the_lights():
-    seen = inspect_frame(raw(glaring_lights()))
-    assert codes(seen) == {"crosstalk unknown", "noise unknown"}
-    assert [light.name for light in seen.lights] == ["red", "green", "blue"]
-    assert seen.lights[1].reflecting > 0.95
-    assert not seen.crosstalk_known
-    assert not seen.noise_known
+    inspection = inspect_frame(raw(glaring_lights()))
+    assert codes(inspection) == {"crosstalk unknown", "noise unknown"}
+    assert [light.name for light in inspection.lights] == ["red", "green", "blue"]
+    assert inspection.lights[1].reflecting > 0.95
+    assert not inspection.crosstalk_known
+    assert not inspection.noise_known
     level = np.tensordot(A, glaring_lights().mean(axis=(1, 2)), axes=1)
-    np.testing.assert_allclose([light.mean * FULL_SCALE for light in seen.lights], level, rtol=0.01)
+    np.testing.assert_allclose([light.mean * FULL_SCALE for light in inspection.lights], level, rtol=0.01)
 
 
 def test_greens_that_differ_as_calibrated_are_no_wrong_pattern():
@@ -410,9 +415,9 @@ def test_greens_that_differ_as_calibrated_are_no_wrong_pattern():
     frame = replace(frame, values=values.astype(np.uint16))
     assert "pattern" in codes(inspect_frame(frame, calibration=CALIBRATION))
     four = replace(CROSSTALK, green_difference=np.array([0.03, 0, 0]))
-    seen = inspect_frame(frame, calibration=replace(CALIBRATION, crosstalk=four))
-    assert seen.greens < 0.005
-    assert "pattern" not in codes(seen)
+    inspection = inspect_frame(frame, calibration=replace(CALIBRATION, crosstalk=four))
+    assert inspection.greens < 0.005
+    assert "pattern" not in codes(inspection)
 
 
 def test_a_wrong_pattern_is_told():
@@ -429,30 +434,30 @@ def test_a_wrong_pattern_is_told():
 
 def test_monochrome_frames_have_neither_lattice_nor_reflection_index():
     frame = grey_frame(1, (0.0, 0.0))
-    seen = inspect_frame(frame, calibration=Calibration(noise=NoiseModel(gain=np.inf, read_noise=8.0)))
-    assert (seen.kind, seen.reflection_index, seen.texture) == ("monochrome", None, None)
-    assert [one.name for one in seen.channels] == ["M"]
-    assert codes(seen) == set()
+    inspection = inspect_frame(frame, calibration=Calibration(noise=NoiseModel(gain=np.inf, read_noise=8.0)))
+    assert (inspection.kind, inspection.reflection_index, inspection.texture) == ("monochrome", None, None)
+    assert [one.name for one in inspection.channels] == ["M"]
+    assert codes(inspection) == set()
     repeats = [grey_frame(1, (0.0, 0.0), noise_seed=n) for n in (1, 2)]
     images = [linearise(one).values for one in repeats]
     solution = correlate(*images, initial=(0, 0), normalise=10.0)
     observed = np.sqrt(np.nanmean(solution.displacement**2))
-    assert np.sqrt(np.nanmean(seen.prediction.std**2)) / observed == pytest.approx(1, abs=0.35)
+    assert np.sqrt(np.nanmean(inspection.prediction.std**2)) / observed == pytest.approx(1, abs=0.35)
 
 
 def test_lights_in_succession_and_three_channels():
     frames = [grey_frame(seed, (0.0, 0.0)) for seed in (1, 2)]
-    seen = inspect_frame(frames)
-    assert [one.name for one in seen.channels] == ["M1", "M2"]
-    assert [light.name for light in seen.lights] == ["light 1", "light 2"]
+    inspection = inspect_frame(frames)
+    assert [one.name for one in inspection.channels] == ["M1", "M2"]
+    assert [light.name for light in inspection.lights] == ["light 1", "light 2"]
     channels = np.tensordot(A, glaring_lights(), axes=1)
     channels = channels + np.random.default_rng(1).normal(size=channels.shape) * np.sqrt(NOISE.variance(channels))
     values = np.clip(np.rint(channels) + BLACK, 0, 4095).astype(np.uint16)
     colour = ChannelFrame(values=values, black_level=np.array(BLACK), white_level=4095)
-    seen = inspect_frame(colour, calibration=CALIBRATION)
-    assert (seen.kind, seen.texture) == ("rgb", None)
-    assert seen.lights[1].reflecting > 0.9
-    assert np.nanmax(seen.prediction.mosaic) == 0
+    inspection = inspect_frame(colour, calibration=CALIBRATION)
+    assert (inspection.kind, inspection.texture) == ("rgb", None)
+    assert inspection.lights[1].reflecting > 0.9
+    assert np.nanmax(inspection.prediction.mosaic) == 0
 
 
 def test_frames_that_cannot_be_inspected():
@@ -471,12 +476,12 @@ def test_frames_that_cannot_be_inspected():
 
 def test_files_of_a_test_are_inspected_as_the_test_says(tmp_path):
     test = colour_test(tmp_path / "test", [(0.0, 0.0)])
-    seen = inspect_files([test.frames[0]], test=rgbmidic.read_test(test.folder / "TEST.toml"))
-    assert seen.name == "frame_0.dng"
-    assert seen.crosstalk_known
-    assert seen.noise_known
+    inspection = inspect_files([test.frames[0]], test=rgbmidic.read_test(test.folder / "TEST.toml"))
+    assert inspection.name == "frame_0.dng"
+    assert inspection.crosstalk_known
+    assert inspection.noise_known
     x0, y0, x1, y1 = REGION
-    assert seen.region.sum() == (x1 - x0 + 1) * (y1 - y0 + 1)
+    assert inspection.region.sum() == (x1 - x0 + 1) * (y1 - y0 + 1)
     assert rgbmidic.inspect_frame is inspect_frame
     damaged = tmp_path / "cut.dng"
     damaged.write_bytes(test.frames[0].read_bytes()[:2000])

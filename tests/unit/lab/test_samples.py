@@ -70,10 +70,10 @@ def test_a_sample_is_fetched_once_and_is_a_test(
     server: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert sample("small") == 0
-    told = capsys.readouterr()
-    assert "cd small && rgbmidic run test.toml --out result" in told.out
-    assert "licence: MIT   source: github.com/someone/something" in told.out
-    assert all(name in told.err for name in FRAMES)
+    output = capsys.readouterr()
+    assert "cd small && rgbmidic run test.toml --out result" in output.out
+    assert "licence: MIT   source: github.com/someone/something" in output.out
+    assert all(name in output.err for name in FRAMES)
     assert read_test(tmp_path / "small" / "test.toml").region.rectangle == (4, 4, 40, 40)
     for name in FRAMES:
         assert (tmp_path / "small" / name).read_bytes() == (server / name).read_bytes()
@@ -121,9 +121,9 @@ def test_settings_of_a_sample_are_a_test_of_its_files(name: str, tmp_path: Path)
     for file in SAMPLES[name].files:
         (tmp_path / file.name).touch()
     frames = read_test(tmp_path / "test.toml").frames
-    found = list_frames(frames.path[0], tmp_path)
-    assert max(frames.reference) < len(found)
-    assert "ref" in found[frames.reference[0]].stem.lower() or name in ("tension", "open-hole")  # these: the first
+    files = list_frames(frames.path[0], tmp_path)
+    assert max(frames.reference) < len(files)
+    assert "ref" in files[frames.reference[0]].stem.lower() or name in ("tension", "open-hole")  # these: the first
 
 
 def test_hashes_are_those_of_the_full_files_and_of_what_the_crops_were_cut_from() -> None:

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.mesh.tri3 import refined
+from rgbmidic.mesh.tri3 import refine_elements
 
 SHAPE = (301, 401)
 SIZE = 25
@@ -128,7 +128,7 @@ def test_a_crack_from_edge_to_edge_parts_the_body(region, crack, parts):
 
 def test_the_gradient_on_either_side_of_a_jump_is_that_of_its_side():
     mesh = split_mesh("rectangle", "through and through")
-    right = mesh.places[:, 0] > 200 + 10 * mesh.places[:, 1] / 315
+    right = mesh.observation_points[:, 0] > 200 + 10 * mesh.observation_points[:, 1] / 315
     values = np.where(right[:, None], 5 + 0.01 * mesh.nodes, -0.02 * mesh.nodes)
     slopes = mesh.nodal_gradient(values)
     np.testing.assert_allclose(slopes[right], np.broadcast_to(0.01 * np.eye(2), slopes[right].shape), atol=1e-12)
@@ -139,7 +139,7 @@ def test_without_a_crack_nodes_are_their_own_places():
     mesh = Tri3Mesh.from_region(REGIONS["ring"], SIZE)
     assert not len(mesh.copies)
     assert not len(mesh.crack_edges)
-    np.testing.assert_array_equal(mesh.places, mesh.nodes)
+    np.testing.assert_array_equal(mesh.observation_points, mesh.nodes)
 
 
 @given(ends=st.lists(st.tuples(st.integers(0, 400), st.integers(0, 300)), min_size=2, max_size=4, unique=True))
@@ -201,7 +201,7 @@ def outline(mesh):
 def test_bisected_elements_fit_together_and_cracks_stay_split(region, crack):
     mesh = coarse = Tri3Mesh.from_region(REGIONS[region], SIZE, CRACKS[crack] if crack else ())
     for _ in range(4):
-        finer = refined(mesh, around(mesh, (150, 110), 40), 5)
+        finer = refine_elements(mesh, around(mesh, (150, 110), 40), 5)
         np.testing.assert_array_equal(finer.nodes[: len(mesh.nodes)], mesh.nodes)
         mesh = finer
     assert len(mesh.elements) > len(coarse.elements) + 40
@@ -224,7 +224,7 @@ def test_no_part_is_shorter_than_the_least_leg():
     for least in (9, 14):
         finer = mesh
         for _ in range(5):
-            finer = refined(finer, np.ones(len(finer.elements), dtype=bool), least)
+            finer = refine_elements(finer, np.ones(len(finer.elements), dtype=bool), least)
         assert min(least, small) <= np.sqrt(2 * finer.areas).min() < 1.5 * least
-        assert refined(finer, np.ones(len(finer.elements), dtype=bool), 2 * least) is finer
-    assert refined(mesh, np.zeros(len(mesh.elements), dtype=bool), 4) is mesh
+        assert refine_elements(finer, np.ones(len(finer.elements), dtype=bool), 2 * least) is finer
+    assert refine_elements(mesh, np.zeros(len(mesh.elements), dtype=bool), 4) is mesh

@@ -93,15 +93,15 @@ def test_a_mutated_mesh_is_sound_or_refused_in_one_line(
                 warnings.simplefilter("error")
                 mesh = read_mesh(path)
         except InputError as error:
-            ends["refused"] = said = str(error)
+            ends["refused"] = message = str(error)
         except Exception as error:
             raise AssertionError(f"mutation {number}: {type(error).__name__}: {error}") from error
         else:
-            ends["read"] = said = f"{path}"
+            ends["read"] = message = f"{path}"
             assert (mesh.areas > 0).all(), number
             assert len(np.unique(mesh.node_numbers)) == len(mesh.points), number
             assert mesh.overlap() is None, number
-        assert str(path) in said, number
-        assert len(said) < 700, number
+        assert str(path) in message, number
+        assert len(message) < 700, number
     assert len(ends) == 2
     assert capfd.readouterr().err == ""

@@ -17,7 +17,7 @@ import pytest
 
 from rgbmidic import FiniteElementMesh, read_mesh
 from rgbmidic.errors import InputError
-from rgbmidic.mesh import content
+from rgbmidic.mesh import mesh_file
 
 meshio = pytest.importorskip("meshio")
 
@@ -340,7 +340,7 @@ def test_what_is_packed_is_not_larger_than_it_states(tmp_path: Path) -> None:
 
 
 def test_what_is_larger_than_is_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(content, "MOST_BYTES", 100)
+    monkeypatch.setattr(mesh_file, "MAX_BYTES", 100)
     for name, text in (("a.inp", INP), ("a.msh", MSH), ("a.avs", AVS), ("a.bdf", BDF), ("a.vtu", "<VTKFile/>" * 11)):
         refused(tmp_path, name, text, "bytes; meshes of up to 100 are read")
 

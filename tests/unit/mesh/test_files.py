@@ -14,7 +14,7 @@ import pytest
 from rgbmidic import CameraCalibration, FiniteElementMesh, Placement, Tri3Mesh, read_mesh
 from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh import Region
-from rgbmidic.mesh.placement import on_image
+from rgbmidic.mesh.placement import place_on_image
 
 meshio = pytest.importorskip("meshio")
 
@@ -303,8 +303,8 @@ def test_a_placement_finds_shift_turn_scale_and_the_side_it_is_seen_from(number:
     moved = placement.vectors_to_px(MM, np.full_like(MM, 0.3))
     assert placement.vectors_to_mm(placement.to_px(MM), moved) == pytest.approx(0.3)
     assert placement.jacobian(MM) @ placement.matrix == pytest.approx(np.broadcast_to(np.eye(2), (5, 2, 2)))
-    again = Placement.from_document(placement.to_document())
-    assert again.to_px(MM) == pytest.approx(placement.to_px(MM))
+    reread = Placement.from_document(placement.to_document())
+    assert reread.to_px(MM) == pytest.approx(placement.to_px(MM))
 
 
 def test_points_on_a_line_leave_a_doubt_that_is_told(caplog: pytest.LogCaptureFixture) -> None:
@@ -315,12 +315,12 @@ def test_points_on_a_line_leave_a_doubt_that_is_told(caplog: pytest.LogCaptureFi
 
 
 def test_a_pair_beyond_what_the_others_explain_is_named(caplog: pytest.LogCaptureFixture) -> None:
-    given = pairs(5)
-    given[:, 2:] += np.random.default_rng(1).normal(scale=0.4, size=(5, 2))
-    Placement.fit(given)
+    point_pairs = pairs(5)
+    point_pairs[:, 2:] += np.random.default_rng(1).normal(scale=0.4, size=(5, 2))
+    Placement.fit(point_pairs)
     assert not caplog.text
-    given[3, 2] += 25
-    Placement.fit(given)
+    point_pairs[3, 2] += 25
+    Placement.fit(point_pairs)
     assert "leaves residuals of" in caplog.text
     assert "mesh.points[3]" in caplog.text
 
@@ -328,9 +328,9 @@ def test_a_pair_beyond_what_the_others_explain_is_named(caplog: pytest.LogCaptur
 def test_the_scale_s_uncertainty_is_that_of_the_residuals() -> None:
     random, scales, stated = np.random.default_rng(0), [], []
     for _ in range(200):
-        given = pairs(5)
-        given[:, 2:] += random.normal(size=(5, 2))
-        placement = Placement.fit(given)
+        point_pairs = pairs(5)
+        point_pairs[:, 2:] += random.normal(size=(5, 2))
+        placement = Placement.fit(point_pairs)
         scales.append(placement.mm_per_pixel)
         stated.append(placement.mm_per_pixel_std)
     assert np.std(scales) / np.sqrt(np.mean(np.square(stated))) == pytest.approx(1, abs=0.15)
@@ -388,18 +388,18 @@ def plate() -> FiniteElementMesh:
 
 def test_what_lies_outside_the_image_or_the_region_is_left_out_and_counted(caplog: pytest.LogCaptureFixture) -> None:
     mesh, placement = pickle.loads(pickle.dumps((plate(), Placement.fit([[0, 0, 10, 50], [10, 0, 20, 50]]))))
-    kept, placed, region = on_image(mesh, placement, (80, 80))
-    assert len(kept.elements) == len(mesh.elements)
+    inner_mesh, placed, region = place_on_image(mesh, placement, (80, 80))
+    assert len(inner_mesh.elements) == len(mesh.elements)
     assert np.abs(region.mask.sum() - placed.areas.sum()) < 0.05 * placed.areas.sum()
-    kept, placed, region = on_image(mesh, placement, (80, 45))
+    inner_mesh, placed, region = place_on_image(mesh, placement, (80, 45))
     assert f"{24} of {48} triangles lie outside the image" in caplog.text
-    assert (kept.points[:, 0] <= 30).all()
-    assert set(kept.node_numbers) <= set(mesh.node_numbers)
-    assert placed.nodes == pytest.approx(kept.points * [1, -1] + [10, 50])
+    assert (inner_mesh.points[:, 0] <= 30).all()
+    assert set(inner_mesh.node_numbers) <= set(mesh.node_numbers)
+    assert placed.nodes == pytest.approx(inner_mesh.points * [1, -1] + [10, 50])
     half = np.zeros((80, 80), dtype=bool)
     half[:, :40] = True
-    kept, _, _ = on_image(mesh, placement, (80, 80), Region.from_mask(half))
+    inner_mesh, _, _ = place_on_image(mesh, placement, (80, 80), Region.from_mask(half))
     assert "lie outside the region" in caplog.text
-    assert set(kept.element_numbers) < set(mesh.element_numbers)
+    assert set(inner_mesh.element_numbers) < set(mesh.element_numbers)
     with pytest.raises(RegionError, match="place it at x 10 to 70, y 10 to 50 px of an image of 8 x 8"):
-        on_image(mesh, placement, (8, 8))
+        place_on_image(mesh, placement, (8, 8))

@@ -202,8 +202,8 @@ def test_where_the_region_is_most_of_the_frame_all_of_it_is_read(tmp_path: Path,
     for index in range(2):
         write_tiff(tmp_path / f"f{index}.tif", grey_frame(3, (0.1 * index, 0.0), shape=SHAPE))
     made = Plan.from_settings(settings(region="rectangle = [100, 100, 700, 600]"))
-    assert made.window == Window.whole(SHAPE)
-    assert made.window_of(np.full_like(made.reference.mesh.nodes, 300.0)) == Window.whole(SHAPE)
+    assert made.window == Window.of_frame(SHAPE)
+    assert made.window_of(np.full_like(made.reference.mesh.nodes, 300.0)) == Window.of_frame(SHAPE)
 
 
 def test_memory_follows_the_region_and_not_the_frame(tmp_path: Path, settings: Settings) -> None:
@@ -224,6 +224,6 @@ def test_memory_follows_the_region_and_not_the_frame(tmp_path: Path, settings: S
         tracemalloc.stop()
         return found
 
-    large, window = (2000, 2000), Window.around(np.array([[900, 900], [999, 999]]), 128 + 96, (2000, 2000))
+    large, window = (2000, 2000), Window.around_points(np.array([[900, 900], [999, 999]]), 128 + 96, (2000, 2000))
     corners = [900 - window.origin[0], 900 - window.origin[1], 999 - window.origin[0], 999 - window.origin[1]]
     assert peak(large, (900, 900, 999, 999)) < 1.3 * peak(window.shape, tuple(corners))

@@ -69,7 +69,7 @@ def test_map_has_the_right_value_at_every_place(tmp_path: Path, reference: AnyAr
 
 def test_a_map_of_a_mesh_with_a_crack_has_the_values_of_both_sides(tmp_path: Path) -> None:
     mesh = Tri3Mesh.from_region(Region.from_rectangle((10, 5, 110, 75), (80, 120)), 20, [[(0, 40), (60, 40)]])
-    above = mesh.places[:, 1] < 40
+    above = mesh.observation_points[:, 1] < 40
     left = mesh.nodes[:, 0] < 59
     origin = Origin(nodes=mesh.nodes, elements=mesh.elements, names=["one"], lights=["one"])
     with ResultStore.create(tmp_path / "out", origin) as store:

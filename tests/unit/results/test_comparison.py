@@ -201,7 +201,7 @@ def test_nodes_without_data_are_left_out_and_so_is_their_strain(tmp_path):
     assert np.isnan(blank.fit.scale)
     assert blank.agreement["levelled", "displacement"].values == 0
     assert np.flatnonzero(np.isnan(made.ratio("levelled", "u"))).tolist() == [7]
-    around = MESH.beside(np.arange(NODES) == 7)
+    around = MESH.adjacent_nodes(np.arange(NODES) == 7)
     assert np.isnan(made.ratio("nodes", "eyy")).tolist() == around.tolist()
     assert made.agreement["nodes", "displacement"].values == 2 * (NODES - 1)
 

@@ -77,7 +77,7 @@ def test_the_arrays_are_in_millimetres_and_seconds(file: h5py.File) -> None:
 
 
 def test_strain_is_finite_and_blank_beside_what_is_not_measured(file: h5py.File) -> None:
-    e, blank = strain(), MESH.beside(np.arange(NODES) == 0)
+    e, blank = strain(), MESH.adjacent_nodes(np.arange(NODES) == 0)
     for name, value in {"exx": e[0, 0], "eyy": e[1, 1], "exy": e[0, 1]}.items():
         np.testing.assert_array_equal(np.isnan(file[name][2]), blank)
         np.testing.assert_allclose(file[name][2][~blank], value, rtol=1e-5)

@@ -512,7 +512,7 @@ def cracked(path: Path, scale: ScaleSettings | None = SCALE) -> Result:
     )
     names = [f"frame {index}" for index in range(5)]
     origin = Origin(nodes=CRACKED.nodes, elements=CRACKED.elements, names=names, lights=("light",), settings=settings)
-    above, behind = CRACKED.places[:, 1] < 100, CRACKED.nodes[:, 0] < 99
+    above, behind = CRACKED.observation_points[:, 1] < 100, CRACKED.nodes[:, 0] < 99
     count = len(CRACKED.nodes)
     with ResultStore.create(path, origin) as store:
         for index in range(5):

@@ -21,7 +21,7 @@ from rgbmidic.illumination.separation import separate
 from rgbmidic.lab.virtual import Scene, State, record, render, strained_plate, truth, turned
 from rgbmidic.lab.virtual.rendering import paint, plate_scene, sphere_scene
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.scene.forecast import Instrument, node_constant, trace_change
+from rgbmidic.scene.forecast import Instrument, nodal_variance_factor, trace_change
 from rgbmidic.scene.speckle import SpecklePatch, SpeckleSpectrum, cover_covariance
 from rgbmidic.scene.zones import material_points, predict_zones
 
@@ -51,9 +51,9 @@ def test_the_node_constant_is_the_scatter_of_nodes_recovered_from_fits_to_noise(
         geometry = pixels.local_x, pixels.local_y, pixels.offsets, pixels.barycentric
         element_vector(*np.ones_like([first, second]), first, second, *geometry, parts)
         loads += [np.bincount(mesh.elements.ravel(), weights=parts[..., c].ravel()) for c in (0, 1)]
-    found = recovery.value @ np.linalg.solve(mesh.mass_matrix.toarray(), np.transpose(loads))
+    recovered = recovery.value @ np.linalg.solve(mesh.mass_matrix.toarray(), np.transpose(loads))
     inner = (abs(mesh.nodes - 75) < 40).all(axis=1)  # as many nodes with eight triangles as with four
-    assert found[inner].var() * size**2 == pytest.approx(node_constant(), rel=0.05)
+    assert recovered[inner].var() * size**2 == pytest.approx(nodal_variance_factor(), rel=0.05)
 
 
 def test_the_cover_s_covariance_is_that_of_the_paint():
@@ -112,10 +112,10 @@ def forecast(made: Instrument, displacement: float = 0.3) -> float:
 def test_noise_falls_as_the_inverse_of_the_element_size_and_as_the_root_of_the_number_of_lights():
     assert forecast(instrument()) == pytest.approx(2 * forecast(instrument(element_size=50.0)))
     grey = plate_scene(size=64, kind="monochrome")
-    one = Instrument.of(replace(grey, lights=grey.lights[:1]))
+    model = Instrument.of(replace(grey, lights=grey.lights[:1]))
     three = Instrument.of(replace(grey, lights=tuple(replace(grey.lights[0], name=name) for name in "abc")))
     # rounding and read noise are per frame: equal lights in succession are independent (paper, section 4)
-    assert forecast(one) / forecast(three) == pytest.approx(np.sqrt(3), rel=1e-6)
+    assert forecast(model) / forecast(three) == pytest.approx(np.sqrt(3), rel=1e-6)
 
 
 def test_crosstalk_costs_every_light_what_unmixing_amplifies():
@@ -134,17 +134,17 @@ def test_more_light_and_a_better_camera_measure_better():
 
 
 def test_green_is_the_best_colour_of_a_bayer_camera():
-    made = instrument("bayer")
-    zones = still(made.scene)
-    share = made.weights(zones, zones)[:, 0, 0]
+    model = instrument("bayer")
+    zones = still(model.scene)
+    share = model.weights(zones, zones)[:, 0, 0]
     assert share[1] > 1.5 * max(share[0], share[2])
 
 
 def test_the_trace_of_the_mosaic_is_that_of_a_demosaiced_texture():
-    made = instrument("bayer")
-    camera = made.scene.camera
-    texture = SpecklePatch.of(made.scene, 192).texture
-    crosstalk = camera.true_crosstalk(made.scene.lights)
+    model = instrument("bayer")
+    camera = model.scene.camera
+    texture = SpecklePatch.of(model.scene, 192).texture
+    crosstalk = camera.true_crosstalk(model.scene.lights)
     errors = []
     for cfa in ("RGGB", "GRBG"):  # the texture has moved by one pixel along x
         colours = np.tile(np.array([["RGB".index(c) for c in cfa[:2]], ["RGB".index(c) for c in cfa[2:]]]), (96, 96))
@@ -152,7 +152,7 @@ def test_the_trace_of_the_mosaic_is_that_of_a_demosaiced_texture():
         mosaic = LinearMosaic(values=values, saturated=np.zeros_like(values, dtype=bool), cfa=cfa, full_scale=4031.0)
         errors.append(separate(mosaic, crosstalk, "malvar").values / 900)
     change = [apply_prefilter(image, "binomial")[10:-10, 10:-10].var() for image in errors[1] - errors[0]]
-    expected = np.einsum("cjj,c->j", made.residual.mosaic, trace_change(np.array([1.0, 0.0])))
+    expected = np.einsum("cjj,c->j", model.residual.mosaic, trace_change(np.array([1.0, 0.0])))
     np.testing.assert_allclose(change, expected, rtol=0.25)
 
 
@@ -163,16 +163,16 @@ def test_a_texture_that_has_not_moved_or_moved_by_two_pixels_keeps_the_mosaic_s_
 
 
 def test_where_no_light_sees_there_is_no_number_and_saturation_is_told():
-    made = instrument()
-    behind = tuple(replace(light, position=(0.0, 0.0, 900.0)) for light in made.scene.lights)
-    dark = still(made.scene, behind)
-    assert np.isnan(made.forecast(dark, dark, np.zeros((3, 1, 2))).std).all()
-    zones = still(made.scene)
+    model = instrument()
+    behind = tuple(replace(light, position=(0.0, 0.0, 900.0)) for light in model.scene.lights)
+    dark = still(model.scene, behind)
+    assert np.isnan(model.forecast(dark, dark, np.zeros((3, 1, 2))).std).all()
+    zones = still(model.scene)
     bright = replace(zones, irradiance=zones.irradiance * np.array([1.0, 5.0, 1.0]).reshape(3, 1, 1))
     # green's glare saturates green's channel, through which red and blue are hardly seen
-    np.testing.assert_array_equal(made.saturated(bright).all(axis=(1, 2)), [False, True, False])
-    assert not made.saturated(zones).any()
-    weights = made.weights(zones, bright)
+    np.testing.assert_array_equal(model.is_saturated(bright).all(axis=(1, 2)), [False, True, False])
+    assert not model.is_saturated(zones).any()
+    weights = model.weights(zones, bright)
     np.testing.assert_array_equal(weights[1], 0)
     assert (weights[[0, 2]] > 0).all()
 
@@ -185,7 +185,7 @@ def observed(scene: Scene, state: State, start: tuple[float, float], inset: int 
 
     def shot(image, seed):
         if grey:
-            frames = [record(image, scene.camera, scene.lights, seed=seed * 9 + i, on=(light.name,))
+            frames = [record(image, scene.camera, scene.lights, seed=seed * 9 + i, shining=(light.name,))
                       for i, light in enumerate(scene.lights)]  # fmt: skip
             return np.concatenate([linearise(frame).values for frame in frames])
         frame = linearise(record(image, scene.camera, scene.lights, seed=seed))
@@ -248,9 +248,9 @@ def test_the_erratic_part_of_a_reflection_has_the_variance_that_is_forecast():
     mat = replace(scene, surface=replace(scene.surface, white=white, black=black))
     specular = render(scene) - render(mat)
     zones = predict_zones(scene)
-    made = Instrument.of(scene, prefilter="none")
+    model = Instrument.of(scene, prefilter="none")
     # against a state with other facets, half of the change is this state's own
-    variance = made.residual.erratic * made._erratic(zones, zones, common=0.0) / 2 * zones.level**2
+    variance = model.residual.erratic * model._erratic(zones, zones, common=0.0) / 2 * zones.level**2
     for light in range(3):
         ripple = specular[light] - cv2.GaussianBlur(specular[light], (0, 0), 8)
         measured = cv2.GaussianBlur(ripple**2, (0, 0), 12)[30:-30, 30:-30]

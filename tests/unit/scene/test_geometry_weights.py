@@ -14,7 +14,7 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.virtual import State
 from rgbmidic.scene.geometry_weights import GeometryWeights
 from rgbmidic.scene.scene import read_scene
-from rgbmidic.scene.zones import material_points, placed, predict_zones
+from rgbmidic.scene.zones import material_points, points_and_normals, predict_zones
 from rgbmidic.settings import TestSettings
 
 SCENE = """
@@ -60,8 +60,8 @@ def test_soft_weights_are_low_where_a_light_reflects_and_the_motion_changes_it(p
     assert weights.max() <= 1
     np.testing.assert_array_equal(found.reference(IMAGES), 1)
     scene = read_scene(tmp_path / "scene.toml").scene
-    seen = material_points(scene, State(angle_deg=6.0))
-    before, after = (predict_zones(scene, State(angle_deg=angle), material=seen).fraction for angle in (0.0, 6.0))
+    material = material_points(scene, State(angle_deg=6.0))
+    before, after = (predict_zones(scene, State(angle_deg=angle), material=material).fraction for angle in (0.0, 6.0))
     for light in (0, 1):
         changed, calm = abs(after - before)[light] > 0.2, np.maximum(after, before)[light] < 0.02
         assert changed.mean() > 0.05
@@ -80,9 +80,9 @@ def test_binary_weights_are_those_of_the_angle_at_every_pixel(prepare, tmp_path)
 
 
 def test_the_reference_excludes_what_any_of_its_frames_excludes(prepare):
-    found = prepare(limit_deg=15.0, reference=[0, 2])
-    both = found.reference(IMAGES)
-    np.testing.assert_array_equal(both, np.minimum(found.deformed(IMAGES, 0), found.deformed(IMAGES, 2)))
+    weights = prepare(limit_deg=15.0, reference=[0, 2])
+    both = weights.reference(IMAGES)
+    np.testing.assert_array_equal(both, np.minimum(weights.deformed(IMAGES, 0), weights.deformed(IMAGES, 2)))
 
 
 @pytest.mark.parametrize("limit_deg", [None, 15.0])
@@ -125,8 +125,8 @@ def test_without_states_every_frame_is_the_body_at_rest_and_the_reflections_coun
 
 def test_weights_by_geometry_can_be_pickled(prepare):
     weights = prepare()
-    again = pickle.loads(pickle.dumps(weights))
-    np.testing.assert_array_equal(again.deformed(IMAGES, 1), weights.deformed(IMAGES, 1))
+    unpickled = pickle.loads(pickle.dumps(weights))
+    np.testing.assert_array_equal(unpickled.deformed(IMAGES, 1), weights.deformed(IMAGES, 1))
 
 
 def test_beside_the_body_nothing_is_seen(prepare):
@@ -140,7 +140,7 @@ def test_a_height_map_takes_the_place_of_the_body(prepare, tmp_path):
     scene = SCENE.replace('kind = "sphere"', 'kind = "plate"\nwidth = 300.0\nheight = 300.0')
     (tmp_path / "scene.toml").write_text(SCENE)
     sphere = read_scene(tmp_path / "scene.toml").scene
-    points, _ = placed(sphere, material_points(sphere))
+    points, _ = points_and_normals(sphere, material_points(sphere))
     np.save(tmp_path / "heights.npy", sphere.body.front[2] - points[2])
     mapped = prepare(scene, height_map="heights.npy", limit_deg=15.0).deformed(IMAGES, 1)
     modelled = prepare(SCENE, limit_deg=15.0).deformed(IMAGES, 1)

@@ -12,7 +12,7 @@ from rgbmidic.lab.measures import Lobe
 from rgbmidic.lab.virtual import Camera, Finish, Light, Sphere, Surface
 from rgbmidic.lab.virtual.rendering import plate_scene, sphere_scene
 from rgbmidic.scene.geometry_weights import angle_weights, surface_from_heights
-from rgbmidic.scene.zones import Reflectance, Zones, material_points, placed, zones_on_surface
+from rgbmidic.scene.zones import Reflectance, Zones, material_points, points_and_normals, zones_on_surface
 
 PAINT = Finish(albedo=0.5, gloss=0.7, lobe_deg=6.0, slope_deg=0.0)
 POINT, NORMAL = np.array([0.0, 0.0, 600.0]), np.array([0.0, 0.0, -1.0])
@@ -34,17 +34,17 @@ def reflection(points, normals, lamps, paint: Finish = PAINT) -> Zones:
 
 def test_a_lamp_in_the_mirror_direction_does_not_deviate():
     scene = plate_scene(tilt_deg=(8.0, -3.0))
-    points, normals = placed(scene, np.zeros((3, 1)))
-    found = reflection(points, normals, [scene.mirror_position(450.0)])
-    np.testing.assert_allclose(found.deviation_deg, 0, atol=1e-5)
-    np.testing.assert_allclose(found.slopes, 0, atol=1e-7)
+    points, normals = points_and_normals(scene, np.zeros((3, 1)))
+    result = reflection(points, normals, [scene.mirror_position(450.0)])
+    np.testing.assert_allclose(result.deviation_deg, 0, atol=1e-5)
+    np.testing.assert_allclose(result.slopes, 0, atol=1e-7)
 
 
 def test_the_light_turns_twice_as_far_as_the_half_way_vector():
     angles = np.array([4.0, 15.0, 40.0])
-    found = reflection(POINT[:, None], NORMAL[:, None], [lamp_at(angle) for angle in angles])
-    np.testing.assert_allclose(found.deviation_deg[:, 0], angles, atol=1e-9)
-    half = np.degrees(np.arctan(np.linalg.norm(found.slopes[:, :, 0], axis=1)))
+    result = reflection(POINT[:, None], NORMAL[:, None], [lamp_at(angle) for angle in angles])
+    np.testing.assert_allclose(result.deviation_deg[:, 0], angles, atol=1e-9)
+    half = np.degrees(np.arctan(np.linalg.norm(result.slopes[:, :, 0], axis=1)))
     np.testing.assert_allclose(half, angles / 2, atol=1e-9)
 
 
@@ -81,7 +81,7 @@ def test_binary_weights_exclude_up_to_the_limit():
 def test_a_height_map_of_a_sphere_reflects_like_the_sphere():
     scene = sphere_scene(size=96)
     scene = replace(scene, camera=replace(scene.camera, focal_px=2000.0))
-    points, normals = placed(scene, material_points(scene))
+    points, normals = points_and_normals(scene, material_points(scene))
     front = scene.body.front[2]
     from_map = surface_from_heights(front - points[2], scene)
     np.testing.assert_allclose(from_map[0], points, atol=1e-9)
@@ -105,9 +105,9 @@ def test_what_makes_no_sense_is_refused(call, message):
 
 
 def test_the_camera_is_where_the_scene_has_it():
-    # points of `placed` are in camera axes: the front point projects on the principal point
+    # points of `points_and_normals` are in camera axes: the front point projects on the principal point
     scene = sphere_scene(size=64)
-    points, _ = placed(scene, np.array([[0.0], [0.0], [-Sphere().radius]]))
+    points, _ = points_and_normals(scene, np.array([[0.0], [0.0], [-Sphere().radius]]))
     camera: Camera = scene.camera
     x = camera.focal_px * points[0] / points[2] + camera.centre[0]
     np.testing.assert_allclose(x, camera.centre[0], atol=1e-9)

@@ -12,7 +12,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.lab.virtual import Cylinder, Plate, Scene, State, Surface, render, turned
 from rgbmidic.lab.virtual.rendering import paint, sphere_scene
 from rgbmidic.scene.camera import reference_camera, three_lights
-from rgbmidic.scene.zones import REFLECTS, Reflectance, macroscopic, material_points, predict_zones
+from rgbmidic.scene.zones import REFLECTS, Reflectance, macroscopic_reflectance, material_points, predict_zones
 
 OVERLAP = 0.9
 """Common part of predicted and rendered zone over both together; the zone's edge moves by a few pixels."""
@@ -74,15 +74,15 @@ def test_the_predicted_level_is_the_rendered_one():
 
 
 def test_wrinkles_widen_the_lobe_and_keep_its_volume():
-    smooth = macroscopic(
+    smooth = macroscopic_reflectance(
         Surface(white=replace(paint().white, slope_deg=0.0), black=replace(paint().black, slope_deg=0))
     )
-    rough = macroscopic(paint())
+    rough = macroscopic_reflectance(paint())
     assert smooth.width_deg == pytest.approx(4.0)
     assert smooth.specular == pytest.approx(1.5)
     assert rough.width_deg > 1.3 * smooth.width_deg
     assert rough.specular * rough.width_deg**2 == pytest.approx(smooth.specular * smooth.width_deg**2)
-    assert macroscopic(replace(paint(), dome=0.004)).width_deg > rough.width_deg
+    assert macroscopic_reflectance(replace(paint(), dome=0.004)).width_deg > rough.width_deg
 
 
 def test_points_of_the_body_keep_their_light_on_a_mat_paint_and_their_zone_moves_on_a_turning_one():
@@ -111,6 +111,6 @@ def test_lamps_may_be_moved_without_a_new_scene():
 
 def test_a_surface_without_albedo_is_still_a_number():
     black = replace(paint(), white=replace(paint().white, albedo=0.0), black=replace(paint().black, albedo=0.0))
-    assert macroscopic(black).diffuse > 0
+    assert macroscopic_reflectance(black).diffuse > 0
     with pytest.raises(InputError):
         Reflectance(diffuse=-1.0, specular=0.0, width_deg=1.0)

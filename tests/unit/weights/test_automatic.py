@@ -41,7 +41,7 @@ def states(gloss: float) -> tuple[IlluminationImages, IlluminationImages]:
     for number, state in enumerate((State(), State(angle_deg=-0.3))):
         rendered = render(made, state)
         shots = [
-            linearise(record(rendered, made.camera, made.lights, seed=10 * number + i, on=(name,)))
+            linearise(record(rendered, made.camera, made.lights, seed=10 * number + i, shining=(name,)))
             for i, name in enumerate(names)
         ]
         images.append(

@@ -46,7 +46,7 @@ def erratic_pixels(rng, count=40):
 def test_bundles_band_and_lobe_of_erratic_pixels():
     white, levels = erratic_pixels(np.random.default_rng(2))
     result = goniometry(ANGLES, levels)
-    assert (result.white == white).all()
+    assert (result.is_white == white).all()
     assert result.lobe.centre_deg == pytest.approx(15, abs=4 * result.lobe.std[2])
     first, last = result.band
     assert -15 < first < 5

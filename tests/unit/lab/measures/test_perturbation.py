@@ -5,7 +5,7 @@ import pytest
 
 from rgbmidic.errors import InputError
 from rgbmidic.fields import high_pass
-from rgbmidic.lab.measures import Area, area_means, area_stds, areas_along_x, perturbation, residual_percent
+from rgbmidic.lab.measures import MeasureArea, area_means, area_stds, areas_along_x, perturbation, residual_percent
 
 SHAPE = (300, 420)
 Y, X = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
@@ -21,7 +21,7 @@ def test_areas_stand_along_x_and_have_the_papers_size():
 
 def test_area_beyond_the_image_is_refused():
     with pytest.raises(InputError, match=r"A0.*420 x 300"):
-        area_stds(X, [Area(name="A0", centre=(410.0, 100.0))])
+        area_stds(X, [MeasureArea(name="A0", centre=(410.0, 100.0))])
 
 
 def test_rotation_stretch_and_bending_of_the_whole_field_give_no_perturbation():
@@ -40,7 +40,7 @@ def test_a_wave_keeps_what_the_gaussian_takes_from_its_copy():
 
 def test_noise_gives_its_standard_deviation_everywhere_in_the_field():
     noise = np.random.default_rng(0).normal(scale=0.01, size=SHAPE)
-    inner, edge = (Area(name="A", centre=centre) for centre in ((200.0, 150.0), (25.0, 50.0)))
+    inner, edge = (MeasureArea(name="A", centre=centre) for centre in ((200.0, 150.0), (25.0, 50.0)))
     assert perturbation(noise, [inner, edge]) == pytest.approx(0.01, rel=0.05)
 
 
@@ -49,7 +49,7 @@ def test_what_lies_beyond_the_field_does_not_matter():
     y, x = np.mgrid[:600, :800].astype(float)
     field = 2e-3 * x + np.sin(x / 300) * np.cos(y / 250)
     field += np.random.default_rng(1).normal(scale=0.01, size=field.shape)
-    area = Area(name="A", centre=(300.0, 300.0))
+    area = MeasureArea(name="A", centre=(300.0, 300.0))
     whole = perturbation(field, [area])
     cut = field.copy()
     cut[:, :215] = np.nan  # the edge is 1.5 sigma from the area
@@ -61,7 +61,7 @@ def test_gaps_take_no_part_and_a_half_empty_area_gives_nothing():
     field = 0.5 + 0.01 * X + rng.normal(scale=0.01, size=SHAPE)
     holes = rng.random(SHAPE) < 0.2
     field[holes] = np.nan
-    area = Area(name="A", centre=(200.0, 150.0))
+    area = MeasureArea(name="A", centre=(200.0, 150.0))
     assert perturbation(field, [area]) == pytest.approx(0.01, rel=0.06)
     assert area_means(field, [area]) == pytest.approx(2.5, abs=0.01)
     field[:, 195:] = np.nan

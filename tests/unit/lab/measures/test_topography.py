@@ -43,8 +43,8 @@ def test_slope_of_a_plane_and_its_uncertainty():
 @pytest.mark.parametrize("spacing", [20.0, 25.0, 40.0])
 def test_spacing_of_wrinkles_comes_out_beside_a_longer_relief(spacing):
     relief = 3 * np.sin(X / 60) * np.sin(Y / 70)
-    found, std = wrinkle_spacing(wrinkles(spacing) + relief, PITCH, longest=60.0)
-    assert found == pytest.approx(spacing, rel=0.06)
+    result, std = wrinkle_spacing(wrinkles(spacing) + relief, PITCH, longest=60.0)
+    assert result == pytest.approx(spacing, rel=0.06)
     assert 0 < std < 0.06 * spacing
 
 
@@ -55,17 +55,17 @@ def test_slope_of_each_paint_without_the_noise():
     for where, rms in ((white, 0.3), (~white, 0.6)):
         # central differences see sin(2 pi p/l)/(2 pi p/l) of the slope of a wave of length l
         slope = rms * 2 * np.pi / 25 * np.sinc(2 * PITCH / 25)
-        found = rms_slope(height + noise, where, PITCH, height_std=0.05)
-        assert np.tan(np.radians(found)) == pytest.approx(slope, rel=0.1)
+        result = rms_slope(height + noise, where, PITCH, height_std=0.05)
+        assert np.tan(np.radians(result)) == pytest.approx(slope, rel=0.1)
 
 
 def test_paints_are_told_by_their_intensity():
     white = (X // 130) % 2 == 0
     intensity = np.where(white, 0.8, 0.1) + np.random.default_rng(3).normal(scale=0.05, size=X.shape)
     intensity[5, 5] = np.nan
-    found = paint_classes(intensity)
-    assert (found == white).mean() > 0.999
-    assert not found[5, 5]
+    result = paint_classes(intensity)
+    assert (result == white).mean() > 0.999
+    assert not result[5, 5]
     with pytest.raises(InputError, match="two paints"):
         paint_classes(np.ones((10, 10)))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rgbmidic.errors import InputError
-from rgbmidic.lab.planning import CONSTANTS, Plan, make_plan, propose_colours, propose_lamps
+from rgbmidic.lab.planning import CONSTANTS, LampPlan, make_plan, propose_colours, propose_lamps
 from rgbmidic.lab.virtual import Cylinder, Light, Plate, Scene, State, turned
 from rgbmidic.lab.virtual.rendering import paint, sphere_scene
 from rgbmidic.scene.camera import reference_camera, three_lights
@@ -16,7 +16,7 @@ from rgbmidic.scene.scene import DatasetSettings, Experiment
 from rgbmidic.scene.zones import REFLECTS, predict_zones
 
 
-def plan(scene: Scene, *states: State, **output: object) -> Plan:
+def plan(scene: Scene, *states: State, **output: object) -> LampPlan:
     return make_plan(Experiment(scene=scene, states=states, output=DatasetSettings(**output)))
 
 
@@ -39,36 +39,36 @@ def with_lamps(scene: Scene, *directions: tuple[float, float]) -> Scene:
     return replace(scene, lights=lights)
 
 
-def overlap(made: Plan) -> float:
+def overlap(made: LampPlan) -> float:
     return max(made.fraction(outlook.reflects.sum(axis=0) > 1) for outlook in made.outlooks)
 
 
 def test_zones_are_those_of_both_states_at_the_points_of_the_reference():
     scene = coarse(sphere_scene())
-    made = plan(scene, turned(2.0), turned(6.0))
-    assert made.inside.mean() > 0.5
+    lamp_plan = plan(scene, turned(2.0), turned(6.0))
+    assert lamp_plan.inside.mean() > 0.5
     shares = [predict_zones(scene).fraction, None]
-    rows, columns = (np.round(a[made.inside]).astype(int) for a in (made.y, made.x))
+    rows, columns = (np.round(a[lamp_plan.inside]).astype(int) for a in (lamp_plan.y, lamp_plan.x))
     near = abs(shares[0][:, rows, columns] - REFLECTS) > 0.02
     at_rest = shares[0][:, rows, columns] > REFLECTS
     # what reflects at rest reflects in every comparison with the state at rest
-    for outlook in made.outlooks:
-        assert outlook.reflects[:, made.inside][near & at_rest].all()
+    for outlook in lamp_plan.outlooks:
+        assert outlook.reflects[:, lamp_plan.inside][near & at_rest].all()
     # a reflection that moves covers more of the field, the farther the more
-    covered = [outlook.reflects[0][made.inside].mean() for outlook in made.outlooks]
+    covered = [outlook.reflects[0][lamp_plan.inside].mean() for outlook in lamp_plan.outlooks]
     assert at_rest[0].mean() < covered[0] < covered[1]
 
 
 def test_the_field_stays_in_view_and_the_uncertainty_is_a_number_on_it():
-    made = plan(coarse(sphere_scene()), turned(4.0))
-    x0, y0, x1, y1 = made.field
-    motion = made.outlooks[0].displacement[:, made.inside]
+    lamp_plan = plan(coarse(sphere_scene()), turned(4.0))
+    x0, y0, x1, y1 = lamp_plan.field
+    motion = lamp_plan.outlooks[0].displacement[:, lamp_plan.inside]
     assert x0 > 20 + np.abs(motion[0]).max() - 1
     assert y0 > 20
     assert x1 < 159
     assert y1 < 159
-    assert np.isfinite(made.outlooks[0].std[made.inside]).all()
-    assert 0 < made.std < 0.1
+    assert np.isfinite(lamp_plan.outlooks[0].std[lamp_plan.inside]).all()
+    assert 0 < lamp_plan.std < 0.1
     assert plan(coarse(sphere_scene()), turned(4.0), region=(40.0, 50.0, 90.0, 95.0)).field == (40, 50, 90, 95)
 
 
@@ -94,18 +94,18 @@ def test_lights_that_all_reflect_in_one_place_leave_none():
 
 def test_moved_lamps_overlap_less_keep_their_distance_and_stay_apart():
     scene = with_lamps(coarse(sphere_scene()), (0.0, 20.0), (25.0, 20.0), (50.0, 20.0))
-    made = plan(scene, turned(1.0), turned(4.0))
-    proposal = propose_lamps(made)
-    assert overlap(made) > 0.05
-    assert overlap(proposal) < 0.2 * overlap(made)
+    lamp_plan = plan(scene, turned(1.0), turned(4.0))
+    proposal = propose_lamps(lamp_plan)
+    assert overlap(lamp_plan) > 0.05
+    assert overlap(proposal) < 0.2 * overlap(lamp_plan)
     assert proposal.gain > 1.02
-    assert proposal.std <= 1.2 * made.std
+    assert proposal.std <= 1.2 * lamp_plan.std
     front = np.array(scene.body.front)
     towards = [np.array(light.position) - front for light in proposal.scene.lights]
     np.testing.assert_allclose([np.linalg.norm(t) for t in towards], 550.0)
     unit = np.array([t / np.linalg.norm(t) for t in towards])
     cosines = (unit @ unit.T)[np.triu_indices(3, 1)]
-    assert cosines.max() <= np.cos(np.radians(CONSTANTS.apart)) + 1e-9
+    assert cosines.max() <= np.cos(np.radians(CONSTANTS.min_angle)) + 1e-9
     # the proposal's figures are those of a plan made for it
     again = plan(replace(scene, lights=proposal.scene.lights), turned(1.0), turned(4.0))
     assert again.std == pytest.approx(proposal.std)
@@ -126,13 +126,13 @@ def test_lamps_of_a_cylinder_go_to_its_ends():
 
 def test_green_gets_the_light_that_reflects_least_before_a_bayer_camera():
     scene = with_lamps(coarse(sphere_scene()), (180.0, 60.0), (0.0, 22.0), (270.0, 25.0))
-    made = plan(scene, turned(4.0))
-    reflecting = [made.fraction(mask) for mask in made.outlooks[0].reflects]
+    lamp_plan = plan(scene, turned(4.0))
+    reflecting = [lamp_plan.fraction(mask) for mask in lamp_plan.outlooks[0].reflects]
     assert int(np.argmin(reflecting)) == 0  # red has the best place
-    proposal = propose_colours(made)
+    proposal = propose_colours(lamp_plan)
     places = {light.name: np.array(light.position) for light in scene.lights}
     np.testing.assert_allclose(dict_of(proposal.scene.lights)["green"], places["red"], atol=1e-6)
-    assert proposal.std < made.std
+    assert proposal.std < lamp_plan.std
 
 
 def dict_of(lights):
@@ -147,9 +147,9 @@ def test_where_colours_are_alike_nothing_is_exchanged():
 
 
 def test_a_plan_without_states_compares_the_body_with_itself():
-    made = plan(coarse(sphere_scene()))
-    assert len(made.outlooks) == 1
-    np.testing.assert_allclose(made.outlooks[0].displacement[:, made.inside], 0, atol=1e-9)
+    lamp_plan = plan(coarse(sphere_scene()))
+    assert len(lamp_plan.outlooks) == 1
+    np.testing.assert_allclose(lamp_plan.outlooks[0].displacement[:, lamp_plan.inside], 0, atol=1e-9)
 
 
 def test_a_paint_without_droplets_cannot_be_planned():

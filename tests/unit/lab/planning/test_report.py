@@ -14,7 +14,7 @@ from rgbmidic.errors import InputError, ResultError
 from rgbmidic.lab.planning import make_plan, propose_lamps
 from rgbmidic.lab.planning_report import (
     lamp_rows,
-    out_of_plane,
+    out_of_plane_error,
     plan_document,
     plan_figure,
     uncertainty_rows,
@@ -117,7 +117,7 @@ def test_the_command_prints_the_tables_and_writes_the_files(made, tmp_path: Path
 
 def test_a_motion_towards_the_camera_is_what_the_renderer_shows(made):
     _, plan, _ = made
-    told = out_of_plane(plan)
+    told = out_of_plane_error(plan)
     x0, y0, x1, y1 = plan.field
     corners = np.array([[x0, x1, x0, x1], [y0, y0, y1, y1]])
     motion = truth(plan.scene, State(translation=(0.0, 0.0, -0.01)), None, tuple(corners))
@@ -127,8 +127,8 @@ def test_a_motion_towards_the_camera_is_what_the_renderer_shows(made):
     assert strain == pytest.approx(0.01 * told["strain_per_mm"], rel=0.03)  # the plate or sphere is not at one distance
     assert told["edge_px_per_mm"] * 0.01 == pytest.approx(np.linalg.norm(motion, axis=0).max(), rel=0.03)
     assert told["unseen_mm"] * told["edge_px_per_mm"] == pytest.approx(plan.std)
-    assert out_of_plane(plan, 2 * depth)["strain_per_mm"] == pytest.approx(told["strain_per_mm"] / 2)
+    assert out_of_plane_error(plan, 2 * depth)["strain_per_mm"] == pytest.approx(told["strain_per_mm"] / 2)
     assert plan_document(plan, {}, 500.0)["out_of_plane"]["stand_off_mm"] == 500
     for wrong in (0.0, -1.0, float("nan")):
         with pytest.raises(InputError, match="--distance"):
-            out_of_plane(plan, wrong)
+            out_of_plane_error(plan, wrong)

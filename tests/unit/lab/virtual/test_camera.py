@@ -83,11 +83,11 @@ def test_three_ccd_has_every_channel_and_lights_can_be_switched():
     frame = record(images, camera, LIGHTS, seed=0)
     assert isinstance(frame, ChannelFrame)
     assert np.abs(frame.values[:, 0, 0] - 64 - CROSSTALK @ [1000, 2000, 500]).max() <= 0.6
-    green = record(images, camera, LIGHTS, seed=0, on=("green",))
+    green = record(images, camera, LIGHTS, seed=0, shining=("green",))
     assert np.abs(green.values[:, 0, 0] - 64 - CROSSTALK[:, 1] * 2000).max() <= 0.6
-    assert np.abs(record(images, camera, LIGHTS, seed=0, on=()).values - 64.0).max() <= 1
+    assert np.abs(record(images, camera, LIGHTS, seed=0, shining=()).values - 64.0).max() <= 1
     with pytest.raises(InputError, match="infrared"):
-        record(images, camera, LIGHTS, seed=0, on=("infrared",))
+        record(images, camera, LIGHTS, seed=0, shining=("infrared",))
 
 
 def test_seed_decides_the_noise():

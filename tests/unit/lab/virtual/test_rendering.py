@@ -28,7 +28,7 @@ from rgbmidic.lab.virtual import (
     turned,
 )
 from rgbmidic.lab.virtual.dataset import true_calibration
-from rgbmidic.lab.virtual.rendering import _aperture, paint, samples_needed
+from rgbmidic.lab.virtual.rendering import _aperture, paint, rays_per_pixel
 from rgbmidic.scene.camera import NOMINAL_DISTANCE, three_lights
 
 FULL = 4095 - 64
@@ -198,7 +198,7 @@ def test_the_number_of_threads_does_not_change_a_bit():
 def test_sampling_pattern_leaves_no_trace(scene, limit):
     """The error of the default sampling is below the shot noise, and has no peak in its spectrum."""
     image = render(scene)
-    fine = render(replace(scene, camera=replace(scene.camera, samples=int(1.7 * samples_needed(scene)))))
+    fine = render(replace(scene, camera=replace(scene.camera, samples=int(1.7 * rays_per_pixel(scene)))))
     shot = np.sqrt(fine.mean() / scene.camera.gain)
     for error in image - fine:
         assert error.std() < limit * shot

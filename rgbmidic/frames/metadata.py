@@ -27,44 +27,44 @@ from rgbmidic.typing import AnyArray, FloatArray
 
 # What readers share
 
-MAXIMUM_BYTES = 2 * 2**30
+MAX_BYTES = 2 * 2**30
 """Largest frame that is unpacked: 1 Gpx of 16 bit, where large sensors have 150 Mpx, or 400 Mpx by shifting."""
 
-CHECKED_FROM, _COMPRESSION = 32 * 2**20, 100
+CHECKED_BYTES, _COMPRESSION = 32 * 2**20, 100
 """Frames of more bytes than the first are refused when stored in less than their hundredth.
 
 Deflate stores real frames of 8 bit in a quarter (coins in the dark, 4.1), pure noise of .3 DN on a black level of zero
 in a seventeenth, but empty pictures, which bombs are, in a thousandth.
 """
 
-MAXIMUM_FRAMES = 2_000_000
+MAX_FRAMES = 2_000_000
 """Most frames that a header may announce: a camera of 64 GB holds so many of 128x128 pixels of 16 bit."""
 
 
-def damaged(path: Path, reason: object) -> FrameError:
+def damaged_file(path: Path, reason: object) -> FrameError:
     """Return the error for a file that cannot be read whole."""
     return FrameError(f"{path} is damaged or truncated: {reason}")
 
 
 @contextmanager
-def faults_of(path: Path, *passed: type[Exception]) -> Iterator[None]:
-    """Turn what another library raises over a damaged file, in many kinds, into a FrameError; but for `passed`."""
+def library_faults(path: Path, *allowed: type[Exception]) -> Iterator[None]:
+    """Turn what another library raises over a damaged file, in many kinds, into a FrameError; but for `allowed`."""
     try:
         yield
     except Exception as error:
-        if isinstance(error, (RgbmidicError, *passed)):
+        if isinstance(error, (RgbmidicError, *allowed)):
             raise
-        raise damaged(path, first_line(error)) from None
+        raise damaged_file(path, first_line(error)) from None
 
 
-def check_size(path: Path, *, needed: int, stored: int) -> None:
+def check_size(path: Path, *, unpacked: int, stored: int) -> None:
     """Refuse, before anything is unpacked, a header that announces more than a camera's frame.
 
     Parameters
     ----------
     path
         The file, for messages.
-    needed
+    unpacked
         Bytes of the unpacked samples.
     stored
         Bytes that they are stored in.
@@ -72,13 +72,13 @@ def check_size(path: Path, *, needed: int, stored: int) -> None:
     Raises
     ------
     FrameError
-        They exceed `MAXIMUM_BYTES`, or no frame of a camera can be compressed so much.
+        They exceed `MAX_BYTES`, or no frame of a camera can be compressed so much.
     """
-    if max(needed, stored) > MAXIMUM_BYTES:
-        size = f"{max(needed, stored) / 1e6:.0f} MB of samples; allowed are {MAXIMUM_BYTES / 1e6:.0f} MB"
+    if max(unpacked, stored) > MAX_BYTES:
+        size = f"{max(unpacked, stored) / 1e6:.0f} MB of samples; allowed are {MAX_BYTES / 1e6:.0f} MB"
         raise FrameError(f"{path} announces {size}")
-    if needed > max(CHECKED_FROM, _COMPRESSION * stored):
-        size = f"{needed / 1e6:.0f} MB of samples in {stored / 1e6:.3g} MB"
+    if unpacked > max(CHECKED_BYTES, _COMPRESSION * stored):
+        size = f"{unpacked / 1e6:.0f} MB of samples in {stored / 1e6:.3g} MB"
         raise FrameError(f"{path} announces {size}: no frame of a camera can be compressed so much")
 
 
@@ -90,14 +90,14 @@ def check_count(path: Path, count: int) -> None:
     FrameError
         So it does.
     """
-    if not 1 <= count <= MAXIMUM_FRAMES:
-        raise FrameError(f"{path} announces {count} frames; allowed are 1 to {MAXIMUM_FRAMES}")
+    if not 1 <= count <= MAX_FRAMES:
+        raise FrameError(f"{path} announces {count} frames; allowed are 1 to {MAX_FRAMES}")
 
 
-def cut_short(path: Path, *, whole: int, count: int) -> FrameError:
-    """Return the error for a frame behind the end of a file that holds only the first `whole` of its `count` frames."""
-    where = f"after frame {whole - 1} of {count}" if whole else f"before the first frame of {count}"
-    return FrameError(f"{path}: the file ends {where} (0 to {count - 1}): truncated or still being written")
+def truncated_file(path: Path, *, n_complete: int, count: int) -> FrameError:
+    """Return the error for a frame behind the end of a file that holds only `n_complete` of `count` frames."""
+    position = f"after frame {n_complete - 1} of {count}" if n_complete else f"before the first frame of {count}"
+    return FrameError(f"{path}: the file ends {position} (0 to {count - 1}): truncated or still being written")
 
 
 def unpack_bits(packed: bytes | AnyArray, bits: int) -> AnyArray:
@@ -124,22 +124,22 @@ def unpack_bits(packed: bytes | AnyArray, bits: int) -> AnyArray:
     values = np.empty((*groups.shape[:-1], group // bits), dtype=np.uint16)
     for sample in range(group // bits):
         byte, begin = divmod(sample * bits, 8)
-        over = -(begin + bits) % 8
-        joined: AnyArray = groups[..., byte].astype(np.uint16 if begin + bits <= 16 else np.uint32)
-        for part in range(byte + 1, byte + (begin + bits + over) // 8):
-            joined = joined << 8 | groups[..., part]
-        values[..., sample] = joined >> over & (2**bits - 1)
+        n_below = -(begin + bits) % 8
+        bits_read: AnyArray = groups[..., byte].astype(np.uint16 if begin + bits <= 16 else np.uint32)
+        for following in range(byte + 1, byte + (begin + bits + n_below) // 8):
+            bits_read = bits_read << 8 | groups[..., following]
+        values[..., sample] = bits_read >> n_below & (2**bits - 1)
     return values.reshape(*lines.shape[:-1], -1)
 
 
 BROKEN_JPEG = ("Corrupt JPEG data", "Premature end of JPEG file", "Inconsistent progression sequence")
-"""How libjpeg's warnings begin (JWRN in its jerror.h) after which it goes on with invented samples."""
+"""Beginnings of libjpeg's warnings (JWRN in its jerror.h) after which it goes on with invented samples."""
 
 _LOCK = threading.Lock()
 
 
 @contextmanager
-def complaints(*starts: bytes) -> Iterator[list[str]]:
+def captured_stderr(*prefixes: bytes) -> Iterator[list[str]]:
     """Collect what C libraries write to standard error: the lines with one of these starts.
 
     The list holds them afterwards; other lines (of threads) are passed on.
@@ -160,7 +160,7 @@ def complaints(*starts: bytes) -> Iterator[list[str]]:
             os.dup2(terminal, 2)
             file.seek(0)
             for line in file:
-                if line.startswith(starts):
+                if line.startswith(prefixes):
                     lines.append(line.decode(errors="replace").strip())
                 elif line.strip():
                     os.write(terminal, line)
@@ -195,7 +195,7 @@ class StoredFrame:
     bits: int | None = None
 
     @classmethod
-    def plain(cls, values: AnyArray, path: Path, cfa: str | None = None) -> StoredFrame:
+    def from_samples(cls, values: AnyArray, path: Path, cfa: str | None = None) -> StoredFrame:
         """Return samples (H, W) or (H, W, C) of a picture that states neither levels nor, as a rule, its pattern.
 
         Parameters
@@ -227,7 +227,7 @@ class StoredFrame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MovieHeader(ABC):
-    """What the header of a movie states of all its frames.
+    """Header of a movie: the properties that all its frames share.
 
     Attributes
     ----------
@@ -259,7 +259,7 @@ class EvenFrames(MovieHeader):
         ``(3,)`` of colour pictures, whose samples lie pixel after pixel.
     stored_bits, order
         Bits in which a sample is stored, 8 or 16 in the byte order of numpy, else packed; `shift` of them lie below it.
-    stated
+    metadata
         What the header states of every frame, without samples.
     oldest
         Place in the file of the frame that was recorded first.
@@ -271,7 +271,7 @@ class EvenFrames(MovieHeader):
     stored_bits: int
     order: str = "<"
     shift: int = 0
-    stated: StoredFrame = field(default_factory=StoredFrame)
+    metadata: StoredFrame = field(default_factory=StoredFrame)
     oldest: int = 0
 
     @property
@@ -279,51 +279,51 @@ class EvenFrames(MovieHeader):
         """Bytes of the samples of a frame."""
         return math.prod((*self.shape, *self.channels)) * self.stored_bits // 8
 
-    def begin(self, index: int) -> int:
+    def frame_offset(self, index: int) -> int:
         """Return the byte at which a frame begins."""
         return self.start + (index + self.oldest) % self.recording.count * (self.size + self.gap)
 
-    def checked(self, path: Path) -> Self:
+    def require_plausible(self, path: Path) -> Self:
         """Return the header itself, unless it announces what no camera records, which is a FrameError."""
         check_count(path, self.recording.count)
         if self.gap < 0:
-            raise damaged(path, f"its header announces frames of {self.size} bytes, {self.size + self.gap} apart")
-        check_size(path, needed=self.size, stored=self.size)
+            raise damaged_file(path, f"its header announces frames of {self.size} bytes, {self.size + self.gap} apart")
+        check_size(path, unpacked=self.size, stored=self.size)
         return self
 
-    def noting_rest(self, size: int) -> Self:
+    def with_rest_noted(self, size: int) -> Self:
         """Return the header with a remark where a file of `size` bytes goes on behind its frames."""
-        if (rest := size - self.start - self.recording.count * (self.size + self.gap)) <= 0:
+        if (n_extra := size - self.start - self.recording.count * (self.size + self.gap)) <= 0:
             return self
-        remark = f"it has {rest} bytes more than the {self.recording.count} frames that its header announces"
+        remark = f"it has {n_extra} bytes more than the {self.recording.count} frames that its header announces"
         return replace(self, recording=replace(self.recording, remarks=(*self.recording.remarks, remark)))
 
     def read(self, path: Path, index: int, rows: range) -> StoredFrame:
         """Read some rows of a frame."""
         with path.open("rb") as file:
-            begin, end = self.begin(index), file.seek(0, 2)
+            begin, end = self.frame_offset(index), file.seek(0, 2)
             if end < begin + self.size:
-                whole = (end - self.start - self.size) // (self.size + self.gap) + 1
-                raise cut_short(path, whole=max(whole, 0), count=self.recording.count)
+                n_complete = (end - self.start - self.size) // (self.size + self.gap) + 1
+                raise truncated_file(path, n_complete=max(n_complete, 0), count=self.recording.count)
             first, last = (self.size * row // self.shape[0] for row in (rows.start, rows.stop))
             file.seek(begin + first)
             content = file.read(last - first)
         if self.stored_bits in (8, 16):
-            stored = np.dtype(f"{self.order}u{self.stored_bits // 8}")
-            values = np.frombuffer(content, stored).astype(stored.newbyteorder("="), copy=False)
+            dtype = np.dtype(f"{self.order}u{self.stored_bits // 8}")
+            values = np.frombuffer(content, dtype).astype(dtype.newbyteorder("="), copy=False)
         else:
             values = unpack_bits(content, self.stored_bits)
         if self.shift:
             values = values >> self.shift
-        return replace(self.stated, values=values.reshape(len(rows), -1, *self.channels))
+        return replace(self.metadata, values=values.reshape(len(rows), -1, *self.channels))
 
 
-class Camera(Protocol):
-    """What is known of the camera that frames come from, as by a `Calibration`; None where it is not known."""
+class CameraMetadata(Protocol):
+    """Properties of the camera that frames come from, as a `Calibration` states them; None where unknown."""
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Name of the camera in messages."""
 
     @property
     def kinds(self) -> tuple[FrameKind, ...]:
@@ -355,9 +355,9 @@ _Statement = tuple[Path | str | None, _T | None]
 
 def raw_frame(
     stored: StoredFrame,
-    stated: FrameSettings,
+    user_metadata: FrameSettings,
     path: Path,
-    camera: Camera | None = None,
+    camera: CameraMetadata | None = None,
     shape: tuple[int, int] | None = None,
 ) -> Mosaic | ChannelFrame:
     """Return the checked frame from what the file, the user and a calibration state.
@@ -369,7 +369,7 @@ def raw_frame(
     ----------
     stored
         Samples, with what the file states.
-    stated
+    user_metadata
         What the user states.
     path
         The file, for messages.
@@ -388,30 +388,35 @@ def raw_frame(
         Two of them state something and do not agree, or something needed is stated by none.
     """
     shape = shape or (stored.values.shape[0], stored.values.shape[1])
-    dtype = stated.dtype and np.dtype(stated.dtype).newbyteorder("=").name
-    _agreed("shape", [(None, stated.shape), (path, shape)])
-    _agreed("dtype", [(None, dtype), (path, stored.values.dtype.name)])
-    known = camera.kinds if camera else ()
-    if (stated.kind or (known[0] if len(known) == 1 else None)) in ("bayer", "monochrome") and stored.kind == "rgb":
+    dtype = user_metadata.dtype and np.dtype(user_metadata.dtype).newbyteorder("=").name
+    _common_value("shape", [(None, user_metadata.shape), (path, shape)])
+    _common_value("dtype", [(None, dtype), (path, stored.values.dtype.name)])
+    kinds = camera.kinds if camera else ()
+    if (user_metadata.kind or (kinds[0] if len(kinds) == 1 else None)) in (
+        "bayer",
+        "monochrome",
+    ) and stored.kind == "rgb":
         first = stored.values[..., :1]
         if (stored.values == first).all():  # one channel that was saved as three
             stored = StoredFrame(values=first[..., 0], bits=stored.bits)
-        elif stated.kind == "monochrome":  # a colour picture under one white light
+        elif user_metadata.kind == "monochrome":  # a colour picture under one white light
             stored = StoredFrame(values=stored.values[..., 1], bits=stored.bits)
-    kind = _agreed("kind", [(None, stated.kind), (path, stored.kind)])
-    if camera and kind and kind not in known:
-        raise _differ("kind", (path if stated.kind is None else None, kind), (camera.name, " or ".join(known)))
-    kind = kind or (*known, "bayer")[0]
+    kind = _common_value("kind", [(None, user_metadata.kind), (path, stored.kind)])
+    if camera and kind and kind not in kinds:
+        raise _contradiction(
+            "kind", (path if user_metadata.kind is None else None, kind), (camera.name, " or ".join(kinds))
+        )
+    kind = kind or (*kinds, "bayer")[0]
     if (kind == "rgb") != (stored.values.ndim == 3):
-        who = None if stated.kind or camera is None else camera.name
+        source = None if user_metadata.kind or camera is None else camera.name
         channels = "one channel" if kind == "rgb" else "three"
-        raise FrameError(f"{_sentence(who, 'kind', kind)}, but {path} has {channels}")
-    if kind != "bayer" and stated.cfa is not None:
+        raise FrameError(f"{_sentence(source, 'kind', kind)}, but {path} has {channels}")
+    if kind != "bayer" and user_metadata.cfa is not None:
         reason = f"{path} is read as {kind}, which has no colour filter array"
-        raise FrameError(f"cfa is stated as {stated.cfa}, but {reason}")
-    cfa = _pattern(stored, stated, path, camera, shape) if kind == "bayer" else None
-    white = _white_level(stored, stated, path, camera)
-    black = _black_level(stored, stated, path, camera)
+        raise FrameError(f"cfa is stated as {user_metadata.cfa}, but {reason}")
+    cfa = _pattern(stored, user_metadata, path, camera, shape) if kind == "bayer" else None
+    white = _white_level(stored, user_metadata, path, camera)
+    black = _black_level(stored, user_metadata, path, camera)
     try:
         if cfa is not None:
             return Mosaic(values=stored.values, cfa=cfa, black_level=black, white_level=white)
@@ -421,21 +426,21 @@ def raw_frame(
         raise FrameError(f"{path}: {error}") from None
 
 
-def _agreed(name: str, statements: Sequence[_Statement[_T]]) -> _T | None:
+def _common_value(name: str, statements: Sequence[_Statement[_T]]) -> _T | None:
     """Return what all statements that there are agree on."""
-    there = [(who, value) for who, value in statements if value is not None]
-    for first, second in combinations(there, 2):
+    stated_values = [(source, value) for source, value in statements if value is not None]
+    for first, second in combinations(stated_values, 2):
         if first[1] != second[1]:
-            raise _differ(name, first, second)
-    return there[0][1] if there else None
+            raise _contradiction(name, first, second)
+    return stated_values[0][1] if stated_values else None
 
 
-def _differ(name: str, first: _Statement[Any], second: _Statement[Any]) -> FrameError:
+def _contradiction(name: str, first: _Statement[Any], second: _Statement[Any]) -> FrameError:
     return FrameError(f"{_sentence(first[0], name, first[1])}, but {second[0]} states {_in_words(second[1])}")
 
 
-def _sentence(who: Path | str | None, name: str, value: Any) -> str:
-    return f"{name} is stated as {_in_words(value)}" if who is None else f"{who} states {name} {_in_words(value)}"
+def _sentence(source: Path | str | None, name: str, value: Any) -> str:
+    return f"{name} is stated as {_in_words(value)}" if source is None else f"{source} states {name} {_in_words(value)}"
 
 
 def _in_words(value: Any) -> str:
@@ -444,46 +449,61 @@ def _in_words(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _white_level(stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None) -> float:
-    statements: list[_Statement[float]] = [(None, stated.white_level), (path, stored.white_level)]
+def _white_level(stored: StoredFrame, user_metadata: FrameSettings, path: Path, camera: CameraMetadata | None) -> float:
+    statements: list[_Statement[float]] = [(None, user_metadata.white_level), (path, stored.white_level)]
     statements += [(camera.name, camera.white_level)] if camera else []
-    white = _agreed("white_level", statements)
+    white = _common_value("white_level", statements)
     largest = float(2**stored.bits - 1 if stored.bits else np.iinfo(stored.values.dtype).max)
     if white is not None and white > largest:
-        who = next(who for who, value in statements if value is not None)
-        raise FrameError(f"{_sentence(who, 'white_level', white)}, but the samples of {path} end at {largest:.0f}")
+        source = next(source for source, value in statements if value is not None)
+        raise FrameError(f"{_sentence(source, 'white_level', white)}, but the samples of {path} end at {largest:.0f}")
     return largest if white is None else white
 
 
-def _black_level(stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None) -> FloatArray:
+def _black_level(
+    stored: StoredFrame, user_metadata: FrameSettings, path: Path, camera: CameraMetadata | None
+) -> FloatArray:
     # a file's black levels differ by position, and LibRaw rounds some; less than a grey level (DN) is no contradiction
     tolerance = 1.0
-    in_file, user, known = stored.black_level, stated.black_level, camera.black_level if camera else None
-    if in_file is not None and user is not None and not (np.abs(in_file - user) < tolerance).all():
-        raise _differ("black_level", (None, user), (path, in_file))
-    if camera and known is not None:
-        if user is not None and abs(user - known) >= tolerance:
-            raise _differ("black_level", (None, user), (camera.name, known))
-        if in_file is not None and abs(in_file.mean() - known) > tolerance:  # captures and frames may be rounded apart
-            raise _differ("black_level", (path, in_file), (camera.name, known))
-    level = next((value for value in (user, known) if value is not None), 0.0)
-    return np.full((1, 1), level) if in_file is None else in_file
+    file_level, user_level, calibrated = (
+        stored.black_level,
+        user_metadata.black_level,
+        camera.black_level if camera else None,
+    )
+    if file_level is not None and user_level is not None and not (np.abs(file_level - user_level) < tolerance).all():
+        raise _contradiction("black_level", (None, user_level), (path, file_level))
+    if camera and calibrated is not None:
+        if user_level is not None and abs(user_level - calibrated) >= tolerance:
+            raise _contradiction("black_level", (None, user_level), (camera.name, calibrated))
+        if (
+            file_level is not None and abs(file_level.mean() - calibrated) > tolerance
+        ):  # captures and frames may be rounded apart
+            raise _contradiction("black_level", (path, file_level), (camera.name, calibrated))
+    level = next((value for value in (user_level, calibrated) if value is not None), 0.0)
+    return np.full((1, 1), level) if file_level is None else file_level
 
 
 def _pattern(
-    stored: StoredFrame, stated: FrameSettings, path: Path, camera: Camera | None, shape: tuple[int, int]
+    stored: StoredFrame, user_metadata: FrameSettings, path: Path, camera: CameraMetadata | None, shape: tuple[int, int]
 ) -> str:
     """Return the Bayer pattern of a mosaic of `shape`; a camera's holds where the frames begin in its own."""
-    known, who, origin = camera.cfa if camera else None, camera.name if camera else "", stated.crop_origin
-    placed = origin is not None or camera is None or camera.shape in (None, shape)
-    if known is not None and origin is not None:
-        known, who = shift_cfa(known, origin[1], origin[0]), f"{who}, at frames.crop_origin = {list(origin)},"
-    hint = "" if placed else "; if the camera cropped the frames, state frames.crop_origin = [x, y]"
+    calibrated, source, origin = (
+        camera.cfa if camera else None,
+        camera.name if camera else "",
+        user_metadata.crop_origin,
+    )
+    is_located = origin is not None or camera is None or camera.shape in (None, shape)
+    if calibrated is not None and origin is not None:
+        calibrated, source = (
+            shift_cfa(calibrated, origin[1], origin[0]),
+            f"{source}, at frames.crop_origin = {list(origin)},",
+        )
+    hint = "" if is_located else "; if the camera cropped the frames, state frames.crop_origin = [x, y]"
     try:
-        cfa = _agreed("cfa", [(None, stated.cfa), (path, stored.cfa), (who, known)])
+        cfa = _common_value("cfa", [(None, user_metadata.cfa), (path, stored.cfa), (source, calibrated)])
     except FrameError as error:
         raise FrameError(f"{error}{hint}") from None
-    if cfa is None or not (placed or stated.cfa or stored.cfa):
+    if cfa is None or not (is_located or user_metadata.cfa or stored.cfa):
         raise FrameError(
             f"{path} does not state its colour filter array: state cfa ({', '.join(BAYER_PATTERNS)}), or kind "
             f'"monochrome" where the camera has none{hint}'

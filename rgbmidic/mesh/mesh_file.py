@@ -1,4 +1,4 @@
-"""What a mesh file states, whatever its format: nodes, elements, sets of elements; checked once, here.
+"""Content of a mesh file, whatever its format: nodes, elements, sets of elements; checked once, here.
 
 A file defines every number once and refers only to what it defines, its nodes lie somewhere, and it is not larger than
 what is read.
@@ -16,18 +16,18 @@ from typing import Self
 import numpy as np
 
 from rgbmidic.errors import InputError
-from rgbmidic.settings import regular
+from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import FloatArray, IntArray
 
 CORNERS = {"triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
 """Shapes that are read, and their corners, in VTK's order."""
-MOST_BYTES = 2**28
+MAX_BYTES = 2**28
 """Largest file, or unpacked content of one: two million nodes and elements in text (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeshContent:
-    """What a mesh file states.
+    """Content of a mesh file.
 
     Attributes
     ----------
@@ -57,69 +57,71 @@ class MeshContent:
 
     def __post_init__(self) -> None:
         """Check that every node is stated once and lies somewhere, and that elements have nodes that are stated."""
-        if lost := [key for key, x in {"numbers": self.numbers, **self.fields}.items() if len(x) != len(self.points)]:
-            raise InputError(f"{lost[0]} of nodes are not as many as nodes")
-        unique("node", self.numbers)
+        if mismatched := [
+            key for key, x in {"numbers": self.numbers, **self.fields}.items() if len(x) != len(self.points)
+        ]:
+            raise InputError(f"{mismatched[0]} of nodes are not as many as nodes")
+        require_unique("node", self.numbers)
         # single precision is what most formats hold: what is beyond its range has no square in double
-        far = ~(np.abs(self.points) <= np.finfo(np.float32).max).all(axis=1)
-        if far.any():
-            place = ", ".join(f"{x:g}" for x in self.points[far][0])
-            raise InputError(f"node {self.numbers[far][0]} lies at ({place}): coordinates are finite numbers")
+        is_far = ~(np.abs(self.points) <= np.finfo(np.float32).max).all(axis=1)
+        if is_far.any():
+            coordinates = ", ".join(f"{x:g}" for x in self.points[is_far][0])
+            raise InputError(f"node {self.numbers[is_far][0]} lies at ({coordinates}): coordinates are finite numbers")
         for shape, nodes, labels in self.blocks:
             if nodes.ndim != 2 or nodes.shape[1] < CORNERS[shape]:
                 raise InputError(f"a {shape} has fewer nodes than corners")
-            wrong = ((nodes < 0) | (nodes >= len(self.points))).any(axis=1)
-            if wrong.any():
-                raise InputError(f"element {labels[wrong][0]} has a node that the file does not state")
+            is_invalid = ((nodes < 0) | (nodes >= len(self.points))).any(axis=1)
+            if is_invalid.any():
+                raise InputError(f"element {labels[is_invalid][0]} has a node that the file does not state")
 
     @classmethod
-    def labelled(
+    def from_labels(
         cls,
         nodes: Sequence[tuple[int, Sequence[float]]],
         elements: Sequence[tuple[str, int, Sequence[int]]],
         sets: Mapping[str, Collection[int]],
         unread: Collection[str],
     ) -> Self:
-        """Take nodes (label, place) and elements (shape, label, labels of the nodes)."""
-        unique("element", np.array([label for _, label, _ in elements], dtype=np.int64))
-        if odd := [label for label, place in nodes if len(place) != 3]:
-            raise InputError(f"node {odd[0]} has not three coordinates")
+        """Return the content of nodes (label, position) and elements (shape, label, labels of the nodes)."""
+        require_unique("element", np.array([label for _, label, _ in elements], dtype=np.int64))
+        if invalid := [label for label, position in nodes if len(position) != 3]:
+            raise InputError(f"node {invalid[0]} has not three coordinates")
         index, cells = {label: i for i, (label, _) in enumerate(nodes)}, dict[str, list[list[int]]]()
         for shape, label, corners in elements:
-            if lost := [node for node in corners if node not in index]:
-                raise InputError(f"element {label} has node {lost[0]}, which the file does not state")
+            if undefined := [node for node in corners if node not in index]:
+                raise InputError(f"element {label} has node {undefined[0]}, which the file does not state")
             if len(corners) < CORNERS[shape]:
                 raise InputError(f"element {label} has fewer nodes than a {shape} has corners")
             cells.setdefault(shape, []).append([label, *(index[node] for node in corners[: CORNERS[shape]])])
         tables = {shape: np.array(rows) for shape, rows in cells.items()}
         blocks = [(shape, table[:, 1:], table[:, 0]) for shape, table in tables.items()]
-        points = np.array([place for _, place in nodes], dtype=np.float64).reshape(-1, 3)
+        points = np.array([position for _, position in nodes], dtype=np.float64).reshape(-1, 3)
         numbers = np.array([label for label, _ in nodes], dtype=np.int64)
         return cls(points=points, numbers=numbers, blocks=blocks, sets=sets, unread=unread)
 
 
-def unique(what: str, labels: IntArray) -> None:
-    """Refuse labels that are there twice."""
-    known, count = np.unique(labels, return_counts=True)
+def require_unique(noun: str, labels: IntArray) -> None:
+    """Refuse labels that occur twice."""
+    values, count = np.unique(labels, return_counts=True)
     if (count > 1).any():
-        raise InputError(f"{what} {known[count > 1][0]} is stated {count[count > 1][0]} times")
+        raise InputError(f"{noun} {values[count > 1][0]} is stated {count[count > 1][0]} times")
 
 
-def real(text: str) -> float:
-    """Value of a real number as Fortran writes it, with the exponent D or a sign alone; 0 of an empty field."""
+def parse_real(text: str) -> float:
+    """Return value of a real number as Fortran writes it, with the exponent D or a sign alone; 0 of an empty field."""
     return float(re.sub(r"(?<=[\d.])(?=[+-])", "E", text.upper().replace("D", "E"))) if text else 0.0
 
 
-def sized(path: Path) -> Path:
-    """The path itself, of a regular file that is not larger than what is read."""
-    if (size := regular(path).stat().st_size) > MOST_BYTES:
-        raise InputError(f"{path} has {size} bytes; meshes of up to {MOST_BYTES} are read")
+def limit_size(path: Path) -> Path:
+    """Return the path itself, of a regular file that is not larger than what is read."""
+    if (size := require_regular_file(path).stat().st_size) > MAX_BYTES:
+        raise InputError(f"{path} has {size} bytes; meshes of up to {MAX_BYTES} are read")
     return path
 
 
-def text_of(path: Path, read: set[str]) -> str:
-    """Text of a file that another may include; it is added to those that are `read`, which are not read again."""
-    if (place := os.path.realpath(path)) in read:
+def read_text(path: Path, read_files: set[str]) -> str:
+    """Return the text of a file that another may include, and add it to `read_files`, which are not read again."""
+    if (real_path := os.path.realpath(path)) in read_files:
         raise InputError(f"{path} is included twice, or includes itself")
-    read.add(place)
-    return sized(path).read_text(encoding="utf-8-sig", errors="replace")
+    read_files.add(real_path)
+    return limit_size(path).read_text(encoding="utf-8-sig", errors="replace")
