@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from rgbmidic.disk import write_complete
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.frames.source import FrameSource
@@ -153,6 +154,8 @@ def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float
     ------
     InputError
         The frame is too small, a level is not a whole number, or a factor is not positive.
+    FrameError
+        The file cannot be written.
     """
     if min(mosaic.values.shape) < 22:
         raise InputError(
@@ -174,6 +177,11 @@ def write_tiff(path: Path | str, frame: Mosaic | ChannelFrame) -> None:
         File to write.
     frame
         The raw frame.
+
+    Raises
+    ------
+    FrameError
+        The file cannot be written.
     """
     if isinstance(frame, ChannelFrame) and len(frame.values) == 3:
         _write(path, np.ascontiguousarray(np.moveaxis(frame.values, 0, -1)), photometric="rgb")
@@ -184,13 +192,8 @@ def write_tiff(path: Path | str, frame: Mosaic | ChannelFrame) -> None:
 def _write(path: Path | str, values: np.ndarray[Any, np.dtype[np.uint16]], **options: Any) -> None:
     import tifffile
 
-    path = Path(path)
-    temporary = path.with_name(path.name + ".part")
-    try:
-        tifffile.imwrite(temporary, values, metadata=None, byteorder="<", software="rgbmidic", **options)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    options |= {"metadata": None, "byteorder": "<", "software": "rgbmidic"}
+    write_complete(Path(path), lambda file: tifffile.imwrite(file, values, **options), error=FrameError)
 
 
 def _dng_tags(mosaic: Mosaic, white_balance: Sequence[float], path: Path | str) -> list[tuple[Any, ...]]:
