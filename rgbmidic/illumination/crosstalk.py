@@ -120,6 +120,8 @@ class Crosstalk:
         its mean over the field. None: the greens are equal, or there is one only (3-CCD).
     green_difference_std : ndarray, shape (k,), or None
         Its standard uncertainty.
+    light_levels : ndarray, shape (k,), or None
+        Mean level of each light in its captures, DN above dark in the channel that sees it best.
     """
 
     matrix: FloatArray
@@ -129,6 +131,7 @@ class Crosstalk:
     field: CrosstalkField | None = None
     green_difference: FloatArray | None = None
     green_difference_std: FloatArray | None = None
+    light_levels: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Check the values and convert them to their types."""
@@ -165,10 +168,11 @@ class Crosstalk:
             std = np.sqrt(np.diag(covariance))
         if std is not None:
             object.__setattr__(self, "std", np.asarray(std, dtype=np.float64).reshape(matrix.shape))
-        self._check_greens()
+        self._check_lights()
 
-    def _check_greens(self) -> None:
-        for name in ("green_difference", "green_difference_std"):
+    def _check_lights(self) -> None:
+        """Check what has one number per light."""
+        for name in ("green_difference", "green_difference_std", "light_levels"):
             if (figures := getattr(self, name)) is None:
                 continue
             values = np.asarray(figures, dtype=np.float64)
@@ -179,6 +183,8 @@ class Crosstalk:
                 )
             if name == "green_difference_std" and (self.green_difference is None or (values < 0).any()):
                 raise CalibrationError("green_difference_std belongs to a green_difference and is not negative")
+            if name == "light_levels" and (values <= 0).any():
+                raise CalibrationError(f"light_levels are positive, not {', '.join(map(str, values))}")
             object.__setattr__(self, name, values)
 
     @classmethod
