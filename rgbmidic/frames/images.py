@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from rgbmidic.arguments import checked
 from rgbmidic.disk import write_complete
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
@@ -135,6 +136,7 @@ class HeaderlessFile(FrameSource):
         return StoredFrame.plain(frame.read(self.path, 0, range(shape[0])[rows]).values, self.path)
 
 
+@checked
 def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float] | None = None) -> None:
     """Write a raw Bayer frame as an uncompressed DNG.
 
@@ -165,6 +167,7 @@ def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float
     _write(path, mosaic.values, photometric="cfa", extratags=tags, rowsperstrip=mosaic.values.shape[0])
 
 
+@checked
 def write_tiff(path: Path | str, frame: Mosaic | ChannelFrame) -> None:
     """Write a frame as an uncompressed 16-bit TIFF: (H, W) for a mosaic or monochrome frame, (H, W, 3) for RGB.
 
@@ -197,7 +200,7 @@ def _write(path: Path | str, values: np.ndarray[Any, np.dtype[np.uint16]], **opt
 
 
 def _dng_tags(mosaic: Mosaic, white_balance: Sequence[float], path: Path | str) -> list[tuple[Any, ...]]:
-    if len(white_balance) != 3 or not all(np.isfinite(factor) and factor > 0 for factor in white_balance):
+    if np.shape(white_balance) != (3,) or not all(np.isfinite(factor) and factor > 0 for factor in white_balance):
         raise InputError(f"white_balance is three positive factors (R, G, B), not {white_balance!r}")
     xyz_to_srgb = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
     black = [_whole(level, "black", path) for level in mosaic.black_level.ravel()]

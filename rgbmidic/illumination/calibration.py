@@ -15,6 +15,7 @@ from typing import Any, TypeVar, cast
 
 import numpy.typing as npt
 
+from rgbmidic.arguments import check_fields
 from rgbmidic.disk import write_complete
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import shift_cfa
@@ -81,6 +82,7 @@ class Calibration:
 
     def __post_init__(self) -> None:
         """Check that the sections agree, and fill in the summary of the noise."""
+        check_fields(self, CalibrationError)
         if self.crosstalk and self.registration and self.crosstalk.lights != self.registration.lights:
             raise CalibrationError(
                 f"crosstalk and registration are of different lights: {', '.join(self.crosstalk.lights)} and "
