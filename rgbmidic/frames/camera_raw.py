@@ -18,7 +18,7 @@ import numpy.typing as npt
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.source import FrameSource
 from rgbmidic.frames.stored import BROKEN_JPEG, StoredFrame, check_size, complaints, damaged
-from rgbmidic.frames.tiff_pages import Tag, is_stored_as_is, missing_data, tag, tiff_pages
+from rgbmidic.frames.tiff_pages import Tag, is_stored_as_is, missing_data, oversized_jpeg, tag, tiff_pages
 from rgbmidic.settings import BAYER_PATTERNS, FrameKind, regular
 from rgbmidic.typing import AnyArray, FloatArray
 
@@ -141,6 +141,7 @@ def _tags(path: Path) -> tuple[bool, FloatArray | None, float]:
             top, left, *_ = tag(page, Tag.ACTIVE_AREA) or (0, 0)
             stored_as_is, (black, spread) = is_stored_as_is(page), _black_cell(page)
             missing = [reason for page in raw if (reason := missing_data(page, path.stat().st_size))]
+            missing += [reason for page in raw if (reason := oversized_jpeg(page, path))]
             black = None if black is None else np.roll(black, (top, left), axis=(0, 1))
     except FrameError:
         return False, None, 0.0

@@ -214,9 +214,10 @@ class ChannelFrame:
 def _convert(frame: Mosaic | ChannelFrame, levels: tuple[int, ...]) -> None:
     """Convert a frame to its types, black levels to the shape `levels`; refuse values and levels that cannot be."""
     black, white = np.asarray(frame.black_level, dtype=np.float64), frame.white_level
-    if black.shape not in ((), (1,), levels):
-        raise InputError(f"black levels are one or of shape {levels}, not {black.shape}")
-    black = np.broadcast_to(black, levels).copy()
+    try:
+        black = np.broadcast_to(black, levels).copy()
+    except ValueError:
+        raise InputError(f"black levels are one or of shape {levels}, not {black.shape}") from None
     if frame.values.dtype != np.uint16 and not ((frame.values >= 0) & (frame.values < 2**16)).all():
         raise InputError("raw grey levels are whole numbers from 0 to 65535")
     if not (np.isfinite(black).all() and np.isfinite(white) and black.min() >= 0 and white > black.max()):

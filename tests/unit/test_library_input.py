@@ -150,9 +150,7 @@ def test_strange_arguments_are_refused_in_one_line(name: str) -> None:
 
 @pytest.mark.parametrize("name", MORE_ARGUMENTS)
 @pytest.mark.filterwarnings("ignore")
-def test_strange_arguments_are_taken_or_refused(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_strange_arguments_are_taken_or_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for value in [*STRANGE, None, {}, {"a": 1}, True, 0, "\0", "y" * 300]:
         with suppress(RgbmidicError):
