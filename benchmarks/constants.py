@@ -38,7 +38,7 @@ VARIED = {
     "statistics": ("freedom", "least_variance", "own"),
 }
 """Constants of each part of the method."""
-QUICK = ("even", "grey", "least_variance", "sigma")
+QUICK = ("least_variance", "sigma")
 """One of each part."""
 NOTHING = {"displacement/stated": 1e-3, "stated [%]": 0.01}
 """What is as good as no change: the last iteration of a solve may move the nodes by so much."""

@@ -416,6 +416,7 @@ def estimate_crosstalk(
         lights=tuple(lights),
         covariance=covariance[0, :3, :, 0, :3].reshape(size, size),
         field=field,
+        light_levels=np.array([signal.base[signal.valid].mean() for signal in signals]),
         **greens,
     )
     if count > 3:

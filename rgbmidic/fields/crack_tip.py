@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cholesky, solve_triangular
 
+from rgbmidic.arguments import check_fields
 from rgbmidic.errors import InputError
 from rgbmidic.fields.cracks import at_some, crack_faces, listed, nearest_node
 from rgbmidic.fields.history import History, Nodal, Part, histories_of
@@ -103,6 +104,7 @@ class Williams:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         e, nu = self.youngs_modulus, self.poissons_ratio
         if not (
             e > 0 and -1 < nu <= 0.5 and self.plane in ("stress", "strain") and (self.terms == 0 or self.terms >= 2)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
 from rgbmidic.fields.history import History, Nodal
 from rgbmidic.fields.nodal import NodalCovariance
@@ -163,6 +164,7 @@ def nearest_node(mesh: Tri3Mesh, name: str, nodes: IntArray, point: FloatArray, 
     return nearest
 
 
+@checked
 def crack_jump(
     nodes: FloatArray,
     elements: npt.NDArray[np.int32],

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.rates import LOWEST, mean_rates
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
 from rgbmidic.fields.units import column
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
@@ -214,6 +215,7 @@ def rate_words(window: int, measured: int) -> str:
     return f"parabolas over {taken} frames{fewer}, polynomials of degree 4 over {min(measured, round(5 * taken / 3))}"
 
 
+@checked
 def rates(
     times: npt.ArrayLike,
     values: npt.ArrayLike,
@@ -257,7 +259,9 @@ def rates(
     """
     when, what, error = (np.asarray(part, dtype=np.float64) for part in (times, values, std))
     references = np.asarray(references, dtype=bool)
-    if not len(when) or what.shape != error.shape or len(when) != len(what) or len(references) != len(when):
+    if not (when.ndim == references.ndim == 1 and what.ndim and when.size):
+        raise InputError(f"rates need times (T,) and references (T,), not {when.shape} and {references.shape}")
+    if what.shape != error.shape or len(when) != len(what) or len(references) != len(when):
         raise InputError(f"rates need a time for each frame, not {when.shape} for values {what.shape}, {error.shape}")
     if not (np.diff(when) > 0).all():
         raise InputError("rates need the times of the frames to rise from each to the next")
@@ -308,6 +312,7 @@ def _noise(
     return np.where(known, np.maximum(noise, floor[:, None]), 0.0), fraction * least
 
 
+@checked
 def high_pass(field: npt.ArrayLike, sigma: float = SIGMA) -> FloatArray:
     """Subtract from a field (H, W) its copy filtered by a Gaussian: the paper's U tilde.
 
@@ -335,7 +340,7 @@ def high_pass(field: npt.ArrayLike, sigma: float = SIGMA) -> FloatArray:
         `field` is not one image, or nothing in it is measured.
     """
     values = np.asarray(field, dtype=np.float64)
-    if values.ndim != 2 or not sigma > 0:
+    if values.ndim != 2 or not 0 < sigma < 1e6:
         raise InputError(f"one image (H, W) and a positive sigma are needed, not shape {values.shape}, sigma {sigma!r}")
     known = np.isfinite(values)
     if known.sum() < 10:

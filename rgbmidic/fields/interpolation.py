@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from rgbmidic.arguments import checked
 from rgbmidic.correlation.recovery import quadratic_fit
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -364,6 +365,7 @@ def _fits(mesh: Tri3Mesh, has_data: bytes) -> tuple[sp.csr_matrix, ...]:
     return sp.eye(count, format="csr"), *map(sp.csr_matrix, slopes)
 
 
+@checked
 def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> FloatImage:
     """Evaluate nodal fields at the pixels of an image.
 
@@ -381,6 +383,10 @@ def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> Flo
     ndarray, shape (C, H, W), float32
         NaN outside the mesh and in elements with a NaN node.
     """
+    if values.ndim != 2 or len(values) != len(mesh.nodes) or min(shape) < 1:
+        raise InputError(
+            f"nodal fields (N, C) of {len(mesh.nodes)} nodes and an image H, W are needed, not {values.shape}, {shape}"
+        )
     pixels = PixelMap.from_mesh(mesh, Region.from_mask(np.ones(shape, dtype=bool)))
     element = np.repeat(np.arange(len(mesh.elements)), np.diff(pixels.offsets))
     places = Places.within(mesh, np.stack([pixels.columns, pixels.rows], axis=1).astype(np.float64), element)
@@ -388,6 +394,7 @@ def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> Flo
     return np.stack([pixels.scatter(part, fill=np.nan) for part in field.T])
 
 
+@checked
 def at_nodes(field: FloatArray, nodes: FloatArray) -> FloatArray:
     """Interpolate a pixel field at nodes, bilinearly.
 
@@ -403,6 +410,11 @@ def at_nodes(field: FloatArray, nodes: FloatArray) -> FloatArray:
     ndarray, shape (N, C)
         NaN where one of the four pixels around is NaN.
     """
+    if field.ndim != 3 or min(field.shape[1:]) < 2 or nodes.shape[1:] != (2,) or not np.isfinite(nodes).all():
+        raise InputError(
+            f"fields (C, H, W) of 2 x 2 px and more are interpolated at finite nodes (N, 2); given are {field.shape} "
+            f"and {nodes.shape}"
+        )
     height, width = field.shape[1:]
     x = np.clip(nodes[:, 0], 0, width - 1)
     y = np.clip(nodes[:, 1], 0, height - 1)
@@ -414,6 +426,7 @@ def at_nodes(field: FloatArray, nodes: FloatArray) -> FloatArray:
     return np.asarray(((1 - ty) * above + ty * below).T)
 
 
+@checked
 def field_rms(mesh: Tri3Mesh, values: FloatArray, truth: FloatArray, *, border: float = 0.0) -> float:
     """Compute the root mean square difference, over pixels and components, of a nodal field and a pixel field.
 
@@ -432,6 +445,8 @@ def field_rms(mesh: Tri3Mesh, values: FloatArray, truth: FloatArray, *, border: 
     -------
     float
     """
+    if truth.ndim != 3 or values.shape[1:] != truth.shape[:1]:
+        raise InputError(f"a truth (C, H, W) is compared with values (N, C), not {truth.shape} with {values.shape}")
     difference = at_pixels(mesh, values, truth.shape[1:]) - truth
     low, high = mesh.nodes.min(axis=0) + border, mesh.nodes.max(axis=0) - border
     rows = slice(int(np.ceil(low[1])), int(high[1]) + 1)

@@ -22,6 +22,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.polynomial import Chebyshev, Polynomial
 
+from rgbmidic.arguments import checked
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.errors import InputError
@@ -205,6 +206,7 @@ def unit_rows(matrix: sp.csr_matrix) -> sp.csr_matrix:
     return unit
 
 
+@checked
 def reference_fraction(count: int) -> float:
     """Return the fraction of a frame's variance that comes from the mean of `count` reference frames, common to all.
 
@@ -217,9 +219,12 @@ def reference_fraction(count: int) -> float:
     -------
     float
     """
+    if count < 1:
+        raise InputError(f"a reference is of one frame or more, not {count}")
     return 1 / (1 + count)
 
 
+@checked
 def frame_covariance(std: FloatArray, common_fraction: float, references: Sequence[bool] | BoolArray) -> FloatArray:
     """Compute the covariance between frames of a quantity that is measured in each.
 
@@ -243,6 +248,11 @@ def frame_covariance(std: FloatArray, common_fraction: float, references: Sequen
     ndarray, shape (T, T, ...)
     """
     variance, reference = np.asarray(std, dtype=np.float64) ** 2, np.asarray(references, dtype=bool)
+    if not 0 < common_fraction <= 0.5 or reference.ndim != 1 or variance.shape[:1] != reference.shape:
+        raise InputError(
+            "frames have 1/2 of their variance in common or less, above 0, and each belongs to the reference or not; "
+            f"given are {common_fraction:g}, and {reference.shape} for {variance.shape}"
+        )
     either, both = reference[:, None] | reference[None], reference[:, None] & reference[None]
     count = round(1 / common_fraction) - 1
     factor = np.where(both, -1 / max(count - 1, 1), np.where(either, 0.0, common_fraction))
@@ -251,6 +261,7 @@ def frame_covariance(std: FloatArray, common_fraction: float, references: Sequen
     return np.asarray(factor * np.minimum(variance[:, None], variance[None]))
 
 
+@checked
 def difference_std(first: FloatArray, second: FloatArray, common_fraction: float) -> FloatArray:
     """Compute the standard uncertainty of a quantity's difference between two frames that are no reference.
 
@@ -266,6 +277,8 @@ def difference_std(first: FloatArray, second: FloatArray, common_fraction: float
     ndarray
     """
     first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    if 1 not in (first.size, second.size) and first.shape != second.shape:
+        raise InputError(f"uncertainties of one quantity have one shape, not {first.shape} and {second.shape}")
     shared = common_fraction * np.minimum(first, second) ** 2
     return np.asarray(np.sqrt(first**2 + second**2 - 2 * shared))
 

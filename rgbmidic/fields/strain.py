@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
 from rgbmidic.fields.interpolation import Places
 from rgbmidic.fields.nodal import NodalCovariance
@@ -113,6 +114,7 @@ def length_of(parts: FloatArray, covariance: FloatArray) -> tuple[FloatArray, Fl
     return np.sqrt(square), np.sqrt(np.maximum(long * first + (1 - long) * noise, 0))
 
 
+@checked
 def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: str = MEASURES[0]) -> Strain:
     """Compute the strain of displacement gradients and, to first order, its standard uncertainty.
 
@@ -138,6 +140,11 @@ def strain_of_gradient(gradient: FloatArray, covariance: FloatArray, measure: st
     if measure not in MEASURES:
         raise InputError(f'unknown strain measure "{measure}"; allowed are {", ".join(MEASURES)}')
     shape = gradient.shape[:-2]
+    if gradient.shape != (*shape, 2, 2) or covariance.shape != (*shape, 4, 4):
+        raise InputError(
+            f"gradients (..., 2, 2) and their covariance (..., 4, 4) are needed, not {gradient.shape} and "
+            f"{covariance.shape}"
+        )
     h, spread = gradient.reshape(-1, 2, 2), covariance.reshape(-1, 4, 4)
     hencky = _of_stretch(h, *_OF_STRETCH["hencky"])
     if measure == "engineering":

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.metadata import BROKEN_JPEG, StoredFrame, captured_stderr, check_size, damaged_file
 from rgbmidic.frames.source import FrameSource
-from rgbmidic.frames.tiff_pages import Tag, has_uncompressed_data, missing_data, tag, tiff_pages
+from rgbmidic.frames.tiff_pages import Tag, has_uncompressed_data, missing_data, oversized_jpeg, tag, tiff_pages
 from rgbmidic.settings import BAYER_PATTERNS, FrameKind, require_regular_file
 from rgbmidic.typing import AnyArray, FloatArray
 
@@ -143,6 +143,7 @@ def _tags(path: Path) -> tuple[bool, FloatArray | None, float]:
             first_row, first_column, *_ = tag(page, Tag.ACTIVE_AREA) or (0, 0)
             is_uncompressed, (black, spread) = has_uncompressed_data(page), _black_cell(page)
             missing = [reason for page in raw if (reason := missing_data(page, path.stat().st_size))]
+            missing += [reason for page in raw if (reason := oversized_jpeg(page, path))]
             black = None if black is None else np.roll(black, (first_row, first_column), axis=(0, 1))
     except FrameError:
         return False, None, 0.0

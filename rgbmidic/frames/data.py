@@ -9,6 +9,7 @@ from fractions import Fraction
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.arguments import check_fields
 from rgbmidic.errors import InputError
 from rgbmidic.settings import BAYER_PATTERNS
 from rgbmidic.typing import FloatArray
@@ -115,7 +116,7 @@ def cfa_channels(cfa: str) -> npt.NDArray[np.intp]:
     InputError
         The name is not a Bayer pattern.
     """
-    name = cfa.upper() if isinstance(cfa, str) else cfa
+    name = cfa.upper() if isinstance(cfa, str) else ""
     if name not in BAYER_PATTERNS:
         raise InputError(f"unknown colour filter array {cfa!r}; allowed are {', '.join(BAYER_PATTERNS)}")
     return np.array(["RGB".index(letter) for letter in name], dtype=np.intp).reshape(2, 2)
@@ -174,6 +175,7 @@ class Mosaic:
 
     def __post_init__(self) -> None:
         """Check the values and convert them to their types."""
+        check_fields(self)
         values = np.asarray(self.values)
         if values.ndim != 2:
             raise InputError(f"a mosaic is one (H, W) image, not an array of shape {values.shape}")
@@ -202,6 +204,7 @@ class ChannelFrame:
 
     def __post_init__(self) -> None:
         """Check the values and convert them to their types."""
+        check_fields(self)
         values = np.asarray(self.values)
         if values.ndim != 3 or values.shape[0] not in (1, 3):
             raise InputError(f"a channel frame has shape (1 or 3, H, W), not {values.shape}")
@@ -209,9 +212,14 @@ class ChannelFrame:
 
 
 def _convert(frame: Mosaic | ChannelFrame, levels: tuple[int, ...]) -> None:
-    """Convert a frame to its types, black levels to the shape `levels`; refuse levels that cannot be."""
-    black = np.broadcast_to(np.asarray(frame.black_level, dtype=np.float64), levels).copy()
-    white = frame.white_level
+    """Convert a frame to its types, black levels to the shape `levels`; refuse values and levels that cannot be."""
+    black, white = np.asarray(frame.black_level, dtype=np.float64), frame.white_level
+    try:
+        black = np.broadcast_to(black, levels).copy()
+    except ValueError:
+        raise InputError(f"black levels are one or of shape {levels}, not {black.shape}") from None
+    if frame.values.dtype != np.uint16 and not ((frame.values >= 0) & (frame.values < 2**16)).all():
+        raise InputError("raw grey levels are whole numbers from 0 to 65535")
     if not (np.isfinite(black).all() and np.isfinite(white) and black.min() >= 0 and white > black.max()):
         raise InputError(
             f"black and white level must be finite with 0 <= black < white; given are black {black.tolist()}, "

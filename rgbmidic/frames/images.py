@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from rgbmidic.arguments import checked
+from rgbmidic.disk import write_complete
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, cfa_channels
 from rgbmidic.frames.metadata import BROKEN_JPEG, EvenFrames, StoredFrame, captured_stderr, check_size, damaged_file
@@ -137,6 +139,7 @@ class HeaderlessFile(FrameSource):
         return StoredFrame.from_samples(frame.read(self.path, 0, range(shape[0])[rows]).values, self.path)
 
 
+@checked
 def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float] | None = None) -> None:
     """Write a raw Bayer frame as an uncompressed DNG.
 
@@ -156,6 +159,8 @@ def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float
     ------
     InputError
         The frame is too small, a level is not a whole number, or a factor is not positive.
+    FrameError
+        The file cannot be written.
     """
     if min(mosaic.values.shape) < 22:
         raise InputError(
@@ -165,6 +170,7 @@ def write_dng(path: Path | str, mosaic: Mosaic, *, white_balance: Sequence[float
     _write(path, mosaic.values, photometric="cfa", extratags=tags, rowsperstrip=mosaic.values.shape[0])
 
 
+@checked
 def write_tiff(path: Path | str, frame: Mosaic | ChannelFrame) -> None:
     """Write a frame as an uncompressed 16-bit TIFF: (H, W) for a mosaic or monochrome frame, (H, W, 3) for RGB.
 
@@ -177,6 +183,11 @@ def write_tiff(path: Path | str, frame: Mosaic | ChannelFrame) -> None:
         File to write.
     frame
         The raw frame.
+
+    Raises
+    ------
+    FrameError
+        The file cannot be written.
     """
     if isinstance(frame, ChannelFrame) and len(frame.values) == 3:
         _write(path, np.ascontiguousarray(np.moveaxis(frame.values, 0, -1)), photometric="rgb")
@@ -187,17 +198,12 @@ def write_tiff(path: Path | str, frame: Mosaic | ChannelFrame) -> None:
 def _write(path: Path | str, values: np.ndarray[Any, np.dtype[np.uint16]], **options: Any) -> None:
     import tifffile
 
-    path = Path(path)
-    temporary = path.with_name(path.name + ".part")
-    try:
-        tifffile.imwrite(temporary, values, metadata=None, byteorder="<", software="rgbmidic", **options)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    options |= {"metadata": None, "byteorder": "<", "software": "rgbmidic"}
+    write_complete(Path(path), lambda file: tifffile.imwrite(file, values, **options), error=FrameError)
 
 
 def _dng_tags(mosaic: Mosaic, white_balance: Sequence[float], path: Path | str) -> list[tuple[Any, ...]]:
-    if len(white_balance) != 3 or not all(np.isfinite(factor) and factor > 0 for factor in white_balance):
+    if np.shape(white_balance) != (3,) or not all(np.isfinite(factor) and factor > 0 for factor in white_balance):
         raise InputError(f"white_balance is three positive factors (R, G, B), not {white_balance!r}")
     xyz_to_srgb = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
     black = [_require_integer(level, "black", path) for level in mosaic.black_level.ravel()]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import FrameError, disk_reason
 from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import AnyArray, FloatImage
@@ -15,6 +16,7 @@ SOFTWARE = 305
 """Tag of a TIFF file: the program that wrote it."""
 
 
+@checked
 def read_mask(path: Path) -> FloatImage:
     """Read a mask; of a colour counts its strongest channel, and of what is transparent the visible part.
 

@@ -12,6 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Self
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import FrameError, disk_faults, legible
 from rgbmidic.frames.formats import advice, frame_formats
 from rgbmidic.frames.stacks import split_dataset
@@ -21,6 +22,7 @@ _RESET = 9999
 """Last number of a camera's counter, after which it begins with 1 (DCF: four digits, 0001 to 9999)."""
 
 
+@checked
 def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]:
     """List frame files in the order of the numbers in their names (`NamedFiles`: frame9 before frame10).
 

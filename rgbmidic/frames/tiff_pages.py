@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -167,6 +168,11 @@ class PageList:
         return content[:number].decode(errors="replace").rstrip("\0")
 
 
+_JPEG_KINDS, _JPEG_HEADER = (6, 7), 4096
+"""Kinds of compression; bytes in which a part of the image has its frame header."""
+_FRAME_HEADER = re.compile(rb"\xff[\xc0-\xc3\xc5-\xc7]..[\x02-\x10](..)(..)([\x01-\x04])", re.DOTALL)
+
+
 def missing_data(page: tifffile.TiffPage, size: int) -> str | None:
     """Describe what the page announces that a file of `size` bytes does not hold; None where all is there."""
     segments = list(zip(page.dataoffsets, page.databytecounts, strict=False))
@@ -177,6 +183,24 @@ def missing_data(page: tifffile.TiffPage, size: int) -> str | None:
         return "a part of its image data has the length zero"
     if any(offset < _FIRST_OFFSET for offset, _ in segments):
         return "a part of its image data lies in the file's header"
+    return None
+
+
+def oversized_jpeg(page: tifffile.TiffPage, path: Path) -> str | None:
+    """Describe what JPEG data of a page announce beyond its tiles, on which a decoder works for minutes; None: nothing.
+
+    The first frame header (SOF, ITU T.81, B.2.2) of each part holds its rows, columns and components.
+    """
+    if page.compression not in _JPEG_KINDS or not is_dng(path):  # other raws cut one JPEG image into slices
+        return None
+    pixels = (page.tilelength or page.rowsperstrip) * (page.tilewidth or page.imagewidth) * page.samplesperpixel
+    with path.open("rb") as file:
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=False):
+            file.seek(offset)
+            found = _FRAME_HEADER.search(file.read(min(count, _JPEG_HEADER)))
+            rows, columns = (int.from_bytes(part) for part in found.groups()[:2]) if found else (0, 0)
+            if found and rows * columns * found[3][0] > 2 * pixels:
+                return f"its JPEG data announce {rows} rows of {columns} x {found[3][0]} samples, the header {pixels}"
     return None
 
 

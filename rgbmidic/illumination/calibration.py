@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy.typing as npt
 
+from rgbmidic.arguments import check_fields
+from rgbmidic.disk import write_complete
 from rgbmidic.errors import CalibrationError
 from rgbmidic.frames.data import shift_cfa
 from rgbmidic.illumination.crosstalk import Crosstalk
@@ -89,6 +90,7 @@ class Calibration:
 
     def __post_init__(self) -> None:
         """Check that the sections agree, and fill in the summary of the noise."""
+        check_fields(self, CalibrationError)
         if self.crosstalk and self.registration and self.crosstalk.lights != self.registration.lights:
             raise CalibrationError(
                 f"crosstalk and registration are of different lights: {', '.join(self.crosstalk.lights)} and "
@@ -408,16 +410,8 @@ def write_document(path: Path | str, document: Mapping[str, Any]) -> None:
     CalibrationError
         The file cannot be written.
     """
-    path = Path(path)
-    temporary = path.with_name(path.name + ".part")
-    try:
-        temporary.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        raise CalibrationError(f"{path} cannot be written: {error.strerror or error}") from None
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
+    text = json.dumps(document, indent=2, allow_nan=False) + "\n"
+    write_complete(Path(path), lambda file: file.write(text.encode()), error=CalibrationError)
 
 
 def _read(kind: type[_Section], document: dict[str, Any], name: str) -> _Section | None:

@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from rgbmidic._kernels.illumination import unmix as unmix_kernel
 from rgbmidic._kernels.splines import PAD, bspline_coefficients, sample_with_gradient
+from rgbmidic.arguments import check_fields, checked
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.images import IlluminationImages, check_names, fill_holes
 from rgbmidic.illumination.linear import LinearChannels
@@ -85,6 +86,7 @@ class CrosstalkField:
 
     def __post_init__(self) -> None:
         """Check the values and convert them to their types."""
+        check_fields(self, CalibrationError)
         values = np.asarray(self.coefficients, dtype=np.float64)
         terms = (self.order + 1) * (self.order + 2) // 2 - 1
         if self.order < 1 or values.ndim != 3 or len(values) != terms or not np.isfinite(values).all():
@@ -96,6 +98,10 @@ class CrosstalkField:
         if min(self.shape) < 2:
             raise CalibrationError(f"a crosstalk field spans frames of 2 x 2 px and more, not {self.shape}")
         if self.std is not None:
+            if self.std.size != values.size:
+                raise CalibrationError(
+                    f"the uncertainty of a field {values.shape} is of its shape, not {self.std.shape}"
+                )
             object.__setattr__(self, "std", np.asarray(self.std, dtype=np.float64).reshape(values.shape))
 
 
@@ -120,6 +126,8 @@ class Crosstalk:
         its mean over the field. None: the greens are equal, or there is one only (3-CCD).
     green_difference_std : ndarray, shape (k,), or None
         Its standard uncertainty.
+    light_levels : ndarray, shape (k,), or None
+        Mean level of each light in its captures, DN above dark in the channel that sees it best.
     """
 
     matrix: FloatArray
@@ -129,9 +137,11 @@ class Crosstalk:
     field: CrosstalkField | None = None
     green_difference: FloatArray | None = None
     green_difference_std: FloatArray | None = None
+    light_levels: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Check the values and convert them to their types."""
+        check_fields(self, CalibrationError)
         check_names(self.lights)
         matrix = np.asarray(self.matrix, dtype=np.float64)
         if matrix.ndim != 2 or matrix.shape[1] != len(self.lights) or matrix.shape[1] > matrix.shape[0]:
@@ -165,10 +175,11 @@ class Crosstalk:
             std = np.sqrt(np.diag(covariance))
         if std is not None:
             object.__setattr__(self, "std", np.asarray(std, dtype=np.float64).reshape(matrix.shape))
-        self._check_greens()
+        self._check_lights()
 
-    def _check_greens(self) -> None:
-        for name in ("green_difference", "green_difference_std"):
+    def _check_lights(self) -> None:
+        """Check what has one number per light."""
+        for name in ("green_difference", "green_difference_std", "light_levels"):
             if (figures := getattr(self, name)) is None:
                 continue
             values = np.asarray(figures, dtype=np.float64)
@@ -179,6 +190,8 @@ class Crosstalk:
                 )
             if name == "green_difference_std" and (self.green_difference is None or (values < 0).any()):
                 raise CalibrationError("green_difference_std belongs to a green_difference and is not negative")
+            if name == "light_levels" and (values <= 0).any():
+                raise CalibrationError(f"light_levels are positive, not {', '.join(map(str, values))}")
             object.__setattr__(self, name, values)
 
     @classmethod
@@ -289,6 +302,7 @@ class Led:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         if not (200 < self.centre < 1200 and 0 < self.width < 300):
             raise InputError(f"an LED has its centre in 200 to 1200 nm and its width in 0 to 300 nm, not {self}")
 
@@ -333,6 +347,7 @@ class Sensitivities:
 
     def __post_init__(self) -> None:
         """Check the values and convert them to their types."""
+        check_fields(self)
         wavelengths, values = np.asarray(self.wavelengths, dtype=float), np.asarray(self.values, dtype=float)
         if wavelengths.ndim != 1 or values.shape != (3, wavelengths.size) or wavelengths.size < 2:
             raise InputError(
@@ -455,6 +470,7 @@ light's own channel does, a neighbour's crosstalk of some 10 % does not. Two lig
 saturates; what leaks from beyond full scale is smooth or judged by the residual like the rest of a reflection."""
 
 
+@checked
 def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float = NEGLIGIBLE) -> IlluminationImages:
     """Return one image per light from camera channels: ``lights = A^-1 channels`` (pseudo-inverse for k < C).
 

@@ -19,7 +19,7 @@ from scipy.special import erf
 from rgbmidic.errors import ConfigurationError, FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, colour_planes
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.checks import Check, refused, reported
+from rgbmidic.illumination.checks import Check, refused, reported, warning
 from rgbmidic.illumination.crosstalk import Crosstalk
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.settings import FrameCheck
@@ -46,6 +46,7 @@ class _Samples:
     values: npt.NDArray[np.float32]  # DN above black
     usable: BoolArray  # in the region, neither saturated nor cut off at 0
     noise: tuple[NoiseModel | None, ...]
+    red_row: int  # of a cell of the pattern
 
     @classmethod
     def of(cls, frame: Frame, calibration: Calibration, inside: BoolArray, window: tuple[slice, slice]) -> _Samples:
@@ -68,6 +69,7 @@ class _Samples:
             values=stored.astype(np.float32) - black.astype(np.float32)[:, None, None],
             usable=inner & (stored < frame.white_level) & (stored > 0),
             noise=tuple(noise[name[0]] for name in names),
+            red_row=int("R" in frame.cfa[2:]) if isinstance(frame, Mosaic) else 0,
         )
 
     @property
@@ -166,6 +168,7 @@ def contradictions(
         checks += _interpolated(samples)
         if calibration.crosstalk is not None:
             checks += _lights(samples, calibration.crosstalk, full_scale, (left, top))
+            checks += _red_and_blue(samples, calibration.crosstalk)
     return reported(checks)
 
 
@@ -431,6 +434,69 @@ def _lights(samples: _Samples, crosstalk: Crosstalk, full_scale: float, origin: 
             "calibration are not those of this frame"
         )
         yield Check("lights", text, max(negative, mirrored), limit)
+
+
+_LIGHT_LEVELS, _GREENS = np.log(1.3), 0.002
+"""Scatter of the ratio of two lamps between calibration and test, and of the greens' difference over their mean with
+the lens: 1.3 is what lamps that were not touched may drift and a target may be coloured; .002 is a seventh of what the
+greens of an ICX655 differ by in red light."""
+
+
+def _red_and_blue(samples: _Samples, crosstalk: Crosstalk) -> Iterator[Check]:
+    """Check that red and blue are not exchanged, as by a window of the sensor that is moved by one row and one column.
+
+    The greens in rows with red and those in rows with blue are exchanged, too: their difference, where it is
+    calibrated, and the levels of the lights relative to those in the captures are compared with what is expected then.
+    Squares of the departures over their scatter show which fits: 9 less is doubtful, of the greens 36 certain.
+    """
+    mosaic, lights = len(samples.names) == 4, crosstalk.lights
+    if crosstalk.matrix.shape[0] != 3 or len(samples.names) not in (3, 4):
+        return
+    means = _block_means(samples.values, BLOCK)
+    clear = _whole_blocks(samples, BLOCK) & (means.min(axis=0) > 0)
+    if clear.sum() < 36:
+        return
+    red, *greens, blue = means[:, clear]
+    first, last = greens[0], greens[-1]
+    channels = np.array([red.mean(), (first.mean() + last.mean()) / 2, blue.mean()])
+    stated, exchanged = (crosstalk.unmixing @ one for one in (channels, channels[::-1]))
+    text = (
+        "{} than if red and blue were exchanged, as where the window of the sensor (offset, crop, region of interest) "
+        "begins one row and one column beside that of the calibration: compare their offsets, or state the pattern "
+        "(frames.cfa)"
+    )
+    better = 0.0
+
+    def fits_better(asked: float, other: float, scatter: float) -> float:
+        """By how much the squared departure `other` is less than that `asked`; 0 where neither fits."""
+        return float((asked**2 - other**2) / scatter**2) if abs(other) < 3 * scatter or abs(asked) < abs(other) else 0.0
+
+    if mosaic and crosstalk.green_difference is not None:
+        sign = 1.0 if samples.red_row == 0 else -1.0
+        relative = sign * (first - last) / channels[1]
+        std = 0.0 if crosstalk.green_difference_std is None else crosstalk.green_difference_std @ np.abs(stated)
+        scatter = np.sqrt(relative.var() / relative.size + (std / channels[1]) ** 2 + _GREENS**2)
+        asked, other = (crosstalk.green_difference @ one / channels[1] for one in (stated, exchanged))
+        better = fits_better(relative.mean() - asked, relative.mean() + other, scatter)
+        found = f"the greens in rows with red exceed those in rows with blue by {relative.mean():.2%}, calibrated "
+        yield Check(
+            "greens", text.format(f"{found}are {asked:.2%}: less probable"), max(better, 0.0), 36.0, doubtful=9.0
+        )
+    if crosstalk.light_levels is None or better < -9 or min(*stated, *exchanged) <= 0 or len(lights) != 3:
+        return
+    order = np.argmax(crosstalk.matrix, axis=0)
+    ends = int(np.argmin(order)), int(np.argmax(order))
+    if (order[ends[0]], order[ends[1]]) != (0, 2):
+        return
+    calibrated, asked, other = (
+        np.log(one[ends[0]] / one[ends[1]]) for one in (crosstalk.light_levels, stated, exchanged)
+    )
+    better = fits_better(asked - calibrated, other - calibrated, _LIGHT_LEVELS)
+    found = (
+        f"light {lights[ends[0]]} is {np.exp(asked):.2g} times as strong as light {lights[ends[1]]}, in the captures "
+        f"of the calibration {np.exp(calibrated):.2g} times: less probable"
+    )
+    yield warning(text.format(found), max(better, 0.0), above=9.0)
 
 
 def _interpolated(samples: _Samples) -> Iterator[Check]:

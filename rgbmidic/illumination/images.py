@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.texture import divide_by_mean
+from rgbmidic.arguments import check_fields
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.linear import LinearChannels
 from rgbmidic.illumination.texture import TextureModel
@@ -81,6 +82,7 @@ class Registration:
 
     def __post_init__(self) -> None:
         """Check the values and convert them to their types."""
+        check_fields(self, CalibrationError)
         check_names(self.lights)
         count, terms = len(self.lights), len(PARAMETERS)
         parameters = np.asarray(self.parameters, dtype=np.float64)
@@ -89,8 +91,8 @@ class Registration:
                 f"a registration of {count} lights has {terms} finite parameters per light, those of the first all 0; "
                 f"given are {parameters.tolist()}"
             )
-        if not self.radius > 0:
-            raise CalibrationError(f"the radius of a registration must be positive, not {self.radius}")
+        if not 0 < self.radius < 1e9:
+            raise CalibrationError(f"the radius of a registration must be positive, in px, not {self.radius}")
         object.__setattr__(self, "parameters", parameters)
         object.__setattr__(self, "centre", (float(self.centre[0]), float(self.centre[1])))
         if self.covariance is not None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.arguments import check_fields
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.settings import bounded
@@ -131,6 +132,7 @@ class Quantity:
 
     def __post_init__(self) -> None:
         """Check the values and convert them to their types."""
+        check_fields(self, CalibrationError)
         value = np.array(self.value, dtype=np.float64, ndmin=1)
         std = np.array(self.std, dtype=np.float64, ndmin=1)
         if value.ndim != 1 or value.shape != std.shape or (std < 0).any():

@@ -13,6 +13,7 @@ from typing import Protocol, runtime_checkable
 import cv2
 import numpy as np
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window
 from rgbmidic.illumination.calibration import Calibration
@@ -36,6 +37,7 @@ DEMOSAICERS = (DEFAULT_METHOD, *_BY_CHANNEL)
 """The methods by the name they have in the configuration, where ``"auto"`` means the one that suits the frame."""
 
 
+@checked
 def separate(
     frame: Mosaic | ChannelFrame | LinearMosaic | LinearChannels,
     calibration: Calibration | Crosstalk,
@@ -100,6 +102,7 @@ def _separated(
     return reconstructed_lights(model, crosstalk, unmixed=mixing is not None)
 
 
+@checked
 def demosaic(
     mosaic: Mosaic | LinearMosaic,
     method: str = DEFAULT_METHOD,

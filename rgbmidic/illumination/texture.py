@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
 from rgbmidic.typing import FloatArray, FloatImage
 
@@ -349,6 +350,7 @@ def _coarse_fraction(model: TextureModel, sums: FloatArray, counts: FloatArray, 
     return float(np.clip(coarse * (1 - common) / ((1 - common) ** 2 + 0.02**2), 0, 1))
 
 
+@checked
 def speckle_diameter(picture: FloatArray, *, background: float = 20.0) -> float | None:
     """Return the size of the speckle in a picture, without the peak that white noise has at distance 0.
 
@@ -364,6 +366,8 @@ def speckle_diameter(picture: FloatArray, *, background: float = 20.0) -> float 
     float or None
         Full width at half maximum of the autocorrelation, averaged over all directions, px; None without a texture.
     """
+    if picture.ndim != 2 or min(picture.shape) < 2 or not 0 < background < 1e6:
+        raise InputError(f"a picture (H, W) and a width above 0 px are needed, not {picture.shape}, {background:g}")
     texture = picture - cv2.GaussianBlur(picture, (0, 0), background)
     power = np.abs(np.fft.rfft2(texture, s=[2 * side for side in texture.shape])) ** 2
     reach = min(int(2 * background), *(side - 1 for side in texture.shape))

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
 from rgbmidic.fields import SIGMA, high_pass
 from rgbmidic.typing import BoolArray, FloatArray
@@ -73,6 +74,7 @@ class MeasureArea:
         return image[..., int(np.ceil(y0)) : int(y1) + 1, int(np.ceil(x0)) : int(x1) + 1]
 
 
+@checked
 def areas_along_x(
     first: tuple[float, float], *, pitch: float = 100.0, count: int = 5, size: tuple[float, float] = AREA_SIZE
 ) -> tuple[MeasureArea, ...]:
@@ -93,9 +95,12 @@ def areas_along_x(
     -------
     tuple of Area
     """
+    if not 0 < count <= 10_000:
+        raise InputError(f"there are 1 to 10,000 areas, not {count}")
     return tuple(MeasureArea(name=f"A{i}", centre=(first[0] + i * pitch, first[1]), size=size) for i in range(count))
 
 
+@checked
 def perturbation(field: npt.ArrayLike, areas: Sequence[MeasureArea], *, sigma: float = SIGMA) -> FloatArray:
     """Perturbation P (paper, section 2.2): standard deviation in each area of a displacement without its long waves.
 
@@ -121,6 +126,7 @@ def perturbation(field: npt.ArrayLike, areas: Sequence[MeasureArea], *, sigma: f
     return area_stds(high_pass(field, sigma), areas)
 
 
+@checked
 def residual_percent(reference: npt.ArrayLike, deformed: npt.ArrayLike, displacement: FloatArray) -> float:
     """Return the residual of a measurement in % of the effective dynamic range (paper, section 2.2).
 
@@ -147,8 +153,9 @@ def residual_percent(reference: npt.ArrayLike, deformed: npt.ArrayLike, displace
     from scipy.ndimage import map_coordinates
 
     f, g = np.asarray(reference, dtype=np.float64), np.asarray(deformed, dtype=np.float64)
-    rows, columns = np.nonzero(np.isfinite(displacement[0]) & np.isfinite(f))
-    if f.shape != g.shape or displacement.shape != (2, *f.shape) or not rows.size:
+    fits = f.ndim == 2 and f.shape == g.shape and displacement.shape == (2, *f.shape)
+    rows, columns = np.nonzero(np.isfinite(displacement[0]) & np.isfinite(f)) if fits else (np.empty(0), np.empty(0))
+    if not rows.size:
         raise InputError(f"images and displacement do not fit: {f.shape}, {g.shape}, {displacement.shape}")
     displacement_at = displacement[:, rows, columns]
     is_missing = ~np.isfinite(g)
@@ -168,6 +175,7 @@ def _area_statistics(image: FloatArray, areas: Sequence[MeasureArea], statistic:
     return np.array([statistic(cut) if np.isfinite(cut).mean() >= 0.5 else np.nan for cut in cuts], dtype=np.float64)
 
 
+@checked
 def area_stds(high_passed: FloatArray, areas: Sequence[MeasureArea]) -> FloatArray:
     """Return the standard deviation of an image in each area.
 
@@ -186,6 +194,7 @@ def area_stds(high_passed: FloatArray, areas: Sequence[MeasureArea]) -> FloatArr
     return _area_statistics(high_passed, areas, np.nanstd)
 
 
+@checked
 def area_means(field: FloatArray, areas: Sequence[MeasureArea]) -> FloatArray:
     """Return the mean of an image in each area.
 
@@ -257,6 +266,7 @@ class Goniometry:
     band: tuple[float, float]
 
 
+@checked
 def pixel_levels(frames: Sequence[npt.ArrayLike], pixels: npt.ArrayLike) -> FloatArray:
     """Return the grey levels (n, m) of chosen pixels in n frames.
 
@@ -289,6 +299,7 @@ def pixel_levels(frames: Sequence[npt.ArrayLike], pixels: npt.ArrayLike) -> Floa
     return np.array(levels)
 
 
+@checked
 def fit_lobe(angles_deg: npt.ArrayLike, levels: npt.ArrayLike) -> Lobe:
     """Fit a diffuse part and a specular lobe to grey levels.
 
@@ -327,6 +338,7 @@ def fit_lobe(angles_deg: npt.ArrayLike, levels: npt.ArrayLike) -> Lobe:
     return Lobe(diffuse=diffuse, specular=specular, centre_deg=centre, width_deg=width, std=(a, b, c, d))
 
 
+@checked
 def goniometry(angles_deg: npt.ArrayLike, levels: npt.ArrayLike, *, min_spread: float = 0.05) -> Goniometry:
     """Return the diffuse light, specular lobe and erratic band of a series of grey levels.
 
@@ -401,6 +413,7 @@ def _lobe(angles: FloatArray, diffuse: float, specular: float, centre: float, wi
     return np.asarray(diffuse * lambert + specular * np.exp(-((angles - centre) ** 2) / (2 * width**2)))
 
 
+@checked
 def detrend(height: npt.ArrayLike, order: int = 4) -> FloatArray:
     """Return a height map minus the best bipolynomial: all x^i y^j with i and j up to `order` (paper, Fig. 10: 4).
 
@@ -438,6 +451,7 @@ def detrend(height: npt.ArrayLike, order: int = 4) -> FloatArray:
     return np.asarray(values - along_y @ coefficients @ along_x.T)
 
 
+@checked
 def local_slope(height: npt.ArrayLike, pitch: float) -> FloatArray:
     """Return the local slope arctan|grad h| by central differences.
 
@@ -457,12 +471,12 @@ def local_slope(height: npt.ArrayLike, pitch: float) -> FloatArray:
         The pitch is not positive, or the height is no map.
     """
     values = _as_map(height)
-    if not (pitch > 0 and math.isfinite(pitch)):
-        raise InputError(f"the pitch of a height map is positive, not {pitch!r}")
+    _check_pitch(pitch)
     along_y, along_x = np.gradient(values, pitch)
     return np.asarray(np.degrees(np.arctan(np.hypot(along_x, along_y))))
 
 
+@checked
 def slope_uncertainty(height_std: float, pitch: float) -> float:
     """Return the standard uncertainty of a small local slope: that of a central difference, ``std / (sqrt(2) pitch)``.
 
@@ -478,9 +492,16 @@ def slope_uncertainty(height_std: float, pitch: float) -> float:
     float
         Degrees.
     """
+    _check_pitch(pitch)
     return math.degrees(math.atan(height_std / (math.sqrt(2) * pitch)))
 
 
+def _check_pitch(pitch: float) -> None:
+    if not pitch > 0:
+        raise InputError(f"the pitch of a height map is positive, not {pitch!r}")
+
+
+@checked
 def paint_classes(intensity: npt.ArrayLike) -> BoolArray:
     """Classify white and black paint of an intensity map, by Otsu's threshold.
 
@@ -509,6 +530,7 @@ def paint_classes(intensity: npt.ArrayLike) -> BoolArray:
     return np.asarray(is_measured & (grey > level))
 
 
+@checked
 def rms_slope(height: npt.ArrayLike, on_paint: BoolArray, pitch: float, *, height_std: float = 0.0) -> float:
     """Return the root mean square local slope of one paint in degrees, measurement noise taken off.
 
@@ -534,15 +556,18 @@ def rms_slope(height: npt.ArrayLike, on_paint: BoolArray, pitch: float, *, heigh
         No measured height lies on the paint, with its neighbours.
     """
     values = _as_map(height)
+    if on_paint.shape != values.shape or on_paint.dtype != bool:
+        raise InputError(f"points of a map {values.shape} are bool of its shape, not {on_paint.dtype} {on_paint.shape}")
     is_valid = (on_paint & np.isfinite(values)).astype(np.uint8)
     slope = local_slope(values, pitch)[cv2.erode(is_valid, np.ones((3, 3), np.uint8), borderValue=0).astype(bool)]
     slope = slope[np.isfinite(slope)]
     if not slope.size:
         raise InputError("no measured height lies on this paint")
-    square = float((np.tan(np.radians(slope)) ** 2).mean() - height_std**2 / pitch**2)
+    square = float((np.tan(np.radians(slope)) ** 2).mean() - np.square(np.float64(height_std) / pitch))
     return math.degrees(math.atan(math.sqrt(max(square, 0))))
 
 
+@checked
 def wrinkle_spacing(height: npt.ArrayLike, pitch: float, *, longest: float = 0.06) -> tuple[float, float]:
     """Return the distance between wrinkles: where the spectrum of the height, summed over all directions, has its peak.
 
@@ -566,6 +591,7 @@ def wrinkle_spacing(height: npt.ArrayLike, pitch: float, *, longest: float = 0.0
         The map is smaller than ten times `longest`, or too coarse for it.
     """
     values = _as_map(height)
+    _check_pitch(pitch)
     if min(values.shape) * pitch < 10 * longest or longest < 4 * pitch:
         raise InputError(
             f"a map of {values.shape} points {pitch} apart does not show wrinkles up to {longest}: it must be at least "

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.mesh.abaqus import read_abaqus
 from rgbmidic.mesh.finite_elements import ROUNDING, FiniteElementMesh, cross
@@ -37,6 +38,7 @@ _READERS: Mapping[str, Callable[[Path], MeshContent]] = {
 }
 
 
+@checked
 def read_mesh(path: Path | str, *, unit: str = "mm", part: str | None = None) -> FiniteElementMesh:
     r"""Read the planar part of a finite-element mesh.
 

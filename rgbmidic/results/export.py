@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from rgbmidic._version import __version__
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.fields.units import column
 from rgbmidic.results.files import check_file, write_complete, write_table, writing
@@ -189,6 +190,7 @@ def _declare_nodal(data: h5py.Group, source: h5py.Dataset, *, turned: bool) -> N
     data.create_virtual_dataset(name, layout)
 
 
+@checked
 def export_result(
     result: Result, to: str, out: Path | str, *, scale: ScaleSettings | None = None, overwrite: bool = False
 ) -> None:

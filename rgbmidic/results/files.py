@@ -8,10 +8,9 @@ import io
 import json
 import os
 import socket
-import threading
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -19,6 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.disk import write_complete as write_complete
 from rgbmidic.errors import ResultError, disk_faults
 from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import AnyArray
@@ -112,38 +112,6 @@ def read_json(path: Path) -> Any:
         raise
     except (OSError, ValueError, RecursionError) as error:
         raise ResultError(f"{path} is damaged: {error}") from None
-
-
-def write_complete(path: Path, write: Callable[[BinaryIO], object], *, new: bool = False) -> None:
-    """Write a file under another name and rename it when all of it is written; else nothing is left of it.
-
-    Parameters
-    ----------
-    path
-        The file.
-    write
-        Writes its content.
-    new
-        Whether a file of this name stays as it is, also one that another process writes at the same time; else it is
-        replaced.
-    """
-    temporary = path.with_name(f"{path.name}.{socket.gethostname()}.{threading.get_ident()}.{os.getpid()}.part")
-    try:
-        with writing(path), temporary.open("w+b") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-            if new:
-                try:
-                    path.hardlink_to(temporary)
-                except OSError:  # it is there; or the disk has no links, where nobody else starts at the same time
-                    if not path.exists():
-                        temporary.replace(path)
-                return
-            temporary.replace(path)
-    finally:
-        with suppress(OSError):  # a read-only disk refuses even to remove what is not there
-            temporary.unlink()
 
 
 def check_file(out: Path, *, overwrite: bool) -> None:

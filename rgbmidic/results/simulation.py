@@ -246,7 +246,7 @@ def place(result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence
     InputError
         No points are known, or they place no mesh.
     """
-    known, where = pairs, "--points"
+    known, where = list(pairs), "--points"
     if not known and (placed := placement_of(result)) is not None:
         known, where = placed.pairs.tolist(), "mesh.points"
     if not known:

@@ -14,6 +14,7 @@ from typing import Literal, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError
 from rgbmidic.frames.data import cfa_channels, sampled_channels
 from rgbmidic.illumination.crosstalk import Crosstalk, Led, Sensitivities, spectral_response
@@ -131,6 +132,7 @@ class Polarisers(SceneSection):
         return 2 * self.extinction / (1 + self.extinction) * (1 - self.depolarised) + self.depolarised
 
 
+@checked
 def rotation(angle_deg: float, axis: Vector) -> FloatArray:
     """Return the rotation matrix by an angle about an axis (Rodrigues)."""
     length = math.hypot(*axis)
@@ -143,6 +145,7 @@ def rotation(angle_deg: float, axis: Vector) -> FloatArray:
     return turn
 
 
+@checked
 def three_lights(target: Vector = (0.0, 0.0, NOMINAL_DISTANCE)) -> tuple[Light, ...]:
     """Return the red, green and blue lamps left, right and above the camera, all equally bright at the target."""
     positions = {"red": (-190.0, -12.0, 90.0), "green": (200.0, 15.0, 90.0), "blue": (10.0, -220.0, 60.0)}

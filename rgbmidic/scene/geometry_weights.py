@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.scene.forecast import Instrument
@@ -192,6 +193,7 @@ def _read_surface(path: Path, scene: Scene) -> tuple[FloatArray, FloatArray]:
     return points[:, rows, columns], normals[:, rows, columns]
 
 
+@checked
 def angle_weights(deviation_deg: FloatArray, limit_deg: float = 15.0) -> FloatImage:
     """Return binary weights: 0 within `limit_deg` of the mirror direction and where the deviation is NaN, 1 elsewhere.
 
@@ -207,6 +209,7 @@ def angle_weights(deviation_deg: FloatArray, limit_deg: float = 15.0) -> FloatIm
     return (deviation_deg > limit_deg).astype(np.float32)
 
 
+@checked
 def surface_from_heights(heights: npt.ArrayLike, scene: Scene) -> tuple[FloatArray, FloatArray]:
     """Return the points and normals of a surface given as a height map over the pixels of the reference image.
 
@@ -229,6 +232,8 @@ def surface_from_heights(heights: npt.ArrayLike, scene: Scene) -> tuple[FloatArr
     """
     camera, distance = scene.camera, scene.body.front[2]
     depth = distance - np.asarray(heights, dtype=np.float64)
+    if depth.ndim != 2 or min(depth.shape) < 2:
+        raise InputError(f"heights are a map of 2 x 2 points and more, not of shape {depth.shape}")
     if not np.nanmin(depth, initial=np.inf) > 0:
         raise InputError(f"heights must stay below the distance of {distance:g} mm to the camera")
     rows, columns = np.indices(depth.shape)

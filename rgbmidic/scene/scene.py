@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rgbmidic._kernels import render as kernels
+from rgbmidic.arguments import check_fields
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.illumination.crosstalk import Led, Sensitivities
 from rgbmidic.scene import SceneSection
@@ -187,6 +188,10 @@ class State:
     displacement: InPlaneField | None = None
     velocity: Vector = (0.0, 0.0, 0.0)
     spin_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the values and convert them to their types."""
+        check_fields(self)
 
     def at_time(self, seconds: float) -> State:
         """Return the state some time later, at rest.

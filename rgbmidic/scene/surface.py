@@ -15,6 +15,7 @@ from scipy.special import pdtr
 
 from rgbmidic._kernels.mesh import interpolate_at_points
 from rgbmidic._kernels.render import PLATE, sample_paint
+from rgbmidic.arguments import check_fields, checked
 from rgbmidic.errors import InputError
 from rgbmidic.scene import SceneSection
 from rgbmidic.settings.conversion import bounded
@@ -94,7 +95,7 @@ class Surface(SceneSection):
 
     white: Finish = field(default_factory=lambda: Finish(albedo=0.80))
     black: Finish = field(default_factory=lambda: Finish(albedo=0.10))
-    droplet: float = bounded(0.23, above=0)
+    droplet: float = bounded(0.23, above=0, at_most=1000)
     spread: float = bounded(0.2, at_least=0, at_most=0.6)
     coverage: float = bounded(0.45, at_least=0, at_most=0.95)
     softness: float = bounded(0.02, at_least=0)
@@ -174,6 +175,7 @@ class Surface(SceneSection):
         return cover.reshape(x.shape), height.reshape(x.shape)
 
 
+@checked
 def height_map(
     surface: Surface, *, size: float, pitch: float, corner: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[FloatArray, FloatArray]:
@@ -200,8 +202,8 @@ def height_map(
     InputError
         There are fewer than 3 points a side.
     """
-    if not (pitch > 0 and size >= 2 * pitch):
-        raise InputError(f"a height map has at least 3 points a side; given are size {size} mm, pitch {pitch} mm")
+    if not (pitch > 0 and 2 <= size / pitch < 50_000):
+        raise InputError(f"a height map has 3 to 50,000 points a side; given are size {size} mm, pitch {pitch} mm")
     steps = np.arange(round(size / pitch) + 1) * pitch
     cover, height = surface.on_plate(corner[0] + steps, corner[1] + steps)
     return height, cover
@@ -228,6 +230,7 @@ class AffineField:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         (xx, xy), (yx, yy) = self.gradient
         if not (1 + xx) * (1 + yy) - xy * yx > 0:
             raise InputError(f"a displacement gradient must not turn the plate inside out: {self.gradient}")
@@ -286,6 +289,7 @@ class MeshField:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_fields(self)
         nodes, values = np.array(self.nodes, dtype=float), np.array(self.displacement, dtype=float)
         elements = np.array(self.elements, dtype=np.int64)
         if nodes.ndim != 2 or nodes.shape[1] != 2 or values.shape != nodes.shape or elements.shape[1:] != (3,):

@@ -12,10 +12,17 @@ import pytest
 from results import make_result, smooth_record
 
 import rgbmidic
-from rgbmidic import Calibration, CameraCalibration, FiniteElementMesh, Placement, Region, Tri3Mesh
+from rgbmidic import Calibration, CameraCalibration, FiniteElementMesh, Placement, Region, Tri3Mesh, fields
 from rgbmidic.errors import InputError, RgbmidicError
-from rgbmidic.illumination.crosstalk import Crosstalk
+from rgbmidic.frames import Mosaic, list_frames, write_dng
+from rgbmidic.illumination import linearise
+from rgbmidic.illumination.crosstalk import Crosstalk, CrosstalkField, Sensitivities
 from rgbmidic.illumination.images import Registration
+from rgbmidic.illumination.linear import Quantity
+from rgbmidic.lab.measures import areas_along_x, fit_lobe, residual_percent, rms_slope
+from rgbmidic.scene.camera import rotation
+from rgbmidic.scene.scene import State
+from rgbmidic.scene.surface import AffineField, MeshField, Surface, height_map
 from rgbmidic.settings import ProbeSettings
 from rgbmidic.typing import as_numbers
 
@@ -35,6 +42,24 @@ PLATE: dict[str, Any] = {
     "node_numbers": [1, 2, 3],
     "element_numbers": [1],
 }
+MESH = Tri3Mesh(nodes=np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]]), elements=np.array([[0, 1, 2]], dtype=np.int32))
+MOSAIC: dict[str, Any] = {
+    "values": np.full((24, 24), 900, dtype=np.uint16),
+    "cfa": "RGGB",
+    "black_level": 64.0,
+    "white_level": 4095.0,
+}
+CROSSTALK: dict[str, Any] = {"matrix": np.eye(3), "lights": ("red", "green", "blue")}
+REGISTRATION: dict[str, Any] = {"lights": ("a", "b"), "parameters": np.zeros((2, 5)), "centre": (1, 1), "radius": 10.0}
+FIELD: dict[str, Any] = {"nodes": MESH.nodes, "elements": MESH.elements, "displacement": np.zeros((3, 2))}
+RATES = np.zeros(8), np.ones(8)
+MESH = Tri3Mesh(nodes=np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]]), elements=np.array([[0, 1, 2]], dtype=np.int32))
+CROSSTALK: dict[str, Any] = {"matrix": np.eye(3), "lights": ("red", "green", "blue")}
+REGISTRATION: dict[str, Any] = {"lights": ("a", "b"), "parameters": np.zeros((2, 5)), "centre": (1, 1), "radius": 10.0}
+FIELD: dict[str, Any] = {"nodes": MESH.nodes, "elements": MESH.elements, "displacement": np.zeros((3, 2))}
+MOSAIC: dict[str, Any] = {"cfa": "RGGB", "black_level": 64.0, "white_level": 4095.0}
+MOSAIC["values"] = np.full((24, 24), 900, dtype=np.uint16)
+RATES = np.zeros(8), np.ones(8)
 TEXTURE = np.random.default_rng(0).uniform(100, 200, (20, 20))
 
 
@@ -68,6 +93,47 @@ ARGUMENTS: dict[str, Callable[[Any], object]] = {
     "state": lambda value: measured(value),
     "region of states": lambda value: measured(TEXTURE, region=value),
 }
+MORE_ARGUMENTS: dict[str, Callable[[Any], object]] = {
+    **{
+        f"{key} of a mosaic": lambda value, key=key: linearise(Mosaic(**MOSAIC | {key: value}))
+        for key in ("values", "cfa", "black_level", "white_level")
+    },
+    **{
+        f"{key} of a crosstalk": lambda value, key=key: Crosstalk(**CROSSTALK | {key: value})
+        for key in ("matrix", "lights", "covariance", "green_difference", "light_levels")
+    },
+    **{
+        f"{key} of a registration": lambda value, key=key: Registration(**REGISTRATION | {key: value})
+        for key in ("parameters", "centre", "radius")
+    },
+    "values of a quantity": lambda value: Quantity(value, np.ones(7)),
+    "matrices of a field": lambda value: CrosstalkField(order=1, coefficients=value, shape=(20, 20)),
+    "kind": lambda value: Calibration(kind=value),
+    "pixel field": lambda value: fields.at_nodes(value, np.array([[1.0, 1.0]])),
+    "nodal field": lambda value: fields.at_pixels(MESH, value, (20, 20)),
+    "truth": lambda value: fields.field_rms(MESH, np.zeros((3, 2)), value),
+    "border": lambda value: fields.field_rms(MESH, np.zeros((3, 2)), np.zeros((2, 20, 20)), border=value),
+    "sigma": lambda value: fields.high_pass(TEXTURE, value),
+    "times": lambda value: fields.rates(value, *RATES, window=3, common_fraction=0.5, references=[True] * 8),
+    "window": lambda value: fields.rates(range(8), *RATES, window=value, common_fraction=0.5, references=[True] * 8),
+    "uncertainty": lambda value: fields.frame_covariance(value, 0.5, [True] + 6 * [False]),
+    "common fraction": lambda value: fields.frame_covariance(RATES[1], value, [True] * 8),
+    "number of reference frames": fields.reference_fraction,
+    "gradient": lambda value: fields.strain_of_gradient(value, np.zeros((3, 4, 4))),
+    "axis": lambda value: rotation(1.0, value),
+    "displacement gradient": lambda value: AffineField(gradient=value),
+    "displacement of a mesh": lambda value: MeshField(**FIELD | {"displacement": value}),
+    "translation": lambda value: State(translation=value),
+    "size of a map": lambda value: height_map(Surface(), size=value, pitch=0.1),
+    "number of areas": lambda value: areas_along_x((0, 0), count=value),
+    "displacement of images": lambda value: residual_percent(TEXTURE, TEXTURE, value),
+    "heights": lambda value: rms_slope(value, np.ones((3, 3), dtype=bool), 0.1),
+    "wavelengths": lambda value: Sensitivities(wavelengths=value, values=np.ones((3, 7))),
+    "levels of light": lambda value: fit_lobe(np.arange(7.0), value),
+    "white balance": lambda value: write_dng("/dev/null/x", Mosaic(**MOSAIC), white_balance=value),
+    **{"file": lambda value: write_dng(value, Mosaic(**MOSAIC)), "mesh": rgbmidic.read_mesh},
+}
+"""Of which some of the strange values are right."""
 
 
 @pytest.mark.parametrize("name", ARGUMENTS)
@@ -82,11 +148,33 @@ def test_strange_arguments_are_refused_in_one_line(name: str) -> None:
     assert refused >= len(STRANGE) - 4
 
 
+@pytest.mark.parametrize("name", MORE_ARGUMENTS)
+@pytest.mark.filterwarnings("ignore")
+def test_strange_arguments_are_taken_or_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for value in [*STRANGE, None, {}, {"a": 1}, True, 0, "\0", "y" * 300]:
+        with suppress(RgbmidicError):
+            MORE_ARGUMENTS[name](value)
+
+
+@pytest.mark.parametrize("path", ["\0", b"x", None, 7])
+def test_what_is_no_name_of_a_file_is_refused(path: Any) -> None:
+    for use in (lambda one: write_dng(one, Mosaic(**MOSAIC)), rgbmidic.read_mesh, lambda one: list_frames("*", one)):
+        with pytest.raises(RgbmidicError):
+            use(path)
+
+
+def test_grey_levels_that_no_camera_has_are_refused() -> None:
+    for value in (-1, 7e4, np.nan):
+        with pytest.raises(InputError, match="grey levels are whole numbers from 0 to 65535"):
+            Mosaic(**MOSAIC | {"values": np.full((24, 24), value)})
+
+
 @pytest.mark.parametrize("lights", [("red", "red"), ("", "red"), (" ", "red"), (1, 2)])
 def test_lights_need_names_of_their_own(lights: tuple[Any, Any]) -> None:
-    with pytest.raises(RgbmidicError, match="each light needs a name, different from the others'"):
+    with pytest.raises(RgbmidicError, match=r"each light needs a name, different from the others'|must be a text"):
         Crosstalk(matrix=np.eye(3)[:, :2], lights=lights)
-    with pytest.raises(RgbmidicError, match="each light needs a name"):
+    with pytest.raises(RgbmidicError, match=r"each light needs a name|must be a text"):
         Registration(lights=lights, parameters=np.zeros((2, 5)), centre=(1, 1), radius=10.0)
     document = Calibration(crosstalk=Crosstalk(matrix=np.eye(3)[:, :2], lights=("red", "blue"))).to_document()
     document["crosstalk"]["lights"] = list(lights)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from rgbmidic.arguments import checked
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
 from rgbmidic.frames import open_series, open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
@@ -104,6 +105,7 @@ def inspect_files(
         raise FrameError(f"{file_names}: {error}") from None
 
 
+@checked
 def inspect_frame(
     frame: Frame | Sequence[Frame],
     *,
@@ -111,7 +113,7 @@ def inspect_frame(
     region: Region | Sequence[float] | None = None,
     element_size: float = ELEMENT_SIZE,
     demosaic: str = "auto",
-    prefilter: str = "binomial",
+    prefilter: Literal["none", "binomial", "gaussian"] = "binomial",
     name: str = "frame",
     seed: int = 0,
     accept: Sequence[str] = (),

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._version import __version__
+from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
@@ -246,6 +247,7 @@ def _record_frames(
     return [record(images, scene.camera, scene.lights, seed=int(seed), shining=shining) for seed in seeds]
 
 
+@checked
 def record(
     images: npt.NDArray[np.floating],
     camera: Camera,
@@ -296,6 +298,8 @@ def record(
         if camera.green_difference:
             half = np.float32(0.5) * np.array(camera.green_difference, dtype=np.float32)
             signal += green_signs(camera.cfa, signal.shape) * np.tensordot(half, illumination, axes=1)
+    if seed < 0 or not signal.max(initial=0) * camera.gain < 2**60:
+        raise InputError(f"a seed is not negative, and images have finite levels: {seed}, {signal.max(initial=0):g} DN")
     generator = np.random.default_rng(seed)
     electrons = generator.poisson(np.maximum(signal, 0) * camera.gain).astype(np.float64)
     if camera.read_noise > 0:

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import erf
 
 from rgbmidic._kernels.render import trace_rows
+from rgbmidic.arguments import checked
 from rgbmidic.scene.camera import DISTANCE, NOMINAL_DISTANCE, PIXEL, Light, Vector, reference_camera, three_lights
 from rgbmidic.scene.scene import Plate, Scene, Sphere, State
 from rgbmidic.scene.surface import AffineField, Finish, Surface
@@ -259,6 +260,7 @@ def paper_scene(*, size: int = 1024, seed: int = 0, colour: bool = False, **came
     return scene if "exposure" in camera else expose(scene)
 
 
+@checked
 def expose(scene: Scene, state: State | None = None, level: float = 0.97) -> Scene:
     """Return the scene with the exposure at which the brightest sample of all channels is a fraction of full scale.
 
@@ -289,6 +291,7 @@ def _lamp_at(angle_deg: float, height_deg: float, distance: float = 550.0) -> Ve
     return float(x), float(distance * np.sin(height)), float(z)
 
 
+@checked
 def turned(angle_deg: float) -> State:
     """Return the body turned by an angle about the vertical through its front point (paper, section 2.1).
 
@@ -304,6 +307,7 @@ def turned(angle_deg: float) -> State:
     return State(angle_deg=angle_deg)
 
 
+@checked
 def strained_plate(
     *, shift_px: tuple[float, float] = (0.25, 0.075), strain: float = 0.002, pixel: float = PIXEL
 ) -> State:

@@ -334,3 +334,17 @@ def test_a_raw_that_libraw_does_not_decode_is_refused_whatever_memory_holds(
         read_frame(whole)
         with pytest.raises(FrameError, match=r"bad\.dng is damaged or truncated"):
             read_frame(bad)
+
+
+def test_a_jpeg_that_announces_more_than_its_tile_is_not_decoded(tmp_path: Path) -> None:
+    """LibRaw works for minutes on 65504 rows of 65490 samples, which it makes up."""
+    path = tmp_path / "large.dng"
+    write_lossless_dng(path, noisy_mosaic((31, 45)))
+    content = bytearray(path.read_bytes())
+    begin = content.index(b"\xff\xc3") + 5
+    content[begin : begin + 4] = b"\xff\xe0\xff\xd2"
+    path.write_bytes(content)
+    with pytest.raises(
+        FrameError, match=r"large\.dng is damaged .* announce 65504 rows of 65490 x 1 samples"
+    ):
+        read_frame(path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.frames import read_frame
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.images import write_dng, write_tiff
+from rgbmidic.illumination.calibration import write_document
 from rgbmidic.settings import BAYER_PATTERNS
 
 
@@ -86,3 +89,19 @@ def test_a_frame_is_replaced_only_as_a_whole(tmp_path: Path) -> None:
         write_dng(tmp_path / "frame.dng", noisy_mosaic(seed=seed))
     np.testing.assert_array_equal(read_frame(tmp_path / "frame.dng").values, noisy_mosaic(seed=1).values)
     assert [file.name for file in tmp_path.iterdir()] == ["frame.dng"]
+
+
+def test_threads_that_write_the_same_file_leave_a_whole_one_and_nothing_else(tmp_path: Path) -> None:
+    frames = [noisy_mosaic((64, 64), seed=seed) for seed in range(4)]
+
+    def write(frame: Mosaic) -> None:
+        for _ in range(5):
+            write_tiff(tmp_path / "frame.tif", frame)
+            write_document(tmp_path / "document.json", {"sum": int(frame.values.sum())})
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(write, frames))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["document.json", "frame.tif"]
+    found = read_frame(tmp_path / "frame.tif", kind="bayer", cfa="RGGB", black_level=0).values
+    assert any(np.array_equal(found, frame.values) for frame in frames)
+    assert json.loads((tmp_path / "document.json").read_text())["sum"] in [int(frame.values.sum()) for frame in frames]

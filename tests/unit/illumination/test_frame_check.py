@@ -98,6 +98,29 @@ def test_less_noise_than_calibrated_is_certain_in_one_frame_and_more_is_doubtful
     assert found(small[0], repeat=moved).get("noise") is not True
 
 
+@pytest.mark.parametrize(("powers", "greens", "name"), [((1.0, 1.0, 0.5), 0.0, ""), ((1.0, 1.0, 1.0), 0.02, "greens")])
+@pytest.mark.parametrize("cfa", ["RGGB", "GBRG"])
+def test_a_window_moved_by_a_row_and_a_column_is_found_by_lamps_or_greens_that_differ(powers, greens, name, cfa):
+    """What is stored at a site of red is then of blue, and the greens are exchanged, too."""
+    images, sites = lights(powers=powers), np.repeat(A, [1, 2, 1], axis=0)
+    sites[1:3, 0] += [greens / 2, -greens / 2]
+    levels = images.mean(axis=(1, 2))
+    crosstalk = replace(CROSSTALK, light_levels=levels * [1.1, 1, 1], green_difference=np.array([greens, 0, 0]))
+    calibration = Calibration(crosstalk=crosstalk, noise=NOISE, cfa=cfa)
+    for moved in (0, 1):
+        cell = np.roll(cfa_channels(cfa), (moved, moved), axis=(0, 1))
+        cell = cell + (cell == 2) + ((cell == 1) & (cell == 2).any(axis=1, keepdims=True))
+        y, x = np.indices(SHAPE)
+        values = np.tensordot(sites, images, axes=1)[cell[y % 2, x % 2], y, x]
+        values += np.random.default_rng(0).normal(size=SHAPE) * np.sqrt(NOISE.variance(values))
+        stored = np.rint(values + BLACK).clip(0, WHITE).astype(np.uint16)
+        frame = Mosaic(values=stored, cfa=cfa, black_level=np.array(BLACK), white_level=WHITE)
+        checks = [one for one in contradictions(frame, calibration, INSIDE) if "exchanged" in one.text]
+        assert [one.name for one in checks] == [name] * moved
+        assert all(one.passed == (name == "") for one in checks)
+        assert found(frame, replace(calibration, crosstalk=CROSSTALK)) == {}  # an older file cannot tell
+
+
 def red(factor):
     def change(values):
         out = values.copy()

@@ -1,0 +1,97 @@
+"""Arguments of functions, and fields of classes, that are of the types of their annotations or refused in one line."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, ParamSpec, TypeVar, Union, cast, get_args, get_origin
+
+import numpy as np
+
+from rgbmidic.errors import ConfigurationError, InputError, RgbmidicError
+from rgbmidic.settings.conversion import convert_value, type_hints
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+_SIMPLE = (float, int, bool, str, Path)
+
+
+def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Refuse what a function cannot take, before it begins: texts for numbers, arrays of texts, infinite numbers.
+
+    Numbers, texts, tuples of them and arrays are looked at, whose annotations say what they are; shapes, bounds and NaN
+    in an array are the function's own business.
+
+    Raises
+    ------
+    InputError
+        An argument is not of the type of its annotation.
+    """
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        bound = signature.bind(*args, **kwargs)
+        for name, value in bound.arguments.items():
+            if signature.parameters[name].kind is not inspect.Parameter.VAR_KEYWORD:
+                bound.arguments[name] = _converted(
+                    value, type_hints(function).get(name), f"{function.__name__}: {name}", InputError
+                )
+        return function(*bound.args, **bound.kwargs)
+
+    return call
+
+
+def check_fields(one: object, error: type[RgbmidicError] = InputError) -> None:
+    """Convert the fields of a frozen dataclass to the types of their annotations, or refuse them.
+
+    Raises
+    ------
+    RgbmidicError
+        A field is not of the type of its annotation.
+    """
+    hints = type_hints(cast(Any, type(one)))
+    for entry in fields(cast(Any, one)):
+        value = getattr(one, entry.name)
+        where = f"{entry.name} of {type(one).__name__}"
+        object.__setattr__(one, entry.name, _converted(value, hints[entry.name], where, error))
+
+
+def _converted(value: Any, hint: Any, where: str, error: type[RgbmidicError]) -> Any:
+    """Value in the type of the annotation; what is neither number, text, tuple nor array, as it is."""
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    if value is None and NoneType in kinds:
+        return None
+    if any(str(getattr(get_origin(kind), "__module__", "")).startswith("numpy") for kind in kinds):
+        return _array(value, where, error)
+    if kinds[0] not in _SIMPLE and get_origin(kinds[0]) not in (tuple, Literal):
+        return value
+    try:
+        value = convert_value(value, hint, where)
+    except ConfigurationError as wrong:
+        raise error(str(wrong)) from None
+    except TypeError:  # no value of a Literal can be compared with it
+        raise error(f"{where} cannot be {value!r:.80}") from None
+    if isinstance(value, float) and not math.isfinite(value):
+        raise error(f"{where} must be finite, not {value}")
+    if isinstance(value, Path) and "\0" in str(value):
+        raise error(f"{where} is no name of a file: it holds a NUL")
+    return value
+
+
+def _array(values: Any, where: str, error: type[RgbmidicError]) -> Any:
+    """Values as an array of numbers."""
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind == "O":
+            array = array.astype(np.float64)
+    except (TypeError, ValueError, OverflowError):
+        array = np.empty(0, dtype=str)
+    if array.dtype.kind not in "buif":
+        raise error(f"{where} is an array of real numbers, not {values!r:.80}")
+    return array
