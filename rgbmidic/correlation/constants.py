@@ -188,7 +188,8 @@ class SolverConstants:
     named: float = 0.1
     lit: float = 0.3
     least_gain: float = 0.05
-    gain_smoothness: float = 1e-3
+    brightness_speckles: float = 6.0
+    brightness_least: float = 6.0
     block: int = 13
     of_element: float = 0.75
     across: int = 4

@@ -21,8 +21,9 @@ from rgbmidic._kernels.owned_pixels import interpolate_nodal, score_sums
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
 from rgbmidic.correlation.assembly import Assembly, unfitted_fraction
+from rgbmidic.correlation.brightness import BrightnessModel, GainFit, window_width
 from rgbmidic.correlation.constants import USUAL, SolverConstants
-from rgbmidic.correlation.images import spline_coefficients, spline_values, usable_pixels, usable_reach
+from rgbmidic.correlation.images import SlidingWindow, spline_coefficients, spline_values, usable_pixels, usable_reach
 from rgbmidic.correlation.texture import TextureGradient
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import Registration
@@ -175,6 +176,9 @@ class Reference:
     images: FloatImage
     weights: FloatImage
     values: FloatImage
+    level: FloatImage
+    gain_window: float | None
+    brightness: BrightnessModel
     gradient: FloatImage
     pixel_weights: FloatImage
     texture: TextureGradient
@@ -194,6 +198,7 @@ class Reference:
         origin: tuple[int, int] = (0, 0),
         material: Tri3Mesh | None = None,
         registration: Registration | None = None,
+        brightness: BrightnessModel = "auto",
         constants: SolverConstants = USUAL,
     ) -> Reference:
         """Prepare the reference state.
@@ -246,6 +251,19 @@ class Reference:
         else:
             values, weighted, own = _where_they_lie(state, mesh, pixels, pixels.gather(inside), registration)
         del state  # before what needs most memory
+        level, sigma = np.ones_like(values), None
+        if brightness not in ("none", "constant"):
+            sigma = window_width(values, own, weighted, pixels, constants) if brightness == "auto" else float(brightness)
+        for light, (f, w) in enumerate(zip(values, weighted, strict=True)):
+            whole = float((w * f).sum(dtype=np.float64) / max(w.sum(dtype=np.float64), 1e-30)) or 1.0
+            level[light] = abs(whole)
+            if sigma is not None:
+                mean, = pixels.from_blocks(SlidingWindow(sigma=sigma).ratios(pixels, np.stack([w * f, w])), SlidingWindow(sigma=sigma).step)
+                np.maximum(mean, np.float32(0.01 * mean.max()), out=level[light])
+                fit = GainFit.of(pixels, w, f, sigma)
+                for axis in own[:, light]:
+                    axis -= f * fit.gain(axis)
+            own[:, light] /= level[light]
         texture = TextureGradient.of_images(own, weighted, pixels, constants.shared)
         gradient = texture.matched(pixels)
         return cls(
@@ -258,6 +276,9 @@ class Reference:
             images=ready,
             weights=usable,
             values=values,
+            level=level,
+            gain_window=sigma,
+            brightness=brightness,
             gradient=gradient,
             pixel_weights=weighted,
             texture=texture,

@@ -90,7 +90,7 @@ class FrameSettings(Checked):
             yield f"frames.white_level must be above black_level {self.black_level}, not {self.white_level}"
 
 
-LOCAL_MEAN = 10.0
+LOCAL_MEAN = 0.0
 """Width (px) of the local mean. Chosen: two to three speckles."""
 
 
