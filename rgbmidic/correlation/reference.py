@@ -260,9 +260,9 @@ class Reference:
             if sigma is not None:
                 mean, = pixels.from_blocks(SlidingWindow(sigma=sigma).ratios(pixels, np.stack([w * f, w])), SlidingWindow(sigma=sigma).step)
                 np.maximum(mean, np.float32(0.01 * mean.max()), out=level[light])
-                fit = GainFit.of(pixels, w, f, sigma)
+                fit = GainFit.over(f, w, pixels, sigma)
                 for axis in own[:, light]:
-                    axis -= f * fit.gain(axis)
+                    axis[:] = fit.residual(axis, f)
             own[:, light] /= level[light]
         texture = TextureGradient.of_images(own, weighted, pixels, constants.shared)
         gradient = texture.matched(pixels)

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import differences, element_squares, warped_weights
 from rgbmidic._kernels.owned_pixels import interpolate_nodal, subtract_quadratic
-from rgbmidic.correlation.brightness import Brightness, GainFit, gain_and_offset
+from rgbmidic.correlation.brightness import Brightness
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import with_data
@@ -227,13 +227,13 @@ def curved_deviation(mesh: Tri3Mesh, barycentric: FloatArray, carried: FloatArra
 
 def reference_brightness(reference: Reference, weights: FloatImage, moments: FloatArray) -> Brightness:
     """Brightness of a deformed state, from the weights (k, P) and the moments (k, E, 6)."""
-    gain, offset, fits = np.ones(len(weights)), np.zeros(len(weights)), ()
-    if reference.brightness != "none":
-        gain, offset = gain_and_offset(moments, reference.constants)
-    if reference.gain_window is not None:
-        lights = zip(weights, reference.values, strict=True)
-        fits = tuple(GainFit.of(reference.pixels, w, f, reference.gain_window) for w, f in lights)
-    return Brightness(values=reference.values, level=reference.level, gain=gain, offset=offset, fits=fits, least_gain=reference.constants.least_gain)
+    if reference.brightness == "none":
+        moments = np.zeros_like(moments)
+    pixels = reference.pixels
+    centres = reference.mesh.centres - pixels.bounds[1::-1]
+    return Brightness.between(
+        pixels, reference.values, reference.level, weights, moments, centres, reference.gain_window, reference.constants
+    )
 
 
 _KNOWN = 12
