@@ -106,7 +106,7 @@ def weighted_block_sums(start, stop, values, weight, lines, run_offsets, offsets
 
 @compiled("lines", fastmath=FAST)
 def corrected_difference(start, stop, lines, reference, unit, difference, gain, offset, least, side, out):
-    """Residual ``(f - (g - b) / a) / unit`` of one light, from f, the `reference` (P,), and the `difference` f - g (P,).
+    """Residual ``(f - (g - b) / a) / unit`` of one light, from the `reference` f (P,) and the `difference` f - g (P,).
 
     The `gain` a (h, w) at the centres of blocks of `side` px is interpolated between them, and is `least` at least. The
     `offset` b has a constant and slopes along columns and rows. `unit` and `out` are (P,) float32.

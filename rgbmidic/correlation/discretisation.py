@@ -27,7 +27,7 @@ from rgbmidic.correlation.images import apply_prefilter, at_blocks, window_sums
 from rgbmidic.correlation.one_sided_fit import at_free_boundary, one_sided_difference
 from rgbmidic.correlation.recovery import Recovery, angle_fraction, quadratic_fit
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.residual import PrecisionMethod, Residual, reference_brightness
+from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys
@@ -446,7 +446,7 @@ def _left(reference: Reference, noise: FloatImage, field: FloatArray) -> Residua
     weights, moments = reference.pixel_weights, np.zeros((len(noise), 0, 6))
     return Residual(
         reference=reference,
-        brightness=reference_brightness(reference, weights, np.zeros((len(noise), 1, 6))),
+        brightness=reference.brightness_of(weights, None),
         weights=weights,
         difference=left,
         moments=moments,

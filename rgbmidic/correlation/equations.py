@@ -356,9 +356,7 @@ def _right_sides(
     return total, held, np.concatenate(rigid) if rigid else np.empty(0)
 
 
-def observed_sensitivity(
-    problem: Problem, equations: Equations, residual: Residual, estimate: Estimate
-) -> FloatArray:
+def observed_sensitivity(problem: Problem, equations: Equations, residual: Residual, estimate: Estimate) -> FloatArray:
     """Sensitivity of the scores to a motion as the deformed images show it, over that of the Hessian, (N,).
 
     The Hessian has the texture of the reference. Where glare or paint has changed since, the deformed images show less

@@ -9,18 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import differences, element_squares, warped_weights
-from rgbmidic._kernels.owned_pixels import interpolate_nodal, subtract_quadratic
+from rgbmidic._kernels.owned_pixels import subtract_quadratic
 from rgbmidic.correlation.brightness import Brightness
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
@@ -32,12 +31,12 @@ class Residual:
     ----------
     reference
         The reference state.
-    values : ndarray, shape (k, P), float32
-        Grey levels f of the reference, corrected for brightness.
+    brightness
+        Of the deformed images.
     weights : ndarray, shape (k, P), float32
         Weights given, warped by the displacement; 0 where g is not known.
     difference : ndarray, shape (k, P), float32
-        f - g(x + u); 0 where g is not known.
+        f - g(x + u) with the brightness of g corrected, in units of the local mean of f (`Brightness.residual`).
     moments : ndarray, shape (k, E, 6)
         Sums of w, w f, w g, w f f, w f g, w g g over the pixels of each element.
     """
@@ -50,14 +49,12 @@ class Residual:
 
     @classmethod
     def at(cls, reference: Reference, deformed: Deformed, displacements: Sequence[FloatArray]) -> Residual:
-        """At one nodal displacement (N, 2) per light, for reference grey levels `values` (k, P).
+        """At one nodal displacement (N, 2) per light.
 
         Parameters
         ----------
         reference, deformed
             Images of both states.
-        values : ndarray, shape (k, P)
-            Grey levels of the reference.
         displacements : sequence of ndarray, shape (N, 2)
             Nodal displacement of every light in px.
 
@@ -73,7 +70,7 @@ class Residual:
             differences(deformed.coefficients[light], values[light], *there, difference[light])
             images = deformed.weights[light], deformed.partial[light], values[light], difference[light]
             warped_weights(*images, reference.pixel_weights[light], *there, weights[light], moments[light])
-        brightness = reference_brightness(reference, weights, moments)
+        brightness = reference.brightness_of(weights, moments)
         for light, one in enumerate(difference):
             one[:] = brightness.residual(light, one)
         return cls(reference=reference, brightness=brightness, weights=weights, difference=difference, moments=moments)
@@ -223,17 +220,6 @@ def curved_deviation(mesh: Tri3Mesh, barycentric: FloatArray, carried: FloatArra
     deviation = sag.transpose(0, 2, 1) @ products
     deviation[..., :3] -= carried[first].transpose(0, 2, 1) @ barycentric
     return np.asarray(deviation, dtype=np.float32)
-
-
-def reference_brightness(reference: Reference, weights: FloatImage, moments: FloatArray) -> Brightness:
-    """Brightness of a deformed state, from the weights (k, P) and the moments (k, E, 6)."""
-    if reference.brightness == "none":
-        moments = np.zeros_like(moments)
-    pixels = reference.pixels
-    centres = reference.mesh.centres - pixels.bounds[1::-1]
-    return Brightness.between(
-        pixels, reference.values, reference.level, weights, moments, centres, reference.gain_window, reference.constants
-    )
 
 
 _KNOWN = 12

@@ -41,7 +41,6 @@ from rgbmidic.timing import stage
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Weighting:
     """Elements, lights and grey levels of a pass, as the residual at an estimate determines them.

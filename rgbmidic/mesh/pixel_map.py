@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.mesh import claim_pixels
-from rgbmidic._kernels.owned_pixels import block_sums, weighted_block_sums, from_image, to_image
+from rgbmidic._kernels.owned_pixels import block_sums, from_image, to_image, weighted_block_sums
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
