@@ -182,7 +182,7 @@ def gain_and_offset(
         total, f, g, ff, fg, gg = sums.T
         total = np.maximum(total, 1e-30)
         ff, fg, gg = ff - f * f / total, fg - f * g / total, gg - g * g / total
-        alike = (ff > 0) & (fg > constants.lit * np.sqrt(np.maximum(ff * gg, 0)))
+        alike = (ff > 0) & (gg > 0) & (fg > constants.lit * np.sqrt(np.maximum(ff * gg, 0)))
         if alike.any():
             gain = np.sqrt(gg[alike] / ff[alike])
             gains[light] = np.median(gain)

@@ -390,8 +390,10 @@ def without_former_keys(document: Mapping[str, Any]) -> Mapping[str, Any]:
     if isinstance(illumination, Mapping) and "normalise" in illumination:
         width = illumination["normalise"]
         changes["illumination"] = {key: value for key, value in illumination.items() if key != "normalise"}
-        if new in (None, "auto", "none"):
-            new = "none" if width == 0 and new != "auto" else width
+        if width == 0:
+            new = {None: "none", "auto": "auto" if brightness in former else "none"}.get(new, new)
+        elif new in (None, "auto", "none"):
+            new = width
         logger.warning("illumination.normalise = %r is no key any more: solver.brightness = %r is used", width, new)
     elif new != brightness:
         logger.warning('solver.brightness = "%s" is now "%s", which is used', brightness, new)
