@@ -21,7 +21,7 @@ from rgbmidic import Region, Solution, SolverSettings, Tri3Mesh
 from rgbmidic.correlation import Deformed, Reference, SolverConstants, Start, track
 from rgbmidic.correlation.images import SlidingWindow, as_light_stack
 from rgbmidic.correlation.start import Search
-from rgbmidic.settings import ELEMENT_SIZE, grey_levels
+from rgbmidic.settings import ELEMENT_SIZE
 from rgbmidic.typing import FloatArray
 from rgbmidic.weights import Statistics, as_weights
 
@@ -67,7 +67,7 @@ class Method:
         weights = as_weights(options.pop("weights", None), f.shape, "weights")
         region = Region.from_rectangle(REGION, SHAPE)
         mesh = Tri3Mesh.from_region(region, options.pop("element_size", ELEMENT_SIZE))
-        _, settings = grey_levels(0.0, SolverSettings(**options), cracked=False)
+        settings = SolverSettings(**options)
         prefilter = settings.prefilter
         reference = Reference.prepare(f, region, weights, mesh=mesh, prefilter=prefilter, constants=self.solver)
         deformed = Deformed.prepare(g, None, prefilter=prefilter)

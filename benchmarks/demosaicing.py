@@ -24,7 +24,7 @@ from scipy.ndimage import map_coordinates
 from rgbmidic import read_frame
 from rgbmidic.fields import at_nodes, at_pixels
 from rgbmidic.illumination.crosstalk import Crosstalk, unmix
-from rgbmidic.illumination.images import IlluminationImages, normalise
+from rgbmidic.illumination.images import IlluminationImages, local_mean
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic, NoiseModel, linearise
 from rgbmidic.illumination.separation import separate
 from rgbmidic.lab.virtual import Scene, State, plate_scene, record, render, sphere_scene, strained_plate, truth, turned
@@ -110,16 +110,16 @@ class Contender:
     name: str
     method: str
     prefilter: str = "binomial"
-    normalise: float | None = 10.0
+    brightness: float | str = "auto"
     masks: bool = False
     one_image: bool = False
 
 
 CONTENDERS = [
-    Contender("masks without prefilter", "malvar", prefilter="none", normalise=None, masks=True),
+    Contender("masks without prefilter", "malvar", prefilter="none", brightness="none", masks=True),
     Contender("Malvar", "malvar"),
     Contender("normalised mosaic", "normalised"),
-    Contender("mean of the lights", "auto", normalise=None, one_image=True),
+    Contender("mean of the lights", "auto", one_image=True),
     Contender("default", "auto"),
     Contender("3-CCD", "3-CCD"),
 ]
@@ -165,14 +165,14 @@ def solved(contender: Contender, pair: list[IlluminationImages], exact: FloatArr
         weights=weights[0],
         deformed_weights=weights[1],
         prefilter=contender.prefilter,
-        normalise=contender.normalise,
+        brightness=contender.brightness,
         statistics=not contender.masks,
     )
 
 
 def together(images: IlluminationImages) -> FloatImage:
     """The mean (1, H, W) of the lights, each divided by its local mean."""
-    return np.asarray(normalise(images.values, 10.0, images.full_scale).mean(axis=0, keepdims=True))
+    return np.mean([image / local_mean(image, 10.0) for image in images.values], axis=0, keepdims=True)
 
 
 def errors(case: Case, contenders: list[Contender], matrix: FloatArray | None = None) -> dict[str, Error]:

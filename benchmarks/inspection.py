@@ -87,7 +87,7 @@ def predicted(name: str, camera: str, side: float) -> tuple[FloatArray, FloatArr
             seeds = 100 * paint + 2 * pair
             frames, reference = shot(first, case, kind, seeds)
             _, deformed = shot(second, case, kind, seeds + 1)
-            found = correlate(reference.values, deformed.values, region=region, element_size=side, normalise=10.0,
+            found = correlate(reference.values, deformed.values, region=region, element_size=side,
                               prefilter="binomial", initial=exact[:, SIZE // 2, SIZE // 2])  # fmt: skip
             inner = (abs(found.nodes - (SIZE - 1) / 2) < SIZE / 2 - INSET - side / 2).all(axis=1)
             observed.append((found.displacement - at_nodes(exact, found.nodes))[inner] ** 2)
@@ -177,7 +177,6 @@ def geometry_weights(quick: bool) -> Iterator[dict[str, object]]:
                     weights=given[0],
                     deformed_weights=given[1],
                     statistics=way == "statistics",
-                    normalise=10.0,
                     prefilter="binomial",
                     initial=exact[:, 144, 144],
                 )

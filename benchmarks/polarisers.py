@@ -145,7 +145,7 @@ class Contender:
             for number, image in enumerate(images)
         ]
         first, second = (np.where(image.valid, image.values, np.nan) for image in seen)
-        found = correlate(first, second, region=region, initial=start, normalise=10.0)
+        found = correlate(first, second, region=region, initial=start)
         mesh, zone = Tri3Mesh(nodes=found.nodes, elements=found.elements), taken.reflection
         error = at_pixels(mesh, found.displacement, (SIZE, SIZE)) - taken.exact
         ratio = (found.displacement - at_nodes(taken.exact, found.nodes)) / found.displacement_std

@@ -42,9 +42,9 @@ def jump(quick: bool) -> Iterator[dict[str, object]]:
     contrast, three textures, all pairs but the tip's: rms(error / stated) of opening and sliding, pairs that are
     measured."""
     region = Region.from_rectangle(REGION, SHAPE)
-    cases = [(size, lights, True) for size in (12, 16, 25) for lights in (1, 3)]
-    cases += [(size, 1, False) for size in (12, 25)]
-    for size, lights, normalised in cases[4:5] if quick else cases:
+    cases = [(size, lights, "auto") for size in (12, 16, 25) for lights in (1, 3)]
+    cases += [(size, 1, "none") for size in (12, 25)]
+    for size, lights, brightness in cases[4:5] if quick else cases:
         mesh, ratios, known = Tri3Mesh.from_region(region, size, [PATH]), [], []
         for texture in range(1 if quick else 3):
             for opening in (2.5,) if quick else (1.0, 2.5, 5.0):
@@ -54,9 +54,12 @@ def jump(quick: bool) -> Iterator[dict[str, object]]:
                         np.stack([level * noisy(image, 10 * n + light) for light, level in enumerate(LIGHTS[:lights])])
                         for n, image in enumerate(states)
                     )
-                    options = {} if normalised else {"normalise": 0.0}
                     found = as_nodal(
-                        [*measure_sequence([deformed], reference=reference, region=region, mesh=mesh, **options)]
+                        [
+                            *measure_sequence(
+                                [deformed], reference=reference, region=region, mesh=mesh, brightness=brightness
+                            )
+                        ]
                     )
                     jump = crack_jump(mesh.nodes, mesh.elements, found, (10, PATH[0][1]), PATH[1])
                     error = jump.opening - opening_at(jump.points[:, 0], opening)
@@ -67,7 +70,7 @@ def jump(quick: bool) -> Iterator[dict[str, object]]:
         yield {
             "elements [px]": str(size),
             "lights": str(lights),
-            "normalise": "default" if normalised else "0",
+            "brightness": brightness,
             "opening: error/stated": float(opened),
             "sliding: error/stated": float(slid),
             "measured [%]": 100 * float(np.mean(known)),
@@ -80,7 +83,7 @@ def tip(quick: bool) -> Iterator[dict[str, object]]:
     the contrast, 16 draws, radii of 34 and 118 px: uncertainty stated (MPa√m), rms(error / stated), the same where the
     tip is fitted, chi-square over degrees of freedom."""
     for size in (20,) if quick else (10, 14, 20):
-        solutions = [cracked(NOISE, seed, 10.0, size) for seed in range(16)]
+        solutions = [cracked(NOISE, seed, size) for seed in range(16)]
         mesh, nodal, radii = (solutions[0].nodes, solutions[0].elements), as_nodal(solutions), (34, 118)
         if size == 20:
             radii = (40, 118)

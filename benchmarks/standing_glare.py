@@ -14,7 +14,6 @@ from rgbmidic.correlation.start import Start, track
 from rgbmidic.frames import Mosaic, Window, cfa_channels
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.images import correlated
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.separation import Separation, reference_images
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -181,10 +180,10 @@ def _measured(plate: HoledPlate, moving: int | None) -> Row:
         Separation(calibration=calibration), frames[: plate.rest], Window.of_frame(frames[0][0].values.shape[-2:])
     )
     mesh = Tri3Mesh.from_region(region, ELEMENT_SIZE)
-    reference = Reference.prepare(correlated(images), region, mesh=mesh, prefilter=solver.prefilter)
+    reference = Reference.prepare(images.values, region, mesh=mesh, prefilter=solver.prefilter)
     start, errors, stated = Start(displacement=np.zeros_like(mesh.nodes)), [], []
     for number in range(plate.rest, len(frames)):
-        ready = correlated(separation(frames[number]))
+        ready = separation(frames[number]).values
         found = track(reference, Deformed.prepare(ready, prefilter=solver.prefilter), start, solver, Statistics())
         start = start.after(mesh, found.displacement, found.measured)
         errors.append(found.displacement - plate.displacement(mesh.nodes, number))

@@ -22,7 +22,6 @@ from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.lab.measures import area_stds
 from rgbmidic.lab.virtual import render, strained_plate, truth
 from rgbmidic.mesh import Region, Tri3Mesh
-from rgbmidic.settings import LOCAL_MEAN
 from rgbmidic.typing import BoolArray, FloatArray
 from rgbmidic.weights.threshold import threshold_weights
 
@@ -59,7 +58,7 @@ def solve_pair(
     low, high = square(pair.size)
     region = Region.from_rectangle((low, low, high, high), (pair.size, pair.size))
     nodes = Tri3Mesh.from_region(region, 25).nodes
-    options = {"initial": at_nodes(pair.exact, nodes) + 0.2, "normalise": 10.0, **options}
+    options = {"initial": at_nodes(pair.exact, nodes) + 0.2, **options}
     if threshold is not None:
         first, second = (threshold_weights(image, threshold=threshold) for image in images)
         options |= {"weights": first, "deformed_weights": second, "statistics": False}
@@ -76,7 +75,7 @@ def correlated(images: tuple[IlluminationImages, IlluminationImages], region: Re
     """
     if images[0].registration is None:
         return correlate(images[0].values, images[1].values, region=region, **options)
-    if options.keys() != {"initial", "normalise"} or options["normalise"] != LOCAL_MEAN:
+    if options.keys() != {"initial"}:
         raise ValueError(f"lights with a registration are measured by defaults only, not with {list(options)}")
     (solution,) = measure_sequence([images[1]], reference=images[0], region=region)
     return solution
@@ -347,7 +346,7 @@ def areas(quick: bool) -> Iterator[Row]:
             first, second = (images_of(frame(i, scene, kind, n), scene) for n, i in enumerate(rendered))
             mesh = Tri3Mesh.from_region(bench.region, 25)
             start = at_nodes(exact, mesh.nodes) + 0.2
-            found = correlated((first, second), bench.region, initial=start, normalise=10.0)
+            found = correlated((first, second), bench.region, initial=start)
             fields = at_pixels(mesh, found.displacement, camera.shape) - exact
             std = at_pixels(mesh, found.displacement_std, camera.shape)
             p, stated = (

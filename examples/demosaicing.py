@@ -43,7 +43,7 @@ exact, scatter, pictures = truth(scene, moved), {}, {}
 for method in DEMOSAICERS:
     reference, deformed = (separate(mosaic, crosstalk, method, texture=lights.texture) for mosaic in pair)
     pictures[method] = reference.values[1, 100:160, 100:160]
-    solution = correlate(reference.values, deformed.values, region=(19, 19, 269, 269), normalise=10.0)
+    solution = correlate(reference.values, deformed.values, region=(19, 19, 269, 269))
     error = solution.displacement - at_nodes(exact, solution.nodes)
     scatter[method] = float(np.nanstd(error - np.nanmean(error, axis=0)))
     bias = np.nanmean(error, axis=0)

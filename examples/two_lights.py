@@ -39,7 +39,7 @@ def photographs(state: State, seed: int) -> IlluminationImages:
 
 reference, deformed = photographs(states[0], seed=0), photographs(states[1], seed=1)
 masks = [threshold_weights(images, threshold=0.5, blur=8) for images in (reference, deformed)]
-solve = partial(correlate, region=(24, 24, 263, 263), statistics=False, normalise=10.0)
+solve = partial(correlate, region=(24, 24, 263, 263), statistics=False)
 
 alone = solve(reference.values[:1], deformed.values[:1])
 together = solve(reference.values, deformed.values, weights=masks[0], deformed_weights=masks[1])

@@ -82,11 +82,11 @@ def cracked_images():
     return texture.image(FIELD), deformed
 
 
-def cracked(noise, seed, normalise, element_size=16):
+def cracked(noise, seed, element_size=16):
     random = np.random.default_rng(seed)
     pair = [image + random.normal(scale=noise, size=FIELD) for image in cracked_images()]
     options = {"region": (6, 6, 253, 253), "element_size": element_size, "cracks": [[(0, TIP[1]), TIP]]}
-    return correlate(*pair, normalise=normalise, **options)
+    return correlate(*pair, **options)
 
 
 def as_nodal(solutions):

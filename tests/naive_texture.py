@@ -33,15 +33,6 @@ def subtract_mean(values, mean, cfa, block):
     return out
 
 
-def divide_by_mean(values, mean, block, least):
-    out = np.full(values.shape, np.nan)
-    for (i, j), value in np.ndenumerate(values):
-        level = between(mean, i, j, block)
-        if level > least:
-            out[i, j] = value / level
-    return out
-
-
 def scaled_contrast(contrast, scale, cfa, block, pad, width):
     rows, columns = contrast.shape
     channels = site_channels(contrast.shape, cfa)

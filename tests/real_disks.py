@@ -22,7 +22,6 @@ from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.separation import Separation
 from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.settings import FrameSettings
-from rgbmidic.settings.sections import LOCAL_MEAN
 
 FILES = {"red": "disks_650nm_250ms.tif", "green": "disks_550nm_25ms.tif", "blue": "disks_450nm_50ms.tif"}
 DARK = {"red": "dark_250ms_*.tif", "green": "dark_25ms_*.tif", "blue": "dark_50ms_*.tif"}
@@ -105,11 +104,11 @@ def lights(
     return Separation(calibration=cropped, demosaic=method, texture=texture)((shot,))
 
 
-def displacement(first: IlluminationImages, second: IlluminationImages, normalise: float | None) -> Solution:
+def displacement(first: IlluminationImages, second: IlluminationImages) -> Solution:
     """Displacement between two crops; all bands move alike, so each is read where it lies, without registration."""
     rows, columns = first.shape
     region = (MARGIN, MARGIN, columns - 1 - MARGIN, rows - 1 - MARGIN)
-    return correlate(first.values, second.values, region=region, element_size=ELEMENT, normalise=normalise)
+    return correlate(first.values, second.values, region=region, element_size=ELEMENT)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,7 +147,6 @@ def errors(
     *,
     offsets: Sequence[Offset] = OFFSETS,
     seed: int = 0,
-    normalise: float | None = LOCAL_MEAN,
 ) -> dict[Offset, Error]:
     """Errors of the displacement by a method at some offsets; each frame has noise of its own."""
     first = lights(bands.shot(ratio, (0, 0), seed), calibration, (0, 0), method)
@@ -156,7 +154,7 @@ def errors(
     for number, offset in enumerate(offsets, start=1):
         shot = bands.shot(ratio, offset, seed + 1000 * number)
         second = lights(shot, calibration, offset, method, first.texture)
-        found[offset] = Error.of(displacement(first, second, normalise), offset)
+        found[offset] = Error.of(displacement(first, second), offset)
     return found
 
 

@@ -24,7 +24,6 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields import at_nodes, at_pixels, high_pass
 from rgbmidic.illumination import IlluminationImages
 from rgbmidic.lab.measures import Goniometry, area_means, area_stds, residual_percent
-from rgbmidic.pipeline import correlated
 from rgbmidic.settings import ELEMENT_SIZE, SolverSettings
 from rgbmidic.weights import SetUpThreshold, Statistics, threshold_weights
 
@@ -173,10 +172,9 @@ def _seen(
         names=tuple(images.names[light] for light in lights),
         full_scale=images.full_scale,
     )
-    values = correlated(chosen) if METHODS[method].default else chosen.values
     if threshold is None:
-        return values, chosen.valid.astype(np.float32)
-    return values, threshold_weights(chosen, threshold=threshold, blur=BLUR)
+        return chosen.values, chosen.valid.astype(np.float32)
+    return chosen.values, threshold_weights(chosen, threshold=threshold, blur=BLUR)
 
 
 def displacement_at_pixels(solution: Solution, shape: tuple[int, int]) -> np.ndarray:

@@ -91,6 +91,55 @@ def block_sums(start, stop, values, lines, run_offsets, side, out):
 
 
 @compiled("out", axis=1, fastmath=FAST)
+def weighted_block_sums(start, stop, values, weight, lines, run_offsets, offsets, side, out):
+    """Sum fields (n, P) times one `weight` (P,) over blocks of `side` px: ``out`` (n, h, w)."""
+    out[:, start:stop] = 0
+    columns = np.zeros((len(values), out.shape[2] * side + _LANES), dtype=np.float32)
+    products = np.empty((len(values), _largest(offsets)), dtype=np.float32)
+    for e in range(run_offsets.size - 1):
+        first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
+        for n in range(len(values)):
+            for i in range(number):
+                products[n, i] = weight[first + i] * values[n, first + i]
+        _add(products, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
+
+
+@compiled("lines", fastmath=FAST)
+def corrected_difference(start, stop, lines, reference, unit, difference, gain, offset, least, side, out):
+    """Residual ``(f - (g - b) / a) / unit`` of one light, from the `reference` f (P,) and the `difference` f - g (P,).
+
+    The `gain` a (h, w) at the centres of blocks of `side` px is interpolated between them, and is `least` at least. The
+    `offset` b has a constant and slopes along columns and rows. `unit` and `out` are (P,) float32.
+    """
+    height, width = gain.shape
+    half, step = np.float32(0.5), np.float32(1.0 / side)
+    for q in range(start, stop):
+        slot, left, row, column = np.int64(lines[q, 0]), np.int64(lines[q, 1]), lines[q, 2], np.int64(lines[q, 3])
+        y = min(max((np.float32(row) + half) * step - half, _ZERO), np.float32(height - 1))
+        above = min(np.int64(y), max(height - 2, 0))
+        below, part = min(above + 1, height - 1), y - np.float32(above)
+        b = np.float32(offset[0] + offset[2] * row)
+        slope = np.float32(offset[1])
+        while left > 0:
+            x = (np.float32(column) + half) * step - half
+            before = np.int64(np.floor(x))
+            # pixels up to the next centre of a block: the gain is linear along them
+            number = min(left, (before + 1) * side + side // 2 - column)
+            i0, i1 = min(max(before, 0), width - 1), min(before + 1, width - 1)
+            at = (_ONE - part) * gain[above, i0] + part * gain[below, i0]
+            change = (_ONE - part) * gain[above, i1] + part * gain[below, i1] - at
+            start_x = x - np.float32(before)
+            first, from_column = np.uint64(slot), np.float32(column)
+            for i in range(np.uint32(number)):
+                t = np.float32(np.int32(i))
+                a = max(at + change * (start_x + t * step), least)
+                f = reference[first + i]
+                g = f - difference[first + i] - (b + slope * (from_column + t))
+                out[first + i] = (f - g / a) / unit[first + i]
+            slot, left, column = slot + number, left - number, column + number
+
+
+@compiled("out", axis=1, fastmath=FAST)
 def product_sums(start, stop, values, weights, lines, run_offsets, offsets, side, out):
     """Sum ``s a b`` and ``s = sqrt(w_a w_b)`` over blocks for each two fields a, b of `values` (k, P).
 

@@ -60,20 +60,6 @@ def subtract_mean(start, stop, values, mean, block, out):
 
 
 @compiled("out")
-def divide_by_mean(start, stop, values, mean, block, least, out):
-    """``out = values / local mean``, NaN where the mean is not above `least`.
-
-    `mean` (h, W) float32: the rows of a grid of `block` px, widened to the columns.
-    """
-    for i in range(start, stop):
-        low, high, part = between(i, block, len(mean))
-        above, below, line, target = mean[low], mean[high], values[i], out[i]
-        for j in range(line.size):
-            level = above[j] + part * (below[j] - above[j])
-            target[j] = line[j] / level if level > least else np.float32(np.nan)
-
-
-@compiled("out")
 def scaled_contrast(start, stop, contrast, scale, block, pad, out):
     """``out = contrast * scale``, mirrored by `pad` pixels on every side.
 

@@ -110,10 +110,12 @@ class SolverConstants:
         the speckle's is none. Two states of one speckle have .9 and more; of 50 speckles chance makes .3 in 1 of 60
         cases (derived).
     least_gain
-        Least gain of the local correction: a light that has lost 95 % of its contrast is not amplified any further.
-    gain_smoothness
-        Weight of the smoothness of gain and offset over the mean entry of their matrix: carries them over gaps. Chosen;
-        with half or twice of it lights differ by 4e-4 px at most.
+        Least local gain over that of the light: where a shadow takes 95 % of it, it is not amplified any further.
+    window_of_gain
+        Standard deviation of the window of the gain in correlation lengths of the speckle. With 4.5 noise-free coarse
+        speckle errs by 1.4 times as much, with 9 a shadow's edge by 1.5 times (benchmarks/grey_levels.py).
+    least_window
+        ... and at least, px: one and a half blocks of its grid.
     block
         Least side (px) of the blocks whose sums give the covariance of the scores: wider than a speckle and any filter.
     of_element
@@ -188,7 +190,8 @@ class SolverConstants:
     named: float = 0.1
     lit: float = 0.3
     least_gain: float = 0.05
-    gain_smoothness: float = 1e-3
+    window_of_gain: float = 6.0
+    least_window: float = 6.0
     block: int = 13
     of_element: float = 0.75
     across: int = 4

@@ -27,7 +27,7 @@ from rgbmidic.correlation.images import apply_prefilter, at_blocks, window_sums
 from rgbmidic.correlation.one_sided_fit import at_free_boundary, one_sided_difference
 from rgbmidic.correlation.recovery import Recovery, angle_fraction, quadratic_fit
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.residual import PrecisionMethod, Residual, corrected_values
+from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys
@@ -166,14 +166,12 @@ def _finer_field(
     functions = halves.prolonged(functions).reshape(2 * len(start), -1)
     problem = Problem(reference=fine, deformed=deformed, options=options, method=method, functions=functions)
     estimate = Estimate(displacement=start, rigid=np.nan_to_num(solution.rigid))
-    first = compare(problem, fine.values, estimate)
-    values = corrected_values(first, options.brightness)
-    first = replace(first, values=values, difference=first.difference_from(values))
+    first = compare(problem, estimate)
     children = np.repeat(used, len(_CHILDREN))
     given = first.weights * np.repeat(children, np.diff(fine.pixels.offsets))
     equations, _ = _weighed(method, first, given, start)
-    estimate = stepped(problem, equations, values, estimate, first.difference)
-    last = compare(problem, values, estimate)
+    estimate = stepped(problem, equations, first.brightness, estimate, first.difference)
+    last = compare(problem, estimate)
     equations, loss = _weighed(method, last, given, start)
     # a robust loss bends less than the weights of one residual state: with these alone noise is followed too little
     rest = loss[:, None] * equations.solve(_right_side(fine, equations.weights, last.difference)).reshape(-1, 2)
@@ -446,4 +444,10 @@ def _left(reference: Reference, noise: FloatImage, field: FloatArray) -> Residua
     interpolate_nodal(field, reference.mesh.elements, *reference.pixels.positions, shown)
     left = noise - reference.gradient[0] * shown[0] - reference.gradient[1] * shown[1]
     weights, moments = reference.pixel_weights, np.zeros((len(noise), 0, 6))
-    return Residual(reference=reference, values=reference.values, weights=weights, difference=left, moments=moments)
+    return Residual(
+        reference=reference,
+        brightness=reference.brightness_of(weights, None),
+        weights=weights,
+        difference=left,
+        moments=moments,
+    )

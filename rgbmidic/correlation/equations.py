@@ -13,6 +13,7 @@ import numpy as np
 
 from rgbmidic._kernels.correlation import differences
 from rgbmidic.correlation.assembly import RigidMotions
+from rgbmidic.correlation.brightness import Brightness
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual
@@ -256,14 +257,14 @@ class UnsolvableError(Exception):
         self.history = estimate.history()
 
 
-def compare(problem: Problem, values: FloatImage, estimate: Estimate) -> Residual:
-    """Return the residual at an estimate, for reference grey levels `values` (k, P)."""
-    return Residual.at(problem.reference, problem.deformed, values, _light_displacements(problem, estimate))
+def compare(problem: Problem, estimate: Estimate) -> Residual:
+    """Return the residual at an estimate."""
+    return Residual.at(problem.reference, problem.deformed, _light_displacements(problem, estimate))
 
 
 @stage("iteration")
 def iterate(
-    problem: Problem, equations: Equations, values: FloatImage, residual: Residual, estimate: Estimate, tolerance: float
+    problem: Problem, equations: Equations, residual: Residual, estimate: Estimate, tolerance: float
 ) -> Estimate:
     """Iterate with one Hessian until no textured node moves by more than `tolerance`.
 
@@ -285,12 +286,12 @@ def iterate(
     UnsolvableError
         The iteration diverged.
     """
-    known: FloatImage | None = residual.difference_from(values)
+    known: FloatImage | None = residual.difference
     constants, left = problem.constants, problem.options.max_iterations - len(estimate.increments)
     relaxation, motion = 1.0, np.zeros_like(estimate.displacement)
     for turn in range(min(constants.pass_iterations, left)):
         before, last = estimate.displacement, motion
-        estimate = stepped(problem, equations, values, estimate, known, relaxation)
+        estimate = stepped(problem, equations, residual.brightness, estimate, known, relaxation)
         known, motion = None, estimate.displacement - before
         # where the deformed images have more contrast than the reference, all nodes swing about the solution (Aitken)
         swing = float((motion * last).sum()) / max(float((last * last).sum()), 1e-30)
@@ -308,13 +309,13 @@ def iterate(
 def stepped(
     problem: Problem,
     equations: Equations,
-    values: FloatImage,
+    brightness: Brightness,
     estimate: Estimate,
     known: FloatImage | None,
     relaxation: float = 1.0,
 ) -> Estimate:
     """One Gauss-Newton iteration; `known` is the difference (k, P) of the states at the estimate, if it is."""
-    steps = equations.increment(*_right_sides(problem, equations, values, estimate, known))
+    steps = equations.increment(*_right_sides(problem, equations, brightness, estimate, known))
     motion, shifts = (relaxation * step for step in steps)
     length = np.hypot(*motion.T)
     longest = float(length[equations.textured].max())
@@ -333,19 +334,20 @@ def stepped(
 
 
 def _right_sides(
-    problem: Problem, equations: Equations, values: FloatImage, estimate: Estimate, known: FloatImage | None
+    problem: Problem, equations: Equations, brightness: Brightness, estimate: Estimate, known: FloatImage | None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
     reference, assembly = problem.reference, problem.reference.assembly
     bend = assembly.smoothness @ estimate.displacement.ravel()
     held = -equations.smoothness * equations.turned_back(bend.reshape(-1, 2)).ravel()
-    total, rigid, difference = held.copy(), [], np.empty_like(values[0])
+    total, rigid, difference = held.copy(), [], np.empty_like(reference.values[0])
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
         if known is not None:
             difference = known[light]
         else:
             there = reference.warp(problem.deformed, light, displacement)
-            differences(problem.deformed.coefficients[light], values[light], *there, difference)
+            differences(problem.deformed.coefficients[light], reference.values[light], *there, difference)
+            difference = brightness.residual(light, difference)
         gradient = reference.gradient[:, light]
         vector = assembly.vector(reference.projected(equations.weights[light], difference, gradient))
         total += vector
@@ -354,9 +356,7 @@ def _right_sides(
     return total, held, np.concatenate(rigid) if rigid else np.empty(0)
 
 
-def observed_sensitivity(
-    problem: Problem, equations: Equations, values: FloatImage, residual: Residual, estimate: Estimate
-) -> FloatArray:
+def observed_sensitivity(problem: Problem, equations: Equations, residual: Residual, estimate: Estimate) -> FloatArray:
     """Sensitivity of the scores to a motion as the deformed images show it, over that of the Hessian, (N,).
 
     The Hessian has the texture of the reference. Where glare or paint has changed since, the deformed images show less
@@ -379,11 +379,11 @@ def observed_sensitivity(
         1 where the Hessian shows nothing.
     """
     step, hessian = problem.constants.probe, problem.reference.assembly.matrix(equations.blocks)
-    before = _right_sides(problem, equations, values, estimate, residual.difference_from(values))[0]
+    before = _right_sides(problem, equations, residual.brightness, estimate, residual.difference)[0]
     observed, assumed = np.zeros((2, len(estimate.displacement)))
     for axis in range(2):
         moved = replace(estimate, displacement=estimate.displacement + step * equations.rotation[:, :, axis])
-        observed += (before - _right_sides(problem, equations, values, moved, None)[0])[axis::2] / step
+        observed += (before - _right_sides(problem, equations, residual.brightness, moved, None)[0])[axis::2] / step
         assumed += (hessian @ np.tile(np.eye(2)[axis], len(observed)))[axis::2]
     return np.divide(observed, assumed, out=np.ones_like(observed), where=assumed > 0)
 

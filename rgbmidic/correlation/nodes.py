@@ -197,7 +197,7 @@ def _centred_products(residual: Residual, precision: Precision | None) -> FloatA
     Lights count by their mean precision in the element over that of the most precise; alike where it is not known.
     """
     products = np.array(residual.centred_products())
-    if precision is not None and len(residual.values) > 1:
+    if precision is not None and len(residual.weights) > 1:
         mean = residual.reference.sums(precision.factor, precision.bend)[..., 0]
         products *= mean / np.maximum(mean.max(axis=0), 1e-300)
     return np.asarray(products.sum(axis=1))

@@ -21,11 +21,12 @@ from rgbmidic._kernels.owned_pixels import interpolate_nodal, score_sums
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
 from rgbmidic.correlation.assembly import Assembly, unfitted_fraction
+from rgbmidic.correlation.brightness import Brightness, BrightnessModel, GainFit, gain_and_offset, window_width
 from rgbmidic.correlation.constants import USUAL, SolverConstants
-from rgbmidic.correlation.images import spline_coefficients, spline_values, usable_pixels, usable_reach
+from rgbmidic.correlation.images import SlidingWindow, spline_coefficients, spline_values, usable_pixels, usable_reach
 from rgbmidic.correlation.texture import TextureGradient
 from rgbmidic.errors import InputError
-from rgbmidic.illumination.images import Registration
+from rgbmidic.illumination.images import DARK, Registration
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
@@ -156,8 +157,12 @@ class Reference:
         Fraction of the variance of a block's score that the fit leaves in the residual (`unfitted_fraction`).
     values, pixel_weights : ndarray, shape (k, P), float32
         The same at the owned pixels.
+    level : ndarray, shape (k, P), float32
+        Local mean of `values`, in units of which residual and gradient are.
+    brightness, gain_window
+        ``solver.brightness``, and the standard deviation (px) of the window of the gain; None where that is one number.
     gradient : ndarray, shape (2, k, P), float32
-        Gradient of the texture common to the lights, in grey levels per px of each, that they are matched with.
+        Gradient of the texture common to the lights, as each shows it, in its `level` per px; without what is a gain.
     texture : TextureGradient
         Where it is from.
     prefilter : str
@@ -175,6 +180,9 @@ class Reference:
     images: FloatImage
     weights: FloatImage
     values: FloatImage
+    level: FloatImage
+    gain_window: float | None
+    brightness: BrightnessModel
     gradient: FloatImage
     pixel_weights: FloatImage
     texture: TextureGradient
@@ -194,6 +202,7 @@ class Reference:
         origin: tuple[int, int] = (0, 0),
         material: Tri3Mesh | None = None,
         registration: Registration | None = None,
+        brightness: BrightnessModel = "auto",
         constants: SolverConstants = USUAL,
     ) -> Reference:
         """Prepare the reference state.
@@ -216,6 +225,8 @@ class Reference:
             Mesh on the first frame, where this is a later one; its nodes are those of `mesh`.
         registration
             Of the lights, where their images do not lie on one grid; the region is then that of the first light.
+        brightness
+            Model of the deformed images' brightness, as ``solver.brightness``.
         constants
             Of the solve.
 
@@ -246,6 +257,12 @@ class Reference:
         else:
             values, weighted, own = _where_they_lie(state, mesh, pixels, pixels.gather(inside), registration)
         del state  # before what needs most memory
+        sigma = brightness if isinstance(brightness, int | float) else None
+        if brightness == "auto":
+            sigma = window_width(values, own, weighted, pixels, constants)
+        level = _local_level(values, weighted, pixels, sigma)
+        weighted *= level > DARK * level.max(axis=1, keepdims=True)
+        own = _relative_gradient(own, values, level, weighted, pixels, sigma)
         texture = TextureGradient.of_images(own, weighted, pixels, constants.shared)
         gradient = texture.matched(pixels)
         return cls(
@@ -258,6 +275,9 @@ class Reference:
             images=ready,
             weights=usable,
             values=values,
+            level=level,
+            gain_window=sigma,
+            brightness=brightness,
             gradient=gradient,
             pixel_weights=weighted,
             texture=texture,
@@ -265,6 +285,32 @@ class Reference:
             registration=registration,
             constants=constants,
         )
+
+    def brightness_of(self, weights: FloatImage, moments: FloatArray | None) -> Brightness:
+        """Estimate the brightness of deformed images.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (k, P), float32
+            Weights of the pixels that both states show.
+        moments : ndarray, shape (k, E, 6), or None
+            `Residual.moments`; None, or the model ``"none"``: gain 1 and offset 0.
+        """
+        gain, offset = np.ones(len(weights)), np.zeros((len(weights), 3))
+        if moments is not None and self.brightness != "none":
+            centres = self.mesh.centres - self.pixels.bounds[1::-1]
+            gain, offset = gain_and_offset(moments, centres, self.constants)
+        whole = Brightness(
+            pixels=self.pixels,
+            values=self.values,
+            level=self.level,
+            gain=gain,
+            offset=offset,
+            least_gain=self.constants.least_gain,
+        )
+        if moments is None or self.gain_window is None:
+            return whole
+        return whole.with_windows(weights, self.gain_window)
 
     def channel_specific(self, light: int) -> FloatImage:
         """Return what a light's own gradient has beyond the one that it is matched with, (2, P).
@@ -474,3 +520,34 @@ def _gradient(coefficients: FloatImage, pixels: PixelMap) -> FloatImage:
     for light, spline in enumerate(coefficients):
         pixel_gradient(pixels.lines, spline, *pixels.bounds[:2], *gradient[:, light])
     return gradient
+
+
+def _local_level(values: FloatImage, weights: FloatImage, pixels: PixelMap, sigma: float | None) -> FloatImage:
+    """Local means (k, P) of grey levels in windows of `sigma` px, at least `DARK` of the largest; None: over all."""
+    level = np.empty_like(values)
+    for f, w, out in zip(values, weights, level, strict=True):
+        if sigma is None:
+            out[:] = abs((w * f).sum(dtype=np.float64)) / max(w.sum(dtype=np.float64), 1e-30) or 1.0
+        else:
+            window = SlidingWindow(sigma=sigma)
+            out[:] = pixels.from_blocks(window.ratios(pixels, np.stack([w * f, w])), window.step)[0]
+            np.maximum(out, np.float32(DARK * out.max() or 1.0), out=out)
+    return level
+
+
+def _relative_gradient(
+    gradient: FloatImage,
+    values: FloatImage,
+    level: FloatImage,
+    weights: FloatImage,
+    pixels: PixelMap,
+    sigma: float | None,
+) -> FloatImage:
+    """Gradient (2, k, P) in units of the `level`, without what is a gain of the grey levels in the window."""
+    relative = np.empty_like(gradient)
+    for light, (f, w) in enumerate(zip(values, weights, strict=True)):
+        fit = GainFit.over(f, w, pixels, sigma) if sigma is not None else None
+        for axis in range(2):
+            one = gradient[axis, light]
+            relative[axis, light] = (fit.remainder(one, f) if fit else one) / level[light]
+    return relative

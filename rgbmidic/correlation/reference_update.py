@@ -237,6 +237,7 @@ class ReferenceUpdate:
             prefilter=prefilter,
             origin=origin,
             registration=self.first.registration,
+            brightness=self.first.brightness,
             constants=self.first.constants,
         )
         step, rigid = self._step(displacement, solution)
@@ -302,4 +303,4 @@ def _residual(
     own = (np.nan_to_num(rigid) @ functions.T).reshape(len(rigid), *displacement.shape)
     motion = list(np.nan_to_num(displacement) + own)
     known = np.asarray(found[reference.mesh.elements].all(axis=1))
-    return Residual.at(reference, deformed, reference.values, motion), known
+    return Residual.at(reference, deformed, motion), known

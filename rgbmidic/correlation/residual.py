@@ -9,17 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.correlation import differences, element_squares, warped_weights
-from rgbmidic._kernels.owned_pixels import interpolate_nodal, subtract_quadratic
+from rgbmidic._kernels.owned_pixels import subtract_quadratic
+from rgbmidic.correlation.brightness import Brightness
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
@@ -31,34 +31,30 @@ class Residual:
     ----------
     reference
         The reference state.
-    values : ndarray, shape (k, P), float32
-        Grey levels f of the reference, corrected for brightness.
+    brightness
+        Of the deformed images.
     weights : ndarray, shape (k, P), float32
         Weights given, warped by the displacement; 0 where g is not known.
     difference : ndarray, shape (k, P), float32
-        f - g(x + u); 0 where g is not known.
+        f - g(x + u) with the brightness of g corrected, in units of the local mean of f (`Brightness.residual`).
     moments : ndarray, shape (k, E, 6)
         Sums of w, w f, w g, w f f, w f g, w g g over the pixels of each element.
     """
 
     reference: Reference
-    values: FloatImage
+    brightness: Brightness
     weights: FloatImage
     difference: FloatImage
     moments: FloatArray
 
     @classmethod
-    def at(
-        cls, reference: Reference, deformed: Deformed, values: FloatImage, displacements: Sequence[FloatArray]
-    ) -> Residual:
-        """At one nodal displacement (N, 2) per light, for reference grey levels `values` (k, P).
+    def at(cls, reference: Reference, deformed: Deformed, displacements: Sequence[FloatArray]) -> Residual:
+        """At one nodal displacement (N, 2) per light.
 
         Parameters
         ----------
         reference, deformed
             Images of both states.
-        values : ndarray, shape (k, P)
-            Grey levels of the reference.
         displacements : sequence of ndarray, shape (N, 2)
             Nodal displacement of every light in px.
 
@@ -66,6 +62,7 @@ class Residual:
         -------
         Residual
         """
+        values = reference.values
         difference, weights = np.empty_like(values), np.empty_like(values)
         moments = np.empty((len(values), len(reference.mesh.elements), 6))
         for light, displacement in enumerate(displacements):
@@ -73,32 +70,18 @@ class Residual:
             differences(deformed.coefficients[light], values[light], *there, difference[light])
             images = deformed.weights[light], deformed.partial[light], values[light], difference[light]
             warped_weights(*images, reference.pixel_weights[light], *there, weights[light], moments[light])
-        return cls(reference=reference, values=values, weights=weights, difference=difference, moments=moments)
-
-    @property
-    def warped(self) -> FloatImage:
-        """Grey levels g(x + u), (k, P); those of f where it is not known."""
-        return self.values - self.difference
+        brightness = reference.brightness_of(weights, moments)
+        for light, one in enumerate(difference):
+            one[:] = brightness.residual(light, one)
+        return cls(reference=reference, brightness=brightness, weights=weights, difference=difference, moments=moments)
 
     @property
     def contrast(self) -> float:
-        """Weighted variance of the reference's grey levels under all lights together."""
-        total, f, _, ff, _, _ = self.moments.sum(axis=(0, 1)) / max(self.moments[..., 0].sum(), 1e-30)
-        return max(float(ff - f * f), 0.0) if total else 0.0
-
-    def difference_from(self, values: FloatImage) -> FloatImage:
-        """Return the difference for other reference grey levels (k, P).
-
-        Parameters
-        ----------
-        values : ndarray, shape (k, P)
-            Grey levels of the reference.
-
-        Returns
-        -------
-        ndarray, shape (k, P)
-        """
-        return self.difference if values is self.values else self.difference + (values - self.values)
+        """Weighted variance of the reference's grey levels over their squared mean, of the lights together."""
+        total, f, _, ff, _, _ = self.moments.sum(axis=1).T
+        mean = f / np.maximum(total, 1e-30)
+        relative = np.divide(ff / np.maximum(total, 1e-30), mean * mean, out=np.ones_like(mean), where=mean != 0) - 1
+        return max(float(relative.mean()), 0.0)
 
     def squares(self, weights: FloatImage) -> FloatArray:
         """Sum w r^2, w and the pixels with weight over each element, for the solve's `weights` (k, P).
@@ -237,81 +220,6 @@ def curved_deviation(mesh: Tri3Mesh, barycentric: FloatArray, carried: FloatArra
     deviation = sag.transpose(0, 2, 1) @ products
     deviation[..., :3] -= carried[first].transpose(0, 2, 1) @ barycentric
     return np.asarray(deviation, dtype=np.float32)
-
-
-def corrected_values(residual: Residual, kind: Literal["auto", "none", "global", "local", "mean"]) -> FloatImage:
-    """Bring the reference to the brightness and contrast of the deformed images (paper, section 2.2).
-
-    f is taken as ``a g + b``; what is returned is ``(f - b) / a`` of the uncorrected reference.
-
-    Parameters
-    ----------
-    residual
-        At the displacement so far.
-    kind
-        ``"global"``: one gain and offset per light. ``"local"``: gain and offset as linear shape functions on the mesh.
-        ``"mean"``: a gain as linear shape functions, that of the mean grey levels in the elements around each node,
-        which are all on its side of a crack. ``"none"``, ``"auto"``: the reference itself.
-
-    Returns
-    -------
-    ndarray, shape (k, P), float32
-        Reference grey levels.
-    """
-    reference = residual.reference
-    if kind in ("none", "auto"):
-        return reference.values
-    if kind == "mean":
-        sums = zip(reference.values, residual.weights, residual.moments[..., 2], strict=True)
-        return np.stack([_gain_of_means(reference, *light) for light in sums])
-    lights = zip(reference.values, residual.warped, residual.weights, strict=True)
-    if kind == "global":
-        return np.stack([_one_gain(reference, *light)[0] for light in lights])
-    return np.stack([_gain_field(reference, *light) for light in lights])
-
-
-def _one_gain(reference: Reference, f: FloatImage, g: FloatImage, weight: FloatImage) -> tuple[FloatImage, bool]:
-    """Correct f (P,) by one offset and, where f and g show the same, one gain; and whether they do."""
-    weight = weight.astype(np.float64)
-    total = weight.sum()
-    if not total:
-        return f, False
-    mean_f, mean_g = (weight * f).sum() / total, (weight * g).sum() / total
-    # both images carry the same noise: the ratio of the deviations is not attenuated by it
-    spread_f, spread_g = (float((weight * (i - m) ** 2).sum()) for i, m in ((f, mean_f), (g, mean_g)))
-    alike = float((weight * (f - mean_f) * (g - mean_g)).sum()) > reference.constants.lit * np.sqrt(spread_f * spread_g)
-    gain = np.sqrt(spread_f / spread_g) if alike else 1.0
-    return np.asarray((f - mean_f) / gain + mean_g, dtype=np.float32), alike
-
-
-def _gain_of_means(reference: Reference, f: FloatImage, weight: FloatImage, sum_g: FloatArray) -> FloatImage:
-    """Correct f (P,) by the ratio of the weighted sums around each node, of which `sum_g` (E,) is that of g."""
-    mesh = reference.mesh
-    around_f, around_g = mesh.to_nodes(reference.sums(weight[None], f)[0, :, 1]), mesh.to_nodes(sum_g)
-    # of a light that is off it may be negative; the least gain bounds it
-    ratio = np.divide(around_g, around_f, out=np.ones_like(around_f), where=around_f > 0)
-    fields = np.empty((2, f.size), dtype=np.float32)
-    interpolate_nodal(np.stack([ratio, ratio], axis=1), mesh.elements, *reference.pixels.positions, fields)
-    return np.asarray(f * np.maximum(fields[0], np.float32(reference.constants.least_gain)))
-
-
-def _gain_field(reference: Reference, f: FloatImage, g: FloatImage, weight: FloatImage) -> FloatImage:
-    """Correct f (P,) by a gain and an offset that are linear in every element."""
-    corrected, alike = _one_gain(reference, f, g, weight)
-    if not alike:
-        return corrected
-    assembly = reference.assembly
-    scale = float(np.sqrt((weight * g * g).sum() / weight.sum())) or 1.0
-    g = g / np.float32(scale)
-    basis = g, np.ones_like(g)
-    system = assembly.matrix(reference.blocks(weight, basis))
-    smooth = reference.constants.gain_smoothness * system.diagonal().mean() * assembly.smoothness.data
-    right_side = assembly.vector(reference.projected(weight, f, basis))
-    nodal = assembly.factorise(with_data(system, system.data + smooth))(right_side).reshape(-1, 2)
-    fields = np.empty((2, f.size), dtype=np.float32)
-    interpolate_nodal(nodal, reference.mesh.elements, *reference.pixels.positions, fields)
-    gain = np.maximum(fields[0] / np.float32(scale), np.float32(reference.constants.least_gain))
-    return np.asarray((f - fields[1]) / gain, dtype=np.float32)
 
 
 _KNOWN = 12
@@ -478,7 +386,8 @@ def _reduced(residual: Residual, side: int, border: int) -> FloatImage:
     count = pixels.block_sums(weights, side)
     level = count.sum(axis=(1, 2), dtype=np.float64)[:, None, None]
     pictures = []
-    for values in (residual.values, residual.warped):
+    f = residual.reference.values / residual.reference.level
+    for values in (f, f - residual.difference):
         sums = pixels.block_sums(values * weights, side)
         mean = sums.sum(axis=(1, 2), dtype=np.float64)[:, None, None] / np.maximum(level, 1e-30)
         total = (sums - mean.astype(np.float32) * count).sum(axis=0)

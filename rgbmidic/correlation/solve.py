@@ -32,16 +32,13 @@ from rgbmidic.correlation.light_bias import light_bias, settled_gradient
 from rgbmidic.correlation.nodes import judge, matching_elements, misfit, one_sided_texture
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual, brought_nearer, corrected_values
+from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual, brought_nearer
 from rgbmidic.correlation.solution import NO_MATCH, NodeStatus, Solution, Status
 from rgbmidic.correlation.uncertainty import standard_uncertainty
 from rgbmidic.errors import InputError
 from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
-
-_REFINED = {"none": 1, "auto": 1, "global": 1, "local": 4, "mean": 2}
-"""Passes whose residual still changes weights and grey levels, for each grey-level correction."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,8 +49,6 @@ class Weighting:
     ----------
     residual
         At the estimate, with the weights warped.
-    values : ndarray, shape (k, P), float32
-        Reference grey levels, corrected for brightness.
     matched : ndarray, shape (E,), bool
         Elements that take part.
     precision
@@ -65,7 +60,6 @@ class Weighting:
     """
 
     residual: Residual
-    values: FloatImage
     matched: BoolArray
     precision: Precision | None = None
     returned: int = 0
@@ -87,10 +81,9 @@ class Weighting:
 @stage("weights")
 def first_weighting(problem: Problem, estimate: Estimate, residual: Residual | None = None) -> Weighting:
     """Return the weighting of the first pass, at the initial guess, where the `residual` may be known."""
-    residual, kind = residual or compare(problem, problem.reference.values, estimate), problem.options.brightness
+    residual = residual or compare(problem, estimate)
     return Weighting(
         residual=residual,
-        values=corrected_values(residual, "global" if kind == "local" else kind),
         matched=matching_elements(residual, estimate.displacement, least=problem.constants.begun),
         learnt_at=estimate.displacement,
     )
@@ -101,7 +94,7 @@ def next_weighting(
     problem: Problem, last: Weighting, equations: Equations, estimate: Estimate, number: int
 ) -> Weighting:
     """Find matching, grey levels and precision anew at the displacement found by pass `number`."""
-    residual, method = compare(problem, last.values, estimate), problem.method
+    residual, method = compare(problem, estimate), problem.method
     # without the precision of the lights, which the first pass has not, an element half on another body may match
     precision = last.precision if number or method is None else method.precision(residual)
     matched = matching_elements(residual, estimate.displacement, precision)
@@ -116,7 +109,6 @@ def next_weighting(
         return weighting
     return replace(
         weighting,
-        values=corrected_values(residual, problem.options.brightness),
         precision=precision if number == 0 or method is None else method.precision(residual),
         learnt_at=estimate.displacement,
     )
@@ -145,7 +137,7 @@ def _learnt_anew(last: Weighting, matched: BoolArray, equations: Equations, esti
         return number + 1
     constants = last.residual.reference.constants
     motion = np.hypot(*(estimate.displacement - last.learnt_at).T)[equations.textured]
-    elsewhere = number == 1 < len(last.residual.values) and (motion > constants.elsewhere).mean() > constants.swinging
+    elsewhere = number == 1 < len(last.residual.weights) and (motion > constants.elsewhere).mean() > constants.swinging
     return max(last.returned, number) if elsewhere else last.returned
 
 
@@ -160,8 +152,7 @@ def settled(weighting: Weighting, equations: Equations) -> bool:
 
 def refining(problem: Problem, weighting: Weighting, number: int) -> bool:
     """Whether the residual of a pass still changes weights or grey levels."""
-    learns = problem.method is not None or problem.options.brightness not in ("none", "auto")
-    return learns and number <= weighting.returned + _REFINED[problem.options.brightness]
+    return problem.method is not None and number <= weighting.returned + 1
 
 
 def solve(
@@ -232,7 +223,7 @@ def _passes(
             break
         equations = _equations(problem, weighting, estimate)
         reached = max(tolerance, problem.constants.first_pass) if number == 0 else tolerance
-        estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, reached)
+        estimate = iterate(problem, equations, weighting.residual, estimate, reached)
         weighting = next_weighting(problem, weighting, equations, estimate, number)
         if (
             number == 0
@@ -242,15 +233,15 @@ def _passes(
             weighting = replace(weighting, residual=replace(weighting.residual, reference=found))
     assert equations is not None
     if estimate.longest > tolerance:
-        estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance)
+        estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
         swinging = equations.textured & (estimate.increments[-1] > tolerance)
         matched = weighting.matched & ~swinging[problem.reference.mesh.elements].any(axis=1)
         few = 0 < swinging.mean() < problem.constants.swinging and matched.any()
         if few and len(estimate.increments) < problem.options.max_iterations:
-            weighting = replace(weighting, residual=compare(problem, weighting.values, estimate), matched=matched)
+            weighting = replace(weighting, residual=compare(problem, estimate), matched=matched)
             equations = _equations(problem, weighting, estimate)
-            estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance)
-        weighting = replace(weighting, residual=compare(problem, weighting.values, estimate))
+            estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
+        weighting = replace(weighting, residual=compare(problem, estimate))
     return problem, estimate, equations, weighting
 
 
@@ -317,7 +308,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
     if weighting.precision is not None:
         bias, bias_std = light_bias(weighting.residual, equations)
-    sensitivity = observed_sensitivity(problem, equations, weighting.values, weighting.residual, estimate)
+    sensitivity = observed_sensitivity(problem, equations, weighting.residual, estimate)
     scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
     fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale
     field = recovery.field(*fitted.T)

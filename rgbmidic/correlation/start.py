@@ -159,7 +159,7 @@ class Search:
         known = np.zeros_like(nodes) if last is None else last
 
         def compared(displacement: FloatArray) -> Residual:
-            return Residual.at(reference, deformed, reference.values, [displacement] * len(reference.images))
+            return Residual.at(reference, deformed, [displacement] * len(reference.images))
 
         if last is None:
             residual = compared(known)

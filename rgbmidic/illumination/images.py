@@ -19,12 +19,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic._kernels.texture import divide_by_mean
 from rgbmidic.arguments import check_fields
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.linear import LinearChannels
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.settings import LOCAL_MEAN
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:  # reading a result takes no kernels
@@ -356,38 +354,6 @@ _RESIZED = 1 / 4 + 2 / 3
 """Variance (square px) that the mean of two pixels, 1/4, and the interpolation between such means, 2/3, add."""
 
 
-def normalise(images: FloatImage, sigma: float, full_scale: float) -> FloatImage:
-    """Divide images (k, H, W) by their local mean; NaN where invalid or dark.
-
-    Parameters
-    ----------
-    images
-        Grey levels above black; NaN marks invalid pixels.
-    sigma
-        Standard deviation of the Gaussian window in px, several speckles wide.
-    full_scale
-        Grey level of a just saturated sample; sets what counts as dark (`DARK`).
-
-    Returns
-    -------
-    ndarray, shape (k, H, W), float32
-
-    Raises
-    ------
-    InputError
-        `sigma` is not positive.
-    """
-    if not sigma > 0:
-        raise InputError(f"the width of the local mean must be positive, not {sigma!r} px")
-    out, dark = np.empty_like(images), np.float32(DARK * full_scale)
-    for image, normalised in zip(images, out, strict=True):
-        if sigma < _WIDE or not np.isfinite(image).all():
-            divide_by_mean(image, local_mean(image, sigma), 1, dark, normalised)
-        else:
-            divide_by_mean(image, _half_blur(image, sigma), 2, dark, normalised)
-    return out
-
-
 def local_mean(image: FloatImage, sigma: float) -> FloatImage:
     """Return the Gaussian mean (H, W) of the finite pixels around each pixel; NaN where there is none."""
     finite = np.isfinite(image)
@@ -438,20 +404,3 @@ def _half_blur(image: FloatImage, sigma: float) -> FloatImage:
 
 def _gaussian(image: FloatImage, sigma: float) -> FloatImage:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
-
-
-def correlated(images: IlluminationImages, sigma: float = LOCAL_MEAN) -> FloatImage:
-    """What the solve correlates (k, H, W): the lights' images, over their local mean of width `sigma` (0: as is).
-
-    Parameters
-    ----------
-    images
-        One image a light.
-    sigma
-        Standard deviation of the Gaussian mean, px.
-
-    Returns
-    -------
-    ndarray, shape (k, H, W), float32
-    """
-    return normalise(images.values, sigma, images.full_scale) if sigma else images.values

@@ -180,7 +180,7 @@ def _compare(settings: TestSettings, result: Result) -> list[DemoRow]:
     options: dict[str, Any] = {
         "region": settings.region.rectangle,
         "element_size": settings.mesh.element_size,
-        "normalise": settings.illumination.normalise,
+        "brightness": settings.solver.brightness,
     }
     rows = []
     for index in range(1, len(result)):

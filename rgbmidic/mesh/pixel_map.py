@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.mesh import claim_pixels
-from rgbmidic._kernels.owned_pixels import block_sums, from_image, to_image
+from rgbmidic._kernels.owned_pixels import block_sums, from_image, to_image, weighted_block_sums
 from rgbmidic.errors import RegionError
 from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
@@ -191,6 +191,26 @@ class PixelMap:
         out = np.empty((len(values), *self.grid(side)), dtype=np.float32)
         block_sums(values, self.lines, self.run_offsets, side, out)
         return out
+
+    def weighted_block_sums(self, values: FloatImage, weight: FloatImage, side: int) -> FloatArray:
+        """Sum `values` (n, P) times a `weight` (P,) over such blocks, shape (n, rows, columns).
+
+        Parameters
+        ----------
+        values : ndarray, shape (n, P), float32
+            Fields at the owned pixels.
+        weight : ndarray, shape (P,), float32
+            Their weight.
+        side
+            Side of the blocks in px.
+
+        Returns
+        -------
+        ndarray, shape (n, rows, columns), float64
+        """
+        out = np.empty((len(values), *self.grid(side)), dtype=np.float32)
+        weighted_block_sums(values, weight, self.lines, self.run_offsets, self.offsets, side, out)
+        return out.astype(np.float64)
 
     def from_blocks(self, grids: FloatImage, side: int) -> FloatImage:
         """Interpolate grids (n, rows, columns) of such blocks between their centres at the owned pixels (n, P).

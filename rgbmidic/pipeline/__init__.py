@@ -1,6 +1,5 @@
 """The main job: raw frames in, displacement fields out."""
 
-from rgbmidic.illumination.images import correlated
 from rgbmidic.illumination.separation import LightSeparation, Separation
 from rgbmidic.pipeline.frame import measure_frame
 from rgbmidic.pipeline.plan import Plan
@@ -14,7 +13,6 @@ __all__ = [
     "Plan",
     "Separation",
     "correlate",
-    "correlated",
     "measure",
     "measure_frame",
     "measure_sequence",

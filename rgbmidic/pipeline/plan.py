@@ -31,7 +31,7 @@ from rgbmidic.frames import Window, read_mask
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.contrast import CONTRAST
 from rgbmidic.illumination.frame_check import check_state
-from rgbmidic.illumination.images import DARK, IlluminationImages, correlated
+from rgbmidic.illumination.images import DARK, IlluminationImages
 from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.illumination.separation import (
     LightSeparation,
@@ -46,7 +46,7 @@ from rgbmidic.mesh.placement import place_on_image
 from rgbmidic.pipeline import suitability
 from rgbmidic.pipeline.objects import check_given
 from rgbmidic.pipeline.source import FrameSequence, Series, open_frames
-from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings, grey_levels
+from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights
 from rgbmidic.weights.threshold import ThresholdWeights, blurred
@@ -94,8 +94,6 @@ class Plan:
     ----------
     settings
         What TEST.toml says.
-    normalise, solver
-        Width of the local mean (px) and settings of the solve that hold for the mesh (`grey_levels`).
     series
         The frames.
     separation
@@ -134,8 +132,6 @@ class Plan:
     """
 
     settings: TestSettings
-    normalise: float
-    solver: SolverSettings
     series: Series
     separation: LightSeparation
     region: Region
@@ -223,7 +219,6 @@ class Plan:
             size = settings.mesh.side
             cracks = [np.subtract(path, window.origin) for path in settings.mesh.cracks]
             mesh = Tri3Mesh.from_region(region, size, cracks)
-        sigma, solver = grey_levels(settings.illumination.normalise, settings.solver, cracked=len(mesh.crack_edges) > 0)
 
         def images_of(index: int) -> IlluminationImages:
             return light_images(separate, series.read(index, window), window)
@@ -233,14 +228,12 @@ class Plan:
         )
         plan = cls(
             settings=settings,
-            normalise=sigma,
-            solver=solver,
             series=series,
             separation=separate,
             region=region,
             weights=weights,
             images=images,
-            reference=_reference(images, weights, region, mesh, sigma, solver.prefilter),
+            reference=_reference(images, weights, region, mesh, settings.solver),
             speckle=suitability.speckle_size(images, region),
             saturated=suitability.saturated_fraction(state, region.mask),
             clipped_at=None if (clipping := suitability.clipping(state)) is None else clipping[0],
@@ -254,6 +247,11 @@ class Plan:
         )
         _check_reference(plan, state, calibration.noise if calibration else None)
         return plan
+
+    @property
+    def solver(self) -> SolverSettings:
+        """Settings of the solve."""
+        return self.settings.solver
 
     @property
     def method(self) -> PrecisionMethod | None:
@@ -272,7 +270,7 @@ class Plan:
         -------
         Plan
         """
-        reference = _reference(self.images, self.weights, self.region, mesh, self.normalise, self.solver.prefilter)
+        reference = _reference(self.images, self.weights, self.region, mesh, self.solver)
         return replace(self, reference=reference)
 
     def prepared(self, images: IlluminationImages, index: int) -> tuple[FloatImage, FloatImage]:
@@ -296,7 +294,7 @@ class Plan:
         """
         weights = as_weights(self.weights.deformed(images, index), images.values.shape, f"weights of frame {index}")
         assert weights is not None
-        return correlated(images, self.normalise), weights
+        return images.values, weights
 
     def window_of(self, *displacements: FloatArray | None) -> Window:
         """Part of a frame that is read to find its displacement from rest and from nodal `displacements` (N, 2).
@@ -320,13 +318,19 @@ class Plan:
 
 
 def _reference(
-    images: IlluminationImages, weights: LightWeights, region: Region, mesh: Tri3Mesh, sigma: float, prefilter: str
+    images: IlluminationImages, weights: LightWeights, region: Region, mesh: Tri3Mesh, solver: SolverSettings
 ) -> Reference:
     """The reference state as the solve needs it."""
-    values, origin, registration = correlated(images, sigma), images.origin, images.registration
     counted = as_weights(weights.reference(images), images.values.shape, "weights of the reference")
     return Reference.prepare(
-        values, region, counted, mesh=mesh, prefilter=prefilter, origin=origin, registration=registration
+        images.values,
+        region,
+        counted,
+        mesh=mesh,
+        prefilter=solver.prefilter,
+        brightness=solver.brightness,
+        origin=images.origin,
+        registration=images.registration,
     )
 
 
@@ -443,9 +447,7 @@ def window_around(points: FloatArray, reach: float, settings: TestSettings, fram
     The separation's local statistics use 96 px around: three standard deviations of their windows with all that is
     between (`rgbmidic.lab.inspection.channels.InspectionConstants`).
     """
-    may_crack = bool(settings.mesh.cracks) or settings.mesh.file is not None
-    sigma, _ = grey_levels(settings.illumination.normalise, settings.solver, cracked=may_crack)
-    return Window.around_points(points, reach + max(96.0, 3 * max(sigma, settings.weights.blur)), frame)
+    return Window.around_points(points, reach + max(96.0, 3 * settings.weights.blur), frame)
 
 
 def read_region(settings: RegionSettings, shape: tuple[int, int]) -> Region:

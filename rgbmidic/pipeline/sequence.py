@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
-from typing import Any, Literal, Unpack, cast
+from typing import Any, Unpack, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,6 @@ from rgbmidic.correlation.images import as_light_stack, unmasked
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import PrecisionMethod
 from rgbmidic.errors import ConfigurationError, FrameError, InputError
-from rgbmidic.illumination.images import normalise as divide_by_local_mean
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, Threads
@@ -30,7 +29,7 @@ from rgbmidic.pipeline.frame import Measured, messages, next_reference
 from rgbmidic.pipeline.objects import check_object, check_type
 from rgbmidic.pipeline.plan import STRIDE, Plan
 from rgbmidic.results.quantities import NO_CHECKSUM
-from rgbmidic.settings import ELEMENT_SIZE, SolverOptions, TestSettings, check_names, grey_levels, sections
+from rgbmidic.settings import ELEMENT_SIZE, SolverOptions, TestSettings, check_names, sections
 from rgbmidic.typing import FloatArray
 from rgbmidic.weights import LightWeights, MaskWeights, Statistics, as_weights
 
@@ -47,7 +46,6 @@ def correlate(
     weights: npt.ArrayLike | None = None,
     initial: npt.ArrayLike | None = None,
     deformed_weights: npt.ArrayLike | None = None,
-    normalise: float | Literal["auto"] | None = None,
     statistics: bool | PrecisionMethod = True,
     mesh_error: bool = False,
     **options: Unpack[SolverOptions],
@@ -71,9 +69,6 @@ def correlate(
         initial guesses are found by a search, and the best solution is returned.
     deformed_weights
         Like `weights`, on the deformed images.
-    normalise
-        Standard deviation in px of the Gaussian of the local mean by which every image is first divided; ``"auto"``: 10
-        px, 30 px if there are cracks. None: grey levels are not changed.
     statistics
         True: weight the lights by the statistics of the residual around each pixel (`rgbmidic.weights.Statistics`).
         False: only by `weights`. Or an object with a method of your own.
@@ -114,15 +109,10 @@ def correlate(
     if not isinstance(region, Region):
         region = Region.from_rectangle(region if region is not None else (0, 0, width - 1, height - 1), (height, width))
     mesh = Tri3Mesh.from_region(region, element_size, cracks)
-    cracked = len(mesh.crack_edges) > 0
-    if normalise is not None:
-        sections.IlluminationSettings(normalise=normalise)  # which checks it
-    sigma, solver = grey_levels(0.0 if normalise is None else normalise, solver_settings(options), cracked=cracked)
-    if sigma:
-        f, g = (divide_by_local_mean(stack, sigma, float(np.nanmax(stack, initial=0.0))) for stack in (f, g))
+    solver = solver_settings(options)
     given = as_weights(weights, f.shape, "weights"), as_weights(deformed_weights, f.shape, "deformed_weights")
     second = aside(Deformed.prepare, g, given[1], prefilter=solver.prefilter)
-    first = Reference.prepare(f, region, given[0], mesh=mesh, prefilter=solver.prefilter)
+    first = Reference.prepare(f, region, given[0], mesh=mesh, prefilter=solver.prefilter, brightness=solver.brightness)
     method = (Statistics() if statistics else None) if isinstance(statistics, bool) else statistics
     check_object("statistics", method, "precision")
     start = Start(displacement=initial_displacement(initial, len(mesh.nodes)))
@@ -186,7 +176,6 @@ def measure_sequence(
     reference: Any = None,
     region: Sequence[float] | Region | None = None,
     element_size: float = ELEMENT_SIZE,
-    normalise: float | Literal["auto"] = "auto",
     statistics: bool = True,
     update_reference: bool = False,
     separation: LightSeparation | None = None,
@@ -207,7 +196,7 @@ def measure_sequence(
         `IlluminationImages`.
         With `settings` anything that a frame source may return (`rgbmidic.pipeline.FrameSequence`), such as raw frames.
     settings
-        Settings of a test, with ``frames.path = []``; they replace `region`, `element_size`, `normalise`,
+        Settings of a test, with ``frames.path = []``; they replace `region`, `element_size`,
         `statistics`, `update_reference` and the `options`.
     reference
         The reference state; None: the first of the `states`, which is measured like the others.
@@ -215,9 +204,6 @@ def measure_sequence(
         Rectangle (x0, y0, x1, y1) in px, or a `rgbmidic.mesh.Region`; None: the whole image.
     element_size
         Side of the triangles in px.
-    normalise
-        Standard deviation in px of the Gaussian of the local mean by which every image is first divided; 0: grey levels
-        are not changed; ``"auto"``: 10 px, 30 px if the mesh has cracks.
     statistics
         Weight every light by the inverse variance of its own residual around each pixel, robustly.
     update_reference
@@ -259,7 +245,6 @@ def measure_sequence(
             frames=sections.FrameSettings(path=(), update_reference=update_reference),
             region=sections.RegionSettings(rectangle=corners),
             mesh=sections.MeshSettings(element_size=element_size),
-            illumination=sections.IlluminationSettings(normalise=normalise),
             weights=sections.WeightSettings(method="statistics" if statistics else "none"),
             solver=solver_settings(options),
         )

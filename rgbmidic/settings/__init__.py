@@ -25,7 +25,6 @@ from rgbmidic.settings.sections import (
     BAYER_PATTERNS,
     ELEMENT_SIZE,
     LENGTH_UNITS,
-    LOCAL_MEAN,
     SMALLEST_HALVED,
     CalibrationSettings,
     FrameCheck,
@@ -37,14 +36,12 @@ from rgbmidic.settings.sections import (
     SolverOptions,
     SolverSettings,
     WeightSettings,
-    grey_levels,
 )
 
 __all__ = [
     "BAYER_PATTERNS",
     "ELEMENT_SIZE",
     "LENGTH_UNITS",
-    "LOCAL_MEAN",
     "PROBE_NAME",
     "SMALLEST_HALVED",
     "CalibrationSettings",
@@ -65,7 +62,6 @@ __all__ = [
     "bounded",
     "check_names",
     "convert_value",
-    "grey_levels",
     "read_range",
     "read_section",
     "read_table",

@@ -7,6 +7,7 @@ and a single entry in place of a list of one are what they stand for, in a file 
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -33,6 +34,8 @@ from rgbmidic.settings.sections import (
     SolverSettings,
     WeightSettings,
 )
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -332,6 +335,7 @@ class TestSettings(CheckedSettings):
         check_names(document, kinds, "section", "the file")
         if "frames" not in document:
             raise ConfigurationError("the section [frames] is missing")
+        document = without_former_keys(document)
         sections = {name: read_section(kinds[name], name, read_table(document, name), base) for name in document}
         return cls(base=base, **sections)
 
@@ -388,3 +392,29 @@ def read_test(path: Path | str) -> TestSettings:
         return TestSettings.from_mapping(document, path.parent)
     except ConfigurationError as error:
         raise ConfigurationError(f"{path}: {error}") from None
+
+
+def without_former_keys(document: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the sections with the grey-level keys of former versions replaced by ``solver.brightness``.
+
+    ``illumination.normalise`` divided each image by its local mean in its own frame; ``solver.brightness`` was
+    ``"global"``, ``"local"`` or ``"mean"``. What they mean now is logged.
+    """
+    illumination, solver = document.get("illumination"), document.get("solver", {})
+    brightness = solver.get("brightness") if isinstance(solver, Mapping) else None
+    former = {"global": "constant", "local": "auto", "mean": "auto"}
+    changes: dict[str, Any] = {}
+    new = former.get(brightness, brightness) if isinstance(brightness, str) else brightness
+    if isinstance(illumination, Mapping) and "normalise" in illumination:
+        width = illumination["normalise"]
+        changes["illumination"] = {key: value for key, value in illumination.items() if key != "normalise"}
+        if width == 0:
+            new = {None: "none", "auto": "auto" if brightness in former else "none"}.get(new, new)
+        elif new in (None, "auto", "none"):
+            new = width
+        logger.warning("illumination.normalise = %r is no key any more: solver.brightness = %r is used", width, new)
+    elif new != brightness:
+        logger.warning('solver.brightness = "%s" is now "%s", which is used', brightness, new)
+    if new == brightness:
+        return {**document, **changes}
+    return {**document, **changes, "solver": {**solver, "brightness": new}}

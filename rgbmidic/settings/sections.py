@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypedDict
 
@@ -90,10 +90,6 @@ class FrameSettings(CheckedSettings):
             yield f"frames.white_level must be above black_level {self.black_level}, not {self.white_level}"
 
 
-LOCAL_MEAN = 10.0
-"""Width (px) of the local mean. Chosen: two to three speckles."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IlluminationSettings(CheckedSettings):
     """Separation of the frame into one image per light (``[illumination]``).
@@ -103,15 +99,11 @@ class IlluminationSettings(CheckedSettings):
     demosaic
         Method of `rgbmidic.illumination.separation` for Bayer frames; ``"auto"``: the reflection-aware one, and
         Malvar's for frames too small for it.
-    normalise
-        Standard deviation in px of the local mean by which each light's image is divided before the solve; 0: grey
-        levels are not changed; ``"auto"``: 10 px, or 30 px where the mesh has cracks (`grey_levels`).
     """
 
     section = "illumination"
 
     demosaic: Literal["auto", "reflection-aware", "malvar", "normalised"] = "auto"
-    normalise: float | Literal["auto"] = bounded("auto", at_least=0, at_most=10_000)
 
 
 FrameCheck = Literal["noise", "levels", "greens", "lights", "demosaiced"]
@@ -322,10 +314,9 @@ class SolverSettings(CheckedSettings):
     rigid
         Rigid functions per light after the first: ``"none"``, ``"translation"`` or ``"translation+rotation"``.
     brightness
-        Grey-level correction: ``"global"``, a gain and offset per light; ``"local"``, both as linear shape functions on
-        the mesh; ``"mean"``, a gain as linear shape functions, from the mean grey levels around the nodes, each on its
-        side of a crack; ``"auto"``, none, or ``"mean"`` where the mesh has cracks and images are divided by their local
-        mean (`grey_levels`).
+        Grey-level correction, ``g(x + u) = a(x) f(x) + b`` for every light: the standard deviation (px) of the window
+        over which the gain a is smooth; ``"auto"``, by the size of the speckle; ``"constant"``, one gain a light;
+        ``"none"``, grey levels are compared as they are.
     fill
         Longest distance in px over which nodes that are not measured get a value carried over from measured ones,
         flagged and with an uncertainty that grows with the distance; 0 leaves them NaN.
@@ -349,7 +340,7 @@ class SolverSettings(CheckedSettings):
 
     prefilter: Literal["none", "binomial", "gaussian"] = "binomial"
     rigid: Literal["none", "translation", "translation+rotation"] = "none"
-    brightness: Literal["auto", "none", "global", "local", "mean"] = "auto"
+    brightness: float | Literal["auto", "constant", "none"] = bounded("auto", at_least=2, at_most=10_000)
     fill: float = bounded(0.0, at_least=0)
     tolerance: float = bounded(1e-3, above=0)
     max_iterations: int = bounded(50, at_least=1)
@@ -360,43 +351,10 @@ class SolverOptions(TypedDict, total=False):
 
     prefilter: Literal["none", "binomial", "gaussian"]
     rigid: Literal["none", "translation", "translation+rotation"]
-    brightness: Literal["auto", "none", "global", "local", "mean"]
+    brightness: float | Literal["auto", "constant", "none"]
     fill: float
     tolerance: float
     max_iterations: int
-
-
-def grey_levels(
-    normalise: float | Literal["auto"], solver: SolverSettings, *, cracked: bool
-) -> tuple[float, SolverSettings]:
-    """Width (px) of the local mean and settings of the solve that hold for a mesh: ``"auto"`` resolved, else as stated.
-
-    A local mean takes in the gap of an open crack, and the other side, which may be lit otherwise. So it is wider where
-    a mesh has cracks, and means over the elements around each node, on one side and without the gap, do the rest.
-
-    Parameters
-    ----------
-    normalise
-        Width of the local mean as stated, px, or ``"auto"``.
-    solver
-        Settings of the solve as stated.
-    cracked
-        Whether the mesh has cracks.
-
-    Returns
-    -------
-    normalise : float
-        px; 0: images are not divided.
-    solver : SolverSettings
-    """
-    if normalise == "auto":
-        # a gap changes so wide a mean nearly alike all over an element, and the gain of the means takes that out; with
-        # 5 the gap is followed no better and a slope of the brightness worse (rendered cracks open by up to 5 px)
-        wider_at_cracks = 3.0
-        normalise = LOCAL_MEAN * (wider_at_cracks if cracked else 1.0)
-    if solver.brightness == "auto":
-        solver = replace(solver, brightness="mean" if cracked and normalise else "none")
-    return normalise, solver
 
 
 def _few_corners(key: str, corners: tuple[Any, ...], min_count: int, count_name: str) -> Iterator[str]:

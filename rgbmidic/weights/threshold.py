@@ -357,7 +357,9 @@ def automatic_threshold(
     mesh, found = Tri3Mesh.from_region(region, element_size), list[SetUpThreshold]()
     typical = float(np.median(blurred(reference, blur)[:, region.mask], axis=1).max()) / reference.full_scale
     for light, name in enumerate(reference.names):
-        before = Reference.prepare(reference.values[light : light + 1], region, mesh=mesh, prefilter=prefilter)
+        before = Reference.prepare(
+            reference.values[light : light + 1], region, mesh=mesh, prefilter=prefilter, brightness="none"
+        )
         after = Deformed.prepare(deformed.values[light : light + 1], prefilter=prefilter)
         solution = track(before, after, Start(displacement=None), SolverSettings(), None)
         if solution.status is Status.FAILED:

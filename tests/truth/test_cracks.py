@@ -181,9 +181,8 @@ COVERED = (0.9, 1.2)
 """rms of error over stated uncertainty of both factors over the draws; 1.09 measured."""
 
 
-@pytest.mark.parametrize("normalise", [None, "auto"])
-def test_stress_intensity_factors_are_found_within_their_uncertainty(normalise):
-    solutions, quiet = [cracked(NOISE, seed, normalise) for seed in range(DRAWS)], cracked(0.0, 0, normalise)
+def test_stress_intensity_factors_are_found_within_their_uncertainty():
+    solutions, quiet = [cracked(NOISE, seed) for seed in range(DRAWS)], cracked(0.0, 0)
     mesh = quiet.nodes, quiet.elements
     found = stress_intensity(*mesh, as_nodal(solutions), TIP, (34, 118), MATERIAL)
     assert found.terms <= 5

@@ -55,7 +55,7 @@ STRETCH = Affine.strain_and_rotation(0.01, 0.5, (0.3, 0.2))
 
 def solved(reference: FloatArray, deformed: FloatArray):
     whole = Region.from_mask(np.ones(SHAPE, dtype=bool))
-    return next(measure_sequence([deformed], reference=reference, mesh=MESH, region=whole, normalise=0.0))
+    return next(measure_sequence([deformed], reference=reference, mesh=MESH, region=whole))
 
 
 def test_an_affine_field_is_exact_on_a_graded_mesh() -> None:

@@ -368,7 +368,7 @@ def test_a_light_that_is_off_leaves_the_others_their_displacement(level, brightn
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1e12])
-@pytest.mark.parametrize("brightness", ["none", "local"])
+@pytest.mark.parametrize("brightness", ["none", "auto"])
 def test_uncertainty_does_not_depend_on_the_unit_of_the_grey_levels(unit, brightness):
     pair = noisy_pair([reference_image(), reference_image()], 2.0, np.random.default_rng(3))
     once, scaled = (correlate(*(i * u for i in pair), region=REGION, brightness=brightness) for u in (1.0, unit))

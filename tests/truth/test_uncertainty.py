@@ -121,7 +121,7 @@ class Sphere:
 
     def measure(self, reference: np.ndarray, deformed: np.ndarray, kind: str) -> Solution:
         pair = [self.images(lights, kind, seed).values for seed, lights in enumerate((reference, deformed))]
-        return correlate(*pair, region=REGION, normalise=10)
+        return correlate(*pair, region=REGION)
 
     def measure_raw(self, spoil: Callable[[np.ndarray], None], kind: str) -> Solution:
         """At 1 degree, with the raw samples of both frames spoiled in place."""
@@ -132,7 +132,7 @@ class Sphere:
             spoil(values)
             linear = linearise(replace(frame, values=values))
             pair.append(unmix(linear, self.crosstalk) if kind == "rgb" else separate(linear, self.crosstalk))
-        return correlate(*(images.values for images in pair), region=REGION, normalise=10)
+        return correlate(*(images.values for images in pair), region=REGION)
 
     def ratio(self, solution: Solution, angle: float, where: np.ndarray | bool = True) -> float:
         """rms(error / u_std) over the nodes."""
@@ -186,7 +186,7 @@ def test_statistics_beat_the_best_threshold_where_reflections_are_erratic() -> N
         if threshold is not None:
             first, second = (threshold_weights(one, threshold=threshold) for one in images)
             options = {"weights": first, "deformed_weights": second, "statistics": False}
-        found = correlate(*(one.values for one in images), region=REGION, normalise=10, **options)
+        found = correlate(*(one.values for one in images), region=REGION, **options)
         mesh = Tri3Mesh(nodes=found.nodes, elements=found.elements)
         return field_rms(mesh, found.displacement, exact, border=25)
 
@@ -198,7 +198,7 @@ def test_three_lights_beat_each_alone(sphere: Sphere, angle: float) -> None:
     reference, deformed = (sphere.images(sphere.lights[a], "bayer", seed).values for seed, a in enumerate((0.0, angle)))
 
     def error(*pair: np.ndarray) -> float:
-        found = correlate(*pair, region=REGION, normalise=10)
+        found = correlate(*pair, region=REGION)
         mesh = Tri3Mesh(nodes=found.nodes, elements=found.elements)
         return field_rms(mesh, found.displacement, sphere.truth[angle], border=25)
 
@@ -279,7 +279,7 @@ def test_glare_of_all_lights_that_stands_still_gives_no_wild_node(
     motion, shape = Affine.strain_and_rotation(0.001 * shift, 0.1 * shift, (shift, 0.3 * shift)), (260, 260)
     lights = [texture.image(shape, *state) + glare for state in ((), (motion,))]
     pair = [one + random.normal(0, 4, one.shape) for one in lights]
-    found = correlate(*pair, region=plate_with_a_hole, normalise=10, initial=(shift, 0.3 * shift), prefilter="binomial")
+    found = correlate(*pair, region=plate_with_a_hole, initial=(shift, 0.3 * shift), prefilter="binomial")
     error = np.abs(found.displacement - motion.displacement(found.nodes, shape))
     assert not ((error > 0.2) & (error > 4 * found.displacement_std)).any()
     assert found.measured.mean() > 0.85

@@ -89,7 +89,9 @@ ARGUMENTS: dict[str, Callable[[Any], object]] = {
         for key in ("lens", "homography", "covariance")
     },
     "reference": lambda value: rgbmidic.correlate(value, TEXTURE),
-    **{key: lambda value, key=key: correlated(**{key: value}) for key in ("weights", "initial", "normalise", "region")},
+    **{
+        key: lambda value, key=key: correlated(**{key: value}) for key in ("weights", "initial", "brightness", "region")
+    },
     "state": lambda value: measured(value),
     "region of states": lambda value: measured(TEXTURE, region=value),
 }

@@ -33,7 +33,6 @@ from rgbmidic.settings import (
     SolverSettings,
     TestSettings,
     WeightSettings,
-    grey_levels,
     read_test,
     require_regular_file,
     unique_keys,
@@ -115,7 +114,7 @@ def test_numbers_become_what_the_field_states(tmp_path: Path) -> None:
     for section in (settings.frames, settings.weights, settings.solver, settings.scale):
         for entry in fields(section):
             value = getattr(section, entry.name)
-            if "float" in str(entry.type) and value is not None:
+            if "float" in str(entry.type) and value is not None and not isinstance(value, str):
                 assert type(value) is float, entry.name
 
 
@@ -312,7 +311,7 @@ BUILT: dict[str, Any] = {
         unit="m",
         part="PLATE",
     ),
-    "illumination": IlluminationSettings(demosaic="malvar", normalise=8.5),
+    "illumination": IlluminationSettings(demosaic="malvar"),
     "region": RegionSettings(rectangle=PLACE, holes=(SQUARE, SQUARE)),
     "region of corners": RegionSettings(polygon=SQUARE),
     "region of a mask": RegionSettings(mask=Path("mask.png")),
@@ -326,7 +325,7 @@ BUILT: dict[str, Any] = {
     ),
     "weights by masks": WeightSettings(method="images", images=(Path("red.png"), Path("green.png"))),
     "solver": SolverSettings(
-        prefilter="gaussian", rigid="translation", brightness="local", fill=50, tolerance=0.5, max_iterations=7
+        prefilter="gaussian", rigid="translation", brightness=8.5, fill=50, tolerance=0.5, max_iterations=7
     ),
     "scale": ScaleSettings(mm_per_pixel=0.5, mm_per_pixel_std=0.25, frame_rate=1000),
     "scale by a camera": ScaleSettings(camera=Path("camera.json")),
@@ -425,20 +424,28 @@ def test_a_number_is_no_word() -> None:
 
 
 @pytest.mark.parametrize(
-    ("normalise", "brightness", "cracked", "runs"),
+    ("normalise", "brightness", "now"),
     [
-        ("auto", "auto", False, (10, "none")),
-        ("auto", "auto", True, (30, "mean")),
-        (10, "auto", True, (10, "mean")),
-        (0, "auto", True, (0, "none")),
-        ("auto", "none", True, (30, "none")),
-        (20, "global", True, (20, "global")),
-        (20, "mean", False, (20, "mean")),
+        (None, "global", "constant"),
+        (None, "local", "auto"),
+        ("auto", None, "auto"),
+        (20, None, 20.0),
+        (20, "mean", 20.0),
+        (0, "auto", "none"),
+        (0, "mean", "auto"),
+        (0, "global", "constant"),
+        (20, "none", 20.0),
     ],
 )
-def test_stated_grey_levels_hold_at_cracks(normalise: Any, brightness: Any, cracked: bool, runs: Any) -> None:
-    sigma, solver = grey_levels(normalise, SolverSettings(brightness=brightness), cracked=cracked)
-    assert (sigma, solver.brightness) == runs
+def test_former_keys_of_the_grey_levels_are_read(
+    normalise: Any, brightness: Any, now: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    document: dict[str, Any] = {"frames": {"path": "*.tif"}, "region": {"rectangle": [0, 0, 9, 9]}}
+    document |= {"illumination": {"normalise": normalise}} if normalise is not None else {}
+    document |= {"solver": {"brightness": brightness}} if brightness is not None else {}
+    assert TestSettings.from_mapping(document).solver.brightness == now
+    (warning,) = caplog.messages
+    assert f"{now!r}".strip("'").removesuffix(".0") in warning
 
 
 def test_a_wrong_number_is_told_at_construction_by_its_field() -> None:

@@ -61,7 +61,7 @@ def test_gaps_are_filled_where_that_is_asked_for(pair, initial):
     np.testing.assert_array_equal(np.isnan(gaps.displacement).any(axis=1), ~gaps.measured)
     assert (filled.node_status[~gaps.measured] == NodeStatus.FILLED).all()
     np.testing.assert_array_equal(filled.displacement[gaps.measured], gaps.displacement[gaps.measured])
-    np.testing.assert_allclose(filled.displacement, np.broadcast_to(SHIFT, filled.displacement.shape), atol=0.0047)
+    np.testing.assert_allclose(filled.displacement, np.broadcast_to(SHIFT, filled.displacement.shape), atol=0.009)
     assert filled.displacement_std[~gaps.measured].min() > np.median(gaps.displacement_std[gaps.measured])
 
 

@@ -92,7 +92,7 @@ def test_a_light_keeps_its_own_gradient_as_far_as_it_moves_with_the_texture(move
     mesh = Tri3Mesh.from_region(region, 20)
     reference = Reference.prepare(f, region, mesh=mesh, prefilter="binomial")
     motion = np.tile([MOTION, 0.0], (len(mesh.nodes), 1))
-    residual = Residual.at(reference, Deformed.prepare(g, prefilter="binomial"), reference.values, [motion] * 3)
+    residual = Residual.at(reference, Deformed.prepare(g, prefilter="binomial"), [motion] * 3)
     found = settled_gradient(residual, residual.weights)
     others = reference.texture.matched(reference.pixels, np.zeros((3, 1, 1)))[0]
 

@@ -131,7 +131,7 @@ def test_strain_beside_a_hole_has_the_uncertainty_of_its_own_column():
     reference = Reference.prepare(first, region, weights, mesh=mesh, prefilter="binomial")
     deformed = Deformed.prepare(noisy(image, 1)[None].astype(np.float32), weights, prefilter="binomial")
     rest = np.zeros_like(mesh.nodes)
-    pulled = Residual.at(reference, deformed, reference.values, [rest]).weights
+    pulled = Residual.at(reference, deformed, [rest]).weights
     equations = Equations.build(reference, pulled, np.zeros((2 * len(mesh.nodes), 0)), np.zeros_like(mesh.nodes))
     inner = equations.textured & ~mesh.adjacent_nodes(~equations.textured)
     assert 0 < inner.sum() < equations.textured.sum() < len(mesh.nodes)

@@ -18,7 +18,7 @@ Y, X = np.mgrid[: SHAPE[0], : SHAPE[1]]
 EVERYWHERE, LEFT, RIGHT, APART = X >= 0, X < 90, X > 110, X > 140
 MOTIONS = ((0.3, 0.2), (0.9, -0.3), (-0.2, 0.7))
 BODIES = ((LEFT | RIGHT) & (X > 11) & (X < 188) & (Y > 11) & (Y < 88)).astype(bool)
-SMALL_ERROR = 0.0055
+SMALL_ERROR = 0.0065
 """Error (px) without noise, where two lights see one spot together: twice the interpolation's."""
 
 

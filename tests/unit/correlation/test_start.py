@@ -113,10 +113,10 @@ def test_confidence_is_the_share_that_correlates():
     texture = Texture.random(7)
     reference, deformed = prepared(texture.image(SHAPE), texture.image(SHAPE, Affine(shift=(20.0, 0.0))))
     displacement = np.tile([20.0, 0.0], (len(reference.mesh.nodes), 1))
-    assert Search().confidence(Residual.at(reference, deformed, reference.values, [displacement])) == 1
+    assert Search().confidence(Residual.at(reference, deformed, [displacement])) == 1
     left = reference.mesh.nodes[:, 0] < 160
     displacement[left] += 12
-    partly = Residual.at(reference, deformed, reference.values, [displacement])
+    partly = Residual.at(reference, deformed, [displacement])
     assert Search().confidence(partly) == pytest.approx(1 - left.mean(), abs=0.15)
 
 
@@ -124,7 +124,7 @@ def test_a_solve_is_the_same_bits_from_a_residual_that_is_known():
     texture = Texture.random(8)
     reference, deformed = prepared(texture.image(SHAPE), texture.image(SHAPE, Affine(shift=(0.3, -0.2))))
     rest = np.zeros_like(reference.mesh.nodes)
-    residual = Residual.at(reference, deformed, reference.values, [rest])
+    residual = Residual.at(reference, deformed, [rest])
     alone, known = (solve(reference, deformed, rest, SolverSettings(), Statistics(), one) for one in (None, residual))
     np.testing.assert_array_equal(known.displacement, alone.displacement)
     np.testing.assert_array_equal(known.displacement_std, alone.displacement_std)

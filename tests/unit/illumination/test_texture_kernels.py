@@ -44,14 +44,6 @@ def test_sums_means_and_scaling(cfa, shape):
     np.testing.assert_allclose(padded, expected, rtol=1e-5, atol=1e-3)
 
 
-@pytest.mark.parametrize("block", [1, 2])
-@pytest.mark.parametrize("shape", SHAPES)
-def test_division_by_the_local_mean(shape, block):
-    values, mean, out = make_contrast(shape), grid_for(shape, block)[0], np.empty(shape, dtype=np.float32)
-    texture.divide_by_mean(values, widened(mean[None], block, shape[1])[0], block, np.float32(0.8), out)
-    np.testing.assert_allclose(out, naive_texture.divide_by_mean(values, mean, block, 0.8), rtol=1e-4)
-
-
 @pytest.mark.parametrize("cfa", BAYER_PATTERNS)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_moments_of_the_planes(cfa, shape):

@@ -179,7 +179,7 @@ def test_predicted_uncertainty_is_the_scatter_of_repeated_frames(glare, size):
     first = _separated(fine((0.0, 0.0)), 10)
     for seed, motion in enumerate(((1.5, 0.5), (-0.5, 1.25), (1.0, -1.0), (0.25, 2.5))):
         second = _separated(fine(motion), 20 + seed)
-        solution = correlate(first, second, initial=motion, element_size=size, normalise=10.0)
+        solution = correlate(first, second, initial=motion, element_size=size)
         inner = ((solution.nodes > 20) & (solution.nodes < SHAPE[0] - 21)).all(axis=1)
         errors.append((solution.displacement - motion)[inner])
     observed = np.sqrt(np.nanmean((np.array(errors) - np.nanmean(errors, axis=1, keepdims=True)) ** 2))
@@ -440,7 +440,7 @@ def test_monochrome_frames_have_neither_lattice_nor_reflection_index():
     assert codes(inspection) == set()
     repeats = [grey_frame(1, (0.0, 0.0), noise_seed=n) for n in (1, 2)]
     images = [linearise(one).values for one in repeats]
-    solution = correlate(*images, initial=(0, 0), normalise=10.0)
+    solution = correlate(*images, initial=(0, 0))
     observed = np.sqrt(np.nanmean(solution.displacement**2))
     assert np.sqrt(np.nanmean(inspection.prediction.std**2)) / observed == pytest.approx(1, abs=0.35)
 

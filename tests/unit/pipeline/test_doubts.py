@@ -171,22 +171,14 @@ def test_a_reference_with_one_lamp_on_is_named_as_that(tmp_path, told):
     assert "too small" not in told()
 
 
-@pytest.mark.parametrize(("normalise", "brightness"), [("auto", "auto"), (12.0, "none")])
-def test_what_runs_at_cracks_is_what_the_provenance_says(normalise, brightness, tmp_path):
-    stated = settings(
-        mesh={"element_size": 12, "cracks": [[[10, 48], [50, 48]]]},
-        illumination={"normalise": normalise},
-        solver={"brightness": brightness},
-    )
-    sigma, correction = (30.0, "mean") if normalise == "auto" else (12.0, "none")
-    runs = {"normalise": sigma, "brightness": correction}
-    plan = Plan.from_settings(stated, source=[frame(0), frame(1)])
-    assert {"normalise": plan.normalise, "brightness": plan.solver.brightness} == runs
+@pytest.mark.parametrize(("brightness", "described"), [("auto", "by the speckle"), (12.0, "stated"), ("none", "none")])
+def test_the_correction_of_the_grey_levels_is_in_the_provenance(brightness, described, tmp_path):
+    stated = settings(mesh={"element_size": 12}, solver={"brightness": brightness})
     result = measure(stated, tmp_path / "out", source=[frame(0), frame(1)])
-    assert result.provenance["grey_levels"] == runs
-    rows = analysis_rows(result)
-    assert rows["grey levels"] == f"divided by their local mean, σ = {sigma:g} px"
-    assert rows["grey-level correction"] == correction
+    corrected = result.provenance["grey_levels"]
+    assert corrected["brightness"] == brightness
+    assert (corrected["gain_window"] is None) == (brightness == "none")
+    assert described in analysis_rows(result)["grey-level correction"]
 
 
 def test_the_calibration_is_read_once(tmp_path, monkeypatch):

@@ -27,7 +27,7 @@ NOTHING: Any = object()
         (lambda: correlate(np.zeros((80, 80, 3)), np.zeros((80, 80, 3))), "the lights come first: np.moveaxis"),
         (lambda: correlate(IMAGE, IMAGE, region="all"), "a rectangle is four finite numbers"),
         (lambda: correlate(IMAGE, IMAGE, initial="none"), "initial must be numbers"),
-        (lambda: correlate(IMAGE, IMAGE, normalise="x"), "normalise must be a number or"),  # type: ignore[arg-type]
+        (lambda: correlate(IMAGE, IMAGE, brightness="x"), "brightness must be a number or"),  # type: ignore[arg-type]
         (lambda: correlate(IMAGE, IMAGE, statistics=NOTHING), r"statistics must be an object that has precision\(\)"),
         (lambda: measure(NOTHING, "out"), "settings must be a TestSettings or the path of a TEST.toml"),
         (lambda: measure("none.toml", "out"), "none.toml"),

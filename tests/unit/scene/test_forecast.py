@@ -196,7 +196,7 @@ def observed(scene: Scene, state: State, start: tuple[float, float], inset: int 
     errors = []
     for draw in range(DRAWS):
         pair = (shot(image, 2 * draw + i) for i, image in enumerate(images))
-        solution = correlate(*pair, region=(inset, inset, size - inset, size - inset), normalise=10.0, initial=start)
+        solution = correlate(*pair, region=(inset, inset, size - inset, size - inset), initial=start)
         errors.append(solution.displacement - at_nodes(exact, solution.nodes))
     inner = (abs(solution.nodes - size / 2) < size / 2 - inset - 12).all(axis=1)
     return np.array(errors)[:, inner], solution.nodes[inner], exact

@@ -1,0 +1,245 @@
+"""Brightness of the deformed images in that of the reference: ``g(x + u) = a(x) f(x) + b(x)`` for every light.
+
+The gain a is smooth over a window of some speckles, the offset b is a plane over the region; both are estimated in the
+frame of the material from the pixels that both states show (paper, section 2.2, whose gain is linear on the mesh). What
+a displacement changes of the gain is taken out of the reference's gradient (`GainFit.remainder`), so that the Hessian
+counts only the information that the unknown gain leaves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from rgbmidic._kernels.owned_pixels import corrected_difference
+from rgbmidic.correlation.constants import SolverConstants
+from rgbmidic.correlation.images import SlidingWindow
+from rgbmidic.mesh import PixelMap
+from rgbmidic.typing import AnyArray, FloatArray, FloatImage
+
+BrightnessModel = float | Literal["auto", "constant", "none"]
+"""The setting ``solver.brightness``."""
+
+_STEP = 4
+"""Side (px) of the blocks on which the gain is estimated, under the standard deviation of the narrowest window."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GainFit:
+    """Gain of one field over another, by local linear regression in a Gaussian window (Fan and Gijbels 1996).
+
+    Attributes
+    ----------
+    pixels
+        P owned pixels.
+    weights : ndarray, shape (P,), float32
+        Weights of the pixels.
+    sigma
+        Standard deviation of the window, px.
+    sums : ndarray, shape (h, w)
+        Weighted sums of the other field over blocks.
+    coefficients : ndarray, shape (3, h, w)
+        Factors that give the gain at a block from the weighted sums of a field and their first moments around it.
+    """
+
+    pixels: PixelMap
+    weights: FloatImage
+    sigma: float
+    sums: FloatArray
+    coefficients: FloatArray
+
+    @classmethod
+    def over(cls, values: FloatImage, weights: FloatImage, pixels: PixelMap, sigma: float) -> GainFit:
+        """Prepare the gain over `values` (P,) with `weights` (P,)."""
+        (sums,) = pixels.weighted_block_sums(values[None], weights, _STEP)
+        total, x, y, xx, xy, yy = _moments(sums, sigma, 2)
+        # a ridge of a tenth of the window's variance: beside gaps too narrow for a slope the mean counts
+        spread = 0.1 * (sigma / _STEP) ** 2 * total
+        xx, yy = xx + spread, yy + spread
+        cofactors = np.stack([xx * yy - xy * xy, xy * y - x * yy, x * xy - xx * y])
+        determinant = (cofactors * (total, x, y)).sum(axis=0)
+        least = 1e-6 * float(determinant.max(initial=0.0)) + 1e-300
+        coefficients = np.where(determinant > least, cofactors / np.maximum(determinant, least), 0.0)
+        return cls(pixels=pixels, weights=weights, sigma=sigma, sums=sums, coefficients=coefficients)
+
+    def block_sums(self, field: FloatImage) -> FloatArray:
+        """Sum a field (P,) with the weights over the blocks, (h, w)."""
+        (sums,) = self.pixels.weighted_block_sums(field[None], self.weights, _STEP)
+        return np.asarray(sums)
+
+    def gain(self, sums: FloatArray) -> FloatImage:
+        """Return the gain (h, w) at the blocks of a field with such `sums`."""
+        return np.asarray((self.coefficients * _moments(sums, self.sigma, 1)).sum(axis=0), dtype=np.float32)
+
+    def remainder(self, field: FloatImage, values: FloatImage) -> FloatImage:
+        """Return what a field (P,) has beyond its gain times the `values` (P,)."""
+        gain = self.pixels.from_blocks(self.gain(self.block_sums(field))[None], _STEP)[0]
+        return np.asarray(field - gain * values)
+
+
+def _moments(sums: FloatArray, sigma: float, order: int) -> FloatArray:
+    """Moments (3 or 6, h, w) of blocks in a window about each: 1, x, y, of second order xx, xy, yy, too; in blocks."""
+    rows, columns = np.arange(len(sums), dtype=np.float64)[:, None], np.arange(sums.shape[1], dtype=np.float64)
+
+    def windowed(grid: FloatArray) -> AnyArray:
+        return cv2.GaussianBlur(grid, (0, 0), sigma / _STEP, borderType=cv2.BORDER_CONSTANT)
+
+    total, x, y = windowed(sums), windowed(sums * columns), windowed(sums * rows)
+    moments = [total, x - columns * total, y - rows * total]
+    if order == 2:
+        xx, xy, yy = (windowed(sums * product) for product in (columns * columns, columns * rows, rows * rows))
+        moments += [
+            xx - columns * (2 * x - columns * total),
+            xy - columns * y - rows * (x - columns * total),
+            yy - rows * (2 * y - rows * total),
+        ]
+    return np.stack(moments)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Brightness:
+    """Brightness of the deformed images, by the pixels that both states show.
+
+    Attributes
+    ----------
+    pixels
+        P owned pixels of the reference.
+    values, level : ndarray, shape (k, P), float32
+        Grey levels of the reference, and their local mean, the unit of the residual.
+    gain : ndarray, shape (k,)
+        Of each light, the median over the elements; 1 where it shows nothing.
+    offset : ndarray, shape (k, 3)
+        Of each light: its constant, and its slopes along the columns and rows of the rectangle around the pixels.
+    fits : tuple of GainFit
+        Of each light; empty where the gain is one number.
+    offset_sums : tuple of ndarray, shape (h, w)
+        Weighted sums of each light's offset over the blocks of its fit.
+    least_gain
+        Least local gain over that of the light.
+    """
+
+    pixels: PixelMap
+    values: FloatImage
+    level: FloatImage
+    gain: FloatArray
+    offset: FloatArray
+    fits: tuple[GainFit, ...] = ()
+    offset_sums: tuple[FloatArray, ...] = ()
+    least_gain: float
+
+    def with_windows(self, weights: FloatImage, sigma: float) -> Brightness:
+        """Return the brightness with a gain that varies over windows of `sigma` px, for weights (k, P)."""
+        lights = zip(self.values, weights, strict=True)
+        fits = tuple(GainFit.over(f, w, self.pixels, sigma) for f, w in lights)
+        rows, columns = ((place + 0.5) * _STEP - 0.5 for place in np.indices(fits[0].sums.shape))
+        totals = self.pixels.block_sums(weights, _STEP)
+        planes = (b[0] + b[1] * columns + b[2] * rows for b in self.offset)
+        offset_sums = tuple(plane * total for plane, total in zip(planes, totals, strict=True))
+        return Brightness(
+            pixels=self.pixels,
+            values=self.values,
+            level=self.level,
+            gain=self.gain,
+            offset=self.offset,
+            fits=fits,
+            offset_sums=offset_sums,
+            least_gain=self.least_gain,
+        )
+
+    def residual(self, light: int, difference: FloatImage) -> FloatImage:
+        """Return a light's residual (P,), ``(f - (g - b) / a) / level``, from the difference f - g (P,)."""
+        gain, out = np.full((1, 1), self.gain[light], dtype=np.float32), np.empty_like(difference)
+        if self.fits:
+            fit = self.fits[light]
+            gain = fit.gain(fit.sums - fit.block_sums(difference) - self.offset_sums[light])
+        least = np.float32(self.least_gain * self.gain[light])
+        images = self.values[light], self.level[light], difference
+        corrected_difference(self.pixels.lines, *images, gain, self.offset[light], least, _STEP, out)
+        return out
+
+
+def gain_and_offset(
+    moments: FloatArray, centres: FloatArray, constants: SolverConstants
+) -> tuple[FloatArray, FloatArray]:
+    """Find the gain (k,) and the offset (k, 3) of each light, from elements that show the same texture in both states.
+
+    The gain is the ratio of the standard deviations, which noise that is alike in both states changes little.
+
+    Parameters
+    ----------
+    moments : ndarray, shape (k, E, 6)
+        Sums of w, w f, w g, w f f, w f g, w g g over elements.
+    centres : ndarray, shape (E, 2)
+        Column and row of the elements.
+    constants
+        Of the solve.
+    """
+    gains, offsets = np.ones(len(moments)), np.zeros((len(moments), 3))
+    for light, sums in enumerate(moments):
+        total, f, g, ff, fg, gg = sums.T
+        total = np.maximum(total, 1e-30)
+        ff, fg, gg = ff - f * f / total, fg - f * g / total, gg - g * g / total
+        alike = (ff > 0) & (gg > 0) & (fg > constants.lit * np.sqrt(np.maximum(ff * gg, 0)))
+        if alike.any():
+            gain = np.sqrt(gg[alike] / ff[alike])
+            gains[light] = np.median(gain)
+            offsets[light] = _offset_plane(centres[alike], (g[alike] - gain * f[alike]) / total[alike])
+    return gains, offsets
+
+
+def _offset_plane(points: FloatArray, values: FloatArray) -> FloatArray:
+    """Fit constant and slopes (3,) of a plane to offsets (M,) at points (M, 2), with Cauchy weights.
+
+    Reflections give single elements offsets, too: of the plane the fraction counts that it has of its mean square and
+    of the scatter about it together.
+    """
+    middle, size = points.mean(axis=0), max(float(np.ptp(points, axis=0).max()), 1.0)
+    basis = np.c_[np.ones(len(points)), (points - middle) / size]
+    plane = np.array([np.median(values), 0.0, 0.0])
+    for _ in range(10):  # until the weights have settled
+        scatter = 1.5 * float(np.median(np.abs(values - basis @ plane)))  # standard deviation of a normal distribution
+        if len(points) < 12 or not scatter:  # four elements for each unknown
+            break
+        weighted = basis / (1 + ((values - basis @ plane) / scatter) ** 2)[:, None]
+        held = 1e-3 * weighted[:, 0].sum() * np.diag([0.0, 1.0, 1.0])  # slopes that elements on a line do not show
+        plane = np.linalg.solve(weighted.T @ basis + held, weighted.T @ values)
+    square = float(((basis @ plane) ** 2).mean())
+    plane = plane * square / max(square + scatter**2, 1e-300)
+    slopes = plane[1:] / size
+    return np.array([plane[0] - slopes @ middle, *slopes])
+
+
+def window_width(
+    values: FloatImage, gradient: FloatImage, weights: FloatImage, pixels: PixelMap, constants: SolverConstants
+) -> float:
+    """Find the standard deviation (px) of the gain's window from the speckle.
+
+    It is a multiple of the correlation length ``sqrt(var f / mean |grad f|^2)``: the standard deviation of the Gaussian
+    that makes such a speckle of white noise.
+
+    Parameters
+    ----------
+    values, weights : ndarray, shape (k, P)
+        Grey levels of the reference and their weights.
+    gradient : ndarray, shape (2, k, P)
+        Their gradient, grey levels per px.
+    pixels
+        P owned pixels.
+    constants
+        Of the solve.
+    """
+    sigma = float(max(pixels.bounds[2:]))
+    for _ in range(2):  # over the region at first, in which shading counts as speckle
+        lengths, window = [], SlidingWindow(sigma=sigma)
+        for f, gx, gy, w in zip(values, *gradient, weights, strict=True):
+            fields = np.stack([w * f, w * f * f, w * (gx * gx + gy * gy), w])
+            mean, square, slope = window.ratios(pixels, fields).astype(np.float64)
+            if (seen := slope > 0).any():
+                variance = np.maximum(square - mean * mean, 0)
+                lengths.append(float(np.sqrt(np.median(variance[seen] / slope[seen]))))
+        length = float(np.median(lengths)) if lengths else 0.0
+        sigma = max(constants.window_of_gain * length, constants.least_window)
+    return sigma

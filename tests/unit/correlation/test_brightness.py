@@ -1,0 +1,102 @@
+"""Brightness of the deformed images: gain by local linear regression, offset as a plane, what a change costs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from textures import Affine, Texture
+
+from rgbmidic import Status, correlate
+from rgbmidic._kernels.owned_pixels import corrected_difference
+from rgbmidic.correlation.brightness import GainFit, gain_and_offset
+from rgbmidic.correlation.constants import USUAL
+from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+
+SHAPE = (160, 200)
+REGION = (20, 20, 180, 140)
+MOTION = Affine.strain_and_rotation(0.003, 0.3, (0.3, -0.2))
+ROWS, COLUMNS = np.indices(SHAPE)
+
+
+@pytest.fixture(scope="module")
+def pixels() -> PixelMap:
+    region = Region.from_rectangle(REGION, SHAPE)
+    return PixelMap.from_mesh(Tri3Mesh.from_region(region, 25), region)
+
+
+def error(gain: np.ndarray | float, offset: np.ndarray | float) -> tuple[float, float, int]:
+    """Rms error (px), rms of error over stated, and iterations under a change of the deformed image."""
+    texture, random = Texture.random(3, speckle=4.0), np.random.default_rng(1)
+    f, g = texture.image(SHAPE), gain * texture.image(SHAPE, MOTION) + offset
+    noisy = [image + 3 * random.standard_normal(SHAPE) for image in (f, g)]
+    found = correlate(*noisy, region=REGION)
+    assert found.status is Status.CONVERGED
+    assert found.measured.all()
+    wrong = found.displacement - MOTION.displacement(found.nodes, SHAPE)
+    ratio = wrong / found.displacement_std
+    return float(np.sqrt((wrong**2).mean())), float(np.sqrt((ratio**2).mean())), found.iterations
+
+
+def test_a_change_of_light_costs_nothing():
+    """Gains and offsets of the whole image, a gradient of light and one of stray light, vignetting."""
+    once, _, iterations = error(1.0, 0.0)
+    across = 0.7 + 0.6 * COLUMNS / SHAPE[1]
+    vignetted = 1 - 0.3 * (((COLUMNS - 100) / 130) ** 2 + ((ROWS - 80) / 130) ** 2)
+    changes = [(1.6, 0.0), (1.0, 25.0), (0.8, -20.0), (across, 0.0), (1.0, 25 * COLUMNS / SHAPE[1]), (vignetted, 0.0)]
+    for gain, offset in changes:
+        changed, ratio, passes = error(gain, offset)
+        # noise of 3 in both states, after a gain a: sqrt((1 + 1 / a^2) / 2) times the error
+        expected = once * np.sqrt((1 + np.mean(1 / np.square(gain))) / 2)
+        assert changed < 1.1 * expected
+        assert 0.8 < ratio < 1.25
+        assert passes <= iterations + 2
+
+
+def test_a_gain_that_is_linear_in_the_window_is_found_at_every_edge(pixels):
+    random = np.random.default_rng(0)
+    values = random.uniform(50, 150, pixels.columns.size).astype(np.float32)
+    gain = 0.5 + 0.004 * pixels.columns + 0.003 * pixels.rows
+    fit = GainFit.over(values, np.ones_like(values), pixels, 10.0)
+    found = fit.gain(fit.block_sums((gain * values).astype(np.float32)))
+    # the ridge holds a twentieth of the slope at an edge, and beyond the last block's centre the gain is that of it
+    np.testing.assert_allclose(pixels.from_blocks(found[None], 4)[0], gain, rtol=0.04)
+    left = fit.remainder((gain * values).astype(np.float32), values)
+    assert np.abs(left).max() < 0.04 * 150 * gain.max()
+
+
+def test_an_offset_is_a_plane_whatever_some_elements_show():
+    random, centres = np.random.default_rng(0), np.random.default_rng(1).uniform(0, 300, (80, 2))
+    f = random.normal(100, 30, (80, 200))
+    plane = 20 + 0.05 * centres[:, 0] - 0.02 * centres[:, 1]
+    g = 0.6 * f + plane[:, None]
+    g[:15] += 50  # a reflection
+    sums = np.stack([np.full(80, 200.0), f.sum(1), g.sum(1), (f * f).sum(1), (f * g).sum(1), (g * g).sum(1)], axis=1)
+    gain, offset = gain_and_offset(sums[None], centres, USUAL)
+    assert gain[0] == pytest.approx(0.6, rel=1e-6)
+    np.testing.assert_allclose(offset[0, 0] + centres @ offset[0, 1:], plane, atol=0.8)
+    unlike = gain_and_offset(np.stack([sums * (1, 1, 0, 1, 0, 0)]), centres, USUAL)
+    np.testing.assert_array_equal(unlike[0], [1.0])
+    np.testing.assert_array_equal(unlike[1], [[0.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("grid", [(1, 1), (30, 40)])
+def test_the_corrected_difference_is_that_of_the_naive_one(pixels, grid):
+    random = np.random.default_rng(2)
+    f, level, difference = random.uniform(50, 150, (3, pixels.columns.size)).astype(np.float32)
+    gain, offset, out = random.uniform(0.2, 2, grid).astype(np.float32), np.array([3.0, 0.1, -0.2]), np.empty_like(f)
+    corrected_difference(pixels.lines, f, level, difference, gain, offset, np.float32(0.4), 4, out)
+    top, left = pixels.bounds[:2]
+    rows, columns = pixels.rows - top, pixels.columns - left
+    places = [np.clip((one + 0.5) / 4 - 0.5, 0, size - 1) for one, size in zip((rows, columns), grid, strict=True)]
+    first = [np.minimum(one.astype(int), max(size - 2, 0)) for one, size in zip(places, grid, strict=True)]
+    (i, j), (s, t) = first, (place - low for place, low in zip(places, first, strict=True))
+    below, right = np.minimum(i + 1, grid[0] - 1), np.minimum(j + 1, grid[1] - 1)
+    a = (1 - s) * ((1 - t) * gain[i, j] + t * gain[i, right]) + s * ((1 - t) * gain[below, j] + t * gain[below, right])
+    b = offset[0] + offset[1] * columns + offset[2] * rows
+    np.testing.assert_allclose(out, (f - (f - difference - b) / np.maximum(a, 0.4)) / level, rtol=2e-4, atol=2e-4)
+
+
+def test_weighted_sums_over_blocks_are_those_of_the_products(pixels):
+    values, weight = np.random.default_rng(3).uniform(0, 1, (2, pixels.columns.size)).astype(np.float32)
+    (found,) = pixels.weighted_block_sums(values[None], weight, 4)
+    np.testing.assert_allclose(found, pixels.block_sums((weight * values)[None], 4)[0], rtol=1e-6)
