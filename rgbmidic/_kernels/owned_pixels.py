@@ -15,6 +15,7 @@ from rgbmidic._kernels.threads import FAST, compiled, helper
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
+_HALF = np.float32(0.5)
 _LANES = 8
 """Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
@@ -117,14 +118,18 @@ def product_sums(start, stop, values, weights, lines, run_offsets, offsets, side
 
 
 @compiled("out", axis=1, fastmath=FAST)
-def score_sums(start, stop, residual, weights, gradient_x, gradient_y, lines, run_offsets, offsets, side, out):
+def score_sums(
+    start, stop, residual, weights, gradient_x, gradient_y, values, corrected, lines, run_offsets, offsets, side, out,
+):  # fmt: skip
     """Sum ``w r gx``, ``w r gy`` and ``w (gx gx + gy gy)`` of fields (k, P) over blocks, and the pixels with weight.
 
-    ``out`` (4, h, w) receives the sums over all lights, and the number of pixels where one has weight.
+    ``out`` (4, h, w) receives the sums over all lights, and the number of pixels where one has weight. One of (6, h, w)
+    receives those of ``w (gx df/dx + gy df/dy)``, too, by differences within each element, for f the `values` and for
+    the `corrected` ones without the residual.
     """
     out[:, start:stop] = 0
-    columns = np.zeros((4, out.shape[2] * side + _LANES), dtype=np.float32)
-    scores = np.empty((4, _largest(offsets)), dtype=np.float32)
+    columns = np.zeros((len(out), out.shape[2] * side + _LANES), dtype=np.float32)
+    scores = np.empty((len(out), _largest(offsets)), dtype=np.float32)
     for e in range(run_offsets.size - 1):
         first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
         scores[:] = 0
@@ -136,7 +141,30 @@ def score_sums(start, stop, residual, weights, gradient_x, gradient_y, lines, ru
                 scores[1, i] += weighted * gy
                 scores[2, i] += w * (gx * gx + gy * gy)
                 scores[3, i] = max(scores[3, i], _ONE if w > _ZERO else _ZERO)
+            if len(out) == 4 or number == 0:
+                continue
+            states = residual[light], weights[light], values[light], corrected[light]
+            for q in range(run_offsets[e], run_offsets[e + 1]):
+                slot, count, row, column = lines[q]
+                here = np.uint64(slot)
+                _slopes(here, here + np.uint64(1), count - 1, gradient_x[light], states, first, scores)
+                if q + 1 < run_offsets[e + 1] and lines[q + 1, 2] == row + 1:
+                    low = max(column, lines[q + 1, 3])
+                    high = min(column + count, lines[q + 1, 3] + lines[q + 1, 1])
+                    here, below = np.uint64(slot + low - column), np.uint64(lines[q + 1, 0] + low - lines[q + 1, 3])
+                    _slopes(here, below, high - low, gradient_y[light], states, first, scores)
         _add(scores, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
+
+
+@helper(fastmath=FAST)
+def _slopes(one, other, number, gradient, states, first, scores):
+    """Add the products of the gradient with differences between pixels beside each other, in both states."""
+    residual, weight, values, corrected = states
+    for i in range(np.uint64(max(number, 0))):
+        a, b = one + i, other + i
+        mean = _HALF * (weight[a] * gradient[a] + weight[b] * gradient[b])
+        scores[4, a - first] += mean * (values[b] - values[a])
+        scores[5, a - first] += mean * (corrected[b] - corrected[a] - residual[b] + residual[a])
 
 
 @helper()
