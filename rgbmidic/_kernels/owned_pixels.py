@@ -129,10 +129,16 @@ def score_sums(
     """
     out[:, start:stop] = 0
     columns = np.zeros((len(out), out.shape[2] * side + _LANES), dtype=np.float32)
-    scores = np.empty((len(out), _largest(offsets)), dtype=np.float32)
+    scores, states = np.empty((2, 6, _largest(offsets)), dtype=np.float32)
+    inside, one = np.empty(_largest(offsets), dtype=np.float32), np.uint64(1)
     for e in range(run_offsets.size - 1):
         first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
         scores[:] = 0
+        if len(out) > 4:
+            inside[:number] = _ONE
+            for q in range(run_offsets[e], run_offsets[e + 1]):
+                if number > 0:
+                    inside[np.uint64(lines[q, 0] + lines[q, 1] - 1) - first] = _ZERO
         for light in range(len(weights)):
             for i in range(number):
                 w, gx, gy = weights[light, first + i], gradient_x[light, first + i], gradient_y[light, first + i]
@@ -143,28 +149,27 @@ def score_sums(
                 scores[3, i] = max(scores[3, i], _ONE if w > _ZERO else _ZERO)
             if len(out) == 4 or number == 0:
                 continue
-            states = residual[light], weights[light], values[light], corrected[light]
-            for q in range(run_offsets[e], run_offsets[e + 1]):
-                slot, count, row, column = lines[q]
-                here = np.uint64(slot)
-                _slopes(here, here + np.uint64(1), count - 1, gradient_x[light], states, first, scores)
-                if q + 1 < run_offsets[e + 1] and lines[q + 1, 2] == row + 1:
-                    low = max(column, lines[q + 1, 3])
-                    high = min(column + count, lines[q + 1, 3] + lines[q + 1, 1])
-                    here, below = np.uint64(slot + low - column), np.uint64(lines[q + 1, 0] + low - lines[q + 1, 3])
-                    _slopes(here, below, high - low, gradient_y[light], states, first, scores)
-        _add(scores, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
-
-
-@helper(fastmath=FAST)
-def _slopes(one, other, number, gradient, states, first, scores):
-    """Add the products of the gradient with differences between pixels beside each other, in both states."""
-    residual, weight, values, corrected = states
-    for i in range(np.uint64(max(number, 0))):
-        a, b = one + i, other + i
-        mean = _HALF * (weight[a] * gradient[a] + weight[b] * gradient[b])
-        scores[4, a - first] += mean * (values[b] - values[a])
-        scores[5, a - first] += mean * (corrected[b] - corrected[a] - residual[b] + residual[a])
+            for i in range(number):
+                w = _HALF * weights[light, first + i]
+                states[0, i], states[1, i] = w * gradient_x[light, first + i], w * gradient_y[light, first + i]
+                states[2, i] = values[light, first + i]
+                states[3, i] = corrected[light, first + i] - residual[light, first + i]
+            for i in range(number - one):
+                mean = inside[i] * (states[0, i] + states[0, i + one])
+                scores[4, i] += mean * (states[2, i + one] - states[2, i])
+                scores[5, i] += mean * (states[3, i + one] - states[3, i])
+            for q in range(run_offsets[e], run_offsets[e + 1] - 1):
+                if lines[q + 1, 2] != lines[q, 2] + 1:
+                    continue
+                low = max(lines[q, 3], lines[q + 1, 3])
+                count = min(lines[q, 3] + lines[q, 1], lines[q + 1, 3] + lines[q + 1, 1]) - low
+                a = np.uint64(lines[q, 0] + low - lines[q, 3]) - first
+                b = np.uint64(lines[q + 1, 0] + low - lines[q + 1, 3]) - first
+                for i in range(np.uint32(max(count, 0))):
+                    mean = states[1, a + i] + states[1, b + i]
+                    scores[4, a + i] += mean * (states[2, b + i] - states[2, a + i])
+                    scores[5, a + i] += mean * (states[3, b + i] - states[3, a + i])
+        _add(scores[: len(out)], first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
 
 
 @helper()
