@@ -95,11 +95,8 @@ class BlockTable:
         displacement = self._mean(score, range_) / information[:, None]
         blocks = 4 * np.pi * (range_ / self.side) ** 2  # that a window holds
         square = ((score - displacement * own[:, None]) ** 2).mean(axis=1)
-        return (
-            displacement,
-            self._mean(square, self.reference.constants.bias_range) / information**2 / blocks,
-            information,
-        )
+        around = self._mean(square, self.reference.constants.bias_range)
+        return displacement, around / information**2 / blocks, information
 
     def _mean(self, grids: FloatArray, range_: float) -> FloatArray:
         """Mean of grids (..., h, w) over a window of a standard deviation of so many px."""
@@ -112,7 +109,8 @@ class BlockTable:
         xx + yy is 1 for white noise and ideal weights. They are raised where blocks are few, so that an error over its
         stated uncertainty has the variance 1.
         """
-        constants, prior = self.reference.constants, self._prior
+        constants = self.reference.constants
+        prior = constants.prior * self.side**2
         window = 4 * np.pi * (constants.score_range / self.side) ** 2
         found = []
         for score, count in zip(self._relative_scores(), self.sums[:, 3], strict=True):
@@ -128,7 +126,8 @@ class BlockTable:
     def correlation(self) -> FloatArray:
         """Correlation of the scores of each two lights over the blocks around that both see, (k, k, h, w)."""
         scores, counts, lights = self._relative_scores(), self.sums[:, 3], range(len(self.sums))
-        typical = [2 * self._prior * _typical_square(one, count) for one, count in zip(scores, counts, strict=True)]
+        prior = self.reference.constants.prior * self.side**2
+        typical = [2 * prior * _typical_square(one, count) for one, count in zip(scores, counts, strict=True)]
         out = np.zeros((len(scores), *counts.shape))
         for a, b in product(lights, lights):
             both = (counts[a] > 0) & (counts[b] > 0)
@@ -146,11 +145,6 @@ class BlockTable:
         """
         reference, deformed = self.at(self.sums[0, 4:], points)
         return np.asarray(np.divide(deformed, reference, out=np.ones_like(deformed), where=reference > 0))
-
-    @property
-    def _prior(self) -> float:
-        """Pixels for which the region's typical score counts where scores are averaged."""
-        return self.reference.constants.prior * self.side**2
 
     def around(self, grid: AnyArray) -> AnyArray:
         """Sums of a grid over the window in which scores are averaged, up to a factor."""

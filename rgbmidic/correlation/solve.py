@@ -364,7 +364,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         misfit=np.where(measured, misfit(mesh, squares, equations.textured), np.nan),
         status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
         reason="" if converged else _unsettled(problem, estimate, measured),
-        rigid=np.where(np.any(equations.weights, axis=1, keepdims=True), estimate.rigid, np.nan),
+        rigid=np.where(total[:, None] > 0, estimate.rigid, np.nan),
         residual=np.sqrt(np.divide(square, total, out=np.full(total.size, np.nan), where=total > 0)),
         weight_fraction=np.mean(some / np.where(seen > 0, seen, np.float32(1)), axis=1, dtype=np.float64),
     )
