@@ -113,7 +113,7 @@ class BlockTable:
         prior = constants.prior * self.side**2
         window = 4 * np.pi * (constants.score_range / self.side) ** 2
         found = []
-        for score, count in zip(self._relative_scores(), self.sums[:, 3], strict=True):
+        for score, count in zip(self._relative(self.sums[:, :2]), self.sums[:, 3], strict=True):
             (x, y), typical, around = score, _typical_square(score, count), self.around(count)
             # an estimate from n blocks has 2 n degrees of freedom; the mean of its inverse is n / (n - 1) times too
             # large; of one block, less one, a quarter: the variance is hardly known, and stated 4 times larger
@@ -125,7 +125,7 @@ class BlockTable:
 
     def correlation(self) -> FloatArray:
         """Correlation of the scores of each two lights over the blocks around that both see, (k, k, h, w)."""
-        scores, counts, lights = self._relative_scores(), self.sums[:, 3], range(len(self.sums))
+        scores, counts, lights = self._relative(self.sums[:, :2]), self.sums[:, 3], range(len(self.sums))
         prior = self.reference.constants.prior * self.side**2
         typical = [2 * prior * _typical_square(one, count) for one, count in zip(scores, counts, strict=True)]
         out = np.zeros((len(scores), *counts.shape))
@@ -150,16 +150,23 @@ class BlockTable:
         """Sums of a grid over the window in which scores are averaged, up to a factor."""
         return window_sums(grid, self.reference.constants.score_range / self.side)
 
-    def _relative_scores(self) -> FloatArray:
-        """Scores over the root of the information around them, (k, 2, h, w).
+    def typical_ratio(self, scores: FloatArray) -> float:
+        """Typical square of other scores (2, h, w) of all lights together over that of the table's."""
+        other, own = (
+            _typical_square(self._relative(one[None])[0], self.sums[0, 3]) for one in (scores, self.sums[0, :2])
+        )
+        return other / own if own > 0 else 0.0
+
+    def _relative(self, scores: FloatArray) -> FloatArray:
+        """Scores (k, 2, h, w) over the root of the information around them.
 
         A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
         smooth, and averaged, is its ratio to the information.
         """
-        even, out = self.reference.constants.even, np.zeros_like(self.sums[:, :2])
-        for (x, y, information, count), one in zip(self.sums[:, :4], out, strict=True):
+        even, out = self.reference.constants.even, np.zeros_like(scores)
+        for (information, count), score, one in zip(self.sums[:, 2:4], scores, out, strict=True):
             level = window_sums(information, even) / np.maximum(window_sums(count, even), 1e-6)
-            np.divide((x, y), np.sqrt(level), out=one, where=(level > 0) & (count > 0))
+            np.divide(score, np.sqrt(level), out=one, where=(level > 0) & (count > 0))
         return out
 
 

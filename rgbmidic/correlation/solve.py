@@ -34,7 +34,7 @@ from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual, brought_nearer, corrected_values
 from rgbmidic.correlation.solution import NO_MATCH, NodeStatus, Solution, Status
-from rgbmidic.correlation.uncertainty import gradient_step, standard_uncertainty
+from rgbmidic.correlation.uncertainty import beyond_chance, gradient_step, standard_uncertainty
 from rgbmidic.errors import InputError
 from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
@@ -317,7 +317,8 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     table = BlockTable.of_all(residual, equations.weights)
     std = standard_uncertainty(residual, table, equations, weighting.precision, recovery)
     if len(equations.weights) > 1:
-        std = np.hypot(std, recovery.field(*gradient_step(weighting.residual, equations).T))
+        step = recovery.field(*gradient_step(weighting.residual, equations).T)
+        std = np.hypot(std, beyond_chance(step, std, residual, table, equations.weights))
     bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
     if weighting.precision is not None:
         lights = BlockTable.of_lights(residual, equations.weights, problem.constants.block)

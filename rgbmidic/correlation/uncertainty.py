@@ -226,14 +226,36 @@ def standard_uncertainty(
 
 
 def gradient_step(residual: Residual, equations: Equations) -> FloatArray:
-    """Step (N, 2) that the gradients of the lights' own images would make from the solution.
-
-    Two gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978). Where a
-    reflection does not follow the surface it pulls with them, and what it still pulls without is less than that
-    (docs/explanation/uncertainty.md).
-    """
+    """Step (N, 2) that the gradients of the lights' own images would make from the solution."""
     reference = residual.reference
     images = zip(equations.weights, residual.difference, reference.texture.images.swapaxes(0, 1), strict=True)
     pulls = np.array([reference.assembly.vector(reference.projected(*light)) for light in images])
     pull, rigid_pull = pulls.sum(axis=0), (pulls[1:] @ equations.functions).ravel()
     return equations.increment(pull, np.zeros_like(pull), rigid_pull)[0]
+
+
+def beyond_chance(
+    step: FloatArray, std: FloatArray, residual: Residual, table: BlockTable, weights: FloatImage
+) -> FloatArray:
+    """Return what the recovered step (N, 5) of `gradient_step` has beyond chance, (N, 5).
+
+    Two gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978): by as much of the
+    uncertainty `std` (N, 5) as the scores of what a light alone shows have of all scores, typically. Where a reflection
+    does not follow the surface it pulls with them, and what it still pulls without is less than that
+    (docs/explanation/uncertainty.md).
+
+    Parameters
+    ----------
+    step, std : ndarray, shape (N, 5)
+        Of u, v, exx, eyy, exy.
+    residual, table
+        Of the solution.
+    weights : ndarray, shape (k, P), float32
+        Of the solve.
+    """
+    reference = table.reference
+    images = BlockTable.of(reference, table.side, [(residual.difference, weights, *reference.texture.images)])
+    chance = np.mean(reference.unfitted) * table.typical_ratio((images.sums - table.sums[:, :4])[0, :2])
+    square = ((step[:, :2] / np.maximum(std[:, :2], 1e-30)) ** 2).mean(axis=1)
+    excess = 1 - chance / np.maximum(square, 1e-30)
+    return np.asarray(step * np.sqrt(np.maximum(excess, 0))[:, None])
