@@ -254,7 +254,7 @@ class Reference:
             assembly=assembly,
             material=material,
             origin=origin,
-            unfitted=unfitted_fraction(mesh, pixels, assembly, gradient, weighted, constants),
+            unfitted=unfitted_fraction(mesh, pixels, assembly, (gradient, weighted), prefilter, constants),
             images=ready,
             weights=usable,
             values=values,
