@@ -62,7 +62,9 @@ def light_bias(table: BlockTable, equations: Equations) -> tuple[FloatArray, Flo
     displacement, variance, information = table.displacement(reach)
     local, chance, _ = table.displacement(constants.local_bias_range)
     beyond = local - displacement
-    beyond *= np.maximum(1 - constants.local_bias * chance / np.maximum((beyond**2).sum(axis=1), 1e-30), 0)[:, None]
+    gain = np.maximum(1 - constants.local_bias * chance / np.maximum((beyond**2).sum(axis=1), 1e-30), 0)
+    beyond *= gain[:, None]
+    variance = variance + 2 * chance * gain  # twice: their scatter is taken about the local displacement itself
     displacement = displacement + beyond
     precision = information / np.maximum(information.sum(axis=0), 1e-30)
     believed, agree = agreement(displacement, variance, precision)
