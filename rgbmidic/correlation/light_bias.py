@@ -64,12 +64,12 @@ def light_bias(table: BlockTable, equations: Equations) -> tuple[FloatArray, Flo
     beyond = local - displacement
     gain = np.maximum(1 - constants.local_bias * chance / np.maximum((beyond**2).sum(axis=1), 1e-30), 0)
     beyond *= gain[:, None]
-    variance = variance + 2 * chance * gain  # twice: their scatter is taken about the local displacement itself
     displacement = displacement + beyond
     precision = information / np.maximum(information.sum(axis=0), 1e-30)
     believed, agree = agreement(displacement, variance, precision)
     part = precision + agree * (believed - precision)
     mean = (part[:, None] * displacement).sum(axis=0)
+    variance += 2 * chance * gain  # twice: its scatter is taken about the local displacement itself
     apart = np.maximum((displacement - mean) ** 2 - variance[:, None], 0)
     left = count / (count - 1) * (part[:, None] ** 2 * apart).sum(axis=0)
     left += ((part - precision)[:, None] * beyond).sum(axis=0) ** 2
