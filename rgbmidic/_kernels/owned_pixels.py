@@ -15,6 +15,7 @@ from rgbmidic._kernels.threads import FAST, compiled, helper
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
+_HALF = np.float32(0.5)
 _LANES = 8
 """Pixels in a vector register: runs have 13 on average, and what does not fill a vector costs as much as eight."""
 
@@ -166,17 +167,27 @@ def product_sums(start, stop, values, weights, lines, run_offsets, offsets, side
 
 
 @compiled("out", axis=1, fastmath=FAST)
-def score_sums(start, stop, residual, weights, gradient_x, gradient_y, lines, run_offsets, offsets, side, out):
+def score_sums(
+    start, stop, residual, weights, gradient_x, gradient_y, values, corrected, lines, run_offsets, offsets, side, out,
+):  # fmt: skip
     """Sum ``w r gx``, ``w r gy`` and ``w (gx gx + gy gy)`` of fields (k, P) over blocks, and the pixels with weight.
 
-    ``out`` (4, h, w) receives the sums over all lights, and the number of pixels where one has weight.
+    ``out`` (4, h, w) receives the sums over all lights, and the number of pixels where one has weight. One of (6, h, w)
+    receives those of ``w (gx df/dx + gy df/dy)``, too, by differences within each element, for f the `values` and for
+    the `corrected` ones without the residual.
     """
     out[:, start:stop] = 0
-    columns = np.zeros((4, out.shape[2] * side + _LANES), dtype=np.float32)
-    scores = np.empty((4, _largest(offsets)), dtype=np.float32)
+    columns = np.zeros((len(out), out.shape[2] * side + _LANES), dtype=np.float32)
+    scores, states = np.empty((2, 6, _largest(offsets)), dtype=np.float32)
+    inside, one = np.empty(_largest(offsets), dtype=np.float32), np.uint64(1)
     for e in range(run_offsets.size - 1):
         first, number = _slots(lines, run_offsets, offsets, e, start * side, stop * side)
         scores[:] = 0
+        if len(out) > 4:
+            inside[:number] = _ONE
+            for q in range(run_offsets[e], run_offsets[e + 1]):
+                if number > 0:
+                    inside[np.uint64(lines[q, 0] + lines[q, 1] - 1) - first] = _ZERO
         for light in range(len(weights)):
             for i in range(number):
                 w, gx, gy = weights[light, first + i], gradient_x[light, first + i], gradient_y[light, first + i]
@@ -185,7 +196,29 @@ def score_sums(start, stop, residual, weights, gradient_x, gradient_y, lines, ru
                 scores[1, i] += weighted * gy
                 scores[2, i] += w * (gx * gx + gy * gy)
                 scores[3, i] = max(scores[3, i], _ONE if w > _ZERO else _ZERO)
-        _add(scores, first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
+            if len(out) == 4 or number == 0:
+                continue
+            for i in range(number):
+                w = _HALF * weights[light, first + i]
+                states[0, i], states[1, i] = w * gradient_x[light, first + i], w * gradient_y[light, first + i]
+                states[2, i] = values[light, first + i]
+                states[3, i] = corrected[light, first + i] - residual[light, first + i]
+            for i in range(number - one):
+                mean = inside[i] * (states[0, i] + states[0, i + one])
+                scores[4, i] += mean * (states[2, i + one] - states[2, i])
+                scores[5, i] += mean * (states[3, i + one] - states[3, i])
+            for q in range(run_offsets[e], run_offsets[e + 1] - 1):
+                if lines[q + 1, 2] != lines[q, 2] + 1:
+                    continue
+                low = max(lines[q, 3], lines[q + 1, 3])
+                count = min(lines[q, 3] + lines[q, 1], lines[q + 1, 3] + lines[q + 1, 1]) - low
+                a = np.uint64(lines[q, 0] + low - lines[q, 3]) - first
+                b = np.uint64(lines[q + 1, 0] + low - lines[q + 1, 3]) - first
+                for i in range(np.uint32(max(count, 0))):
+                    mean = states[1, a + i] + states[1, b + i]
+                    scores[4, a + i] += mean * (states[2, b + i] - states[2, a + i])
+                    scores[5, a + i] += mean * (states[3, b + i] - states[3, a + i])
+        _add(scores[: len(out)], first, lines, run_offsets, e, start * side, stop * side, side, columns, out)
 
 
 @helper()

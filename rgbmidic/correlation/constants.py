@@ -72,8 +72,6 @@ class SolverConstants:
         Fraction of the largest texture below which a node has no part in that median: it is seen by no light, or blank.
     lost
         Uncertainty (px) from which a node is decorrelated: a position uncertain by half a pixel is no match.
-    probe
-        Motion (px) by which the sensitivity is observed: 20 times a node's noise, a fortieth of a speckle (derived).
     one_sided
         Texture in the worse direction over that in the better one under which the former may be noise... Chosen; half
         or twice of it matters in a deep shadow only.
@@ -176,7 +174,6 @@ class SolverConstants:
     informed: float = 0.01
     silent: float = 1e-3
     lost: float = 0.5
-    probe: float = 0.1
     one_sided: float = 0.3
     noisy: float = 0.3
     matched: tuple[float, float] = (0.4, 0.6)

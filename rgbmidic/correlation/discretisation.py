@@ -21,9 +21,10 @@ from scipy.sparse.linalg import splu
 
 from rgbmidic._kernels.owned_pixels import interpolate_nodal
 from rgbmidic._kernels.threads import one_blas_thread
-from rgbmidic.correlation.assembly import Assembly, block_side, rigid_functions
+from rgbmidic.correlation.assembly import Assembly, rigid_functions
+from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
-from rgbmidic.correlation.images import apply_prefilter, at_blocks, window_sums
+from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.one_sided_fit import at_free_boundary, one_sided_difference
 from rgbmidic.correlation.recovery import Recovery, angle_fraction, quadratic_fit
 from rgbmidic.correlation.reference import Deformed, Reference
@@ -205,15 +206,11 @@ def _weighed(
 
 def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:
     """Variance of the scores in x and y (N, 2) over the square of their information, per pixel, around each node."""
-    pixels, mesh, constants = residual.reference.pixels, residual.reference.mesh, residual.reference.constants
-    side = block_side(pixels, mesh.size, constants)
-    fields = residual.difference, weights, *residual.reference.gradient
-    x, y, information, count = residual.reference.score_sums(side, *fields)
-    xx, yy, information, count = (
-        window_sums(grid, constants.score_range / side) for grid in (x * x, y * y, information, count)
-    )
+    table, mesh = BlockTable.of_all(residual, weights), residual.reference.mesh
+    x, y, information, count = table.sums[0, :4]
+    xx, yy, information, count = map(table.around, (x * x, y * y, information, count))
     scale = np.divide(count, information**2, out=np.zeros_like(count), where=information > 0)
-    return at_blocks(pixels, np.stack([xx * scale, yy * scale]), side, mesh.nodes).T
+    return table.at(np.stack([xx * scale, yy * scale]), mesh.nodes).T
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

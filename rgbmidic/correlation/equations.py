@@ -7,7 +7,7 @@ motions of the lights. They are factorised once a pass; each iteration solves fo
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -165,6 +165,17 @@ class Equations:
             rigid = self.rigid.increment(motion, held_side, rigid_side)
             motion = motion - self.rigid.follows @ rigid
         return self.turned(motion.reshape(-1, 2)), rigid
+
+    def inverse_stretch(self, mesh: Tri3Mesh, displacement: FloatArray) -> FloatArray:
+        """Half the trace of the inverse stretch around each node, (N,), for a displacement (N, 2).
+
+        Gradients of the deformed image are smaller than those of the same texture on the reference by that.
+        """
+        texture = np.einsum("eaad->ed", self.blocks)[:, [0, 2]].sum(axis=1)
+        ((xx, xy), (yx, yy)) = np.moveaxis(np.eye(2) + mesh.element_gradient(displacement), 0, -1)
+        inverse = np.hypot(xx + yy, yx - xy) / np.maximum(2 * np.abs(xx * yy - xy * yx), 1e-3)
+        total, mean = mesh.to_nodes(texture), mesh.to_nodes(texture * inverse)
+        return np.divide(mean, total, out=np.ones_like(total), where=total > 0)
 
     def turned(self, vectors: FloatArray) -> FloatArray:
         """Turn nodal vectors (N, 2, ...) from the axes of the reference to where they are now."""
@@ -354,38 +365,6 @@ def _right_sides(
         if light:
             rigid.append(equations.functions.T @ vector)
     return total, held, np.concatenate(rigid) if rigid else np.empty(0)
-
-
-def observed_sensitivity(problem: Problem, equations: Equations, residual: Residual, estimate: Estimate) -> FloatArray:
-    """Sensitivity of the scores to a motion as the deformed images show it, over that of the Hessian, (N,).
-
-    The Hessian has the texture of the reference. Where glare or paint has changed since, the deformed images show less
-    of it. It is observed by a small motion of all nodes along each axis of the reference.
-
-    Parameters
-    ----------
-    problem, equations
-        Of the last pass.
-    values : ndarray, shape (k, P), float32
-        Reference grey levels.
-    residual
-        At the `estimate`.
-    estimate
-        The solution.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        1 where the Hessian shows nothing.
-    """
-    step, hessian = problem.constants.probe, problem.reference.assembly.matrix(equations.blocks)
-    before = _right_sides(problem, equations, residual.brightness, estimate, residual.difference)[0]
-    observed, assumed = np.zeros((2, len(estimate.displacement)))
-    for axis in range(2):
-        moved = replace(estimate, displacement=estimate.displacement + step * equations.rotation[:, :, axis])
-        observed += (before - _right_sides(problem, equations, residual.brightness, moved, None)[0])[axis::2] / step
-        assumed += (hessian @ np.tile(np.eye(2)[axis], len(observed)))[axis::2]
-    return np.divide(observed, assumed, out=np.ones_like(observed), where=assumed > 0)
 
 
 def _light_displacements(problem: Problem, estimate: Estimate) -> list[FloatArray]:

@@ -111,13 +111,6 @@ def window_sums(grid: AnyArray, sigma: float) -> AnyArray:
     return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT))
 
 
-def at_blocks(pixels: PixelMap, grids: AnyArray, side: int, points: FloatArray) -> AnyArray:
-    """Values (n, M) of grids (n, h, w) of blocks of `side` px in the blocks nearest to points (M, 2) in px."""
-    place = (points[:, ::-1] - pixels.bounds[:2]) / side
-    row, column = np.clip(np.round(place - 0.5).astype(int), 0, np.array(grids.shape[1:]) - 1).T
-    return np.asarray(grids[:, row, column])
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlidingWindow:
     """Gaussian window for means of fields around the owned pixels, applied on a grid of blocks.

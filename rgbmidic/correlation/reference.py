@@ -17,7 +17,7 @@ from rgbmidic._kernels.correlation import (
     element_vector,
     warped_weights,
 )
-from rgbmidic._kernels.owned_pixels import interpolate_nodal, score_sums
+from rgbmidic._kernels.owned_pixels import interpolate_nodal
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
 from rgbmidic.correlation.assembly import Assembly, unfitted_fraction
@@ -271,7 +271,7 @@ class Reference:
             assembly=assembly,
             material=material,
             origin=origin,
-            unfitted=unfitted_fraction(mesh, pixels, assembly, gradient, weighted, constants),
+            unfitted=unfitted_fraction(mesh, pixels, assembly, (gradient, weighted), prefilter, constants),
             images=ready,
             weights=usable,
             values=values,
@@ -437,25 +437,6 @@ class Reference:
         out = np.empty((len(values), len(self.mesh.elements), 2))
         element_sums(values, factor, self.pixels.offsets, out)
         return out
-
-    def score_sums(self, side: int, *fields: FloatImage) -> FloatArray:
-        """Sums over blocks of `side` px of all lights' scores ``w r grad f`` and their information ``w |grad f|^2``.
-
-        Parameters
-        ----------
-        side
-            Side of the blocks in px.
-        *fields : ndarray, shape (k, P)
-            Residual r, weights w, and gradient along x and y.
-
-        Returns
-        -------
-        ndarray, shape (4, rows, columns)
-            Scores in x and y, information, and the number of pixels where a light has weight.
-        """
-        pixels, sums = self.pixels, np.empty((4, *self.pixels.grid(side)), dtype=np.float32)
-        score_sums(*fields, pixels.lines, pixels.run_offsets, pixels.offsets, side, sums)
-        return sums.astype(np.float64)
 
 
 def carried(mesh: Tri3Mesh, pixels: PixelMap, motion: FloatArray) -> tuple[AnyArray, ...]:

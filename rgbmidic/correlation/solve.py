@@ -19,6 +19,7 @@ import numpy as np
 
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import rigid_functions
+from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.equations import (
     Equations,
     Estimate,
@@ -26,7 +27,6 @@ from rgbmidic.correlation.equations import (
     UnsolvableError,
     compare,
     iterate,
-    observed_sensitivity,
 )
 from rgbmidic.correlation.light_bias import light_bias, settled_gradient
 from rgbmidic.correlation.nodes import judge, matching_elements, misfit, one_sided_texture
@@ -34,7 +34,7 @@ from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual, brought_nearer
 from rgbmidic.correlation.solution import NO_MATCH, NodeStatus, Solution, Status
-from rgbmidic.correlation.uncertainty import standard_uncertainty
+from rgbmidic.correlation.uncertainty import beyond_chance, gradient_step, standard_uncertainty
 from rgbmidic.errors import InputError
 from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
@@ -118,7 +118,8 @@ def _lost_nodes(
     problem: Problem, last: Weighting, equations: Equations, residual: Residual, estimate: Estimate, number: int
 ) -> BoolArray:
     """Find the nodes (N,) that leave the next pass; a one-sided texture does not hold a node either, but matches."""
-    std = standard_uncertainty(residual, equations, last.precision)
+    table = BlockTable.of_all(residual, equations.weights)
+    std = standard_uncertainty(residual, table, equations, last.precision)
     unheld = std.max(axis=1) > problem.constants.lost
     wanders = np.zeros(len(unheld), dtype=bool)
     if number >= problem.constants.returns and len(estimate.increments) < problem.options.max_iterations:
@@ -304,11 +305,16 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     recovery = Recovery.over(reference.material, used, equations.information(reference))
     fitted = estimate.displacement
     residual = weighting.residual.without(*map(equations.turned_back, recovery.bend(fitted)))
-    std = standard_uncertainty(residual, equations, weighting.precision, recovery)
+    table = BlockTable.of_all(residual, equations.weights)
+    std = standard_uncertainty(residual, table, equations, weighting.precision, recovery)
+    if len(equations.weights) > 1:
+        step = recovery.field(*gradient_step(weighting.residual, equations).T)
+        std = np.hypot(std, beyond_chance(step, std, residual, table, equations.weights))
     bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
     if weighting.precision is not None:
-        bias, bias_std = light_bias(weighting.residual, equations)
-    sensitivity = observed_sensitivity(problem, equations, weighting.residual, estimate)
+        lights = BlockTable.of_lights(residual, equations.weights, problem.constants.block)
+        bias, bias_std = light_bias(lights, equations)
+    sensitivity = table.sensitivity(mesh.nodes) * equations.inverse_stretch(mesh, fitted)
     scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
     fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale
     field = recovery.field(*fitted.T)
@@ -350,7 +356,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         misfit=np.where(measured, misfit(mesh, squares, equations.textured), np.nan),
         status=Status.CONVERGED if converged else Status.NOT_CONVERGED,
         reason="" if converged else _unsettled(problem, estimate, measured),
-        rigid=np.where(np.any(equations.weights, axis=1, keepdims=True), estimate.rigid, np.nan),
+        rigid=np.where(total[:, None] > 0, estimate.rigid, np.nan),
         residual=np.sqrt(np.divide(square, total, out=np.full(total.size, np.nan), where=total > 0)),
         weight_fraction=np.mean(some / np.where(seen > 0, seen, np.float32(1)), axis=1, dtype=np.float64),
     )

@@ -1,27 +1,25 @@
 """Standard uncertainty of nodal quantities: the scores' covariance from the residual, carried through the equations.
 
-The score ``q = sum_j w_j r_j grad f_j`` of a pixel is correlated over the reach of filters, demosaicing and speckle and
-between the lights; the variance of its sum over blocks wider than that reach holds all of it (the block estimator of
-the long-run variance).
+The scores' covariance is the information times the design effect of the table of blocks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import combinations_with_replacement
 
 import numpy as np
 import scipy.sparse as sp
 
 from rgbmidic.correlation.assembly import RigidMotions, block_side
-from rgbmidic.correlation.constants import SolverConstants
+from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.equations import Equations
-from rgbmidic.correlation.images import at_blocks, window_sums
 from rgbmidic.correlation.recovery import Functional, Recovery, functional_std
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Precision, Residual
-from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
+from rgbmidic.mesh.tri3 import with_data
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
 def displacing_fraction(reference: Reference, difference: FloatImage, weight: FloatImage) -> FloatImage:
@@ -37,28 +35,24 @@ def displacing_fraction(reference: Reference, difference: FloatImage, weight: Fl
         Its inverse variance.
     """
     block = reference.constants.block
-    xx, _, yy = BlockScores.of(reference, block, difference, weight, *reference.texture.texture).products()
+    table = BlockTable.of(reference, block, [(difference[None], weight[None], *reference.texture.texture[:, None])])
+    xx, _, yy = table.design_effect()[0]
     # at least 0.01: of images without noise it is not 0 (up to twice of it nothing changes)
     fraction = np.maximum(xx + yy, 0.01)
     return np.asarray(reference.pixels.from_blocks(fraction[None], block)[0])
 
 
-def score_covariance(residual: Residual, weights: FloatImage, texture: FloatArray) -> FloatArray:
+def score_covariance(table: BlockTable, texture: FloatArray) -> FloatArray:
     """Covariance of the right-hand side, as element blocks (E, 3, 3, 3).
 
     Parameters
     ----------
-    residual
-        At the solution.
-    weights : ndarray, shape (k, P), float32
-        Of the solve.
+    table
+        Of the solution.
     texture : ndarray, shape (E, 3, 3, 3)
         Element blocks of its Hessian.
     """
-    reference = residual.reference
-    side = block_side(reference.pixels, reference.mesh.size, reference.constants)
-    own = BlockScores.of(reference, side, residual.difference, weights, *reference.gradient)
-    along_x, along_y = _axis_ratios(reference, own, texture) / reference.unfitted
+    along_x, along_y = _axis_ratios(table, table.design_effect()[0], texture) / table.reference.unfitted
     scale = np.stack([along_x, np.sqrt(along_x * along_y), along_y], axis=-1)
     return np.asarray(texture * scale[:, None, None])
 
@@ -84,18 +78,19 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
     """
     reference = residual.reference
     mesh, pixels, slopes = reference.mesh, reference.pixels, reference.gradient
-    side = block_side(pixels, mesh.size, reference.constants)
     score = np.einsum("kp,kp,akp->ap", weights, residual.difference, slopes)
     information = np.einsum("kp,akp,akp->p", weights, slopes, slopes)
     common = np.divide(score, information, out=np.zeros_like(score), where=information > 0)
     lost = np.asarray(1 / np.sqrt(reference.unfitted) - 1, dtype=np.float32)
     if lost.ndim:
         lost = np.repeat(lost, np.diff(pixels.offsets))
-    own, roots = [], []
-    for difference, weight, gx, gy in zip(residual.difference, weights, *slopes, strict=True):
-        whole = difference + lost * (gx * common[0] + gy * common[1])
-        own.append(BlockScores.of(reference, side, whole, weight, gx, gy))
-        roots.append(np.sqrt(_axis_ratios(reference, own[-1], reference.blocks(weight, (gx, gy)))))
+    whole = residual.difference + lost * np.einsum("akp,ap->kp", slopes, common)
+    table = BlockTable.of_lights(
+        replace(residual, difference=whole), weights, block_side(pixels, mesh.size, reference.constants)
+    )
+    effects, correlation = table.design_effect(), table.correlation()
+    blocks = map(reference.blocks, weights, slopes.swapaxes(0, 1))
+    roots = [np.sqrt(_axis_ratios(table, *light)) for light in zip(effects, blocks, strict=True)]
     for a, b in combinations_with_replacement(range(len(weights)), 2):
         # the gradients of two lights are parallel
         slope = (np.copysign(np.sqrt(np.maximum(axis[a] * axis[b], 0)), axis[a]) for axis in slopes)
@@ -103,106 +98,34 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
         (x, y), (other_x, other_y) = roots[a], roots[b]
         scale = np.stack([x * other_x, (x * other_y + y * other_x) / 2, y * other_y], axis=-1)
         if a != b:
-            scale *= at_blocks(pixels, own[a].correlation(own[b])[None], side, mesh.centres).T
+            scale *= table.at(correlation[a, b][None], mesh.centres).T
         yield a, b, texture * scale[:, None, None]
 
 
-def _axis_ratios(reference: Reference, own: BlockScores, texture: FloatArray) -> FloatArray:
+def _axis_ratios(table: BlockTable, effect: FloatArray, texture: FloatArray) -> FloatArray:
     """Variance of the scores in x and y over their information in that axis, (2, E).
 
-    The information is divided by the gradients along x and y in the `texture` (E, 3, 3, 3) around each element.
+    `effect` (3, h, w) is their variance over the information in both, which is divided by the gradients along x and y
+    in the `texture` (E, 3, 3, 3) around each element.
     """
-    mesh = reference.mesh
-    along_x, _, along_y = at_blocks(reference.pixels, own.products(), own.side, mesh.centres)
+    mesh = table.reference.mesh
+    along_x, along_y = table.at(effect[::2], mesh.centres)
     xx, _, yy = texture.sum(axis=(1, 2)).T
     x, y = (mesh.to_nodes(part)[mesh.elements].sum(axis=1) for part in (xx, yy))
     fraction = np.divide(x, x + y, out=np.full_like(x, 0.5), where=x + y > 0)
-    least = reference.constants.seen  # nodes with less of the texture are not measured
+    least = table.reference.constants.seen  # nodes with less of the texture are not measured
     fraction = np.clip(fraction, least, 1 - least)
     return np.stack([along_x / fraction, along_y / (1 - fraction)])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BlockScores:
-    """Scores of blocks in x and y over the root of their information, and the pixels of the blocks.
-
-    A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is smooth,
-    and averaged, is its ratio to the information.
-
-    Attributes
-    ----------
-    x, y, count : ndarray, shape (rows, columns)
-    side : int
-        Of the blocks, px.
-    constants : SolverConstants
-    """
-
-    x: FloatArray
-    y: FloatArray
-    count: FloatArray
-    side: int
-    constants: SolverConstants
-
-    @classmethod
-    def of(cls, reference: Reference, side: int, *fields: FloatImage) -> BlockScores:
-        """Scores of all lights together; `fields` are difference, weights, gradient in x and y, (k, P) or (P,)."""
-        even = reference.constants.even
-        x, y, information, count = reference.score_sums(side, *(np.atleast_2d(field) for field in fields))
-        level = window_sums(information, even) / np.maximum(window_sums(count, even), 1e-6)
-        scale = np.divide(1, np.sqrt(level), out=np.zeros_like(level), where=(level > 0) & (count > 0))
-        return cls(x=x * scale, y=y * scale, count=count, side=side, constants=reference.constants)
-
-    @property
-    def typical_square(self) -> float:
-        """Square of a score in one direction, per pixel, typical of the region's blocks.
-
-        A median, so that what does not match has no part in it: ``x^2 + y^2`` of two independent Gaussian scores is
-        distributed exponentially, with a median of 2 ln 2 variances.
-        """
-        whole = self.count >= 0.5 * self.count.max(initial=0.0)
-        square = (self.x**2 + self.y**2)[whole] / np.maximum(self.count[whole], 1.0)
-        return float(np.median(square)) / (2 * np.log(2)) if square.size else 0.0
-
-    def around(self, grid: AnyArray) -> AnyArray:
-        """Sums of a grid over the window in which scores are averaged, up to a factor."""
-        return window_sums(grid, self.constants.score_range / self.side)
-
-    def products(self) -> FloatArray:
-        """Products xx, xy, yy of the scores per pixel, averaged; shape (3, rows, columns).
-
-        xx + yy is 1 for white noise and ideal weights. They are raised where blocks are few, so that an error over its
-        stated uncertainty has the variance 1.
-        """
-        typical, around, prior = self.typical_square, self.around(self.count), self.constants.prior * self.side**2
-        # an estimate from n blocks has 2 n degrees of freedom; the mean of its inverse is n / (n - 1) times too large
-        window = 4 * np.pi * (self.constants.score_range / self.side) ** 2
-        number = np.minimum(window * around, self.count.sum()) / self.side**2
-        ratios = [
-            (self.around(product) + prior * expected) / (around + prior)
-            for product, expected in ((self.x * self.x, typical), (self.x * self.y, 0.0), (self.y * self.y, typical))
-        ]
-        # of one block, less one, a quarter: the variance is hardly known, and stated 4 times larger
-        return np.asarray(np.stack(ratios) * (number / np.maximum(number - 1, 0.25)))
-
-    def correlation(self, other: BlockScores) -> FloatArray:
-        """Correlation (rows, columns) with the scores of another light over the blocks around that both see."""
-        both = (self.count > 0) & (other.count > 0)
-        product = self.around(both * (self.x * other.x + self.y * other.y))
-        first, second = (
-            self.around(both * (one.x**2 + one.y**2)) + 2 * self.constants.prior * self.side**2 * one.typical_square
-            for one in (self, other)
-        )
-        scale = np.sqrt(first * second)
-        return np.divide(product, scale, out=np.zeros_like(product), where=scale > 0)
-
-
 def _in_reference_axes(functional: Functional, rotation: FloatArray) -> Functional:
     """Return a quantity linear in the displacement as one of the motion in axes that turn with the surface."""
-    columns = [
-        [matrix @ sp.diags(turn) for matrix, turn in zip(functional, row, strict=True) if matrix is not None]
+    parts = [part for part in functional if part is not None]  # of one structure
+    axes = [axis for axis, part in enumerate(functional) if part is not None]
+    along_x, along_y = (
+        with_data(parts[0], sum(part.data * row[axis][part.indices] for part, axis in zip(parts, axes, strict=True)))
         for row in rotation.T
-    ]
-    along_x, along_y = (sp.csr_matrix(sum(parts)) for parts in columns)
+    )
     return along_x, along_y
 
 
@@ -262,20 +185,21 @@ def _probed_std(
 
 
 def standard_uncertainty(
-    residual: Residual, equations: Equations, precision: Precision | None, recovery: Recovery | None = None
+    residual: Residual,
+    table: BlockTable,
+    equations: Equations,
+    precision: Precision | None,
+    recovery: Recovery | None = None,
 ) -> FloatArray:
     """Evaluate the standard uncertainty of the linear fit's u and v, or of what a recovery gives.
 
     The covariance is ``M^-1 S M^-1`` with S the covariance of the right-hand side (docs: uncertainty), and what the
     rigid motions of the lights add. Displacement is stated at the textured nodes, strain where all nodes around are
-    textured, too. That of a recovery holds the step, too, that the lights' channel-specific gradients would make from
-    the solution: two gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978).
-    Where a reflection does not follow the surface it pulls with them, and what it still pulls without is less than that
-    (docs/explanation/uncertainty.md).
+    textured, too.
 
     Parameters
     ----------
-    residual, equations, precision
+    residual, table, equations, precision
         Of the last pass.
     recovery
         Of the field from the linear fit; None for the fit itself.
@@ -292,18 +216,46 @@ def standard_uncertainty(
         inner = textured & ~reference.mesh.adjacent_nodes(~textured)
         asked += [(one, inner) for one in recovery.strain_functionals]
     asked = [(_in_reference_axes(functional, equations.rotation), nodes) for functional, nodes in asked]
-    scores = score_covariance(residual, equations.weights, equations.blocks)
-    std = _probed_std(equations, scores, reference, asked)
+    std = _probed_std(equations, score_covariance(table, equations.blocks), reference, asked)
     if equations.rigid is not None:
         rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in asked])
         std = np.sqrt(np.maximum(std**2 + rigid, 0))
     if precision is not None:
         std = std * precision.robust_loss(reference, equations.weights)[:, None]
-    if recovery is None or len(equations.weights) == 1:
-        return std
-    specific = map(reference.channel_specific, range(len(equations.weights)))
-    lights = zip(equations.weights, residual.difference, specific, strict=True)
-    pulls = np.array([reference.assembly.vector(reference.projected(*light)) for light in lights])
+    return std
+
+
+def gradient_step(residual: Residual, equations: Equations) -> FloatArray:
+    """Step (N, 2) that the gradients of the lights' own images would make from the solution."""
+    reference = residual.reference
+    images = zip(equations.weights, residual.difference, reference.texture.images.swapaxes(0, 1), strict=True)
+    pulls = np.array([reference.assembly.vector(reference.projected(*light)) for light in images])
     pull, rigid_pull = pulls.sum(axis=0), (pulls[1:] @ equations.functions).ravel()
-    step, _ = equations.increment(pull, np.zeros_like(pull), rigid_pull)
-    return np.hypot(std, recovery.field(*step.T))
+    return equations.increment(pull, np.zeros_like(pull), rigid_pull)[0]
+
+
+def beyond_chance(
+    step: FloatArray, std: FloatArray, residual: Residual, table: BlockTable, weights: FloatImage
+) -> FloatArray:
+    """Return what the recovered step (N, 5) of `gradient_step` has beyond chance, (N, 5).
+
+    Two gradients that measure the same motion differ by noise alone (Hausman, Econometrica 46, 1978): by as much of the
+    uncertainty `std` (N, 5) as the scores of what a light alone shows have of all scores, typically. Where a reflection
+    does not follow the surface it pulls with them, and what it still pulls without is less than that
+    (docs/explanation/uncertainty.md).
+
+    Parameters
+    ----------
+    step, std : ndarray, shape (N, 5)
+        Of u, v, exx, eyy, exy.
+    residual, table
+        Of the solution.
+    weights : ndarray, shape (k, P), float32
+        Of the solve.
+    """
+    reference = table.reference
+    images = BlockTable.of(reference, table.side, [(residual.difference, weights, *reference.texture.images)])
+    chance = np.mean(reference.unfitted) * table.typical_ratio((images.sums - table.sums[:, :4])[0, :2])
+    square = ((step[:, :2] / np.maximum(std[:, :2], 1e-30)) ** 2).mean(axis=1)
+    excess = 1 - chance / np.maximum(square, 1e-30)
+    return np.asarray(step * np.sqrt(np.maximum(excess, 0))[:, None])

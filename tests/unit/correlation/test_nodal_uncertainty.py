@@ -13,6 +13,7 @@ from rgbmidic import Region, Tri3Mesh, correlate
 from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.correlation.equations import Equations
+from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.recovery import Recovery, functional_std
 from rgbmidic.correlation.residual import Residual
 
@@ -24,13 +25,14 @@ def noisy(image, seed):
     return image + np.random.default_rng(seed).normal(0, NOISE, image.shape)
 
 
+@pytest.mark.parametrize("prefilter", ["none", "binomial"])
 @pytest.mark.parametrize("size", [6, 13, 20])
-def test_the_unfitted_share_is_that_of_the_projection(size):
+def test_the_unfitted_share_is_that_of_the_projection(size, prefilter):
     shape = (60, 60)
     region = Region.from_rectangle((4, 4, 55, 55), shape)
     mesh = Tri3Mesh.from_region(region, size)
     image = Texture.random(1).image(shape)[None].astype(np.float32)
-    reference = Reference.prepare(image, region, mesh=mesh, prefilter="none")
+    reference = Reference.prepare(image, region, mesh=mesh, prefilter=prefilter)
     pixels, slopes = reference.pixels, (reference.gradient[0][0], reference.gradient[1][0])
     columns = np.zeros((pixels.rows.size, len(mesh.nodes), 2))
     for element, corners in enumerate(mesh.elements):
@@ -44,8 +46,18 @@ def test_the_unfitted_share_is_that_of_the_projection(size):
     inside = (index[:, None] == np.arange(grid[0] * grid[1])) & used[:, None]
     scores = np.concatenate([slope[:, None] * inside for slope in slopes], axis=1).astype(float)
     system = columns.reshape(len(columns), -1) * used[:, None]
-    fitted = system @ np.linalg.lstsq(system, scores, rcond=1e-6)[0]
-    left = 1 - (fitted**2).sum() / (scores**2).sum()
+    unfitted = scores - system @ np.linalg.lstsq(system, scores, rcond=1e-6)[0]
+    inner = np.repeat(~mesh.on_boundary, 2)
+    moved = system @ np.linalg.pinv(system.T @ system, rcond=1e-9)[:, inner]
+
+    def passed(columns):
+        images = (pixels.scatter(column) for column in columns.T.astype(np.float32))
+        return sum((apply_prefilter(image, prefilter) ** 2).sum() for image in images) / (columns**2).sum()
+
+    half = unfitted.shape[1] // 2
+    axes = zip((unfitted[:, :half], unfitted[:, half:]), (moved[:, ::2], moved[:, 1::2]), strict=True)
+    ratio = np.sqrt(np.prod([passed(residual) / passed(motion) for residual, motion in axes]))
+    left = (unfitted**2).sum() / (scores**2).sum() * ratio
     assert reference.unfitted == pytest.approx(left, rel=0.1)
 
 

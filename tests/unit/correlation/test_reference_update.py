@@ -108,7 +108,7 @@ def test_the_uncertainty_of_the_total_covers_noise_that_cancels_and_paint_that_c
     """After 1 and 3 renewals. Noise of the frames in between cancels; what the paint has changed by adds up."""
     ratios, stated = [], []
     motions = [Affine(shift=(0.37 * k, -0.23 * k)) for k in range(5)]
-    for seed in range(3):
+    for seed in range(6):
         random, texture = np.random.default_rng(seed), Texture.random(seed)
         image = texture.image
         images = [image(SHAPE, motion) for motion in motions]

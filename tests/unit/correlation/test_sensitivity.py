@@ -9,8 +9,9 @@ from textures import Affine, Texture
 from rgbmidic import NodeStatus, Region, Tri3Mesh, correlate
 from rgbmidic.correlation import Deformed, Reference, solve, uncertainty
 from rgbmidic.correlation.assembly import rigid_functions
+from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.constants import USUAL
-from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, observed_sensitivity
+from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare
 from rgbmidic.correlation.recovery import Recovery, functional_std
 from rgbmidic.settings import SolverSettings
 
@@ -22,11 +23,12 @@ def noisy(image, seed):
     return image + np.random.default_rng(seed).normal(0, NOISE, image.shape)
 
 
-@pytest.mark.parametrize("contrast", [1.0, 0.5])
-def test_the_sensitivity_is_the_contrast_that_the_deformed_image_has_left(contrast):
-    texture = Texture.random(4)
-    images = texture.image(SHAPE), contrast * texture.image(SHAPE, Affine(shift=(0.3, -0.2)))
-    region = Region.from_rectangle(REGION, SHAPE)
+@pytest.mark.parametrize(("contrast", "strain"), [(1.0, 0.0), (0.5, 0.0), (1.0, 0.1)])
+def test_the_sensitivity_is_the_contrast_that_the_deformed_image_has_left(contrast, strain):
+    """A texture that is stretched has smaller gradients: by the mean of both directions."""
+    texture, motion = Texture.random(4), Affine(shift=(0.3, -0.2), gradient=((1 + strain, 0), (0, 1)))
+    images = texture.image(SHAPE), contrast * texture.image(SHAPE, motion)
+    region = Region.from_rectangle((10, 10, 119, 139), SHAPE)
     mesh = Tri3Mesh.from_region(region, 20)
     f, g = (image[None].astype(np.float32) for image in images)
     reference = Reference.prepare(f, region, mesh=mesh, prefilter="binomial", brightness="none")
@@ -35,11 +37,12 @@ def test_the_sensitivity_is_the_contrast_that_the_deformed_image_has_left(contra
     problem = Problem(
         reference=reference, deformed=deformed, options=SolverSettings(), method=None, functions=functions
     )
-    estimate = Estimate(displacement=np.tile([0.3, -0.2], (len(mesh.nodes), 1)), rigid=np.zeros((1, 0)))
+    estimate = Estimate(displacement=motion.displacement(mesh.nodes, SHAPE), rigid=np.zeros((1, 0)))
     residual = compare(problem, estimate)
     equations = Equations.build(reference, residual.weights, functions, estimate.displacement)
-    found = observed_sensitivity(problem, equations, residual, estimate)
+    found = BlockTable.of_all(residual, residual.weights).sensitivity(mesh.nodes)
     np.testing.assert_allclose(found, contrast, atol=0.02)
+    np.testing.assert_allclose(equations.inverse_stretch(mesh, estimate.displacement), (1 + 1 / (1 + strain)) / 2)
 
 
 @pytest.mark.parametrize("contrast", [0.5, 2.0])

@@ -51,25 +51,33 @@ def test_sums_of_products_of_two_fields(pixels):
     np.testing.assert_allclose(out, expected_sums(pixels, fields, 4), atol=1e-4)
 
 
-@pytest.mark.parametrize("side", [4, 13])
-def test_scores_of_all_lights_together(pixels, side):
+@pytest.mark.parametrize(("side", "sums"), [(4, 6), (13, 6), (13, 4)])
+def test_scores_of_all_lights_together_and_the_slopes_of_both_states(pixels, side, sums):
     random = np.random.default_rng(1)
-    residual, gx, gy = random.normal(size=(3, 3, pixels.rows.size)).astype(np.float32)
+    residual, gx, gy, f, corrected = random.normal(size=(5, 3, pixels.rows.size)).astype(np.float32)
     weight = np.maximum(random.normal(size=residual.shape), 0).astype(np.float32)
-    out = np.full((4, *pixels.grid(side)), 7, dtype=np.float32)
-    score_sums(residual, weight, gx, gy, pixels.lines, pixels.run_offsets, pixels.offsets, side, out)
+    out = np.full((sums, *pixels.grid(side)), 7, dtype=np.float32)
+    score_sums(residual, weight, gx, gy, f, corrected, pixels.lines, pixels.run_offsets, pixels.offsets, side, out)
     scores = weight * residual * gx, weight * residual * gy, weight * (gx**2 + gy**2)
-    fields = np.stack([*(part.sum(axis=0) for part in scores), (weight > 0).any(axis=0)])
-    np.testing.assert_allclose(out, expected_sums(pixels, fields, side), atol=2e-4)
+    fields = [*(part.sum(axis=0) for part in scores), (weight > 0).any(axis=0)]
+    element = np.repeat(np.arange(len(pixels.origin)), np.diff(pixels.offsets))
+    slot = {place: n for n, place in enumerate(zip(element, pixels.rows, pixels.columns, strict=True))}
+    g, slopes = corrected - residual, np.zeros((2, residual.shape[1]))
+    for (e, row, column), a in slot.items():
+        for gradient, beside in ((gx, (e, row, column + 1)), (gy, (e, row + 1, column))):
+            if (b := slot.get(beside)) is not None:
+                mean = (weight[:, a] * gradient[:, a] + weight[:, b] * gradient[:, b]) / 2
+                slopes[:, a] += mean @ (f[:, b] - f[:, a]), mean @ (g[:, b] - g[:, a])
+    np.testing.assert_allclose(out, expected_sums(pixels, [*fields, *slopes][:sums], side), atol=4e-4)
 
 
 def test_the_same_bits_on_one_and_three_threads(pixels):
     values = np.random.default_rng(3).uniform(size=(2, pixels.rows.size)).astype(np.float32)
 
     def found():
-        sums, summed = np.zeros((6, *pixels.grid(4)), np.float32), np.zeros((4, *pixels.grid(4)), np.float32)
+        sums, summed = np.zeros((6, *pixels.grid(4)), np.float32), np.zeros((6, *pixels.grid(4)), np.float32)
         product_sums(values, values, pixels.lines, pixels.run_offsets, pixels.offsets, 4, sums)
-        score_sums(values, values, values, values, pixels.lines, pixels.run_offsets, pixels.offsets, 4, summed)
+        score_sums(*[values] * 6, pixels.lines, pixels.run_offsets, pixels.offsets, 4, summed)
         blocks = pixels.block_sums(values, 5)
         return sums, summed, blocks, pixels.from_blocks(blocks, 5), pixels.scatter(values[1])
 

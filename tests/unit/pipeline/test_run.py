@@ -470,7 +470,7 @@ def test_a_rotation_is_followed_without_a_new_reference(tmp_path: Path) -> None:
 
 def test_paint_that_wears_off_is_followed_by_renewed_references_to_the_same_bits(tmp_path: Path) -> None:
     motions = [Affine(shift=(0.1 * index, 0.0)) for index in range(20)]
-    chosen = renewing_test(tmp_path, motions, 1.0, 4.0)
+    chosen = renewing_test(tmp_path, motions, 0.9, 2.0)
 
     def interrupt(done: int, total: int, line: str) -> None:
         if done == 18:
