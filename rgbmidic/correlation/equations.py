@@ -337,8 +337,9 @@ def _right_sides(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
     reference, assembly = problem.reference, problem.reference.assembly
-    bend = assembly.smoothness @ estimate.displacement.ravel()
-    held = -equations.smoothness * equations.turned_back(bend.reshape(-1, 2)).ravel()
+    bend = (assembly.smoothness @ estimate.displacement.ravel()).reshape(-1, 2)
+    bend[equations.textured] = 0
+    held = -equations.smoothness * equations.turned_back(bend).ravel()
     total, rigid, difference = held.copy(), [], np.empty_like(values[0])
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
         if known is not None:
