@@ -41,6 +41,8 @@ class Equations:
         Element blocks of the Hessian.
     smoothness : float
         Factor on the smoothness of the `Assembly`.
+    gradient
+        Displacement gradient (N, 2, 2) around each node for a displacement (N, 2).
     node_blocks : ndarray, shape (3, N)
         Entries xx, xy and yy of the nodes' own blocks of the Hessian.
     solve
@@ -59,6 +61,7 @@ class Equations:
     blocks: FloatArray
     node_blocks: FloatArray
     smoothness: float
+    gradient: Callable[[FloatArray], FloatArray]
     solve: Callable[[FloatArray], FloatArray]
     rigid: RigidMotions | None
     observability: FloatArray
@@ -96,10 +99,6 @@ class Equations:
         assembly, constants = reference.assembly, reference.constants
         per_light = reference.hessians(weights)
         blocks = np.sum(per_light, axis=0)
-        rotation = _rotation(reference.mesh, displacement, blocks)
-        functions = _turned_back(rotation, functions.reshape(len(rotation), 2, functions.shape[1])).reshape(
-            *functions.shape
-        )
         own = assembly.node_blocks(blocks)
         least = constants.seen if given is None else constants.informed
         observability = _observability(own, assembly.nodal_area, least, constants)
@@ -111,12 +110,23 @@ class Equations:
         scale = float(np.median(diagonal[textured]) if textured.any() else diagonal.max(initial=0.0)) or 1.0
         held = scale * (constants.smoothness * assembly.smoothness.data + constants.constant * assembly.diagonal)
         solve = assembly.factorise(assembly.matrix(blocks, held))
+        hold = with_data(assembly.smoothness, held)
+        around = _gradient_around(reference.mesh, blocks)
+
+        def gradient(displacement: FloatArray) -> FloatArray:
+            nodal = around(displacement).reshape(-1, 2)
+            # nodes without data have that of the others, carried along as a displacement is
+            return np.asarray(nodal - solve(hold @ nodal)).reshape(-1, 2, 2)
+
+        rotation = _rotation(gradient(displacement))
+        functions = _turned_back(rotation, functions.reshape(len(rotation), 2, functions.shape[1])).reshape(
+            *functions.shape
+        )
         light = np.stack([xx + yy for xx, _, yy in map(assembly.node_blocks, per_light)], axis=1)
         total = light.sum(axis=1, keepdims=True)
         rigid = None
         if functions.shape[1] and len(per_light) > 1:
             shown = np.asarray(textured[reference.mesh.elements].all(axis=1))
-            hold = with_data(assembly.smoothness, held)
             rigid = RigidMotions.eliminate(assembly, per_light, functions, hold, solve, shown, constants)
         return cls(
             weights=weights,
@@ -125,6 +135,7 @@ class Equations:
             blocks=blocks,
             node_blocks=own,
             smoothness=constants.smoothness * scale,
+            gradient=gradient,
             solve=solve,
             rigid=rigid,
             observability=observability,
@@ -165,6 +176,16 @@ class Equations:
             motion = motion - self.rigid.follows @ rigid
         return self.turned(motion.reshape(-1, 2)), rigid
 
+    def held_side(self, reference: Reference, displacement: FloatArray) -> FloatArray:
+        """Right-hand side (2 N,) of the smoothness: at nodes without texture, by what is not affine around them."""
+        out = np.zeros_like(displacement)
+        if not self.textured.all():
+            smoothness, nodes = reference.assembly.smoothness, reference.mesh.nodes
+            bend, at_border = ((smoothness @ field.ravel()).reshape(-1, 2) for field in (displacement, nodes))
+            bend -= np.einsum("nij,nj->ni", self.gradient(displacement), at_border)
+            out = np.where(self.textured[:, None], out, -self.smoothness * self.turned_back(bend))
+        return out.ravel()
+
     def turned(self, vectors: FloatArray) -> FloatArray:
         """Turn nodal vectors (N, 2, ...) from the axes of the reference to where they are now."""
         return np.asarray(np.einsum("nij,nj...->ni...", self.rotation, vectors))
@@ -174,16 +195,25 @@ class Equations:
         return _turned_back(self.rotation, vectors)
 
 
-def _rotation(mesh: Tri3Mesh, displacement: FloatArray, blocks: FloatArray) -> FloatArray:
-    """Rotation (N, 2, 2) of the surface around each node: the polar factor of I + grad u in the plane.
+def _gradient_around(mesh: Tri3Mesh, blocks: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return what averages the gradient of a displacement (N, 2) over the elements around each node, (N, 2, 2).
 
     Elements count by what they show: one that is half on another body, and left out, turns in a way of its own.
     """
     texture = np.einsum("eaad->ed", blocks)[:, [0, 2]].sum(axis=1)
     shown = texture + 1e-6 * (texture.mean() or 1.0)  # where nothing is shown all count alike
-    gradient = mesh.element_gradient(displacement)
-    spin, trace = gradient[:, 1, 0] - gradient[:, 0, 1], 2 + gradient[:, 0, 0] + gradient[:, 1, 1]
-    angle = np.arctan2(mesh.to_nodes(shown * spin), mesh.to_nodes(shown * trace))
+    around = mesh.to_nodes(shown)
+
+    def average(displacement: FloatArray) -> FloatArray:
+        parts = shown * mesh.element_gradient(displacement).reshape(-1, 4).T
+        return np.stack([mesh.to_nodes(part) / around for part in parts], axis=1).reshape(-1, 2, 2)
+
+    return average
+
+
+def _rotation(gradient: FloatArray) -> FloatArray:
+    """Rotation (N, 2, 2) of the surface around each node: the polar factor of I + grad u in the plane."""
+    angle = np.arctan2(gradient[:, 1, 0] - gradient[:, 0, 1], 2 + gradient[:, 0, 0] + gradient[:, 1, 1])
     cos, sin = np.cos(angle), np.sin(angle)
     return np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
 
@@ -337,9 +367,7 @@ def _right_sides(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
     reference, assembly = problem.reference, problem.reference.assembly
-    bend = (assembly.smoothness @ estimate.displacement.ravel()).reshape(-1, 2)
-    bend[equations.textured] = 0
-    held = -equations.smoothness * equations.turned_back(bend).ravel()
+    held = equations.held_side(reference, estimate.displacement)
     total, rigid, difference = held.copy(), [], np.empty_like(values[0])
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
         if known is not None:
