@@ -25,16 +25,17 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Equations:
-    """Factorised normal equations for given weights, in axes that turn with the surface.
+    """Factorised normal equations for given weights, in axes that turn and stretch with the surface.
 
-    The reference's gradient stands for that of the deformed image, which the surface has turned with it: the motion is
-    solved for in the axes of the reference and turned to where they are now.
+    The reference's gradient stands for that of the deformed image, which the surface has turned and stretched: the
+    motion is solved for in the axes of the reference and carried to where they are now (the inverse compositional
+    step: Baker and Matthews, IJCV 56, 2004).
 
     Attributes
     ----------
     weights : ndarray, shape (k, P), float32
-    rotation : ndarray, shape (N, 2, 2)
-        Of the surface around each node.
+    deformation : ndarray, shape (N, 2, 2)
+        Deformation gradient of the surface around each node.
     functions : ndarray, shape (2 N, m)
         The rigid functions in the axes of the reference.
     blocks : ndarray, shape (E, 3, 3, 3)
@@ -56,7 +57,7 @@ class Equations:
     """
 
     weights: FloatImage
-    rotation: FloatArray
+    deformation: FloatArray
     functions: FloatArray
     blocks: FloatArray
     node_blocks: FloatArray
@@ -118,10 +119,9 @@ class Equations:
             # nodes without data have that of the others, carried along as a displacement is
             return np.asarray(nodal - solve(hold @ nodal)).reshape(-1, 2, 2)
 
-        rotation = _rotation(gradient(displacement))
-        functions = _turned_back(rotation, functions.reshape(len(rotation), 2, functions.shape[1])).reshape(
-            *functions.shape
-        )
+        deformation = _deformation(gradient(displacement), constants)
+        by_node = functions.reshape(len(deformation), 2, functions.shape[1])
+        functions = _turned_back(deformation, by_node).reshape(functions.shape)
         light = np.stack([xx + yy for xx, _, yy in map(assembly.node_blocks, per_light)], axis=1)
         total = light.sum(axis=1, keepdims=True)
         rigid = None
@@ -130,7 +130,7 @@ class Equations:
             rigid = RigidMotions.eliminate(assembly, per_light, functions, hold, solve, shown, constants)
         return cls(
             weights=weights,
-            rotation=rotation,
+            deformation=deformation,
             functions=functions,
             blocks=blocks,
             node_blocks=own,
@@ -187,12 +187,12 @@ class Equations:
         return out.ravel()
 
     def turned(self, vectors: FloatArray) -> FloatArray:
-        """Turn nodal vectors (N, 2, ...) from the axes of the reference to where they are now."""
-        return np.asarray(np.einsum("nij,nj...->ni...", self.rotation, vectors))
+        """Turn nodal vectors (N, 2, ...) from the axes of the reference to where they are now, stretched."""
+        return np.asarray(np.einsum("nij,nj...->ni...", self.deformation, vectors))
 
     def turned_back(self, vectors: FloatArray) -> FloatArray:
         """Turn nodal vectors (N, 2, ...) into the axes of the reference."""
-        return _turned_back(self.rotation, vectors)
+        return _turned_back(self.deformation, vectors)
 
 
 def _gradient_around(mesh: Tri3Mesh, blocks: FloatArray) -> Callable[[FloatArray], FloatArray]:
@@ -211,15 +211,19 @@ def _gradient_around(mesh: Tri3Mesh, blocks: FloatArray) -> Callable[[FloatArray
     return average
 
 
-def _rotation(gradient: FloatArray) -> FloatArray:
-    """Rotation (N, 2, 2) of the surface around each node: the polar factor of I + grad u in the plane."""
+def _deformation(gradient: FloatArray, constants: SolverConstants) -> FloatArray:
+    """Deformation gradient (N, 2, 2), I + grad u; where that is nearly singular its rotation, the polar factor."""
+    deformation = np.eye(2) + gradient
+    square = np.maximum((deformation**2).sum(axis=(1, 2)), 1)
+    flat = np.linalg.det(deformation) < constants.flattened * square
     angle = np.arctan2(gradient[:, 1, 0] - gradient[:, 0, 1], 2 + gradient[:, 0, 0] + gradient[:, 1, 1])
     cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
+    rotation = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
+    return np.where(flat[:, None, None], rotation, deformation)
 
 
-def _turned_back(rotation: FloatArray, vectors: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("nji,nj...->ni...", rotation, vectors))
+def _turned_back(deformation: FloatArray, vectors: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("nij,nj...->ni...", np.linalg.inv(deformation), vectors))
 
 
 def _observability(own: FloatArray, area: FloatArray, least: float, constants: SolverConstants) -> FloatArray:
@@ -411,7 +415,7 @@ def observed_sensitivity(
     before = _right_sides(problem, equations, values, estimate, residual.difference_from(values))[0]
     observed, assumed = np.zeros((2, len(estimate.displacement)))
     for axis in range(2):
-        moved = replace(estimate, displacement=estimate.displacement + step * equations.rotation[:, :, axis])
+        moved = replace(estimate, displacement=estimate.displacement + step * equations.deformation[:, :, axis])
         observed += (before - _right_sides(problem, equations, values, moved, None)[0])[axis::2] / step
         assumed += (hessian @ np.tile(np.eye(2)[axis], len(observed)))[axis::2]
     return np.divide(observed, assumed, out=np.ones_like(observed), where=assumed > 0)

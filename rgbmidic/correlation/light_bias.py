@@ -127,5 +127,5 @@ def light_bias(residual: Residual, equations: Equations) -> tuple[FloatArray, Fl
     place = (mesh.nodes[:, ::-1] - (top, left_edge)).T / scores.side - 0.5
     at_nodes = [map_coordinates(one, place, order=1, mode="nearest") for one in (*off, *left)]
     bias, square = np.stack(at_nodes, axis=1).reshape(-1, 2, 2).swapaxes(0, 1)
-    x, y = np.sqrt(np.einsum("nij,nj->ni", equations.rotation**2, square)).T
+    x, y = np.sqrt(np.einsum("nij,nj->ni", equations.deformation**2, square)).T
     return equations.turned(bias), np.stack([x, y, x / reach, y / reach, np.hypot(x, y) / (2 * reach)], axis=1)

@@ -196,11 +196,11 @@ class BlockScores:
         return np.divide(product, scale, out=np.zeros_like(product), where=scale > 0)
 
 
-def _in_reference_axes(functional: Functional, rotation: FloatArray) -> Functional:
-    """Return a quantity linear in the displacement as one of the motion in axes that turn with the surface."""
+def _in_reference_axes(functional: Functional, deformation: FloatArray) -> Functional:
+    """Return a quantity linear in the displacement as one of the motion in axes that follow the surface."""
     columns = [
         [matrix @ sp.diags(turn) for matrix, turn in zip(functional, row, strict=True) if matrix is not None]
-        for row in rotation.T
+        for row in deformation.T
     ]
     along_x, along_y = (sp.csr_matrix(sum(parts)) for parts in columns)
     return along_x, along_y
@@ -291,7 +291,7 @@ def standard_uncertainty(
     if recovery is not None:
         inner = textured & ~reference.mesh.beside(~textured)
         asked += [(one, inner) for one in recovery.strain_functionals]
-    asked = [(_in_reference_axes(functional, equations.rotation), nodes) for functional, nodes in asked]
+    asked = [(_in_reference_axes(functional, equations.deformation), nodes) for functional, nodes in asked]
     scores = score_covariance(residual, equations.weights, equations.blocks)
     std = _probed_std(equations, scores, reference, asked)
     if equations.rigid is not None:
