@@ -120,8 +120,8 @@ class Equations:
             return np.asarray(nodal - solve(hold @ nodal)).reshape(-1, 2, 2)
 
         deformation = _deformation(gradient(displacement), constants)
-        by_node = functions.reshape(len(deformation), 2, functions.shape[1])
-        functions = _turned_back(deformation, by_node).reshape(functions.shape)
+        size, count = functions.shape
+        functions = _turned_back(deformation, functions.reshape(size // 2, 2, count)).reshape(size, count)
         light = np.stack([xx + yy for xx, _, yy in map(assembly.node_blocks, per_light)], axis=1)
         total = light.sum(axis=1, keepdims=True)
         rigid = None

@@ -18,7 +18,7 @@ from rgbmidic.correlation.nodes import correlation
 from rgbmidic.correlation.reference import Deformed, Reference, drawn
 from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.correlation.solution import Solution
-from rgbmidic.correlation.start import Start, track
+from rgbmidic.correlation.start import Start, nodal_slopes, track
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.settings import SolverSettings
@@ -41,8 +41,8 @@ class ReferenceUpdate:
     solution : Solution, or None
         Of frame r on the first one; None before any update.
     scores : ndarray, shape (E, 2), or None
-        Sums over the elements of the residual times the gradient in the step to frame r, turned as the elements are;
-        None before any update.
+        Sums over the elements of the residual of frame r on the first times the gradient, carried to where the elements
+        are; None before any update.
     """
 
     first: Reference
@@ -94,13 +94,13 @@ class ReferenceUpdate:
     def accumulated(self, step: Solution, deformed: Deformed) -> Solution:
         """Return the solution on the first frame from that on this reference.
 
-        The errors of both steps hold frame r's noise with opposite signs: ``Var(u) = Var(u_r) + Var(w) +
-        2 Cov(u_r, w)``. The covariance is ``-g Var(w)`` with g the regression of the scores of the first step on those
-        of the second, over the elements: 1/2 for noise alone, so that frame r's cancels, 0 where the paint has changed,
-        which adds up, and negative where both are off alike, as by a curvature that linear elements cannot follow.
-        Measured on draws of noise, of changing paint and of noise under rotation, after 1 to 4 updates: rms of error
-        over stated uncertainty .92 to 1.07, g .43 to .50 and, for paint, .02 to .03. Strains, linear in the
-        displacement, add up likewise.
+        What the displacement of frame r errs by, the surface carries along: in the step with the deformation gradient F
+        it becomes F times as much. Both errors may have a part in common, and
+        ``Var(u) = (F Var(u_r) F^T + Var(w)) (1 + 2 sum(a b) / sum(a^2 + b^2))``, where a and b are the scores of the
+        elements between the first frame and frame r and in the step: the factor is 1/2 for noise alone, for frame r's
+        cancels; 1 where the paint has changed, which adds up; and up to 2 where both are off alike, as by a pattern
+        that is interpolated or filtered otherwise where it is compressed. Strains, linear in the displacement, add up
+        likewise.
 
         Parameters
         ----------
@@ -114,23 +114,32 @@ class ReferenceUpdate:
         Solution
             On the first frame.
         """
-        if self.solution is None or self.scores is None:
+        if self.solution is None or self.scores is None or not step.measured.any():
             return step
-        last = self.solution
+        last, mesh = self.solution, self.first.mesh
         before, after = self.scores, _scores(self.reference, deformed, step.displacement, step.rigid)
         both = np.isfinite(before + after)
-        square = float((after[both] ** 2).sum())
-        regression = float(np.clip(-(before[both] * after[both]).sum() / square, -1, 0.5)) if square > 0 else 0.0
-        own, mesh = 1 - 2 * regression, self.first.mesh
+        before, after = before[both], after[both]
+        squares = float((before**2 + after**2).sum())
+        in_common = 1 + 2 * float((before * after).sum()) / squares if squares > 0 else 1.0
+        slope = nodal_slopes(self.reference.mesh, step.displacement, step.measured, self.first.constants)[0]
+        (xx, xy), (yx, yy) = squared = np.moveaxis((np.eye(2) + slope) ** 2, 0, -1)
+        # slopes of u along y and of v along x have half the variance of the shear strain's double each
+        of_strain = np.array([[xx, 0 * xx, 2 * xy], [0 * xx, yy, 2 * yx], [yx / 4, xy / 4, (xx + yy) / 2]])
+
+        def total_std(of_reference: FloatArray, of_step: FloatArray, carried: FloatArray) -> FloatArray:
+            square = np.einsum("ijn,nj->ni", carried, _single(of_reference) ** 2) + of_step**2
+            return np.asarray(np.sqrt(in_common * square))
+
         return replace(
             step,
             nodes=mesh.nodes,
             elements=mesh.elements,
             displacement=self.displacement + step.displacement,
-            displacement_std=np.sqrt(_single(last.displacement_std) ** 2 + own * step.displacement_std**2),
-            bias_std=np.sqrt(_single(last.bias_std) ** 2 + own * step.bias_std**2),
+            displacement_std=total_std(last.displacement_std, step.displacement_std, squared),
+            bias_std=total_std(last.bias_std, step.bias_std, squared),
             strain=_single(last.strain) + step.strain,
-            strain_std=np.sqrt(_single(last.strain_std) ** 2 + own * step.strain_std**2),
+            strain_std=total_std(last.strain_std, step.strain_std, of_strain),
             rigid=last.rigid + step.rigid if step.rigid.size else step.rigid,
         )
 
@@ -239,17 +248,17 @@ class ReferenceUpdate:
             registration=self.first.registration,
             constants=self.first.constants,
         )
-        step, rigid = self._step(displacement, solution)
-        gaps = np.where(measured[:, None], step, np.nan)
         deformed = Deformed.prepare(images, weights, prefilter=prefilter, origin=origin)
-        scores = _scores(self.reference, deformed, gaps, rigid)
-        turn = np.eye(2) + self.reference.mesh.element_gradient(step)
+        scores = _scores(self.first, deformed, np.where(measured[:, None], displacement, np.nan), solution.rigid)
+        (xx, xy), (yx, yy) = np.moveaxis(np.eye(2) + mesh.element_gradient(displacement), 0, -1)
+        # of as many pixels and as large a gradient as frame r has there: det(F) F^-T
+        cofactors = np.stack([yy, -yx, -xy, xx], axis=1).reshape(-1, 2, 2)
         return ReferenceUpdate(
             first=self.first,
             reference=reference,
             displacement=displacement,
             solution=solution,
-            scores=np.einsum("ecd,ed->ec", turn, scores),
+            scores=np.einsum("ecd,ed->ec", cofactors, scores),
         )
 
 
