@@ -43,6 +43,8 @@ class ReferenceUpdate:
     scores : ndarray, shape (E, 2), or None
         Sums over the elements of the residual of frame r on the first times the gradient, carried to where the elements
         are; None before any update.
+    uv_correlation : ndarray, shape (N,)
+        Correlation of the errors of u and v of frame r, that of the texture around each node.
     """
 
     first: Reference
@@ -50,6 +52,7 @@ class ReferenceUpdate:
     displacement: FloatArray
     solution: Solution | None = None
     scores: FloatArray | None = None
+    uv_correlation: FloatArray | float = 0.0
 
     @classmethod
     def none(cls, first: Reference) -> ReferenceUpdate:
@@ -95,7 +98,7 @@ class ReferenceUpdate:
         """Return the solution on the first frame from that on this reference.
 
         What the displacement of frame r errs by, the surface carries along: in the step with the deformation gradient F
-        it becomes F times as much. Both errors may have a part in common, and
+        it becomes F times as much, in u and v together (`uv_correlation`). Both errors may have a part in common, and
         ``Var(u) = (F Var(u_r) F^T + Var(w)) (1 + 2 sum(a b) / sum(a^2 + b^2))``, where a and b are the scores of the
         elements between the first frame and frame r and in the step: the factor is 1/2 for noise alone, for frame r's
         cancels; 1 where the paint has changed, which adds up; and up to 2 where both are off alike, as by a pattern
@@ -123,23 +126,29 @@ class ReferenceUpdate:
         squares = float((before**2 + after**2).sum())
         in_common = 1 + 2 * float((before * after).sum()) / squares if squares > 0 else 1.0
         slope = nodal_slopes(self.reference.mesh, step.displacement, step.measured, self.first.constants)[0]
-        (xx, xy), (yx, yy) = squared = np.moveaxis((np.eye(2) + slope) ** 2, 0, -1)
-        # slopes of u along y and of v along x have half the variance of the shear strain's double each
-        of_strain = np.array([[xx, 0 * xx, 2 * xy], [0 * xx, yy, 2 * yx], [yx / 4, xy / 4, (xx + yy) / 2]])
+        deformation = np.moveaxis(np.eye(2) + slope, 0, -1)
 
-        def total_std(of_reference: FloatArray, of_step: FloatArray, carried: FloatArray) -> FloatArray:
-            square = np.einsum("ijn,nj->ni", carried, _single(of_reference) ** 2) + of_step**2
-            return np.asarray(np.sqrt(in_common * square))
+        def carried(std: FloatArray) -> FloatArray:
+            """Variance (N, 2) along x and y of what has this standard uncertainty in frame r."""
+            (u, v), uv = (std**2).T, self.uv_correlation * std.prod(axis=1)
+            return np.stack([a**2 * u + b**2 * v + 2 * a * b * uv for a, b in deformation], axis=1)
 
+        def total(of_reference: FloatArray, of_step: FloatArray) -> FloatArray:
+            return np.asarray(np.sqrt(in_common * (of_reference + of_step**2)))
+
+        strain = _single(last.strain_std)
+        normal, before = carried(strain[:, :2]), np.maximum((strain[:, :2] ** 2).sum(axis=1), 1e-300)
+        # slopes along x and along y are alike: half the shear strain's are those of u, half those of v
+        shear = strain[:, 2] ** 2 * normal.sum(axis=1) / before
         return replace(
             step,
             nodes=mesh.nodes,
             elements=mesh.elements,
             displacement=self.displacement + step.displacement,
-            displacement_std=total_std(last.displacement_std, step.displacement_std, squared),
-            bias_std=total_std(last.bias_std, step.bias_std, squared),
+            displacement_std=total(carried(_single(last.displacement_std)), step.displacement_std),
+            bias_std=total(carried(_single(last.bias_std)), step.bias_std),
             strain=_single(last.strain) + step.strain,
-            strain_std=total_std(last.strain_std, step.strain_std, of_strain),
+            strain_std=total(np.column_stack([normal, shear]), step.strain_std),
             rigid=last.rigid + step.rigid if step.rigid.size else step.rigid,
         )
 
@@ -259,7 +268,19 @@ class ReferenceUpdate:
             displacement=displacement,
             solution=solution,
             scores=np.einsum("ecd,ed->ec", cofactors, scores),
+            uv_correlation=_uv_correlation(self.first, displacement),
         )
+
+
+def _uv_correlation(first: Reference, displacement: FloatArray) -> FloatArray:
+    """Correlation (N,) of u and v at a displacement (N, 2): that of F M^-1 F^T, with M the Hessian around each node."""
+    hessians = first.hessians(first.pixel_weights)
+    xx, xy, yy = first.assembly.node_blocks(np.sum(hessians, axis=0))
+    adjugate = np.stack([yy, -xy, -xy, xx], axis=1).reshape(-1, 2, 2)
+    deformation = np.eye(2) + first.mesh.nodal_gradient(displacement)
+    covariance = deformation @ adjugate @ deformation.swapaxes(1, 2)
+    scale = np.sqrt(np.maximum(covariance[:, 0, 0] * covariance[:, 1, 1], 0))
+    return np.asarray(np.divide(covariance[:, 0, 1], scale, out=np.zeros_like(scale), where=scale > 0))
 
 
 def _single(values: FloatArray) -> FloatArray:
