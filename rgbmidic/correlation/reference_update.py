@@ -137,9 +137,9 @@ class ReferenceUpdate:
             return np.asarray(np.sqrt(in_common * (of_reference + of_step**2)))
 
         strain = _single(last.strain_std)
-        normal, before = carried(strain[:, :2]), np.maximum((strain[:, :2] ** 2).sum(axis=1), 1e-300)
+        normal, slopes = carried(strain[:, :2]), np.maximum((strain[:, :2] ** 2).sum(axis=1), 1e-300)
         # slopes along x and along y are alike: half the shear strain's are those of u, half those of v
-        shear = strain[:, 2] ** 2 * normal.sum(axis=1) / before
+        shear = strain[:, 2] ** 2 * normal.sum(axis=1) / slopes
         return replace(
             step,
             nodes=mesh.nodes,
