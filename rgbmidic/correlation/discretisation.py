@@ -162,7 +162,7 @@ def _finer_field(
     mesh, fine, count = halves.mesh, halves.fine, len(halves.mesh.nodes)
     used = np.asarray(solution.measured[mesh.elements].all(axis=1))
     start = halves.interpolated(solution.displacement[mesh.nearest(solution.measured)[1]], used)
-    functions = rigid_functions(mesh.nodes, options.rigid).reshape(count, -1)
+    fine, functions = fine.filtered_as(start), rigid_functions(mesh.nodes, options.rigid).reshape(count, -1)
     functions = halves.prolonged(functions).reshape(2 * len(start), -1)
     problem = Problem(reference=fine, deformed=deformed, options=options, method=method, functions=functions)
     estimate = Estimate(displacement=start, rigid=np.nan_to_num(solution.rigid))

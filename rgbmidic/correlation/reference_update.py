@@ -332,4 +332,5 @@ def _residual(
     own = (np.nan_to_num(rigid) @ functions.T).reshape(len(rigid), *displacement.shape)
     motion = list(np.nan_to_num(displacement) + own)
     known = np.asarray(found[reference.mesh.elements].all(axis=1))
-    return Residual.at(reference, deformed, reference.values, motion), known
+    filtered = reference.filtered_as(np.nan_to_num(displacement))
+    return Residual.at(filtered, deformed, filtered.values, motion), known

@@ -234,12 +234,14 @@ def _passes(
         reached = max(tolerance, problem.constants.first_pass) if number == 0 else tolerance
         estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, reached)
         weighting = next_weighting(problem, weighting, equations, estimate, number)
-        if (
-            number == 0
-            and (found := settled_gradient(weighting.residual, weighting.weights())) is not problem.reference
-        ):
-            problem, equations = replace(problem, reference=found), None
-            weighting = replace(weighting, residual=replace(weighting.residual, reference=found))
+        if number == 0:
+            found = settled_gradient(weighting.residual, weighting.weights()).filtered_as(estimate.displacement)
+            if found is not problem.reference:
+                residual, beyond = weighting.residual, found.values - problem.reference.values
+                values, difference = residual.values + beyond, residual.difference + beyond
+                residual = replace(residual, reference=found, values=values, difference=difference)
+                weighting = replace(weighting, residual=residual, values=weighting.values + beyond)
+                problem, equations = replace(problem, reference=found), None
     assert equations is not None
     if estimate.longest > tolerance:
         estimate = iterate(problem, equations, weighting.values, weighting.residual, estimate, tolerance)
