@@ -266,7 +266,10 @@ def all_outputs():
     owned_pixels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
     curved = less_curved(case, case.displacement, case.random.normal(size=(len(case.mesh.nodes), 2, 3)))
     blocks = block_products(case, np.ones(case.pixels.grid(7), dtype=np.float32), 7, 2)
-    found = hessian, difference, weights, moments, squares, sums, vector, fields, curved, blocks
+    second, factors = case.reference[None].copy(), case.random.normal(size=(elements, 3)).astype(np.float32)
+    place = case.pixels.lines, case.pixels.run_offsets, *case.pixels.bounds[:2]
+    owned_pixels.add_second_derivatives(factors, case.image[None], *place, second)
+    found = hessian, difference, weights, moments, squares, sums, vector, fields, curved, blocks, second
     return [case.coefficients, *found]
 
 
