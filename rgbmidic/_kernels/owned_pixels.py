@@ -82,6 +82,28 @@ def subtract_quadratic(
                 less[i] = given[i] - gx[i] * dx - gy[i] * dy
 
 
+@compiled("factors", fastmath=FAST)
+def add_second_derivatives(start, stop, factors, images, lines, run_offsets, top, left, out):
+    """Add second derivatives of images (k, H, W) float32, times `factors` (E, 3) for xx, xy and yy, to ``out`` (k, P).
+
+    They are second differences of the pixels around; nothing is added at the images' own edges.
+    """
+    height, width = images.shape[1:]
+    for light in range(len(images)):
+        for e in range(start, stop):
+            xx, xy, yy = factors[e, 0], factors[e, 1] / np.float32(4), factors[e, 2]
+            for q in range(run_offsets[e], run_offsets[e + 1]):
+                row, first = top + lines[q, 2], left + lines[q, 3]
+                if row == 0 or row == height - 1:
+                    continue
+                above, here, below = images[light, row - 1], images[light, row], images[light, row + 1]
+                for c in range(max(first, 1), min(first + lines[q, 1], width - 1)):
+                    twice = here[c] + here[c]
+                    second = xx * (here[c - 1] - twice + here[c + 1]) + yy * (above[c] - twice + below[c])
+                    cross = above[c - 1] - above[c + 1] - below[c - 1] + below[c + 1]
+                    out[light, lines[q, 0] + c - first] += second + xy * cross
+
+
 @compiled("out", axis=1, fastmath=FAST)
 def block_sums(start, stop, values, lines, run_offsets, side, out):
     """Sum fields (n, P) over blocks of `side` px: ``out`` (n, h, w)."""

@@ -53,6 +53,14 @@ class SolverConstants:
         and below .5 each halves the error (derived).
     longest_step
         Longest motion of a node in one iteration, px: a speckle (3 to 5 px), beyond which the gradient is another's.
+    strained, most_filtered
+        Rms change of the inverse stretch ``C^-1 - 1`` (twice the strain) from which the reference is filtered as the
+        deformed images are: at a strain of 5 % that takes an error of .0016 px, at half a per cent a tenth. Its
+        largest change: a surface compressed to .45, beyond which the filter's first term does not hold. Chosen.
+    flattened
+        Area of a deformed surface over the square of its stretch (trace of C) from which its deformation gradient
+        carries the axes of the reference along, below it the rotation alone: what is 20 times as long as wide, or has
+        lost 19 parts in 20 of its area, is no match. Chosen.
     smoothness
         Weight of the smoothness that carries nodes without data along, relative to the texture's median Hessian.
         Chosen; with a tenth or ten times of it three lights under a moving reflection differ by 4e-5 and 4e-4 px at
@@ -167,6 +175,9 @@ class SolverConstants:
     patience: int = 3
     swing: float = 0.5
     longest_step: float = 4.0
+    strained: float = 0.01
+    most_filtered: float = 4.0
+    flattened: float = 0.05
     smoothness: float = 1e-4
     constant: float = 1e-9
     rounding: float = 1e-4

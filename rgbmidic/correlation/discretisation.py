@@ -127,10 +127,10 @@ def discretisation_error(
         return solution
     halves, draws = _halves(reference)
     with one_blas_thread():
-        values, variance, rotation = _finer_field(halves, deformed, solution, options, method)
+        values, variance, deformation = _finer_field(halves, deformed, solution, options, method)
         std = np.concatenate([solution.displacement_std, solution.strain_std], axis=1)
         noise = np.sqrt(draws.own_variance * np.column_stack([variance, variance, variance.mean(axis=1)]))
-        turned = np.sqrt(np.einsum("nij,nj->ni", rotation**2, noise[:, :2] ** 2))
+        turned = np.sqrt(np.einsum("nij,nj->ni", deformation**2, noise[:, :2] ** 2))
         noise[:, :4] *= np.tile(turned / np.maximum(noise[:, :2], 1e-300), 2)  # slopes of u have its direction
         less = noise < _CONSTANTS.chance * std
         own = np.concatenate([solution.displacement, solution.strain], axis=1)
@@ -157,13 +157,13 @@ def _finer_field(
     -------
     tuple
         u, v, exx, eyy, exy (N, 5) at the nodes of the solution, NaN where the finer mesh sees too little; the variance
-        of the scores in x and y of the reference that it leaves, (N, 2), as `_score_variance`; and the rotation
-        (N, 2, 2) of these axes.
+        of the scores in x and y of the reference that it leaves, (N, 2), as `_score_variance`; and the deformation
+        gradient (N, 2, 2) that carries these axes.
     """
     mesh, fine, count = halves.mesh, halves.fine, len(halves.mesh.nodes)
     used = np.asarray(solution.measured[mesh.elements].all(axis=1))
     start = halves.interpolated(solution.displacement[mesh.nearest_nodes(solution.measured)[1]], used)
-    functions = rigid_functions(mesh.nodes, options.rigid).reshape(count, -1)
+    fine, functions = fine.filtered_as(start), rigid_functions(mesh.nodes, options.rigid).reshape(count, -1)
     functions = halves.prolonged(functions).reshape(2 * len(start), -1)
     problem = Problem(reference=fine, deformed=deformed, options=options, method=method, functions=functions)
     estimate = Estimate(displacement=start, rigid=np.nan_to_num(solution.rigid))
@@ -182,7 +182,7 @@ def _finer_field(
     straight = halves.straightened(last, equations, recovery, found)
     variance = _score_variance(straight, equations.weights) * (loss[:, None] ** 2)
     known = (equations.textured & ~fine.mesh.adjacent_nodes(~equations.textured))[:count]
-    return np.where(known[:, None], recovery.field(*found.T), np.nan), variance[:count], equations.rotation[:count]
+    return np.where(known[:, None], recovery.field(*found.T), np.nan), variance[:count], equations.deformation[:count]
 
 
 def _right_side(reference: Reference, weights: FloatImage, difference: FloatImage) -> FloatArray:

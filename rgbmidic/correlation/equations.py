@@ -26,22 +26,25 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Equations:
-    """Factorised normal equations for given weights, in axes that turn with the surface.
+    """Factorised normal equations for given weights, in axes that turn and stretch with the surface.
 
-    The reference's gradient stands for that of the deformed image, which the surface has turned with it: the motion is
-    solved for in the axes of the reference and turned to where they are now.
+    The reference's gradient stands for that of the deformed image, which the surface has turned and stretched: the
+    motion is solved for in the axes of the reference and carried to where they are now (the inverse compositional
+    step: Baker and Matthews, IJCV 56, 2004).
 
     Attributes
     ----------
     weights : ndarray, shape (k, P), float32
-    rotation : ndarray, shape (N, 2, 2)
-        Of the surface around each node.
+    deformation : ndarray, shape (N, 2, 2)
+        Deformation gradient of the surface around each node.
     functions : ndarray, shape (2 N, m)
         The rigid functions in the axes of the reference.
     blocks : ndarray, shape (E, 3, 3, 3)
         Element blocks of the Hessian.
     smoothness : float
         Factor on the smoothness of the `Assembly`.
+    gradient
+        Displacement gradient (N, 2, 2) around each node for a displacement (N, 2).
     node_blocks : ndarray, shape (3, N)
         Entries xx, xy and yy of the nodes' own blocks of the Hessian.
     solve
@@ -55,11 +58,12 @@ class Equations:
     """
 
     weights: FloatImage
-    rotation: FloatArray
+    deformation: FloatArray
     functions: FloatArray
     blocks: FloatArray
     node_blocks: FloatArray
     smoothness: float
+    gradient: Callable[[FloatArray], FloatArray]
     solve: Callable[[FloatArray], FloatArray]
     rigid: RigidMotions | None
     observability: FloatArray
@@ -97,10 +101,6 @@ class Equations:
         assembly, constants = reference.assembly, reference.constants
         per_light = reference.hessians(weights)
         blocks = np.sum(per_light, axis=0)
-        rotation = _rotation(reference.mesh, displacement, blocks)
-        functions = _turned_back(rotation, functions.reshape(len(rotation), 2, functions.shape[1])).reshape(
-            *functions.shape
-        )
         own = assembly.node_blocks(blocks)
         least = constants.seen if given is None else constants.informed
         observability = _observability(own, assembly.nodal_area, least, constants)
@@ -112,20 +112,31 @@ class Equations:
         scale = float(np.median(diagonal[textured]) if textured.any() else diagonal.max(initial=0.0)) or 1.0
         held = scale * (constants.smoothness * assembly.smoothness.data + constants.constant * assembly.diagonal)
         solve = assembly.factorise(assembly.matrix(blocks, held))
+        hold = with_data(assembly.smoothness, held)
+        around = _gradient_around(reference.mesh, blocks)
+
+        def gradient(displacement: FloatArray) -> FloatArray:
+            nodal = around(displacement).reshape(-1, 2)
+            # nodes without data have that of the others, carried along as a displacement is
+            return np.asarray(nodal - solve(hold @ nodal)).reshape(-1, 2, 2)
+
+        deformation = _deformation(gradient(displacement), constants)
+        size, count = functions.shape
+        functions = _turned_back(deformation, functions.reshape(size // 2, 2, count)).reshape(size, count)
         light = np.stack([xx + yy for xx, _, yy in map(assembly.node_blocks, per_light)], axis=1)
         total = light.sum(axis=1, keepdims=True)
         rigid = None
         if functions.shape[1] and len(per_light) > 1:
             shown = np.asarray(textured[reference.mesh.elements].all(axis=1))
-            hold = with_data(assembly.smoothness, held)
             rigid = RigidMotions.eliminate(assembly, per_light, functions, hold, solve, shown, constants)
         return cls(
             weights=weights,
-            rotation=rotation,
+            deformation=deformation,
             functions=functions,
             blocks=blocks,
             node_blocks=own,
             smoothness=constants.smoothness * scale,
+            gradient=gradient,
             solve=solve,
             rigid=rigid,
             observability=observability,
@@ -166,42 +177,54 @@ class Equations:
             motion = motion - self.rigid.follows @ rigid
         return self.turned(motion.reshape(-1, 2)), rigid
 
-    def inverse_stretch(self, mesh: Tri3Mesh, displacement: FloatArray) -> FloatArray:
-        """Half the trace of the inverse stretch around each node, (N,), for a displacement (N, 2).
-
-        Gradients of the deformed image are smaller than those of the same texture on the reference by that.
-        """
-        texture = np.einsum("eaad->ed", self.blocks)[:, [0, 2]].sum(axis=1)
-        ((xx, xy), (yx, yy)) = np.moveaxis(np.eye(2) + mesh.element_gradient(displacement), 0, -1)
-        inverse = np.hypot(xx + yy, yx - xy) / np.maximum(2 * np.abs(xx * yy - xy * yx), 1e-3)
-        total, mean = mesh.to_nodes(texture), mesh.to_nodes(texture * inverse)
-        return np.divide(mean, total, out=np.ones_like(total), where=total > 0)
+    def held_side(self, reference: Reference, displacement: FloatArray) -> FloatArray:
+        """Right-hand side (2 N,) of the smoothness: at nodes without texture, by what is not affine around them."""
+        out = np.zeros_like(displacement)
+        if not self.textured.all():
+            smoothness, nodes = reference.assembly.smoothness, reference.mesh.nodes
+            bend, at_border = ((smoothness @ field.ravel()).reshape(-1, 2) for field in (displacement, nodes))
+            bend -= np.einsum("nij,nj->ni", self.gradient(displacement), at_border)
+            out = np.where(self.textured[:, None], out, -self.smoothness * self.turned_back(bend))
+        return out.ravel()
 
     def turned(self, vectors: FloatArray) -> FloatArray:
-        """Turn nodal vectors (N, 2, ...) from the axes of the reference to where they are now."""
-        return np.asarray(np.einsum("nij,nj...->ni...", self.rotation, vectors))
+        """Turn nodal vectors (N, 2, ...) from the axes of the reference to where they are now, stretched."""
+        return np.asarray(np.einsum("nij,nj...->ni...", self.deformation, vectors))
 
     def turned_back(self, vectors: FloatArray) -> FloatArray:
         """Turn nodal vectors (N, 2, ...) into the axes of the reference."""
-        return _turned_back(self.rotation, vectors)
+        return _turned_back(self.deformation, vectors)
 
 
-def _rotation(mesh: Tri3Mesh, displacement: FloatArray, blocks: FloatArray) -> FloatArray:
-    """Rotation (N, 2, 2) of the surface around each node: the polar factor of I + grad u in the plane.
+def _gradient_around(mesh: Tri3Mesh, blocks: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return what averages the gradient of a displacement (N, 2) over the elements around each node, (N, 2, 2).
 
     Elements count by what they show: one that is half on another body, and left out, turns in a way of its own.
     """
     texture = np.einsum("eaad->ed", blocks)[:, [0, 2]].sum(axis=1)
     shown = texture + 1e-6 * (texture.mean() or 1.0)  # where nothing is shown all count alike
-    gradient = mesh.element_gradient(displacement)
-    spin, trace = gradient[:, 1, 0] - gradient[:, 0, 1], 2 + gradient[:, 0, 0] + gradient[:, 1, 1]
-    angle = np.arctan2(mesh.to_nodes(shown * spin), mesh.to_nodes(shown * trace))
+    around = mesh.to_nodes(shown)
+
+    def average(displacement: FloatArray) -> FloatArray:
+        parts = shown * mesh.element_gradient(displacement).reshape(-1, 4).T
+        return np.stack([mesh.to_nodes(part) / around for part in parts], axis=1).reshape(-1, 2, 2)
+
+    return average
+
+
+def _deformation(gradient: FloatArray, constants: SolverConstants) -> FloatArray:
+    """Deformation gradient (N, 2, 2), I + grad u; where that is nearly singular its rotation, the polar factor."""
+    deformation = np.eye(2) + gradient
+    square = np.maximum((deformation**2).sum(axis=(1, 2)), 1)
+    flat = np.linalg.det(deformation) < constants.flattened * square
+    angle = np.arctan2(gradient[:, 1, 0] - gradient[:, 0, 1], 2 + gradient[:, 0, 0] + gradient[:, 1, 1])
     cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
+    rotation = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
+    return np.where(flat[:, None, None], rotation, deformation)
 
 
-def _turned_back(rotation: FloatArray, vectors: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("nji,nj...->ni...", rotation, vectors))
+def _turned_back(deformation: FloatArray, vectors: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("nij,nj...->ni...", np.linalg.inv(deformation), vectors))
 
 
 def _observability(own: FloatArray, area: FloatArray, least: float, constants: SolverConstants) -> FloatArray:
@@ -349,8 +372,7 @@ def _right_sides(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
     reference, assembly = problem.reference, problem.reference.assembly
-    bend = assembly.smoothness @ estimate.displacement.ravel()
-    held = -equations.smoothness * equations.turned_back(bend.reshape(-1, 2)).ravel()
+    held = equations.held_side(reference, estimate.displacement)
     total, rigid, difference = held.copy(), [], np.empty_like(reference.values[0])
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
         if known is not None:

@@ -72,6 +72,12 @@ def _taps(prefilter: str) -> FloatImage:
     return PREFILTERS[prefilter].astype(np.float32)
 
 
+def filter_variance(prefilter: str) -> np.float32:
+    """Variance (square px) of a prefilter along an axis."""
+    taps = _taps(prefilter)
+    return np.float32((taps * (np.arange(len(taps)) - len(taps) // 2) ** 2).sum())
+
+
 def usable_reach(prefilter: str) -> int:
     """Pixels to each side that a filtered value and its spline use."""
     return len(PREFILTERS[prefilter]) // 2 + 1

@@ -75,5 +75,5 @@ def light_bias(table: BlockTable, equations: Equations) -> tuple[FloatArray, Flo
     left += ((part - precision)[:, None] * beyond).sum(axis=0) ** 2
     off = mean - (precision[:, None] * displacement).sum(axis=0)
     bias, square = table.at(np.concatenate([off, left]), nodes).T.reshape(-1, 2, 2).swapaxes(0, 1)
-    x, y = np.sqrt(np.einsum("nij,nj->ni", equations.rotation**2, square)).T
+    x, y = np.sqrt(np.einsum("nij,nj->ni", equations.deformation**2, square)).T
     return equations.turned(bias), np.stack([x, y, x / reach, y / reach, np.hypot(x, y) / (2 * reach)], axis=1)

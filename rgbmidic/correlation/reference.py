@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -17,13 +17,20 @@ from rgbmidic._kernels.correlation import (
     element_vector,
     warped_weights,
 )
-from rgbmidic._kernels.owned_pixels import interpolate_nodal
+from rgbmidic._kernels.owned_pixels import add_second_derivatives, interpolate_nodal
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
 from rgbmidic.correlation.assembly import Assembly, unfitted_fraction
 from rgbmidic.correlation.brightness import Brightness, BrightnessModel, GainFit, gain_and_offset, window_width
 from rgbmidic.correlation.constants import USUAL, SolverConstants
-from rgbmidic.correlation.images import SlidingWindow, spline_coefficients, spline_values, usable_pixels, usable_reach
+from rgbmidic.correlation.images import (
+    SlidingWindow,
+    filter_variance,
+    spline_coefficients,
+    spline_values,
+    usable_pixels,
+    usable_reach,
+)
 from rgbmidic.correlation.texture import TextureGradient
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import DARK, Registration
@@ -325,6 +332,34 @@ class Reference:
         ndarray, shape (2, P), float32
         """
         return self.texture.images[:, light] - self.gradient[:, light]
+
+    def filtered_as(self, displacement: FloatArray) -> Reference:
+        """Return the reference with the grey levels that the prefilter leaves of it where it is deformed.
+
+        A filter of the variance s^2 adds ``s^2/2`` of the Laplacian. That along the axes of the deformed images is
+        ``C^-1 : grad grad`` in those of the reference, with C the right Cauchy-Green tensor: a pattern that is
+        compressed loses more contrast, and what the two states differ by would displace it.
+
+        Parameters
+        ----------
+        displacement : ndarray, shape (N, 2)
+            Of the nodes, px.
+
+        Returns
+        -------
+        Reference
+            With other `values`; itself where the surface is hardly strained.
+        """
+        (xx, xy), (yx, yy) = np.moveaxis(np.eye(2) + self.mesh.element_gradient(displacement), 0, -1)
+        inverse = np.stack([xy**2 + yy**2, -(xx * xy + yx * yy), xx**2 + yx**2], axis=1)
+        inverse /= np.maximum((xx * yy - xy * yx) ** 2, 1e-9)[:, None]
+        beyond = np.clip(inverse - (1, 0, 1), -1, self.constants.most_filtered)
+        if np.sqrt((beyond**2).mean()) < self.constants.strained:
+            return self
+        factors = filter_variance(self.prefilter) / 2 * (beyond * (1, 2, 1)).astype(np.float32)
+        values, (top, left, _, _) = self.values.copy(), self.pixels.bounds
+        add_second_derivatives(factors, self.images, self.pixels.lines, self.pixels.run_offsets, top, left, values)
+        return replace(self, values=values)
 
     def offset(self, deformed: Deformed) -> FloatArray:
         """Column and row of these images (2,) at which those of a deformed state begin.

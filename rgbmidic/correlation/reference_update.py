@@ -18,7 +18,7 @@ from rgbmidic.correlation.nodes import correlation
 from rgbmidic.correlation.reference import Deformed, Reference, drawn
 from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.correlation.solution import Solution
-from rgbmidic.correlation.start import Start, track
+from rgbmidic.correlation.start import Start, nodal_slopes, track
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.settings import SolverSettings
@@ -41,8 +41,10 @@ class ReferenceUpdate:
     solution : Solution, or None
         Of frame r on the first one; None before any update.
     scores : ndarray, shape (E, 2), or None
-        Sums over the elements of the residual times the gradient in the step to frame r, turned as the elements are;
-        None before any update.
+        Sums over the elements of the residual of frame r on the first times the gradient, carried to where the elements
+        are; None before any update.
+    uv_correlation : ndarray, shape (N,)
+        Correlation of the errors of u and v of frame r, that of the texture around each node.
     """
 
     first: Reference
@@ -50,6 +52,7 @@ class ReferenceUpdate:
     displacement: FloatArray
     solution: Solution | None = None
     scores: FloatArray | None = None
+    uv_correlation: FloatArray | float = 0.0
 
     @classmethod
     def none(cls, first: Reference) -> ReferenceUpdate:
@@ -94,13 +97,13 @@ class ReferenceUpdate:
     def accumulated(self, step: Solution, deformed: Deformed) -> Solution:
         """Return the solution on the first frame from that on this reference.
 
-        The errors of both steps hold frame r's noise with opposite signs: ``Var(u) = Var(u_r) + Var(w) +
-        2 Cov(u_r, w)``. The covariance is ``-g Var(w)`` with g the regression of the scores of the first step on those
-        of the second, over the elements: 1/2 for noise alone, so that frame r's cancels, 0 where the paint has changed,
-        which adds up, and negative where both are off alike, as by a curvature that linear elements cannot follow.
-        Measured on draws of noise, of changing paint and of noise under rotation, after 1 to 4 updates: rms of error
-        over stated uncertainty .92 to 1.07, g .43 to .50 and, for paint, .02 to .03. Strains, linear in the
-        displacement, add up likewise.
+        What the displacement of frame r errs by, the surface carries along: in the step with the deformation gradient F
+        it becomes F times as much, in u and v together (`uv_correlation`). Both errors may have a part in common, and
+        ``Var(u) = (F Var(u_r) F^T + Var(w)) (1 + 2 sum(a b) / sum(a^2 + b^2))``, where a and b are the scores of the
+        elements between the first frame and frame r and in the step: the factor is 1/2 for noise alone, for frame r's
+        cancels; 1 where the paint has changed, which adds up; and up to 2 where both are off alike, as by a pattern
+        that is interpolated or filtered otherwise where it is compressed. Strains, linear in the displacement, add up
+        likewise.
 
         Parameters
         ----------
@@ -114,23 +117,38 @@ class ReferenceUpdate:
         Solution
             On the first frame.
         """
-        if self.solution is None or self.scores is None:
+        if self.solution is None or self.scores is None or not step.measured.any():
             return step
-        last = self.solution
+        last, mesh = self.solution, self.first.mesh
         before, after = self.scores, _scores(self.reference, deformed, step.displacement, step.rigid)
         both = np.isfinite(before + after)
-        square = float((after[both] ** 2).sum())
-        regression = float(np.clip(-(before[both] * after[both]).sum() / square, -1, 0.5)) if square > 0 else 0.0
-        own, mesh = 1 - 2 * regression, self.first.mesh
+        before, after = before[both], after[both]
+        squares = float((before**2 + after**2).sum())
+        in_common = 1 + 2 * float((before * after).sum()) / squares if squares > 0 else 1.0
+        slope = nodal_slopes(self.reference.mesh, step.displacement, step.measured, self.first.constants)[0]
+        deformation = np.moveaxis(np.eye(2) + slope, 0, -1)
+
+        def carried(std: FloatArray) -> FloatArray:
+            """Variance (N, 2) along x and y of what has this standard uncertainty in frame r."""
+            (u, v), uv = (std**2).T, self.uv_correlation * std.prod(axis=1)
+            return np.stack([a**2 * u + b**2 * v + 2 * a * b * uv for a, b in deformation], axis=1)
+
+        def total(of_reference: FloatArray, of_step: FloatArray) -> FloatArray:
+            return np.asarray(np.sqrt(in_common * (of_reference + of_step**2)))
+
+        strain = _single(last.strain_std)
+        normal, slopes = carried(strain[:, :2]), np.maximum((strain[:, :2] ** 2).sum(axis=1), 1e-300)
+        # slopes along x and along y are alike: half the shear strain's are those of u, half those of v
+        shear = strain[:, 2] ** 2 * normal.sum(axis=1) / slopes
         return replace(
             step,
             nodes=mesh.nodes,
             elements=mesh.elements,
             displacement=self.displacement + step.displacement,
-            displacement_std=np.sqrt(_single(last.displacement_std) ** 2 + own * step.displacement_std**2),
-            bias_std=np.sqrt(_single(last.bias_std) ** 2 + own * step.bias_std**2),
+            displacement_std=total(carried(_single(last.displacement_std)), step.displacement_std),
+            bias_std=total(carried(_single(last.bias_std)), step.bias_std),
             strain=_single(last.strain) + step.strain,
-            strain_std=np.sqrt(_single(last.strain_std) ** 2 + own * step.strain_std**2),
+            strain_std=total(np.column_stack([normal, shear]), step.strain_std),
             rigid=last.rigid + step.rigid if step.rigid.size else step.rigid,
         )
 
@@ -240,18 +258,30 @@ class ReferenceUpdate:
             brightness=self.first.brightness,
             constants=self.first.constants,
         )
-        step, rigid = self._step(displacement, solution)
-        gaps = np.where(measured[:, None], step, np.nan)
         deformed = Deformed.prepare(images, weights, prefilter=prefilter, origin=origin)
-        scores = _scores(self.reference, deformed, gaps, rigid)
-        turn = np.eye(2) + self.reference.mesh.element_gradient(step)
+        scores = _scores(self.first, deformed, np.where(measured[:, None], displacement, np.nan), solution.rigid)
+        (xx, xy), (yx, yy) = np.moveaxis(np.eye(2) + mesh.element_gradient(displacement), 0, -1)
+        # of as many pixels and as large a gradient as frame r has there: det(F) F^-T
+        cofactors = np.stack([yy, -yx, -xy, xx], axis=1).reshape(-1, 2, 2)
         return ReferenceUpdate(
             first=self.first,
             reference=reference,
             displacement=displacement,
             solution=solution,
-            scores=np.einsum("ecd,ed->ec", turn, scores),
+            scores=np.einsum("ecd,ed->ec", cofactors, scores),
+            uv_correlation=_uv_correlation(self.first, displacement),
         )
+
+
+def _uv_correlation(first: Reference, displacement: FloatArray) -> FloatArray:
+    """Correlation (N,) of u and v at a displacement (N, 2): that of F M^-1 F^T, with M the Hessian around each node."""
+    hessians = first.hessians(first.pixel_weights)
+    xx, xy, yy = first.assembly.node_blocks(np.sum(hessians, axis=0))
+    adjugate = np.stack([yy, -xy, -xy, xx], axis=1).reshape(-1, 2, 2)
+    deformation = np.eye(2) + first.mesh.nodal_gradient(displacement)
+    covariance = deformation @ adjugate @ deformation.swapaxes(1, 2)
+    scale = np.sqrt(np.maximum(covariance[:, 0, 0] * covariance[:, 1, 1], 0))
+    return np.asarray(np.divide(covariance[:, 0, 1], scale, out=np.zeros_like(scale), where=scale > 0))
 
 
 def _single(values: FloatArray) -> FloatArray:
@@ -303,4 +333,5 @@ def _residual(
     own = (np.nan_to_num(rigid) @ functions.T).reshape(len(rigid), *displacement.shape)
     motion = list(np.nan_to_num(displacement) + own)
     known = np.asarray(found[reference.mesh.elements].all(axis=1))
-    return Residual.at(reference, deformed, motion), known
+    filtered = reference.filtered_as(np.nan_to_num(displacement))
+    return Residual.at(filtered, deformed, motion), known

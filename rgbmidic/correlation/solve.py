@@ -226,12 +226,12 @@ def _passes(
         reached = max(tolerance, problem.constants.first_pass) if number == 0 else tolerance
         estimate = iterate(problem, equations, weighting.residual, estimate, reached)
         weighting = next_weighting(problem, weighting, equations, estimate, number)
-        if (
-            number == 0
-            and (found := settled_gradient(weighting.residual, weighting.weights())) is not problem.reference
-        ):
-            problem, equations = replace(problem, reference=found), None
-            weighting = replace(weighting, residual=replace(weighting.residual, reference=found))
+        if number == 0:
+            found = settled_gradient(weighting.residual, weighting.weights()).filtered_as(estimate.displacement)
+            if found is not problem.reference:
+                same, problem = found.values is problem.reference.values, replace(problem, reference=found)
+                residual = replace(weighting.residual, reference=found) if same else compare(problem, estimate)
+                weighting, equations = replace(weighting, residual=residual), None
     assert equations is not None
     if estimate.longest > tolerance:
         estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
@@ -314,7 +314,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
     if weighting.precision is not None:
         lights = BlockTable.of_lights(residual, equations.weights, problem.constants.block)
         bias, bias_std = light_bias(lights, equations)
-    sensitivity = table.sensitivity(mesh.nodes) * equations.inverse_stretch(mesh, fitted)
+    sensitivity = table.sensitivity(mesh.nodes)
     scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
     fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale
     field = recovery.field(*fitted.T)

@@ -28,7 +28,7 @@ from rgbmidic.correlation.solve import solve
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import each
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -314,6 +314,38 @@ def find_start(reference: Reference, deformed: Deformed) -> FoundStart:
     return max(Search().starts(reference, deformed), key=lambda found: found.confidence, default=rest)
 
 
+def nodal_slopes(
+    mesh: Tri3Mesh, displacement: FloatArray, measured: BoolArray, constants: SolverConstants = USUAL
+) -> tuple[FloatArray, IntArray]:
+    """Average the displacement gradient of the intact elements around each node, or around the nearest that has some.
+
+    Parameters
+    ----------
+    mesh
+        N nodes, E elements.
+    displacement : ndarray, shape (N, 2)
+        px; of nodes that are not measured it may be NaN.
+    measured : ndarray, shape (N,), bool
+        Which of them are measured.
+    constants
+        Of the solve.
+
+    Returns
+    -------
+    tuple of ndarray
+        The gradient (N, 2, 2), and the node (N,) that it is from.
+    """
+    known = np.where(measured[:, None], displacement, 0.0)
+    gradient = mesh.element_gradient(known)
+    intact = measured[mesh.elements].all(axis=1) & ~torn_elements(mesh, known, constants)
+    weight = np.where(intact, mesh.areas, 0.0)
+    around = mesh.to_nodes(weight)
+    nearest = mesh.nearest_nodes(measured & (around > 0) if intact.any() else measured)[1]
+    parts = [mesh.to_nodes(weight * part) for part in gradient.reshape(-1, 4).T]
+    slope = np.stack(parts, axis=1) / np.maximum(around, 1e-300)[:, None]
+    return slope.reshape(-1, 2, 2)[nearest], nearest
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
     """Initial guess of a frame, and the references so far.
@@ -360,14 +392,7 @@ class Start:
         """
         if not measured.any():
             return self
-        known = np.where(measured[:, None], displacement, 0.0)
-        gradient = mesh.element_gradient(known)
-        intact = measured[mesh.elements].all(axis=1) & ~torn_elements(mesh, known, constants)
-        weight = np.where(intact, mesh.areas, 0.0)
-        around = mesh.to_nodes(weight)
-        nearest = mesh.nearest_nodes(measured & (around > 0) if intact.any() else measured)[1]
-        parts = [mesh.to_nodes(weight * part) for part in gradient.reshape(-1, 4).T]
-        slope = (np.stack(parts, axis=1) / np.maximum(around, 1e-300)[:, None]).reshape(-1, 2, 2)[nearest]
+        slope, nearest = nodal_slopes(mesh, displacement, measured, constants)
         beyond = displacement[nearest] + np.einsum("nij,nj->ni", slope, mesh.nodes - mesh.nodes[nearest])
         filled = np.where(measured[:, None], displacement, beyond)
         return replace(self, displacement=filled, unmeasured=float((~measured).mean()))

@@ -118,13 +118,13 @@ def _axis_ratios(table: BlockTable, effect: FloatArray, texture: FloatArray) -> 
     return np.stack([along_x / fraction, along_y / (1 - fraction)])
 
 
-def _in_reference_axes(functional: Functional, rotation: FloatArray) -> Functional:
-    """Return a quantity linear in the displacement as one of the motion in axes that turn with the surface."""
+def _in_reference_axes(functional: Functional, deformation: FloatArray) -> Functional:
+    """Return a quantity linear in the displacement as one of the motion in axes that follow the surface."""
     parts = [part for part in functional if part is not None]  # of one structure
     axes = [axis for axis, part in enumerate(functional) if part is not None]
     along_x, along_y = (
         with_data(parts[0], sum(part.data * row[axis][part.indices] for part, axis in zip(parts, axes, strict=True)))
-        for row in rotation.T
+        for row in deformation.T
     )
     return along_x, along_y
 
@@ -215,7 +215,7 @@ def standard_uncertainty(
     if recovery is not None:
         inner = textured & ~reference.mesh.adjacent_nodes(~textured)
         asked += [(one, inner) for one in recovery.strain_functionals]
-    asked = [(_in_reference_axes(functional, equations.rotation), nodes) for functional, nodes in asked]
+    asked = [(_in_reference_axes(functional, equations.deformation), nodes) for functional, nodes in asked]
     std = _probed_std(equations, score_covariance(table, equations.blocks), reference, asked)
     if equations.rigid is not None:
         rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in asked])

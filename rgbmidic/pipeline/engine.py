@@ -96,7 +96,7 @@ class Schedule:
         while self._ready or running:
             while self._ready and len(running) < workers.slots:
                 place, start = self._next(workers.slots)
-                updated = self._sink.updated(start.reference_updates[-2:])  # all that the reference depends on
+                updated = self._sink.updated(start.reference_updates[-1:])  # all that the reference depends on
                 # a key frame looks for what has been lost; frames between key frames follow what there is
                 own = replace(start, unmeasured=0.0) if is_key(place) else start
                 running[workers.submit(self._plan.series.selected[place], own, updated)] = place, start

@@ -63,7 +63,7 @@ class Measured:
 
 
 Updated = Sequence[tuple[int, Solution]] | ReferenceUpdate
-"""Index and solution of the last two frames that became the reference, all that it depends on; or the reference."""
+"""Index and solution of the last frame that became the reference, all that it depends on; or the reference."""
 
 
 def measure_frame(plan: Plan, index: int, start: Start, updated: Updated = ()) -> FrameRecord:
@@ -81,8 +81,8 @@ def measure_frame(plan: Plan, index: int, start: Start, updated: Updated = ()) -
     start
         From where its displacement is looked for; a frame of the reference starts from rest.
     updated
-        Index and solution of the last two of ``start.reference_updates``: all that the reference they make depends on;
-        or that reference.
+        Index and solution of the last of ``start.reference_updates``, all that the reference depends on; or that
+        reference.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def attempt(plan: Plan, index: int, start: Start, updated: Updated = ()) -> Meas
 
 
 def _reference_of(plan: Plan, updated: Updated) -> ReferenceUpdate:
-    """The reference that updates make in turn."""
+    """The reference that an update makes; the first without."""
     if isinstance(updated, ReferenceUpdate):
         return updated
 

@@ -329,11 +329,10 @@ class _Live:
         for text in messages(record.values):
             logger.warning("state %d: %s", place, text)
         self._starts[place] = after
-        if (frames := after.reference_updates)[-2:] not in self._updates:
-            before = self._updates[frames[:-1][-2:]]
-            self._updates[frames[-2:]] = next_reference(plan, before, plan.series.selected[place], self.solution)
+        if (last := after.reference_updates[-1:]) not in self._updates:
+            self._updates[last] = next_reference(plan, self._updates[()], plan.series.selected[place], self.solution)
         # a later state starts from this one, from the first, or from the last at a multiple of a power of STRIDE
         needed = {place // STRIDE**power * STRIDE**power for power in range(20)}
         self._starts = {one: start for one, start in self._starts.items() if one in needed}
-        kept = {(), *(start.reference_updates[-2:] for start in self._starts.values())}
+        kept = {(), *(start.reference_updates[-1:] for start in self._starts.values())}
         self._updates = {frames: one for frames, one in self._updates.items() if frames in kept}

@@ -22,7 +22,7 @@ AFFINE_RMS = 9.5e-4
 STRAIN = 4e-5
 """rms error of the strain at the nodes, no noise: up to 2.8e-5."""
 STRAIN_BIAS = 2.7e-6
-"""Mean error of the strain at the nodes, no noise: up to 1.8e-6."""
+"""Mean error of the strain at the nodes, no noise, rms over five textures: up to 1.8e-6."""
 NOISE = 0.02
 """Standard deviation in px of u and v of one light, noise of 8 % of the contrast: .0160 with the default prefilter."""
 ROOT_OF_LIGHTS = 0.015
@@ -88,13 +88,14 @@ def test_strain_and_rotation_are_recovered(strain, degrees, prefilter):
     assert rms(error(found, motion)) <= AFFINE_RMS
 
 
-def test_the_strain_of_a_stretch_is_that_stretch_and_of_a_rigid_motion_none():
-    for stretch in (0.0, 0.01):
-        motion = Affine(shift=(0.4, 0.3), gradient=((1 + stretch, 0.002), (0.0, 1 - stretch / 3)))
-        found = correlate(reference_image(), texture().image(SHAPE, motion), region=REGION)
-        truth = np.broadcast_to((stretch, -stretch / 3, 0.001), found.strain.shape)
-        assert np.abs((found.strain - truth).mean(axis=0)).max() <= STRAIN_BIAS
-        assert rms(found.strain - truth) <= STRAIN
+@pytest.mark.parametrize("stretch", [0.0, 0.01])
+def test_the_strain_of_a_stretch_is_that_stretch_and_of_a_rigid_motion_none(stretch):
+    motion = Affine(shift=(0.4, 0.3), gradient=((1 + stretch, 0.002), (0.0, 1 - stretch / 3)))
+    pairs = [(one.image(SHAPE), one.image(SHAPE, motion)) for one in map(texture, range(5))]
+    strains = np.array([correlate(*pair, region=REGION).strain for pair in pairs])
+    errors = strains - (stretch, -stretch / 3, 0.001)
+    assert rms(errors.mean(axis=1)) <= STRAIN_BIAS
+    assert rms(errors) <= STRAIN
 
 
 DRAWS = 40

@@ -232,6 +232,26 @@ def less_curved(case, carried, bend):
     return out
 
 
+@pytest.mark.parametrize("outlined", [False, True])
+def test_second_derivatives_at_the_owned_pixels_equal_the_naive_twin(outlined):
+    case = scene(13, outlined=outlined)
+    out, expected = case.reference[None].copy(), case.reference.astype(np.float64)
+    factors = case.random.normal(size=(len(case.mesh.elements), 3)).astype(np.float32)
+    bounds = case.image[2:29, 3:35]  # of which some owned pixels are the edge
+    places = zip(case.pixels.rows - 2, case.pixels.columns - 3, strict=True)
+    element = np.repeat(np.arange(len(factors)), np.diff(case.pixels.offsets))
+    for slot, (row, column) in enumerate(places):
+        if 0 < row < len(bounds) - 1 and 0 < column < bounds.shape[1] - 1:
+            around = bounds[row - 1 : row + 2, column - 1 : column + 2].astype(np.float64)
+            xx, yy = (line @ (1, -2, 1) for line in (around[1], around[:, 1]))
+            xy = (around[0, 0] - around[0, 2] - around[2, 0] + around[2, 2]) / 4
+            expected[slot] += factors[element[slot]] @ (xx, xy, yy)
+    top, left = case.pixels.bounds[:2]
+    place = case.pixels.lines, case.pixels.run_offsets, top - 2, left - 3
+    owned_pixels.add_second_derivatives(factors, np.ascontiguousarray(bounds[None]), *place, out)
+    close(out[0], expected)
+
+
 def all_outputs():
     """What every parallel kernel writes."""
     case = scene(11, "over the edge", shape=(151, 173))
@@ -246,7 +266,10 @@ def all_outputs():
     owned_pixels.interpolate_nodal(case.displacement, case.mesh.elements, *case.on_map, case.pixels.barycentric, fields)
     curved = less_curved(case, case.displacement, case.random.normal(size=(len(case.mesh.nodes), 2, 3)))
     blocks = block_products(case, np.ones(case.pixels.grid(7), dtype=np.float32), 7, 2)
-    found = hessian, difference, weights, moments, squares, sums, vector, fields, curved, blocks
+    second, factors = case.reference[None].copy(), case.random.normal(size=(elements, 3)).astype(np.float32)
+    place = case.pixels.lines, case.pixels.run_offsets, *case.pixels.bounds[:2]
+    owned_pixels.add_second_derivatives(factors, case.image[None], *place, second)
+    found = hessian, difference, weights, moments, squares, sums, vector, fields, curved, blocks, second
     return [case.coefficients, *found]
 
 

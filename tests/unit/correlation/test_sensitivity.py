@@ -25,7 +25,7 @@ def noisy(image, seed):
 
 @pytest.mark.parametrize(("contrast", "strain"), [(1.0, 0.0), (0.5, 0.0), (1.0, 0.1)])
 def test_the_sensitivity_is_the_contrast_that_the_deformed_image_has_left(contrast, strain):
-    """A texture that is stretched has smaller gradients: by the mean of both directions."""
+    """A stretch is none: gradients count on the reference."""
     texture, motion = Texture.random(4), Affine(shift=(0.3, -0.2), gradient=((1 + strain, 0), (0, 1)))
     images = texture.image(SHAPE), contrast * texture.image(SHAPE, motion)
     region = Region.from_rectangle((10, 10, 119, 139), SHAPE)
@@ -39,10 +39,8 @@ def test_the_sensitivity_is_the_contrast_that_the_deformed_image_has_left(contra
     )
     estimate = Estimate(displacement=motion.displacement(mesh.nodes, SHAPE), rigid=np.zeros((1, 0)))
     residual = compare(problem, estimate)
-    equations = Equations.build(reference, residual.weights, functions, estimate.displacement)
     found = BlockTable.of_all(residual, residual.weights).sensitivity(mesh.nodes)
     np.testing.assert_allclose(found, contrast, atol=0.02)
-    np.testing.assert_allclose(equations.inverse_stretch(mesh, estimate.displacement), (1 + 1 / (1 + strain)) / 2)
 
 
 @pytest.mark.parametrize("contrast", [0.5, 2.0])
