@@ -173,7 +173,7 @@ def reconstruct(
             learnt = learn_texture(gather(learnt), model)
             moments = gather(learnt)
     factors = colour_factors(moments, learnt, model)
-    displacement = light_displacement(moments, factors, learnt)
+    displacement = light_displacement(moments, factors, learnt, model)
     glints = displacement.significant
     if learnt.specific >= COLOURED:
         # a coloured specimen has no texture in common that could tell how the channels see the lights
