@@ -25,6 +25,7 @@ from rgbmidic.correlation.assembly import Assembly, rigid_functions
 from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
 from rgbmidic.correlation.images import apply_prefilter
+from rgbmidic.correlation.light_bias import settled_gradient
 from rgbmidic.correlation.one_sided_fit import at_free_boundary, one_sided_difference
 from rgbmidic.correlation.recovery import Recovery, angle_fraction, quadratic_fit
 from rgbmidic.correlation.reference import Deformed, Reference
@@ -170,17 +171,22 @@ def _finer_field(
     first = compare(problem, estimate)
     children = np.repeat(used, len(_CHILDREN))
     given = first.weights * np.repeat(children, np.diff(fine.pixels.offsets))
-    equations, _ = _weighed(method, first, given, start)
+    weights, _ = _weighed(method, first, given)
+    fine = settled_gradient(first, weights)
+    problem, first = replace(problem, reference=fine), replace(first, reference=fine)
+    without, noise = np.zeros((start.size, 0)), None if method is None else given  # without rigid functions
+    equations = Equations.build(fine, weights, without, start, noise)
     estimate = stepped(problem, equations, first.brightness, estimate, first.difference)
     last = compare(problem, estimate)
-    equations, loss = _weighed(method, last, given, start)
+    weights, loss = _weighed(method, last, given)
+    equations = Equations.build(fine, weights, without, start, noise)
     # a robust loss bends less than the weights of one residual state: with these alone noise is followed too little
-    rest = loss[:, None] * equations.solve(_right_side(fine, equations.weights, last.difference)).reshape(-1, 2)
+    rest = loss * equations.solve(_right_side(fine, equations.weights, last.difference)).reshape(-1, 2)
     last = replace(last, difference=_left(fine, last.difference, rest).difference)
     found = estimate.displacement + equations.turned(rest)
     recovery = halves.recovery(children & equations.textured[fine.mesh.elements].all(axis=1), equations)
     straight = halves.straightened(last, equations, recovery, found)
-    variance = _score_variance(straight, equations.weights) * (loss[:, None] ** 2)
+    variance = _score_variance(straight, equations.weights) * loss**2
     known = (equations.textured & ~fine.mesh.adjacent_nodes(~equations.textured))[:count]
     return np.where(known[:, None], recovery.field(*found.T), np.nan), variance[:count], equations.deformation[:count]
 
@@ -192,16 +198,14 @@ def _right_side(reference: Reference, weights: FloatImage, difference: FloatImag
 
 
 def _weighed(
-    method: PrecisionMethod | None, residual: Residual, given: FloatImage, start: FloatArray
-) -> tuple[Equations, FloatArray]:
-    """Equations with weights by the residual's precision, and the factor (N,) by which the robust loss bends less."""
-    reference, weights, loss = residual.reference, given, np.ones(len(start))
+    method: PrecisionMethod | None, residual: Residual, given: FloatImage
+) -> tuple[FloatImage, FloatArray | float]:
+    """Weights by the residual's precision, and the factor (N, 1) by which the robust loss bends less."""
     precision = None if method is None else method.precision(residual)
-    if precision is not None:
-        weights = given * precision.factor
-        loss = precision.robust_loss(reference, weights)
-    without = np.zeros((start.size, 0))  # rigid functions
-    return Equations.build(reference, weights, without, start, None if method is None else given), loss
+    if precision is None:
+        return given, 1.0
+    weights = given * precision.factor
+    return weights, precision.robust_loss(residual.reference, weights)[:, None]
 
 
 def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:

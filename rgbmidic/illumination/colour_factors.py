@@ -35,6 +35,7 @@ MEAN_WIDTH, MOMENT_WIDTH = 8.0, 14.0
 """Standard deviation (px) of the windows over which means and moments are taken: several speckles wide."""
 LEAST = 0.001
 """Least channel-specific variance: how well two colours can agree."""
+_BETWEEN = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 EQUALLY_APART = 0.2
 """Range (px) of the lights' displacement within the squares whose products of samples are taken together."""
 
@@ -230,7 +231,12 @@ def local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
     sums = np.empty((8, *(-(-side // MEAN_BLOCK) for side in values.shape)), dtype=np.float32)
     kernels.block_sums(values, MEAN_BLOCK, sums)
     order = list(_planes(red))
-    return _smooth(sums[:4][order], sums[4:][order], MEAN_WIDTH / MEAN_BLOCK)
+    means = _smooth(sums[:4][order], sums[4:][order], MEAN_WIDTH / MEAN_BLOCK)
+    for plane, mean in zip(order, means, strict=True):  # from the middle of a site's samples to that of the block
+        row, column = np.array(divmod(plane, 2)) - 0.5
+        there = np.array([[1, 0, -column / MEAN_BLOCK], [0, 1, -row / MEAN_BLOCK]])
+        mean[:] = cv2.warpAffine(mean, there, mean.shape[::-1], flags=_BETWEEN, borderMode=cv2.BORDER_REPLICATE)
+    return means
 
 
 def _planes(red: tuple[int, int]) -> tuple[int, int, int, int]:

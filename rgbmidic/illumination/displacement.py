@@ -14,14 +14,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from rgbmidic._kernels.texture import CELLS, displacement_scores
-from rgbmidic.illumination.colour_factors import ColourFactors, Moments, blurred, widened
+from rgbmidic.illumination.colour_factors import ColourFactors, Moments, widened
 from rgbmidic.illumination.images import frame_geometry, registration_basis
-from rgbmidic.illumination.mosaic_model import BLOCK, FAINTEST
+from rgbmidic.illumination.mosaic_model import BLOCK, FAINTEST, MosaicModel
 from rgbmidic.illumination.texture import TextureModel
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 SIZE, REACH = 5, 8
 """Side of the square of samples of a prediction, px; rows and columns over which predictions are correlated."""
@@ -48,11 +49,13 @@ class LightDisplacement:
 
     @property
     def significant(self) -> FloatArray:
-        """The displacement shrunk towards 0 by what chance explains of it (James and Stein 1961), (k, 2, h, w)."""
-        most = 1.25  # standard deviations that chance may make in each direction
-        chance = 2 * most**2 * (self.std**2).sum(axis=0)
-        gain = 1 - chance / np.maximum((self.values**2).sum(axis=(0, 1)), 1e-12)
-        return np.asarray(self.values * np.maximum(gain, 0))
+        """The displacement shrunk by what chance explains of it, (k, 2, h, w).
+
+        Empirical Bayes (Efron and Morris 1973): how far glints displace the lights is known from the whole frame.
+        """
+        chance, square = (self.std**2).mean(axis=0), (self.values**2).mean(axis=(0, 1))
+        glints = max(float(np.average(square - chance, weights=chance**-2)), 0.0)
+        return np.asarray(self.values * (glints / (glints + chance)))
 
     @property
     def without_glints(self) -> LightDisplacement:
@@ -141,13 +144,13 @@ def agreement(
 
 
 def light_displacement(
-    moments: Moments, factors: ColourFactors, texture: TextureModel, *, window: float = WINDOW
+    moments: Moments, factors: ColourFactors, texture: TextureModel, model: MosaicModel, *, window: float = WINDOW
 ) -> LightDisplacement:
     """Displacement of the lights' textures against each other, beyond their registration.
 
     Parameters
     ----------
-    moments, factors, texture
+    moments, factors, texture, model
         Of the mosaic.
     window
         Standard deviation (px) of the window in which a displacement is taken.
@@ -163,14 +166,30 @@ def light_displacement(
     sums = np.empty((count, 3, *slope.shape[1:]), dtype=np.float32)
     displacement_scores(moments.lights, scale, CELLS, sums)
     blocks = window / BLOCK
-    around = np.array([[blurred(grid, blocks) for grid in one] for one in sums], dtype=np.float64)
+    around = np.array([[_window_sums(grid, blocks) for grid in one] for one in sums], dtype=np.float64)
     information = around[:, 2:] + 1e-12
     found = around[:, :2] / information
     # by the scatter of the blocks' scores, which are nearly independent
     scatter = ((sums[:, :2] - found * sums[:, 2:]) ** 2).mean(axis=1).astype(np.float32)
-    chance = np.array([blurred(grid, blocks / np.sqrt(2)) for grid in scatter]) / (4 * np.pi * blocks**2)
+    chance = np.array([_window_sums(grid, blocks / np.sqrt(2)) for grid in scatter]) / (4 * np.pi * blocks**2)
     # cells of 2 px; a light against the mean of all, not of the others
     unit = 2 / texture.gradient_gain * (count - 1) / count
     std = unit * np.sqrt(np.maximum(chance, 1e-12)) / information[:, 0]
+    found = unit * found - _at_rest(moments.red, factors, texture, model)[:, :, None, None]
     # a single light lies at the mean of all, exactly
-    return LightDisplacement(values=unit * (found - found.mean(axis=0)), std=np.maximum(std, LEAST_STD))
+    return LightDisplacement(values=found - found.mean(axis=0), std=np.maximum(std, LEAST_STD))
+
+
+def _window_sums(grid: FloatImage, sigma: float) -> FloatImage:
+    return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT))
+
+
+def _at_rest(red: tuple[int, int], factors: ColourFactors, texture: TextureModel, model: MosaicModel) -> FloatArray:
+    """Displacement (k, 2) that lights at one place show, px: that of the planes of the sites that see them."""
+    slope = np.median(factors.light_slope, axis=(1, 2))
+    slope = np.maximum(slope, FAINTEST * slope.max())
+    fraction = np.linalg.pinv(model.sites) * (model.sites @ slope) / slope[:, None]
+    row, column = red
+    # column and row in the cell of red, of green in red and in blue rows, and of blue
+    odd = np.array([[column, row], [1 - column, row], [column, 1 - row], [1 - column, 1 - row]])
+    return np.asarray(texture.plane_displacement * (fraction @ (1 - 2 * odd)))

@@ -131,6 +131,18 @@ class TextureModel:
         return float(-20 * (ends[1] - ends[0]) / (whole[0] - whole[1]))
 
     @cached_property
+    def plane_displacement(self) -> float:
+        """Displacement (px) that the low-passed plane of the samples in even columns, or rows, shows at rest.
+
+        That of odd ones shows it with the other sign: each has three of the six weights of the binomial.
+        """
+        weights = np.asarray(self.weights)
+        apart = _line(self.widths, 0, 1, [2.0, -2.0]) * (_line(self.widths, 0, 0) + _line(self.widths, 1, 1))[:, None]
+        near, far = weights @ _plane_moments(self.widths, np.array([1.9, 2.1]))
+        ahead, behind = weights @ apart / 2
+        return float((ahead - behind) / (20 * (near - far)))
+
+    @cached_property
     def band(self) -> BandEnergy:
         """Second moments of the low-passed planes of a Bayer mosaic for this texture."""
         return BandEnergy(*(np.asarray(self.weights) @ _band_energies(self.widths) + self.offset).tolist())

@@ -8,12 +8,18 @@ from scipy.ndimage import shift
 from rgbmidic._kernels.texture import displacement_scores
 from rgbmidic.illumination.colour_factors import enlarged, widened
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.displacement import agreement
+from rgbmidic.illumination.displacement import LightDisplacement, agreement
 from rgbmidic.illumination.separation import separate
 
 SHAPE = (192, 192)
 MEAN = np.array([1500, 2000, 1100])[:, None, None]
 INSIDE = np.s_[:, 24:-24, 24:-24]
+LOW, HIGH = 0.85, 1.25
+"""Displacement over its standard uncertainty (1.10)."""
+AT_REST = 0.003
+"""px, mean displacement of lights at one place, of 12 draws (.0008)."""
+BY_CHANCE = 0.1
+"""Part of the variance that chance makes which the separation takes for glints (.033)."""
 
 
 def lights_displaced(by, **options):
@@ -32,12 +38,26 @@ def test_displacement_is_found_through_crosstalk_noise_and_mosaic(by):
 
 def test_uncertainty_is_that_of_the_draws():
     """Of textures at one place: their displacement over its standard uncertainty, 12 speckles and noises."""
-    ratios = []
+    ratios, means, taken = [], [], []
     for seed in range(12):
         mosaic = scenes.mosaic_of(lights_displaced([(0, 0)] * 3, seed=seed), seed=seed)
         found = separate(mosaic, scenes.CROSSTALK).displacement
-        ratios.append((found.values / found.std[:, None])[:, :, 4:-4, 4:-4])
-    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+        ratios.append(found.values / found.std[:, None])
+        means.append(found.values.mean(axis=(2, 3)))
+        taken.append((found.significant**2).mean() / (found.values**2).mean())
+    assert LOW < np.sqrt(np.mean(np.square(ratios))) < HIGH
+    assert np.abs(np.mean(means, axis=0)).max() < AT_REST
+    assert np.mean(taken) < BY_CHANCE
+
+
+def test_what_most_of_a_frame_shows_is_taken_and_what_chance_shows_is_not():
+    random = np.random.default_rng(0)
+    std, glints = np.full((3, 30, 30), 0.01), random.normal(0, 0.05, (3, 2, 30, 30))
+    noise = random.normal(0, 0.01, glints.shape)
+    taken = LightDisplacement(values=glints + noise, std=std).significant
+    assert ((taken - glints) ** 2).mean() < (noise**2).mean()  # better than what was measured
+    np.testing.assert_allclose(taken, glints, atol=0.06)
+    assert (LightDisplacement(values=noise, std=std).significant ** 2).mean() < 0.1 * (noise**2).mean()
 
 
 def test_displaced_lights_do_not_pull_the_others():
