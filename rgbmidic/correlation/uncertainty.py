@@ -255,7 +255,7 @@ def beyond_chance(
     """
     reference = table.reference
     images = BlockTable.of(reference, table.side, [(residual.difference, weights, *reference.texture.images)])
-    chance = np.mean(reference.unfitted) * table.typical_ratio((images.sums - table.sums[:, :4])[0, :2])
+    chance = np.nan_to_num(reference.unfitted).mean() * table.typical_ratio((images.sums - table.sums[:, :4])[0, :2])
     square = ((step[:, :2] / np.maximum(std[:, :2], 1e-30)) ** 2).mean(axis=1)
     excess = 1 - chance / np.maximum(square, 1e-30)
     return np.asarray(step * np.sqrt(np.maximum(excess, 0))[:, None])
