@@ -17,7 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.threads import aside
-from rgbmidic.correlation import Deformed, Reference, Solution, Start, discretisation_error, fill, track
+from rgbmidic.correlation import (
+    Deformed,
+    Reference,
+    Solution,
+    Start,
+    discretisation_error,
+    fill,
+    track,
+    with_one_sided_error,
+)
 from rgbmidic.correlation.images import as_light_stack, unmasked
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import PrecisionMethod
@@ -131,6 +140,8 @@ def correlate(
         logger.warning("%s", solution.disagreement)
     if mesh_error:
         solution = discretisation_error(first, second.result(), solution, solver, method)
+    else:
+        solution = with_one_sided_error(mesh, solution)
     return fill(mesh, solution, solver.fill) if solver.fill else solution
 
 
