@@ -20,8 +20,7 @@ from rgbmidic.correlation.recovery import Recovery, angle_fraction
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys
-from rgbmidic.mesh.tri3 import with_data
-from rgbmidic.typing import BoolArray, FloatArray
+from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 _POWERS = np.array([(i, n - i) for n in range(4) for i in range(n, -1, -1)])
 _WIDTH = 0.8
@@ -30,12 +29,19 @@ twentieth of the displacement's instead of a fifth, but find half of the error i
 _FACTOR = 1.2
 """Error over what the cubic makes of it: 1.03 to 1.3 in waves of 15 to 6 elements, 1.5 at 4, for values and slopes, at
 straight and round edges and at holes (without noise)."""
+_ROUGH = (0.0, 0.0), (0.27, 0.8), (2.1, 7.5)
+"""Error of values, and of slopes times the side of an element, over `_Missed.apart` at a concave boundary: elsewhere,
+beside and at it. At the rim of a hole in tension strain falls off within an element or two, which no order of
+polynomials follows: 1.6 to 2.9 and 6 to 9, beside it 0.17 to 0.4 and 0.6 to 1, elements of 0.08 to 0.3 of its diameter."""
+_SURE = 2.5
+"""Mean square at concave boundaries over that by independent noise, from which it is not taken for noise: noise alone
+has 0.4 (derived)."""
 _NOISE = 1.2
 """Variance of the noise of an operator over that of independent nodes: 1.0 to 1.4 (derived on such meshes)."""
 
 
 def at_free_boundary(mesh: Tri3Mesh, used: BoolArray | None = None) -> BoolArray:
-    """Nodes (N,) on the boundary of `used` elements (E,), and those less than a quarter of an element from its edges."""
+    """Nodes (N,) on the boundary of `used` elements (E,), and those within a quarter of an element of it."""
     elements, areas = (mesh.elements, mesh.areas) if used is None else (mesh.elements[used], mesh.areas[used])
     sides = elements[:, EDGES]
     keys = edge_keys(sides.reshape(-1, 2), len(mesh.nodes))
@@ -89,16 +95,29 @@ def _of_cubics(mesh: Tri3Mesh, operator: sp.csr_matrix) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Missed:
-    """Operators (N, N) from recovered displacements to what their values and slopes miss, and a mean over places.
+    """Operators (N, N) from recovered displacements to what they miss.
 
-    Rows of nodes that are not near the boundary are empty. The mean is that over nodes up to two edges away, those at
-    the boundary and those beside it apart.
+    Attributes
+    ----------
+    value, slope_x, slope_y
+        What values and slopes miss of a cubic, at nodes near the boundary; other rows are empty.
+    apart
+        Value of a cubic through the recovered displacements, less these, at concave boundaries.
+    along
+        Mean over the nodes up to two edges away, those at the boundary and those beside it apart.
+    of_concave
+        Mean over the nodes of `apart` up to two edges away.
+    rough : ndarray, shape (N, 2)
+        See `_ROUGH`.
     """
 
     value: sp.csr_matrix
     slope_x: sp.csr_matrix
     slope_y: sp.csr_matrix
-    around: sp.csr_matrix
+    apart: sp.csr_matrix
+    along: sp.csr_matrix
+    of_concave: sp.csr_matrix
+    rough: FloatArray
 
 
 @lru_cache(maxsize=2)  # of a mesh with data everywhere, and of the last frame
@@ -121,22 +140,46 @@ def _missed(mesh: Tri3Mesh, used: bytes) -> _Missed:
     size = mesh.sizes[nodes, None]
     x, y = ((axis[other] - axis[nodes, None]) / size for axis in mesh.nodes.T)
     basis = np.stack([x**i * y**j for i, j in _POWERS], axis=1)
+    angle = angle_fraction(mesh, elements)[nodes, None]
+    weight = np.where(has_node, np.exp(-(x**2 + y**2) * angle / (2 * _WIDTH**2)), 0)[:, None]
+    is_concave = edge[nodes, None] & (angle > 0.52)
+    apart = np.where(is_concave, _fitted(weight, basis)[:, 0] - (other == nodes[:, None]), 0)
     basis[:, 6:] += np.moveaxis(of_cubics[0][other], -1, 1) / size[:, None] ** 3
-    square = (x**2 + y**2) * angle_fraction(mesh, elements)[nodes, None]
-    weighted = np.where(has_node, np.exp(-square / (2 * _WIDTH**2)), 0)[:, None] * basis
+    third = _fitted(weight, basis)[:, 6:] / size[:, None] ** 3
+    places = np.repeat(nodes, number), reach.indices
+    parts = [np.einsum("nt,ntw->nw", one[nodes], third) for one in of_cubics]
+    value, slope_x, slope_y, apart = (
+        sp.csr_matrix((part[has_node], places), shape=(count, count)) for part in (*parts, apart)
+    )
+    apart.eliminate_zeros()
+    near = edge.astype(np.intp)
+    near[nodes] += 1  # 2 at the boundary, 1 beside it
+    rows, columns = sp.csr_matrix(beside @ beside).nonzero()
+    alike = (near[rows] == near[columns]) & (near[rows] > 0)
+    has_apart = np.diff(apart.indptr) > 0
+    return _Missed(
+        value=value,
+        slope_x=slope_x,
+        slope_y=slope_y,
+        apart=apart,
+        along=_mean(rows[alike], columns[alike], count),
+        of_concave=_mean(*(part[has_apart[columns] & (near[rows] > 0)] for part in (rows, columns)), count),
+        rough=np.array(_ROUGH)[near],
+    )
+
+
+def _mean(rows: IntArray, columns: IntArray, count: int) -> sp.csr_matrix:
+    """Average over the columns of each row."""
+    number = np.bincount(rows, minlength=count)
+    return sp.csr_matrix((1 / number[rows], (rows, columns)), shape=(count, count))
+
+
+def _fitted(weight: FloatArray, basis: FloatArray) -> FloatArray:
+    """Solve weighted fits (n, terms, W) of a basis (n, terms, W)."""
+    weighted = weight * basis
     normal = weighted @ basis.transpose(0, 2, 1)
     normal += np.diag([0, *[1e-6] * (len(_POWERS) - 1)])  # as of the recovery: 0 where nodes do not determine it
-    third = np.linalg.solve(normal, weighted)[:, 6:] / size[:, None] ** 3
-    places = np.repeat(nodes, number), reach.indices
-    parts = (np.einsum("nt,ntw->nw", one[nodes], third)[has_node] for one in of_cubics)
-    value, slope_x, slope_y = (sp.csr_matrix((part, places), shape=(count, count)) for part in parts)
-    fitted = np.zeros(count, dtype=bool)
-    fitted[nodes] = True
-    alike = fitted[ends[0]] & fitted[ends[1]] & (edge[ends[0]] == edge[ends[1]])
-    along = sp.csr_matrix((np.ones(alike.sum(), dtype=bool), (ends[0][alike], ends[1][alike])), shape=(count, count))
-    near = sp.csr_matrix(along @ along, dtype=np.float64)
-    around = with_data(near, 1 / np.repeat(np.diff(near.indptr), np.diff(near.indptr)))
-    return _Missed(value=value, slope_x=slope_x, slope_y=slope_y, around=around)
+    return np.asarray(np.linalg.solve(normal, weighted))
 
 
 def one_sided_error(mesh: Tri3Mesh, used: BoolArray, displacement: FloatArray, std: FloatArray) -> FloatArray:
@@ -154,19 +197,28 @@ def one_sided_error(mesh: Tri3Mesh, used: BoolArray, displacement: FloatArray, s
     Returns
     -------
     ndarray, shape (N, 5)
-        Error of u, v, exx, eyy, exy as a standard deviation: a mean square over some elements along the boundary, beyond
-        noise. 0 at other nodes.
+        Error of u, v, exx, eyy, exy as a standard deviation: the root of a mean square over some elements
+        along the boundary, beyond noise. 0 at other nodes.
     """
     missed = _missed(mesh, used.tobytes())
-    (u, v), variance = np.nan_to_num(displacement).T, np.nan_to_num(std**2).T
-    half_x, half_y = missed.slope_x / 2, missed.slope_y / 2
-    parts = (missed.value, None), (None, missed.value), (missed.slope_x, None), (None, missed.slope_y), (half_y, half_x)
-    square = []
-    for operators in parts:
-        terms = [(one, *field) for one, *field in zip(operators, (u, v), variance, strict=True) if one is not None]
-        total = sum(one @ values for one, values, _ in terms)
-        square.append(total**2 - _NOISE * sum(one.power(2) @ spread for one, _, spread in terms))
-    return np.asarray(_FACTOR * np.sqrt(np.maximum(missed.around @ np.stack(square, axis=1), 0)))
+    u, v = fields = tuple(zip(np.nan_to_num(displacement).T, np.nan_to_num(std**2).T, strict=True))
+    terms = [[(missed.value, u)], [(missed.value, v)], [(missed.slope_x, u)], [(missed.slope_y, v)]]
+    terms.append([(missed.slope_y / 2, u), (missed.slope_x / 2, v)])
+    square, noise = np.moveaxis([_square_and_noise(missed.along, *one) for one in terms], 0, -1)
+    smooth = _FACTOR * np.sqrt(np.maximum(square - _NOISE * noise, 0))
+    square, noise = np.moveaxis([_square_and_noise(missed.of_concave, (missed.apart, one)) for one in fields], 0, -1)
+    rough = np.sqrt(np.where(square > _SURE * noise, square - noise, 0))
+    slopes = np.column_stack([rough, np.hypot(*rough.T) / 2]) / mesh.sizes[:, None]
+    return np.asarray(np.maximum(smooth, np.column_stack([missed.rough[:, :1] * rough, missed.rough[:, 1:] * slopes])))
+
+
+def _square_and_noise(
+    mean: sp.csr_matrix, *terms: tuple[sp.csr_matrix, tuple[FloatArray, FloatArray]]
+) -> tuple[FloatArray, FloatArray]:
+    """Average the square of a sum of operators on nodal values, and its part by independent noise, (N,) each."""
+    total = np.sum([operator @ values for operator, (values, _) in terms], axis=0)
+    noise = np.sum([operator.power(2) @ variance for operator, (_, variance) in terms], axis=0)
+    return mean @ total**2, mean @ noise
 
 
 def with_one_sided_error(mesh: Tri3Mesh, solution: Solution) -> Solution:
