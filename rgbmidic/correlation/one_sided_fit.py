@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
@@ -20,7 +21,8 @@ from rgbmidic.correlation.recovery import Recovery, angle_fraction
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys
-from rgbmidic.typing import BoolArray, FloatArray, IntArray
+from rgbmidic.mesh.tri3 import with_data
+from rgbmidic.typing import BoolArray, FloatArray
 
 _POWERS = np.array([(i, n - i) for n in range(4) for i in range(n, -1, -1)])
 _WIDTH = 0.8
@@ -32,10 +34,12 @@ straight and round edges and at holes (without noise)."""
 _ROUGH = (0.0, 0.0), (0.27, 0.8), (2.1, 7.5)
 """Error of values, and of slopes times the side of an element, over `_Missed.apart` at a concave boundary: elsewhere,
 beside and at it. At the rim of a hole in tension strain falls off within an element or two, which no order of
-polynomials follows: 1.6 to 2.9 and 6 to 9, beside it 0.17 to 0.4 and 0.6 to 1, elements of 0.08 to 0.3 of its diameter."""
-_SURE = 2.5
-"""Mean square at concave boundaries over that by independent noise, from which it is not taken for noise: noise alone
-has 0.4 (derived)."""
+polynomials follows: 1.6 to 2.9 and 6 to 9, beside it 0.17 to 0.4 and 0.6 to 1 (elements of 0.08 to 0.3 of its
+diameter)."""
+_ROUGH_NOISE = 0.5
+"""Variance of the noise of `_Missed.apart` over that of independent nodes: 0.34 to 0.56 (derived)."""
+_SURE = 1.2
+"""The same from which it is not taken for noise."""
 _NOISE = 1.2
 """Variance of the noise of an operator over that of independent nodes: 1.0 to 1.4 (derived on such meshes)."""
 
@@ -148,27 +152,27 @@ def _missed(mesh: Tri3Mesh, used: bytes) -> _Missed:
     third = _fitted(weight, basis)[:, 6:] / size[:, None] ** 3
     places = np.repeat(nodes, number), reach.indices
     parts = [np.einsum("nt,ntw->nw", one[nodes], third) for one in of_cubics]
-    value, slope_x, slope_y, apart = (
+    value, slope_x, slope_y, rough = (
         sp.csr_matrix((part[has_node], places), shape=(count, count)) for part in (*parts, apart)
     )
-    apart.eliminate_zeros()
+    rough.eliminate_zeros()
     near = edge.astype(np.intp)
     near[nodes] += 1  # 2 at the boundary, 1 beside it
     rows, columns = sp.csr_matrix(beside @ beside).nonzero()
     alike = (near[rows] == near[columns]) & (near[rows] > 0)
-    has_apart = np.diff(apart.indptr) > 0
+    is_rough = (near[rows] > 0) & (np.diff(rough.indptr) > 0)[columns]
     return _Missed(
         value=value,
         slope_x=slope_x,
         slope_y=slope_y,
-        apart=apart,
+        apart=rough,
         along=_mean(rows[alike], columns[alike], count),
-        of_concave=_mean(*(part[has_apart[columns] & (near[rows] > 0)] for part in (rows, columns)), count),
+        of_concave=_mean(rows[is_rough], columns[is_rough], count),
         rough=np.array(_ROUGH)[near],
     )
 
 
-def _mean(rows: IntArray, columns: IntArray, count: int) -> sp.csr_matrix:
+def _mean(rows: npt.NDArray[np.integer], columns: npt.NDArray[np.integer], count: int) -> sp.csr_matrix:
     """Average over the columns of each row."""
     number = np.bincount(rows, minlength=count)
     return sp.csr_matrix((1 / number[rows], (rows, columns)), shape=(count, count))
@@ -202,23 +206,23 @@ def one_sided_error(mesh: Tri3Mesh, used: BoolArray, displacement: FloatArray, s
     """
     missed = _missed(mesh, used.tobytes())
     u, v = fields = tuple(zip(np.nan_to_num(displacement).T, np.nan_to_num(std**2).T, strict=True))
-    terms = [[(missed.value, u)], [(missed.value, v)], [(missed.slope_x, u)], [(missed.slope_y, v)]]
-    terms.append([(missed.slope_y / 2, u), (missed.slope_x / 2, v)])
-    square, noise = np.moveaxis([_square_and_noise(missed.along, *one) for one in terms], 0, -1)
+    half_x, half_y = (with_data(one, one.data / 2) for one in (missed.slope_x, missed.slope_y))
+    alone = ((missed.value, u), (missed.value, v), (missed.slope_x, u), (missed.slope_y, v))
+    parts = [_square_and_noise(missed.along, *terms) for terms in (*zip(alone), ((half_y, u), (half_x, v)))]
+    square, noise = np.stack(parts, axis=-1)
     smooth = _FACTOR * np.sqrt(np.maximum(square - _NOISE * noise, 0))
-    square, noise = np.moveaxis([_square_and_noise(missed.of_concave, (missed.apart, one)) for one in fields], 0, -1)
-    rough = np.sqrt(np.where(square > _SURE * noise, square - noise, 0))
+    square, noise = np.stack([_square_and_noise(missed.of_concave, (missed.apart, one)) for one in fields], axis=-1)
+    rough = np.sqrt(np.where(square > _SURE * noise, square - _ROUGH_NOISE * noise, 0))
     slopes = np.column_stack([rough, np.hypot(*rough.T) / 2]) / mesh.sizes[:, None]
-    return np.asarray(np.maximum(smooth, np.column_stack([missed.rough[:, :1] * rough, missed.rough[:, 1:] * slopes])))
+    of_values, of_slopes = missed.rough.T[:, :, None]
+    return np.asarray(np.maximum(smooth, np.column_stack([of_values * rough, of_slopes * slopes])))
 
 
-def _square_and_noise(
-    mean: sp.csr_matrix, *terms: tuple[sp.csr_matrix, tuple[FloatArray, FloatArray]]
-) -> tuple[FloatArray, FloatArray]:
-    """Average the square of a sum of operators on nodal values, and its part by independent noise, (N,) each."""
+def _square_and_noise(mean: sp.csr_matrix, *terms: tuple[sp.csr_matrix, tuple[FloatArray, FloatArray]]) -> FloatArray:
+    """Average the square of a sum of operators on nodal values, and its part by independent noise, (2, N)."""
     total = np.sum([operator @ values for operator, (values, _) in terms], axis=0)
     noise = np.sum([operator.power(2) @ variance for operator, (_, variance) in terms], axis=0)
-    return mean @ total**2, mean @ noise
+    return np.stack([mean @ total**2, mean @ noise])
 
 
 def with_one_sided_error(mesh: Tri3Mesh, solution: Solution) -> Solution:
