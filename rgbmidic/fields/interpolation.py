@@ -2,7 +2,8 @@
 
 The slope at a node is the mean, by the areas of the elements between, of what the quadratics of the nodes beside it
 (`quadratic_fit`) have there: each node's own has too small a slope where waves are short, those beside it too large a
-one. In an element ``sum phi_a (u_a + slope_a . (x - x_a) / 2)`` over its corners is continuous, linear in the nodal
+one. At an edge, where all of them lie on one side, it is the mean of that and its own, which leaves a tenth to three
+tenths less of the error of waves of 4 to 10 elements beside the edge. In an element ``sum phi_a (u_a + slope_a . (x - x_a) / 2)`` over its corners is continuous, linear in the nodal
 values and exact for quadratic fields; along an edge it is the cubic through values and slopes of both ends.
 """
 
@@ -17,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from rgbmidic.correlation.one_sided_fit import at_free_boundary
 from rgbmidic.correlation.recovery import quadratic_fit
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -359,7 +361,9 @@ def _fits(mesh: Tri3Mesh, has_data: bytes) -> tuple[sp.csr_matrix, ...]:
     around.data /= np.bincount(row, weights=around.data, minlength=count)[row]
     to_x, to_y = (with_data(around, around.data * (axis[row] - axis[around.indices])) for axis in mesh.nodes.T)
     slopes = around @ x + to_x @ xx + to_y @ xy, around @ y + to_x @ xy + to_y @ yy
-    return sp.eye(count, format="csr"), *map(sp.csr_matrix, slopes)
+    its_own = np.where(at_free_boundary(mesh, used), 0.5, 0.0)
+    mixed = (sp.diags(1 - its_own) @ mean + sp.diags(its_own) @ one for mean, one in zip(slopes, (x, y), strict=True))
+    return sp.eye(count, format="csr"), *map(sp.csr_matrix, mixed)
 
 
 def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> FloatImage:
