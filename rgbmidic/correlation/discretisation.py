@@ -24,8 +24,8 @@ from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import Assembly, block_side, rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
 from rgbmidic.correlation.images import apply_prefilter, at_blocks, window_sums
-from rgbmidic.correlation.one_sided_fit import at_free_boundary, one_sided_error
-from rgbmidic.correlation.recovery import Recovery, quadratic_fit
+from rgbmidic.correlation.one_sided_fit import one_sided_error
+from rgbmidic.correlation.recovery import Recovery, at_free_boundary, nodal_slopes
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, corrected_values
 from rgbmidic.correlation.solution import Solution
@@ -266,11 +266,11 @@ class _Halves:
         return total.reshape(2 * count, *sums.shape[1:])
 
     def interpolated(self, nodal: FloatArray, used: BoolArray) -> FloatArray:
-        """Interpolate a displacement (N, 2) between nodes with its second derivatives there."""
+        """Interpolate a displacement (N, 2) at the nodes of the finer mesh, as everywhere between nodes."""
         ends = self.mesh.neighbours
-        second = np.stack([curved @ nodal for curved in quadratic_fit(self.mesh, used)[3:]], axis=-1)[ends].mean(axis=1)
-        x, y = (self.mesh.nodes[ends[:, 1]] - self.mesh.nodes[ends[:, 0]]).T
-        sag = np.einsum("nct,nt->nc", second, np.stack([x * x, 2 * x * y, y * y], axis=1)) / 8
+        slopes = np.stack([one @ nodal for one in nodal_slopes(self.mesh, used)], axis=-1)[ends]
+        arm = self.mesh.nodes[ends[:, 1]] - self.mesh.nodes[ends[:, 0]]
+        sag = np.einsum("ncd,nd->nc", slopes[:, 1] - slopes[:, 0], arm) / 8
         return np.concatenate([nodal, nodal[ends].mean(axis=1) - sag])
 
     def recovery(self, used: BoolArray, equations: Equations) -> Recovery:

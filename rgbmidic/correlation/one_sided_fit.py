@@ -17,10 +17,9 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from rgbmidic.correlation.recovery import Recovery, angle_fraction
+from rgbmidic.correlation.recovery import Recovery, angle_fraction, at_free_boundary
 from rgbmidic.correlation.solution import Solution
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.mesh.outline_mesh import EDGES, edge_keys
 from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray
 
@@ -31,33 +30,17 @@ twentieth of the displacement's instead of a fifth, but find half of the error i
 _FACTOR = 1.3
 """Error over what the cubic makes of it: 1.03 to 1.3 in waves of 15 to 6 elements, 1.5 at 4, for values and slopes, at
 straight and round edges and at holes (without noise)."""
-_ROUGH = (0.0, 0.0), (0.27, 0.8), (2.1, 7.5)
-"""Error of values, and of slopes times the side of an element, over `_Missed.apart` at a concave boundary: elsewhere,
+_DEPARTURE = (0.0, 0.0), (0.27, 0.8), (2.1, 7.5)
+"""Error of values, and of slopes times the side of an element, over `_BoundaryFits.departure` at a concave boundary: elsewhere,
 beside and at it. At the rim of a hole in tension strain falls off within an element or two, which no order of
 polynomials follows: 1.6 to 2.9 and 6 to 9, beside it 0.17 to 0.4 and 0.6 to 1 (elements of 0.08 to 0.3 of its
 diameter)."""
-_ROUGH_NOISE = 0.5
-"""Variance of the noise of `_Missed.apart` over that of independent nodes: 0.34 to 0.56 (derived)."""
+_DEPARTURE_NOISE = 0.5
+"""Variance of the noise of `_BoundaryFits.departure` over that of independent nodes: 0.34 to 0.56 (derived)."""
 _SURE = 1.2
 """The same from which it is not taken for noise."""
 _NOISE = 1.2
 """Variance of the noise of an operator over that of independent nodes: 1.0 to 1.4 (derived on such meshes)."""
-
-
-def at_free_boundary(mesh: Tri3Mesh, used: BoolArray | None = None) -> BoolArray:
-    """Nodes (N,) on the boundary of `used` elements (E,), and those within a quarter of an element of it."""
-    elements, areas = (mesh.elements, mesh.areas) if used is None else (mesh.elements[used], mesh.areas[used])
-    sides = elements[:, EDGES]
-    keys = edge_keys(sides.reshape(-1, 2), len(mesh.nodes))
-    _, index, count = np.unique(keys, return_inverse=True, return_counts=True)
-    is_free = (count[index] == 1).reshape(-1, 3)
-    length = np.linalg.norm(np.diff(mesh.nodes[sides], axis=2)[:, :, 0], axis=2)
-    opposite = np.roll(elements, 1, axis=1)  # edge a joins the corners a and a + 1
-    is_near = 2 * areas[:, None] / length < mesh.sizes[opposite] / 4
-    found = np.zeros(len(mesh.nodes), dtype=bool)
-    found[sides[is_free]] = True
-    found[opposite[is_near & is_free]] = True
-    return found
 
 
 @lru_cache(maxsize=2)
@@ -88,47 +71,49 @@ def _moved(x: FloatArray, y: FloatArray, quadratic: FloatArray, cubic: FloatArra
     return np.stack(moved, axis=-1) + cubic
 
 
-def _of_cubics(mesh: Tri3Mesh, operator: sp.csr_matrix) -> FloatArray:
-    """Apply an operator of a recovery (N, N) to cubics about each node, (N, 4)."""
-    row = np.repeat(np.arange(len(mesh.nodes)), np.diff(operator.indptr))
-    x, y = (mesh.nodes[operator.indices] - mesh.nodes[row]).T
-    fitted = _moved(x, y, mesh.linear_fit_offset[operator.indices], cubic_fit_offset(mesh)[operator.indices])
-    parts = (operator.data[:, None] * fitted).T
-    return np.stack([np.bincount(row, part, len(mesh.nodes)) for part in parts], axis=1)
+def _of_cubics(mesh: Tri3Mesh, operator: sp.csr_matrix, nodes: BoolArray) -> FloatArray:
+    """Apply the rows of some `nodes` (N,) of a recovery's operator (N, N) to cubics about each, (N, 4)."""
+    row = np.repeat(np.arange(len(nodes)), np.diff(operator.indptr))
+    chosen = nodes[row]
+    row, column = row[chosen], operator.indices[chosen]
+    x, y = (mesh.nodes[column] - mesh.nodes[row]).T
+    fitted = _moved(x, y, mesh.linear_fit_offset[column], cubic_fit_offset(mesh)[column])
+    parts = (operator.data[chosen, None] * fitted).T
+    return np.stack([np.bincount(row, part, len(nodes)) for part in parts], axis=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Missed:
-    """Operators (N, N) from recovered displacements to what they miss.
+class _BoundaryFits:
+    """Operators (N, N) from recovered displacements to what they miss near the boundary; other rows are empty.
 
     Attributes
     ----------
     value, slope_x, slope_y
-        What values and slopes miss of a cubic, at nodes near the boundary; other rows are empty.
-    apart
-        Value of a cubic through the recovered displacements, less these, at concave boundaries.
-    along
-        Mean over the nodes up to two edges away, those at the boundary and those beside it apart.
-    of_concave
-        Mean over the nodes of `apart` up to two edges away.
-    rough : ndarray, shape (N, 2)
-        See `_ROUGH`.
+        What values and slopes miss of the cubic.
+    departure
+        Value of a cubic through the recovered displacements, as if they missed nothing, less these, at concave
+        boundaries.
+    mean
+        Over the nodes up to two edges away, those at the boundary and those beside it apart.
+    concave_mean
+        Over the nodes up to two edges away that have a `departure`.
+    factors : ndarray, shape (N, 2)
+        Those of `_DEPARTURE`.
     """
 
     value: sp.csr_matrix
     slope_x: sp.csr_matrix
     slope_y: sp.csr_matrix
-    apart: sp.csr_matrix
-    along: sp.csr_matrix
-    of_concave: sp.csr_matrix
-    rough: FloatArray
+    departure: sp.csr_matrix
+    mean: sp.csr_matrix
+    concave_mean: sp.csr_matrix
+    factors: FloatArray
 
 
 @lru_cache(maxsize=2)  # of a mesh with data everywhere, and of the last frame
-def _missed(mesh: Tri3Mesh, used: bytes) -> _Missed:
+def _boundary_fits(mesh: Tri3Mesh, used: bytes) -> _BoundaryFits:
+    """Fit cubics to the nodes up to three edges of `used` elements away."""
     elements, count = np.frombuffer(used, dtype=bool), len(mesh.nodes)
-    recovery = Recovery.over(mesh, elements, np.ones(count))
-    of_cubics = [_of_cubics(mesh, one) for one in (recovery.value, recovery.slope_x, recovery.slope_y)]
     corners = mesh.elements[elements]
     ends = np.repeat(corners, 3, axis=1).ravel(), np.tile(corners, 3).ravel()
     beside = sp.csr_matrix((np.ones(len(ends[0]), dtype=bool), ends), shape=(count, count))
@@ -137,38 +122,38 @@ def _missed(mesh: Tri3Mesh, used: bytes) -> _Missed:
     reach = sp.csr_matrix(beside[nodes] @ beside @ beside)
     enough = np.diff(reach.indptr) >= len(_POWERS)
     nodes, reach = nodes[enough], reach[enough]
-    number = np.diff(reach.indptr)
+    number, size = np.diff(reach.indptr), mesh.sizes[nodes, None]
     has_node = np.arange(number.max(initial=1)) < number[:, None]
     other = np.repeat(nodes[:, None], has_node.shape[1], axis=1)
     other[has_node] = reach.indices
-    size = mesh.sizes[nodes, None]
     x, y = ((axis[other] - axis[nodes, None]) / size for axis in mesh.nodes.T)
     basis = np.stack([x**i * y**j for i, j in _POWERS], axis=1)
     angle = angle_fraction(mesh, elements)[nodes, None]
     weight = np.where(has_node, np.exp(-(x**2 + y**2) * angle / (2 * _WIDTH**2)), 0)[:, None]
-    is_concave = edge[nodes, None] & (angle > 0.52)
-    apart = np.where(is_concave, _fitted(weight, basis)[:, 0] - (other == nodes[:, None]), 0)
-    basis[:, 6:] += np.moveaxis(of_cubics[0][other], -1, 1) / size[:, None] ** 3
-    third = _fitted(weight, basis)[:, 6:] / size[:, None] ** 3
+    departure = np.where(edge[nodes, None] & (angle > 0.52), _fits(weight, basis)[:, 0] - (other == nodes[:, None]), 0)
+    recovery, chosen = Recovery.over(mesh, elements, np.ones(count)), np.zeros((2, count), dtype=bool)
+    chosen[0, reach.indices] = chosen[1, nodes] = True
+    missed = [
+        _of_cubics(mesh, one, chosen[min(order, 1)])
+        for order, one in enumerate((recovery.value, recovery.slope_x, recovery.slope_y))
+    ]
+    basis[:, 6:] += np.moveaxis(missed[0][other], -1, 1) / size[:, None] ** 3
+    third = _fits(weight, basis)[:, 6:] / size[:, None] ** 3
     places = np.repeat(nodes, number), reach.indices
-    parts = [np.einsum("nt,ntw->nw", one[nodes], third) for one in of_cubics]
-    value, slope_x, slope_y, rough = (
-        sp.csr_matrix((part[has_node], places), shape=(count, count)) for part in (*parts, apart)
-    )
-    rough.eliminate_zeros()
-    near = edge.astype(np.intp)
-    near[nodes] += 1  # 2 at the boundary, 1 beside it
+    parts = *(np.einsum("nt,ntw->nw", one[nodes], third) for one in missed), departure
+    *operators, departing = (sp.csr_matrix((part[has_node], places), shape=(count, count)) for part in parts)
+    departing.eliminate_zeros()
+    level = np.zeros(count, dtype=np.intp)
+    level[nodes] = 1 + edge[nodes]
     rows, columns = sp.csr_matrix(beside @ beside).nonzero()
-    alike = (near[rows] == near[columns]) & (near[rows] > 0)
-    is_rough = (near[rows] > 0) & (np.diff(rough.indptr) > 0)[columns]
-    return _Missed(
-        value=value,
-        slope_x=slope_x,
-        slope_y=slope_y,
-        apart=rough,
-        along=_mean(rows[alike], columns[alike], count),
-        of_concave=_mean(rows[is_rough], columns[is_rough], count),
-        rough=np.array(_ROUGH)[near],
+    alike = (level[rows] == level[columns]) & (level[rows] > 0)
+    concave = (level[rows] > 0) & (np.diff(departing.indptr) > 0)[columns]
+    return _BoundaryFits(
+        **dict(zip(("value", "slope_x", "slope_y"), operators, strict=True)),
+        departure=departing,
+        mean=_mean(rows[alike], columns[alike], count),
+        concave_mean=_mean(rows[concave], columns[concave], count),
+        factors=np.array(_DEPARTURE)[level],
     )
 
 
@@ -178,7 +163,7 @@ def _mean(rows: npt.NDArray[np.integer], columns: npt.NDArray[np.integer], count
     return sp.csr_matrix((1 / number[rows], (rows, columns)), shape=(count, count))
 
 
-def _fitted(weight: FloatArray, basis: FloatArray) -> FloatArray:
+def _fits(weight: FloatArray, basis: FloatArray) -> FloatArray:
     """Solve weighted fits (n, terms, W) of a basis (n, terms, W)."""
     weighted = weight * basis
     normal = weighted @ basis.transpose(0, 2, 1)
@@ -204,17 +189,17 @@ def one_sided_error(mesh: Tri3Mesh, used: BoolArray, displacement: FloatArray, s
         Error of u, v, exx, eyy, exy as a standard deviation: the root of a mean square over some elements
         along the boundary, beyond noise. 0 at other nodes.
     """
-    missed = _missed(mesh, used.tobytes())
+    fits = _boundary_fits(mesh, used.tobytes())
     u, v = fields = tuple(zip(np.nan_to_num(displacement).T, np.nan_to_num(std**2).T, strict=True))
-    half_x, half_y = (with_data(one, one.data / 2) for one in (missed.slope_x, missed.slope_y))
-    alone = ((missed.value, u), (missed.value, v), (missed.slope_x, u), (missed.slope_y, v))
-    parts = [_square_and_noise(missed.along, *terms) for terms in (*zip(alone), ((half_y, u), (half_x, v)))]
+    half_x, half_y = (with_data(one, one.data / 2) for one in (fits.slope_x, fits.slope_y))
+    alone = ((fits.value, u), (fits.value, v), (fits.slope_x, u), (fits.slope_y, v))
+    parts = [_square_and_noise(fits.mean, *terms) for terms in (*zip(alone), ((half_y, u), (half_x, v)))]
     square, noise = np.stack(parts, axis=-1)
     smooth = _FACTOR * np.sqrt(np.maximum(square - _NOISE * noise, 0))
-    square, noise = np.stack([_square_and_noise(missed.of_concave, (missed.apart, one)) for one in fields], axis=-1)
-    rough = np.sqrt(np.where(square > _SURE * noise, square - _ROUGH_NOISE * noise, 0))
+    square, noise = np.stack([_square_and_noise(fits.concave_mean, (fits.departure, one)) for one in fields], axis=-1)
+    rough = np.sqrt(np.where(square > _SURE * noise, square - _DEPARTURE_NOISE * noise, 0))
     slopes = np.column_stack([rough, np.hypot(*rough.T) / 2]) / mesh.sizes[:, None]
-    of_values, of_slopes = missed.rough.T[:, :, None]
+    of_values, of_slopes = fits.factors.T[:, :, None]
     return np.asarray(np.maximum(smooth, np.column_stack([of_values * rough, of_slopes * slopes])))
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from nodal_tests import COVARIANCE, MESH, dense_correlation
 
-from rgbmidic.correlation.one_sided_fit import at_free_boundary
-from rgbmidic.correlation.recovery import quadratic_fit
+from rgbmidic.correlation.recovery import at_free_boundary, quadratic_fit
 from rgbmidic.fields import Nodal, Places, ProfileLine, StrainGauges, at_pixels, make_probe
 from rgbmidic.fields.interpolation import PointSum
 from rgbmidic.mesh import Region, Tri3Mesh
