@@ -24,7 +24,7 @@ from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import Assembly, block_side, rigid_functions
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
 from rgbmidic.correlation.images import apply_prefilter, at_blocks, window_sums
-from rgbmidic.correlation.one_sided_fit import one_sided_error
+from rgbmidic.correlation.one_sided_fit import one_sided_error, with_one_sided_error
 from rgbmidic.correlation.recovery import Recovery, at_free_boundary, nodal_slopes
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual, corrected_values
@@ -107,13 +107,14 @@ def discretisation_error(
     -------
     Solution
         With `displacement_error` (N, 2) in px and `strain_error` (N, 3), as standard deviations: NaN at nodes that are
-        not measured, and everywhere on elements under 8 px. `displacement_std` and `strain_std` are then those of noise
+        not measured, and everywhere on elements under 8 px, where the uncertainty is that of `with_one_sided_error`.
+        Else `displacement_std` and `strain_std` are then those of noise
         alone: the misfit of the elements, which the residual holds, is taken out. ``hypot(std, error)`` is the standard
         uncertainty with both.
     """
     mesh, measured = reference.mesh, solution.measured
     if not measured.any() or mesh.size < SMALLEST_HALVED:
-        return solution
+        return with_one_sided_error(mesh, solution)
     halves, draws = _halves(reference)
     with one_blas_thread():
         values, variance, rotation = _finer_field(halves, deformed, solution, options, method)

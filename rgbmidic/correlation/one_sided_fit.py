@@ -31,12 +31,15 @@ _FACTOR = 1.3
 """Error over what the cubic makes of it: 1.03 to 1.3 in waves of 15 to 6 elements, 1.5 at 4, for values and slopes, at
 straight and round edges and at holes (without noise)."""
 _DEPARTURE = (0.0, 0.0), (0.27, 0.8), (2.1, 7.5)
-"""Error of values, and of slopes times the side of an element, over `_BoundaryFits.departure` at a concave boundary: elsewhere,
-beside and at it. At the rim of a hole in tension strain falls off within an element or two, which no order of
-polynomials follows: 1.6 to 2.9 and 6 to 9, beside it 0.17 to 0.4 and 0.6 to 1 (elements of 0.08 to 0.3 of its
+"""Error of values, and of slopes times the side of an element, over `_BoundaryFits.departure` of a concave boundary:
+elsewhere, beside and at it. At the rim of a hole in tension strain falls off within an element or two, which no order
+of polynomials follows: 1.6 to 2.9 and 6 to 9, beside it 0.17 to 0.4 and 0.6 to 1 (elements of 0.08 to 0.3 of its
 diameter)."""
 _DEPARTURE_NOISE = 0.5
 """Variance of the noise of `_BoundaryFits.departure` over that of independent nodes: 0.34 to 0.56 (derived)."""
+_UNRESOLVED, _FEW = 4.0, 3
+"""Error of strain over its noise, and number of nodes, from which strain is called unresolved. Chosen: with twice the
+noise, from which finer elements pay, planes would be called so by chance."""
 _SURE = 1.2
 """The same from which it is not taken for noise."""
 _NOISE = 1.2
@@ -218,4 +221,34 @@ def with_one_sided_error(mesh: Tri3Mesh, solution: Solution) -> Solution:
         solution,
         displacement_std=np.hypot(solution.displacement_std, error[:, :2]),
         strain_std=np.hypot(solution.strain_std, error[:, 2:]),
+    )
+
+
+def unresolved_strain(mesh: Tri3Mesh, solution: Solution, with_error: Solution) -> str:
+    """Say by how much the strain at free boundaries is not resolved; empty where it is.
+
+    Parameters
+    ----------
+    mesh
+        N nodes.
+    solution, with_error
+        As `solve` returned it, and with what `with_one_sided_error` or `discretisation_error` adds.
+
+    Returns
+    -------
+    str
+        The error is rounded to 1, 2 or 5 of its decade, so that the frames of a test have few texts.
+    """
+    noise, missed = with_error.strain_std, with_error.strain_error
+    if not np.isfinite(missed).any():
+        noise, missed = solution.strain_std, np.sqrt(np.maximum(noise**2 - solution.strain_std**2, 0))
+    missed = np.where(at_free_boundary(mesh)[:, None] & (missed > _UNRESOLVED * noise), missed, 0)
+    if missed.any(axis=1).sum() < _FEW:
+        return ""
+    decade = 10 ** np.floor(np.log10(missed.max()))
+    largest = decade * max(step for step in (1, 2, 5) if step * decade <= missed.max() * (1 + 1e-9))
+    return (
+        f"the strain at edges of the region is not resolved by elements of {mesh.size:.3g} px: it may be off by "
+        f"{largest:.1g} or more, over {_UNRESOLVED:g} times its noise; its uncertainty holds that, smaller elements or "
+        "mesh.refine resolve more"
     )

@@ -25,6 +25,7 @@ from rgbmidic.correlation import (
     discretisation_error,
     fill,
     track,
+    unresolved_strain,
     with_one_sided_error,
 )
 from rgbmidic.correlation.images import as_light_stack, unmasked
@@ -138,10 +139,13 @@ def correlate(
     solution = track(first, second.result(), start, solver, method)
     if solution.disagreement:
         logger.warning("%s", solution.disagreement)
+    found = solution
     if mesh_error:
-        solution = discretisation_error(first, second.result(), solution, solver, method)
+        solution = discretisation_error(first, second.result(), found, solver, method)
     else:
-        solution = with_one_sided_error(mesh, solution)
+        solution = with_one_sided_error(mesh, found)
+    if unresolved := unresolved_strain(mesh, found, solution):
+        logger.warning("%s", unresolved)
     return fill(mesh, solution, solver.fill) if solver.fill else solution
 
 
