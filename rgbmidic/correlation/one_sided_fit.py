@@ -40,7 +40,7 @@ _DEPARTURE_NOISE = 0.5
 _UNRESOLVED, _FEW = 4.0, 3
 """Error of strain over its noise, and number of nodes, from which strain is called unresolved. Chosen: with twice the
 noise, from which finer elements pay, planes would be called so by chance."""
-_SURE = 1.2
+_SURE = 1.3
 """The same from which it is not taken for noise."""
 _NOISE = 1.2
 """Variance of the noise of an operator over that of independent nodes: 1.0 to 1.4 (derived on such meshes)."""
@@ -99,7 +99,7 @@ class _BoundaryFits:
     mean
         Over the nodes up to two edges away, those at the boundary and those beside it apart.
     concave_mean
-        Over the nodes up to two edges away that have a `departure`.
+        Over the nodes up to four edges away that have a `departure`, the nearer ones more.
     factors : ndarray, shape (N, 2)
         Those of `_DEPARTURE`.
     """
@@ -151,11 +151,12 @@ def _boundary_fits(mesh: Tri3Mesh, used: bytes) -> _BoundaryFits:
     rows, columns = sp.csr_matrix(beside @ beside).nonzero()
     alike = (level[rows] == level[columns]) & (level[rows] > 0)
     concave = (level[rows] > 0) & (np.diff(departing.indptr) > 0)[columns]
+    concave_mean = _mean(rows[concave], columns[concave], count)
     return _BoundaryFits(
         **dict(zip(("value", "slope_x", "slope_y"), operators, strict=True)),
         departure=departing,
         mean=_mean(rows[alike], columns[alike], count),
-        concave_mean=_mean(rows[concave], columns[concave], count),
+        concave_mean=sp.csr_matrix(concave_mean @ concave_mean),
         factors=np.array(_DEPARTURE)[level],
     )
 
@@ -201,7 +202,7 @@ def one_sided_error(mesh: Tri3Mesh, used: BoolArray, displacement: FloatArray, s
     smooth = _FACTOR * np.sqrt(np.maximum(square - _NOISE * noise, 0))
     square, noise = np.stack([_square_and_noise(fits.concave_mean, (fits.departure, one)) for one in fields], axis=-1)
     rough = np.sqrt(np.where(square > _SURE * noise, square - _DEPARTURE_NOISE * noise, 0))
-    slopes = np.column_stack([rough, np.hypot(*rough.T) / 2]) / mesh.sizes[:, None]
+    slopes = np.hypot(*rough.T)[:, None] * [np.sqrt(0.5), np.sqrt(0.5), 0.5] / mesh.sizes[:, None]
     of_values, of_slopes = fits.factors.T[:, :, None]
     return np.asarray(np.maximum(smooth, np.column_stack([of_values * rough, of_slopes * slopes])))
 
