@@ -24,26 +24,53 @@ from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray
 
 _POWERS = np.array([(i, n - i) for n in range(4) for i in range(n, -1, -1)])
-_WIDTH = 0.8
-"""Standard deviation of the weights of the fits, in sides of an element as inside. With 1.3 they have less noise, a
-twentieth of the displacement's instead of a fifth, but find half of the error in waves of 4 elements."""
-_FACTOR = 1.3
-"""Error over what the cubic makes of it: 1.03 to 1.3 in waves of 15 to 6 elements, 1.5 at 4, for values and slopes, at
-straight and round edges and at holes (without noise)."""
-_DEPARTURE = (0.0, 0.0), (0.27, 0.8), (2.1, 7.5)
-"""Error of values, and of slopes times the side of an element, over `_BoundaryFits.departure` of a concave boundary:
-elsewhere, beside and at it. At the rim of a hole in tension strain falls off within an element or two, which no order
-of polynomials follows: 1.6 to 2.9 and 6 to 9, beside it 0.17 to 0.4 and 0.6 to 1 (elements of 0.08 to 0.3 of its
-diameter)."""
-_DEPARTURE_NOISE = 0.5
-"""Variance of the noise of `_BoundaryFits.departure` over that of independent nodes: 0.34 to 0.56 (derived)."""
-_UNRESOLVED, _FEW = 4.0, 3
-"""Error of strain over its noise, and number of nodes, from which strain is called unresolved. Chosen: with twice the
-noise, from which finer elements pay, planes would be called so by chance."""
-_SURE = 1.3
-"""The same from which it is not taken for noise."""
-_NOISE = 1.2
-"""Variance of the noise of an operator over that of independent nodes: 1.0 to 1.4 (derived on such meshes)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OneSidedConstants:
+    """Constants of the estimate.
+
+    Attributes
+    ----------
+    width
+        Standard deviation of the weights of the fits, in sides of an element as inside. With 1.3 they have less noise,
+        a twentieth of the displacement's instead of a fifth, but find half of the error in waves of 4 elements.
+    factor
+        Error over what the cubic makes of it: 1.03 to 1.3 in waves of 15 to 6 elements, 1.5 at 4, for values and
+        slopes, at straight and round edges and at holes (without noise).
+    noise
+        Variance of the noise of an operator over that of independent nodes: 1.0 to 1.4 (derived on such meshes).
+    angle
+        Fraction of the full angle from which a boundary is concave.
+    departure
+        Error of values, and of slopes times the side of an element, over `_BoundaryFits.departure` of a concave
+        boundary: elsewhere, beside and at it. At the rim of a hole in tension strain falls off within an element or
+        two, which no order of polynomials follows: 1.6 to 2.9 and 6 to 9, beside it 0.17 to 0.4 and 0.6 to 1 (elements
+        of 0.08 to 0.3 of its diameter).
+    departure_noise
+        Variance of the noise of `_BoundaryFits.departure` over that of independent nodes: 0.34 to 0.56 (derived).
+    sure
+        The same from which it is not taken for noise: strain at the rim of a hole in an affine field has 1.1 times its
+        uncertainty at most.
+    unresolved
+        Errors of displacement and of strain over their noise from which strain is called unresolved: with less a hole
+        at rest is called so by chance (measured: 1 of 10 frames with 1 and 4).
+    few
+        Number of nodes of which less are not spoken of. Chosen.
+    """
+
+    width: float = 0.8
+    factor: float = 1.3
+    noise: float = 1.2
+    angle: float = 0.52
+    departure: tuple[tuple[float, float], ...] = ((0.0, 0.0), (0.27, 0.8), (2.1, 7.5))
+    departure_noise: float = 0.5
+    sure: float = 1.3
+    unresolved: tuple[float, float] = (1.3, 4.0)
+    few: int = 3
+
+
+_CONSTANTS = OneSidedConstants()
 
 
 @lru_cache(maxsize=2)
@@ -101,7 +128,7 @@ class _BoundaryFits:
     concave_mean
         Over the nodes up to four edges away that have a `departure`, the nearer ones more.
     factors : ndarray, shape (N, 2)
-        Those of `_DEPARTURE`.
+        Those of `OneSidedConstants.departure`.
     """
 
     value: sp.csr_matrix
@@ -132,8 +159,10 @@ def _boundary_fits(mesh: Tri3Mesh, used: bytes) -> _BoundaryFits:
     x, y = ((axis[other] - axis[nodes, None]) / size for axis in mesh.nodes.T)
     basis = np.stack([x**i * y**j for i, j in _POWERS], axis=1)
     angle = angle_fraction(mesh, elements)[nodes, None]
-    weight = np.where(has_node, np.exp(-(x**2 + y**2) * angle / (2 * _WIDTH**2)), 0)[:, None]
-    departure = np.where(edge[nodes, None] & (angle > 0.52), _fits(weight, basis)[:, 0] - (other == nodes[:, None]), 0)
+    weight = np.where(has_node, np.exp(-(x**2 + y**2) * angle / (2 * _CONSTANTS.width**2)), 0)[:, None]
+    departure = np.where(
+        edge[nodes, None] & (angle > _CONSTANTS.angle), _fits(weight, basis)[:, 0] - (other == nodes[:, None]), 0
+    )
     recovery, chosen = Recovery.over(mesh, elements, np.ones(count)), np.zeros((2, count), dtype=bool)
     chosen[0, reach.indices] = chosen[1, nodes] = True
     missed = [
@@ -150,14 +179,14 @@ def _boundary_fits(mesh: Tri3Mesh, used: bytes) -> _BoundaryFits:
     level[nodes] = 1 + edge[nodes]
     rows, columns = sp.csr_matrix(beside @ beside).nonzero()
     alike = (level[rows] == level[columns]) & (level[rows] > 0)
-    concave = (level[rows] > 0) & (np.diff(departing.indptr) > 0)[columns]
-    concave_mean = _mean(rows[concave], columns[concave], count)
+    departs = (level[rows] > 0) & (np.diff(departing.indptr) > 0)[columns]
+    concave_mean = _mean(rows[departs], columns[departs], count)
     return _BoundaryFits(
         **dict(zip(("value", "slope_x", "slope_y"), operators, strict=True)),
         departure=departing,
         mean=_mean(rows[alike], columns[alike], count),
         concave_mean=sp.csr_matrix(concave_mean @ concave_mean),
-        factors=np.array(_DEPARTURE)[level],
+        factors=np.array(_CONSTANTS.departure)[level],
     )
 
 
@@ -199,9 +228,9 @@ def one_sided_error(mesh: Tri3Mesh, used: BoolArray, displacement: FloatArray, s
     alone = ((fits.value, u), (fits.value, v), (fits.slope_x, u), (fits.slope_y, v))
     parts = [_square_and_noise(fits.mean, *terms) for terms in (*zip(alone), ((half_y, u), (half_x, v)))]
     square, noise = np.stack(parts, axis=-1)
-    smooth = _FACTOR * np.sqrt(np.maximum(square - _NOISE * noise, 0))
+    smooth = _CONSTANTS.factor * np.sqrt(np.maximum(square - _CONSTANTS.noise * noise, 0))
     square, noise = np.stack([_square_and_noise(fits.concave_mean, (fits.departure, one)) for one in fields], axis=-1)
-    rough = np.sqrt(np.where(square > _SURE * noise, square - _DEPARTURE_NOISE * noise, 0))
+    rough = np.sqrt(np.where(square > _CONSTANTS.sure * noise, square - _CONSTANTS.departure_noise * noise, 0))
     slopes = np.hypot(*rough.T)[:, None] * [np.sqrt(0.5), np.sqrt(0.5), 0.5] / mesh.sizes[:, None]
     of_values, of_slopes = fits.factors.T[:, :, None]
     return np.asarray(np.maximum(smooth, np.column_stack([of_values * rough, of_slopes * slopes])))
@@ -240,16 +269,19 @@ def unresolved_strain(mesh: Tri3Mesh, solution: Solution, with_error: Solution) 
     str
         The error is rounded to 1, 2 or 5 of its decade, so that the frames of a test have few texts.
     """
-    noise, missed = with_error.strain_std, with_error.strain_error
+    before, noise = (np.column_stack([one.displacement_std, one.strain_std]) for one in (solution, with_error))
+    missed = np.column_stack([with_error.displacement_error, with_error.strain_error])
     if not np.isfinite(missed).any():
-        noise, missed = solution.strain_std, np.sqrt(np.maximum(noise**2 - solution.strain_std**2, 0))
-    missed = np.where(at_free_boundary(mesh)[:, None] & (missed > _UNRESOLVED * noise), missed, 0)
-    if missed.any(axis=1).sum() < _FEW:
+        noise, missed = before, np.sqrt(np.maximum(noise**2 - before**2, 0))
+    is_large = missed > np.repeat(_CONSTANTS.unresolved, [2, 3]) * noise
+    unresolved = at_free_boundary(mesh) & is_large[:, :2].any(axis=1) & is_large[:, 2:].any(axis=1)
+    if unresolved.sum() < _CONSTANTS.few:
         return ""
-    decade = 10 ** np.floor(np.log10(missed.max()))
-    largest = decade * max(step for step in (1, 2, 5) if step * decade <= missed.max() * (1 + 1e-9))
+    most = np.where(is_large[unresolved, 2:], missed[unresolved, 2:], 0).max() * (1 + 1e-9)
+    decade = 10 ** np.floor(np.log10(most))
+    largest = decade * max(step for step in (1, 2, 5) if step * decade <= most)
     return (
-        f"the strain at edges of the region is not resolved by elements of {mesh.size:.3g} px: it may be off by "
-        f"{largest:.1g} or more, over {_UNRESOLVED:g} times its noise; its uncertainty holds that, smaller elements or "
-        "mesh.refine resolve more"
+        f"the strain at edges of the region is not resolved: it may be off by {largest:.1g} or more, over "
+        f"{_CONSTANTS.unresolved[1]:g} times its noise; its uncertainty holds that, smaller elements or mesh.refine "
+        "resolve more"
     )
