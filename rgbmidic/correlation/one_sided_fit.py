@@ -50,8 +50,8 @@ class OneSidedConstants:
     departure_noise
         Variance of the noise of `_BoundaryFits.departure` over that of independent nodes: 0.34 to 0.56 (derived).
     sure
-        The same from which it is not taken for noise: strain at the rim of a hole in an affine field has 1.1 times its
-        uncertainty at most.
+        Mean square over that by noise from which it is not taken for noise: in affine fields the uncertainty of strain
+        is then 1.03 times as large, at the rim of a hole 1.1 times at most (measured).
     unresolved
         Errors of displacement and of strain over their noise from which strain is called unresolved: with less a hole
         at rest is called so by chance (measured: 1 of 10 frames with 1 and 4).
@@ -65,7 +65,7 @@ class OneSidedConstants:
     angle: float = 0.52
     departure: tuple[tuple[float, float], ...] = ((0.0, 0.0), (0.27, 0.8), (2.1, 7.5))
     departure_noise: float = 0.5
-    sure: float = 1.3
+    sure: float = 2.5
     unresolved: tuple[float, float] = (1.3, 4.0)
     few: int = 3
 
@@ -228,9 +228,9 @@ def one_sided_error(mesh: Tri3Mesh, used: BoolArray, displacement: FloatArray, s
     alone = ((fits.value, u), (fits.value, v), (fits.slope_x, u), (fits.slope_y, v))
     parts = [_square_and_noise(fits.mean, *terms) for terms in (*zip(alone), ((half_y, u), (half_x, v)))]
     square, noise = np.stack(parts, axis=-1)
-    smooth = _CONSTANTS.factor * np.sqrt(np.maximum(square - _CONSTANTS.noise * noise, 0))
+    smooth = _CONSTANTS.factor * _beyond(square, _CONSTANTS.noise * noise)
     square, noise = np.stack([_square_and_noise(fits.concave_mean, (fits.departure, one)) for one in fields], axis=-1)
-    rough = np.sqrt(np.where(square > _CONSTANTS.sure * noise, square - _CONSTANTS.departure_noise * noise, 0))
+    rough = _beyond(square, _CONSTANTS.departure_noise * noise)
     slopes = np.hypot(*rough.T)[:, None] * [np.sqrt(0.5), np.sqrt(0.5), 0.5] / mesh.sizes[:, None]
     of_values, of_slopes = fits.factors.T[:, :, None]
     return np.asarray(np.maximum(smooth, np.column_stack([of_values * rough, of_slopes * slopes])))
@@ -241,6 +241,11 @@ def _square_and_noise(mean: sp.csr_matrix, *terms: tuple[sp.csr_matrix, tuple[Fl
     total = np.sum([operator @ values for operator, (values, _) in terms], axis=0)
     noise = np.sum([operator.power(2) @ variance for operator, (_, variance) in terms], axis=0)
     return np.stack([mean @ total**2, mean @ noise])
+
+
+def _beyond(square: FloatArray, noise: FloatArray) -> FloatArray:
+    """Root of what a mean square has beyond noise, 0 where it may be noise."""
+    return np.sqrt(np.where(square > _CONSTANTS.sure * noise, square - noise, 0))
 
 
 def with_one_sided_error(mesh: Tri3Mesh, solution: Solution) -> Solution:
