@@ -255,6 +255,7 @@ def with_one_sided_error(mesh: Tri3Mesh, solution: Solution) -> Solution:
     return replace(
         solution,
         displacement_std=np.hypot(solution.displacement_std, error[:, :2]),
+        edge_std=np.where(solution.measured[:, None], error[:, :2], np.nan),
         strain_std=np.hypot(solution.strain_std, error[:, 2:]),
     )
 

@@ -122,12 +122,14 @@ class ReferenceUpdate:
         square = float((after[both] ** 2).sum())
         regression = float(np.clip(-(before[both] * after[both]).sum() / square, -1, 0.5)) if square > 0 else 0.0
         own, mesh = 1 - 2 * regression, self.first.mesh
+        # what is missed near edges is found anew from the whole displacement
+        before_std = np.sqrt(np.maximum(_single(last.displacement_std) ** 2 - _single(last.edge_std) ** 2, 0))
         return replace(
             step,
             nodes=mesh.nodes,
             elements=mesh.elements,
             displacement=self.displacement + step.displacement,
-            displacement_std=np.sqrt(_single(last.displacement_std) ** 2 + own * step.displacement_std**2),
+            displacement_std=np.sqrt(before_std**2 + own * step.displacement_std**2),
             bias_std=np.sqrt(_single(last.bias_std) ** 2 + own * step.bias_std**2),
             strain=_single(last.strain) + step.strain,
             strain_std=np.sqrt(_single(last.strain_std) ** 2 + own * step.strain_std**2),
