@@ -136,7 +136,9 @@ def compared_plates(
 
     def record(index: int) -> FrameRecord:
         (u, v), (u_std, v_std) = solutions[index].displacement.T, solutions[index].displacement_std.T
-        return FrameRecord.of(nodes=len(nodes), lights=3, number=index, status=0, u=u, v=v, u_std=u_std, v_std=v_std)
+        edge_std = solutions[index].edge_std
+        stated = {"u_std": u_std, "v_std": v_std} | dict(zip(("u_edge_std", "v_edge_std"), edge_std.T, strict=True))
+        return FrameRecord.of(nodes=len(nodes), lights=3, number=index, status=0, u=u, v=v, **stated)
 
     mesh = {"nodes": nodes, "elements": solutions[0].elements, "references": []}
     result = make_result(folder / "result", frames=draws, record=record, **mesh)

@@ -2,6 +2,7 @@
 
 from rgbmidic.correlation.constants import SolverConstants
 from rgbmidic.correlation.discretisation import discretisation_error
+from rgbmidic.correlation.one_sided_fit import unresolved_strain, with_one_sided_error
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual
@@ -26,4 +27,6 @@ __all__ = [
     "find_start",
     "solve",
     "track",
+    "unresolved_strain",
+    "with_one_sided_error",
 ]

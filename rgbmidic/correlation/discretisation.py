@@ -26,8 +26,8 @@ from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.light_bias import settled_gradient
-from rgbmidic.correlation.one_sided_fit import at_free_boundary, one_sided_difference
-from rgbmidic.correlation.recovery import Recovery, angle_fraction, quadratic_fit
+from rgbmidic.correlation.one_sided_fit import one_sided_error, with_one_sided_error
+from rgbmidic.correlation.recovery import Recovery, at_free_boundary, nodal_slopes
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.correlation.solution import Solution
@@ -55,20 +55,12 @@ class DiscretisationConstants:
         more for what is lost with differences taken for noise; chosen on the DIC Challenge star.
     unsmoothed
         Inverse second moment of the rows of TRI3's mass matrix over h^2/3: what `_Halves.unsmooth` overstates.
-    one_sided
-        Error at the boundary over `one_sided_difference`, of displacement (2) and strain (3): 0.7 to 1.5 and 1.4 to 3.8
-        at the rim of a hole in elements of 0.15 to 0.3 of its diameter and at straight edges in waves of 3 to 8 (see
-        there). Chosen: that of straight edges.
-    concave
-        The same at concave boundaries, holes and notches, over that at straight ones: strain concentrates there, and
-        falls off with all orders (measured at holes: 1.4 to 2 times).
     sure
         Standard deviations of the mean square of noise alone by which the difference, of displacement (2) and of strain
-        (3), and what is `_Halves.beyond` (5) must exceed it. Strain's difference has 3 to 4 times the noise of strain,
+        (3), and what is `_Halves.beyond` (3) must exceed it. Strain's difference has 3 to 4 times the noise of strain,
         so that what passes by chance would be a multiple of it. Chosen: affine fields come out 15 % larger at most.
     sure_at_edge
-        The same at the boundary, where the difference has 10 to 16 times the noise of strain, and what one-sided fits
-        miss about as much as strain has.
+        The same at the boundary, where the difference has 10 to 16 times the noise of strain.
     uneven
         Variance of the same over that with equal weights: a robust loss weighs pixels unevenly (measured on affine
         fields).
@@ -85,11 +77,9 @@ class DiscretisationConstants:
     spread: int = 4
     of_difference: float = 1.25
     unsmoothed: float = 0.72
-    one_sided: tuple[float, ...] = (0.8, 0.8, 1.7, 1.7, 1.7)
-    concave: float = 1.7
-    sure: tuple[float, ...] = (1.2, 1.2, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0, 2.0, 2.0)
-    sure_at_edge: tuple[float, ...] = (3.6, 3.6, 12.0, 12.0, 12.0, 1.0, 1.0, 2.0, 2.0, 2.0)
-    uneven: tuple[float, ...] = (1.15, 1.15, 1.4, 1.4, 1.4, 1.15, 1.15, 1.4, 1.4, 1.4)
+    sure: tuple[float, ...] = (1.2, 1.2, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0)
+    sure_at_edge: tuple[float, ...] = (3.6, 3.6, 12.0, 12.0, 12.0, 2.0, 2.0, 2.0)
+    uneven: tuple[float, ...] = (1.15, 1.15, 1.4, 1.4, 1.4, 1.4, 1.4, 1.4)
     chance: float = 0.8
     held: float = 1e-6
 
@@ -119,13 +109,14 @@ def discretisation_error(
     -------
     Solution
         With `displacement_error` (N, 2) in px and `strain_error` (N, 3), as standard deviations: NaN at nodes that are
-        not measured, and everywhere on elements under 8 px. `displacement_std` and `strain_std` are then those of noise
+        not measured, and everywhere on elements under 8 px, where the uncertainty is that of `with_one_sided_error`.
+        Else `displacement_std` and `strain_std` are then those of noise
         alone: the misfit of the elements, which the residual holds, is taken out. ``hypot(std, error)`` is the standard
         uncertainty with both.
     """
     mesh, measured = reference.mesh, solution.measured
     if not measured.any() or mesh.size < SMALLEST_HALVED:
-        return solution
+        return with_one_sided_error(mesh, solution)
     halves, draws = _halves(reference)
     with one_blas_thread():
         values, variance, deformation = _finer_field(halves, deformed, solution, options, method)
@@ -136,9 +127,10 @@ def discretisation_error(
         less = noise < _CONSTANTS.chance * std
         own = np.concatenate([solution.displacement, solution.strain], axis=1)
         used = np.asarray(measured[mesh.elements].all(axis=1))
-        difference = np.concatenate([own - values, halves.beyond(used, own)], axis=1)
+        difference = np.concatenate([own - values, halves.beyond(own)], axis=1)
         error = halves.error(draws, difference, np.where(less, noise, std))
         std = np.where(less, noise / np.sqrt(_CONSTANTS.chance), std)
+        error = np.fmax(error, one_sided_error(mesh, used, solution.displacement, std[:, :2]))
     return replace(
         solution,
         displacement_std=std[:, :2],
@@ -223,10 +215,10 @@ class _Draws:
 
     Attributes
     ----------
-    variance : ndarray, shape (N, 10)
-        Variance of the difference of both fields (5), and of what is `_Halves.beyond` the coarse one (5), over that of
+    variance : ndarray, shape (N, 8)
+        Variance of the difference of both fields (5), and of what is `_Halves.beyond` the coarse one (3), over that of
         the coarse one.
-    scatter : ndarray, shape (N, 10)
+    scatter : ndarray, shape (N, 8)
         Relative standard deviation of their mean square over a window.
     own_variance : ndarray, shape (N, 5)
         Variance of u, v, exx, eyy, exy over that of the scores in their direction which the finer mesh leaves.
@@ -274,11 +266,11 @@ class _Halves:
         return total.reshape(2 * count, *sums.shape[1:])
 
     def interpolated(self, nodal: FloatArray, used: BoolArray) -> FloatArray:
-        """Interpolate a displacement (N, 2) between nodes with its second derivatives there."""
+        """Interpolate a displacement (N, 2) at the nodes of the finer mesh, as everywhere between nodes."""
         ends = self.mesh.neighbours
-        second = np.stack([curved @ nodal for curved in quadratic_fit(self.mesh, used)[3:]], axis=-1)[ends].mean(axis=1)
-        x, y = (self.mesh.nodes[ends[:, 1]] - self.mesh.nodes[ends[:, 0]]).T
-        sag = np.einsum("nct,nt->nc", second, np.stack([x * x, 2 * x * y, y * y], axis=1)) / 8
+        slopes = np.stack([one @ nodal for one in nodal_slopes(self.mesh, used)], axis=-1)[ends]
+        arm = self.mesh.nodes[ends[:, 1]] - self.mesh.nodes[ends[:, 0]]
+        sag = np.einsum("ncd,nd->nc", slopes[:, 1] - slopes[:, 0], arm) / 8
         return np.concatenate([nodal, nodal[ends].mean(axis=1) - sag])
 
     def recovery(self, used: BoolArray, equations: Equations) -> Recovery:
@@ -297,25 +289,22 @@ class _Halves:
             total, number = self.around @ total, self.around @ number
         return np.asarray(np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0))
 
-    def beyond(self, used: BoolArray, field: FloatArray) -> FloatArray:
-        """What a field (N, ..., 5) has lost: by unsmoothing its strain inside, by one-sided fits at the boundary."""
-        out = one_sided_difference(self.mesh, used, field)
-        inner, strain = ~self.at_edge, np.ascontiguousarray(field[..., 2:])
-        unsmoothed = self.unsmooth(np.nan_to_num(strain.reshape(len(strain), -1))).reshape(strain.shape)
-        out[inner, ..., 2:] = unsmoothed[inner]
+    def beyond(self, field: FloatArray) -> FloatArray:
+        """What the strain of a field (N, ..., 5) has lost by smoothing, (N, ..., 3); NaN at the boundary."""
+        strain = np.ascontiguousarray(field[..., 2:])
+        out = self.unsmooth(np.nan_to_num(strain.reshape(len(strain), -1))).reshape(strain.shape)
+        out[self.at_edge] = np.nan
         return out
 
     def error(self, draws: _Draws, difference: FloatArray, std: FloatArray) -> FloatArray:
-        """Error (N, 5) from the difference of the two fields and what is `beyond` (N, 10), and noise (N, 5)."""
-        constants, edge = _CONSTANTS, self.at_edge[:, None]
-        noise = np.array(constants.uneven) * draws.variance * np.tile(std, 2) ** 2
-        sure = np.where(edge, constants.sure_at_edge, constants.sure) * draws.scatter
+        """Error (N, 5) from the difference of the two fields and what is `beyond` (N, 8), and noise (N, 5)."""
+        constants = _CONSTANTS
+        noise = np.array(constants.uneven) * draws.variance * np.column_stack([std, std[:, 2:]]) ** 2
+        sure = np.where(self.at_edge[:, None], constants.sure_at_edge, constants.sure) * draws.scatter
         square = self._excess(difference, noise, sure)
         square[:, :5] *= constants.of_difference**2
-        is_concave = angle_fraction(self.mesh, np.ones(len(self.mesh.elements), dtype=bool)) > 0.52
-        factor = np.where(is_concave, constants.concave, 1.0)[:, None]
-        lost = np.where(edge, factor * constants.one_sided, constants.unsmoothed)
-        return np.asarray(np.sqrt(np.fmax(square[:, :5], lost**2 * square[:, 5:])))
+        square[:, 2:5] = np.fmax(square[:, 2:5], constants.unsmoothed**2 * square[:, 5:])
+        return np.asarray(np.sqrt(square[:, :5]))
 
     def _excess(self, values: FloatArray, variance: FloatArray, sure: FloatArray) -> FloatArray:
         """Mean square around each node beyond the noise, 0 where it may be noise; nodes count by their precision."""
@@ -404,7 +393,7 @@ def _drawn(halves: _Halves, reference: Reference) -> _Draws:
     fields = recovery.field(found[::2], found[1::2])
     found = finer.solve(right)
     difference = fields - fine_recovery.field(found[::2], found[1::2])
-    squares = np.concatenate([difference, halves.beyond(everywhere, fields)], axis=2) ** 2
+    squares = np.concatenate([difference, halves.beyond(fields)], axis=2) ** 2
     means = halves.averaged(squares.reshape(count, -1)).reshape(squares.shape)
     typical = means.mean(axis=1)
     per_node = (fields**2).mean(axis=1)
@@ -424,7 +413,8 @@ def _drawn(halves: _Halves, reference: Reference) -> _Draws:
     if not mesh.is_graded:
         left[:] = left.mean(axis=0)
     own_variance = energy * per_node / np.column_stack([left, left, left.mean(axis=1)])
-    return _Draws(variance=typical / np.tile(own, 2), scatter=scatter, own_variance=own_variance)
+    variance = typical / np.concatenate([own, own[:, 2:]], axis=1)
+    return _Draws(variance=variance, scatter=scatter, own_variance=own_variance)
 
 
 def _scores(equations: Equations, random: np.random.Generator) -> FloatArray:

@@ -140,12 +140,14 @@ class ReferenceUpdate:
         normal, slopes = carried(strain[:, :2]), np.maximum((strain[:, :2] ** 2).sum(axis=1), 1e-300)
         # slopes along x and along y are alike: half the shear strain's are those of u, half those of v
         shear = strain[:, 2] ** 2 * normal.sum(axis=1) / slopes
+        # what is missed near edges is found anew from the whole displacement
+        before_std = np.sqrt(np.maximum(_single(last.displacement_std) ** 2 - _single(last.edge_std) ** 2, 0))
         return replace(
             step,
             nodes=mesh.nodes,
             elements=mesh.elements,
             displacement=self.displacement + step.displacement,
-            displacement_std=total(carried(_single(last.displacement_std)), step.displacement_std),
+            displacement_std=total(carried(before_std), step.displacement_std),
             bias_std=total(carried(_single(last.bias_std)), step.bias_std),
             strain=_single(last.strain) + step.strain,
             strain_std=total(np.column_stack([normal, shear]), step.strain_std),

@@ -64,6 +64,8 @@ class Solution(Described):
     bias_std : ndarray, shape (N, 2), float64
         Part of it in px that the bias of the lights leaves (`light_bias`), alike over some 24 px: the variance beside
         it, ``displacement_std**2 - bias_std**2``, follows the mesh. 0 with a single light; NaN where not measured.
+    edge_std : ndarray, shape (N, 2), float64
+        Part of it in px that the recovery misses near free boundaries (`with_one_sided_error`); NaN where not measured.
     strain, strain_std : ndarray, shape (N, 3), float64
         Small strain (exx, eyy, exy), tensor shear, and its standard uncertainty: slopes of the quadratic through the
         neighbouring nodes; NaN where the node or a neighbour is not measured.
@@ -97,6 +99,7 @@ class Solution(Described):
     displacement: FloatArray
     displacement_std: FloatArray
     bias_std: FloatArray
+    edge_std: FloatArray
     strain: FloatArray
     strain_std: FloatArray
     displacement_error: FloatArray
@@ -167,6 +170,7 @@ class Solution(Described):
             displacement=np.full((count, 2), np.nan),
             displacement_std=np.full((count, 2), np.nan),
             bias_std=np.full((count, 2), np.nan),
+            edge_std=np.full((count, 2), np.nan),
             strain=np.full((count, 3), np.nan),
             strain_std=np.full((count, 3), np.nan),
             displacement_error=np.full((count, 2), np.nan),

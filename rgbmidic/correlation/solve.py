@@ -349,6 +349,7 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         displacement=np.where(measured[:, None], field[:, :2], np.nan),
         displacement_std=np.where(measured[:, None], std[:, :2], np.nan),
         bias_std=np.where(measured[:, None], bias_std[:, :2], np.nan),
+        edge_std=np.where(measured[:, None], np.zeros(2), np.nan),
         strain=np.where(inner[:, None], field[:, 2:], np.nan),
         strain_std=np.where(inner[:, None], std[:, 2:], np.nan),
         node_status=node_status,

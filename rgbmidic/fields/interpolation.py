@@ -1,9 +1,8 @@
 """The field between the nodes of a mesh: points, pixels and the weights of the nodes there.
 
-The slope at a node is the mean, by the areas of the elements between, of what the quadratics of the nodes beside it
-(`quadratic_fit`) have there: each node's own has too small a slope where waves are short, those beside it too large a
-one. In an element ``sum phi_a (u_a + slope_a . (x - x_a) / 2)`` over its corners is continuous, linear in the nodal
-values and exact for quadratic fields; along an edge it is the cubic through values and slopes of both ends.
+In an element it is ``sum phi_a (u_a + slope_a . (x - x_a) / 2)`` over its corners, with slopes from the quadratics
+around (`nodal_slopes`): continuous, linear in the nodal values and exact for quadratic fields; along an edge it is the
+cubic through values and slopes of both ends.
 """
 
 from __future__ import annotations
@@ -18,10 +17,9 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.arguments import checked
-from rgbmidic.correlation.recovery import quadratic_fit
+from rgbmidic.correlation.recovery import nodal_slopes
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
-from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage, IntArray
 
 _ROUNDING = 1e-6
@@ -354,15 +352,7 @@ class PointSum:
 def _fits(mesh: Tri3Mesh, has_data: bytes) -> tuple[sp.csr_matrix, ...]:
     """Matrices (N, N) from nodal values to the value at each node and to its slopes along x and y."""
     used = np.asarray(np.frombuffer(has_data, dtype=bool)[mesh.elements].all(axis=1))
-    _, x, y, xx, xy, yy = quadratic_fit(mesh, used)
-    count, corners = len(mesh.nodes), mesh.elements[used]
-    pairs = np.concatenate([corners[:, [a, b]] for a in range(3) for b in range(3) if a != b])
-    around = sp.csr_matrix((np.tile(mesh.areas[used], 6), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    row = np.repeat(np.arange(count), np.diff(around.indptr))
-    around.data /= np.bincount(row, weights=around.data, minlength=count)[row]
-    to_x, to_y = (with_data(around, around.data * (axis[row] - axis[around.indices])) for axis in mesh.nodes.T)
-    slopes = around @ x + to_x @ xx + to_y @ xy, around @ y + to_x @ xy + to_y @ yy
-    return sp.eye(count, format="csr"), *map(sp.csr_matrix, slopes)
+    return sp.eye(len(mesh.nodes), format="csr"), *nodal_slopes(mesh, used)
 
 
 @checked

@@ -17,7 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.threads import machine
-from rgbmidic.correlation import Deformed, Solution, Start, Status, discretisation_error, fill
+from rgbmidic.correlation import (
+    Deformed,
+    Solution,
+    Start,
+    Status,
+    discretisation_error,
+    fill,
+    unresolved_strain,
+    with_one_sided_error,
+)
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import brightness_change
 from rgbmidic.errors import FrameError, RgbmidicError
@@ -203,9 +212,15 @@ def solve_frame(plan: Plan, index: int, start: Start, reference_update: Referenc
     if solution.disagreement:
         warnings.append(solution.disagreement)
     key = place % STRIDE == 0 or place == len(plan.series.selected) - 1
-    if (settings.mesh.error is True or (settings.mesh.error == "key" and key)) and solution.measured.any():
+    if solution.measured.any():
         with stage("conclusion"):
-            solution = discretisation_error(reference, deformed, solution, plan.solver, plan.method)
+            found = solution
+            if settings.mesh.error is True or (settings.mesh.error == "key" and key):
+                solution = discretisation_error(reference, deformed, found, plan.solver, plan.method)
+            else:
+                solution = with_one_sided_error(reference.mesh, found)
+            if unresolved := unresolved_strain(reference.mesh, found, solution):
+                warnings.append(unresolved)
     kept = fill(reference.mesh, solution, settings.solver.fill) if settings.solver.fill else solution
     moved = solution.displacement - reference.offset(deformed)
     brightness = brightness_change(plan.images.values, images.values, reference, moved)

@@ -36,7 +36,7 @@ logger = logging.getLogger(__name__)
 
 _OF_NODES = {
     array: [one.name for one in QUANTITIES.values() if one.source.startswith(f"{array}.")]
-    for array in ("displacement", "displacement_std", "bias_std", "strain", "strain_std")
+    for array in ("displacement", "displacement_std", "bias_std", "edge_std", "strain", "strain_std")
 }
 """Quantities of a frame that it makes a reference with, as columns of its solution's arrays."""
 

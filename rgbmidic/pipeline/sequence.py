@@ -17,7 +17,17 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.threads import aside
-from rgbmidic.correlation import Deformed, Reference, Solution, Start, discretisation_error, fill, track
+from rgbmidic.correlation import (
+    Deformed,
+    Reference,
+    Solution,
+    Start,
+    discretisation_error,
+    fill,
+    track,
+    unresolved_strain,
+    with_one_sided_error,
+)
 from rgbmidic.correlation.images import as_light_stack, unmasked
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import PrecisionMethod
@@ -119,8 +129,13 @@ def correlate(
     solution = track(first, second.result(), start, solver, method)
     if solution.disagreement:
         logger.warning("%s", solution.disagreement)
+    found = solution
     if mesh_error:
-        solution = discretisation_error(first, second.result(), solution, solver, method)
+        solution = discretisation_error(first, second.result(), found, solver, method)
+    else:
+        solution = with_one_sided_error(mesh, found)
+    if unresolved := unresolved_strain(mesh, found, solution):
+        logger.warning("%s", unresolved)
     return fill(mesh, solution, solver.fill) if solver.fill else solution
 
 

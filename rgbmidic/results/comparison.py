@@ -222,8 +222,11 @@ class Comparison:
         moved = np.stack([record.u, record.v], axis=1).astype(np.float64)
         measured = self.placement.vectors_to_mm(nodes, moved).T
         slopes = self.placement.jacobian(np.where(np.isfinite(moved), nodes + moved, nodes))
-        stds = [[record.u_std, record.v_std], [np.nan_to_num(record.u_bias_std), np.nan_to_num(record.v_bias_std)]]
-        noise = np.sqrt(np.einsum("nij,sjn->sin", slopes**2, np.square(stds, dtype=np.float64)))
+        names = ("u_std", "v_std"), ("u_bias_std", "v_bias_std"), ("u_edge_std", "v_edge_std")
+        stds = np.square([[getattr(record, name) for name in pair] for pair in names], dtype=np.float64)
+        whole, bias, missed = np.einsum("nij,sjn->sin", slopes**2, [stds[0], *np.nan_to_num(stds[1:])])
+        # a levelled simulation has passed through the recovery, and misses what that does
+        noise, stated = (np.sqrt([np.maximum(one, 0), bias]) for one in (whole - missed, whole))
         simulated = self.simulation.at(time)
         levelled = np.where(np.isfinite(measured), self.levelling(simulated), np.nan)
         fit, rigid, taken = self._fit(index, measured, noise, levelled)
@@ -231,25 +234,25 @@ class Comparison:
             measured = measured - rigid
         gradient = self.simulated_mesh.nodal_gradient(simulated)
         strain = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4))).components
-        values, own = self._at_nodes(measured, noise)
+        values, own = self._at_nodes(measured, stated)
         ways = {
-            "nodes": np.concatenate([simulated.T, strain.T]),
-            "levelled": self._at_nodes(levelled, noise * [[[1]], [[0]]])[0],
+            "nodes": (np.concatenate([simulated.T, strain.T]), own),
+            "levelled": (self._at_nodes(levelled, noise * [[[1]], [[0]]])[0], self._at_nodes(measured, noise)[1]),
         }
         common = self.relative_std * values * np.array([1, 1, 0, 0, 0])[:, None]
         std = np.hypot(own[0], common)
         agreement = {}
-        for way, of_simulation in ways.items():
+        for way, (of_simulation, errors) in ways.items():
             for name, rows in {"displacement": [0, 1], **{name: [row] for row, name in enumerate(QUANTITIES)}}.items():
                 left = taken * len(rows) / 2 if self.remove_rigid and max(rows) < 2 else 0.0
                 difference = (values - of_simulation)[rows]
-                agreement[way, name] = self._agreement(rows, difference, own[:, rows], common[rows], left)
+                agreement[way, name] = self._agreement(rows, difference, errors[:, rows], common[rows], left)
         return FrameComparison(
             frame=index,
             time=time,
             measured=dict(zip(QUANTITIES, values, strict=True)),
             std=dict(zip(QUANTITIES, std, strict=True)),
-            simulated={way: dict(zip(QUANTITIES, rows, strict=True)) for way, rows in ways.items()},
+            simulated={way: dict(zip(QUANTITIES, rows, strict=True)) for way, (rows, _) in ways.items()},
             agreement=agreement,
             fit=fit,
         )

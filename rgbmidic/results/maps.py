@@ -21,7 +21,17 @@ from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.results.physical import MOVED, Physical, displacements, frame_times, named, reference_frames, shared_part
+from rgbmidic.results.physical import (
+    EDGE,
+    MOVED,
+    Physical,
+    displacements,
+    edge_std,
+    frame_times,
+    named,
+    reference_frames,
+    shared_part,
+)
 from rgbmidic.results.quantities import DERIVED, UNKNOWN_TIME, UV, WITH_ERROR, Quantity, map_quantities
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import MeshSettings, ProbeSettings, ScaleSettings
@@ -241,7 +251,9 @@ class Maps(Portable):
             raise InputError(f"there is no frame {frame} in a result of {len(self.result)} frames")
         base = name.removesuffix("_std")
         derived = base in DERIVED or name in WITH_ERROR
-        stored = ("light_fraction",) if kind == "fraction" else () if derived or name in MOVED else (name,)
+        stored: tuple[str, ...] = () if derived or name in MOVED else EDGE if name in EDGE else (name,)
+        if kind == "fraction":
+            stored = ("light_fraction",)
         read = next(self.result.table.each(["u", "v", "node_status", *stored], [frame]))
         nothing = np.full(len(self.result.nodes), np.nan)
         if name in WITH_ERROR:
@@ -254,6 +266,8 @@ class Maps(Portable):
             values, std = np.where(read["node_status"] == 0, read["light_fraction"][:, light], np.nan), nothing
         elif name in MOVED:
             values, std = self.physical.length * next(self._displacements([frame]))[MOVED.index(name)], nothing
+        elif name in EDGE:
+            values, std = self.physical.length * edge_std(self.physical.rectified, read)[EDGE.index(name)], nothing
         else:
             values, std = np.asarray(read[name], dtype=np.float64), nothing
         return MapValues(

@@ -29,6 +29,7 @@ from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 logger = logging.getLogger(__name__)
 
 MOVED = ("u", "v", "u_std", "v_std", "u_bias_std", "v_bias_std")
+EDGE = ("u_edge_std", "v_edge_std")
 """Displacement, its standard uncertainty and the part that the lights' bias leaves, as functions take them."""
 
 
@@ -168,6 +169,11 @@ def _moved(rectified: Rectification, read: Mapping[str, AnyArray]) -> FloatArray
     return np.stack(rectified.displacement(*moved))
 
 
+def edge_std(rectified: Rectification, read: Mapping[str, AnyArray]) -> FloatArray:
+    """Return what the recovery misses near edges (2, N), in rectified px."""
+    return np.stack(rectified.displacement(*(np.asarray(read[name], np.float64) for name in ("u", "v", *EDGE)))[2:])
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Physical(Portable):
     """A result with its units.
@@ -303,6 +309,7 @@ class Physical(Portable):
         for component, (value, std, bias) in zip("uv", moved.reshape(3, 2, -1).swapaxes(0, 1), strict=True):
             values |= zip((component, f"{component}_std"), self.units.lengths(value, std), strict=True)
             values[f"{component}_bias_std"] = self.length * bias
+        values |= zip(EDGE, self.length * edge_std(self.rectified, record.values), strict=True)
         values |= named(self.gauges.strain(*moved, measure=self.measure))
         gradient = self.mesh.element_gradient(moved[:2].T)
         elements = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4)), self.measure)

@@ -28,7 +28,7 @@ from rgbmidic.settings import TestSettings
 from rgbmidic.typing import AnyArray
 
 SCHEMA_NAME = "rgbmidic-result"
-SCHEMA_VERSION = 12
+SCHEMA_VERSION = 13
 """Goes up with every change of the quantities or files: a result of another version is refused, not guessed at."""
 
 PROVENANCE = "provenance.json"

@@ -255,6 +255,7 @@ _AT_NODE = "relative to the reference, at the node"
 _NOT_FIT = "(not the best linear fit's nodal value)"
 _AROUND = "slope of the quadratic through the neighbouring nodes; NaN also next to a node that is not measured"
 _BIAS = "part of {}_std left by the bias of the lights, alike over some 24 px; 0 where there is none"
+_EDGE = "part of {}_std that the recovery misses near edges of the region; 0 elsewhere and with `mesh.error`"
 _LEFT_OUT = "discretisation error of {}, caused by mesh and recovery, one sigma; empty unless `mesh.error` requests it"
 _ENDS = ("converged", "not converged", "failed")
 _NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
@@ -288,6 +289,8 @@ _TABLE = (
     Quantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
     Quantity("u_bias_std", _NODE, "px", "bias_std.0", _BIAS.format("u"), kind="positive"),
     Quantity("v_bias_std", _NODE, "px", "bias_std.1", _BIAS.format("v"), kind="positive"),
+    Quantity("u_edge_std", _NODE, "px", "edge_std.0", _EDGE.format("u"), kind="positive"),
+    Quantity("v_edge_std", _NODE, "px", "edge_std.1", _EDGE.format("v"), kind="positive"),
     *with_uncertainty(
         Quantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
         Quantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),

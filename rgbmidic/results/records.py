@@ -96,6 +96,8 @@ class Quantities:
     v_std = _Attribute()
     u_bias_std = _Attribute()
     v_bias_std = _Attribute()
+    u_edge_std = _Attribute()
+    v_edge_std = _Attribute()
     exx = _Attribute()
     eyy = _Attribute()
     exy = _Attribute()

@@ -36,10 +36,11 @@ def test_chi_square_scatters_as_its_degrees_of_freedom_say(comparisons):
 def test_resolution_is_difference_at_the_nodes_and_none_when_levelled(comparisons):
     """Elements as wide as the hole's radius miss the concentration of strain beside it.
 
-    Read linearly between the measurement's nodes displacement had 2.6; by the field between them it has 1.4.
+    Read linearly between the measurement's nodes displacement had 2.6; by the field between them it has 1.4, and 0.98
+    with what the recovery misses beside the hole in the uncertainty.
     """
-    assert chi_square(comparisons[1.0], "nodes", "displacement") > RATIO[1] ** 2
-    assert chi_square(comparisons[1.0], "nodes", "eyy") > 8
+    assert RATIO[0] ** 2 < chi_square(comparisons[1.0], "nodes", "displacement") < RATIO[1] ** 2
+    assert chi_square(comparisons[1.0], "nodes", "eyy") > 2  # measured: 3.8; 9 without
 
 
 def test_a_wrong_modulus_is_found_at_the_level_of_the_uncertainty(comparisons):

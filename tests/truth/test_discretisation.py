@@ -16,7 +16,7 @@ REGION = (15, 15, 304, 304)
 MIDDLE, RADIUS = 160, 50  # of the hole: elements are a fifth of its diameter
 TOGETHER = (0.75, 1.25)  # measured: .79 to 1.19
 AT_EDGE = (0.6, 1.6)  # measured: .69 to 1.44
-AT_RIM = 1.8  # measured: 1.43 and 1.55
+AT_RIM = 1.5  # measured: 1.13 to 1.38
 INFLATED = 1.15  # measured: 1.04 and 1.14
 Field = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
@@ -102,10 +102,14 @@ def test_noise_and_discretisation_error_are_the_true_error(elements: float, ligh
         assert low < ratio < high, (name, found)
 
 
-def test_the_error_at_the_rim_of_a_hole_and_of_the_peak_strain_is_stated() -> None:
+@pytest.mark.parametrize("mesh_error", [True, False])
+def test_the_error_at_the_rim_of_a_hole_and_of_the_peak_strain_is_stated(
+    mesh_error: bool, caplog: pytest.LogCaptureFixture
+) -> None:
     y, x = np.mgrid[:SIZE, :SIZE]
     mask = (np.abs(x - MIDDLE) < 145) & (np.abs(y - MIDDLE) < 145) & (np.hypot(x - MIDDLE, y - MIDDLE) > RADIUS + 1)
-    found = measured(hole, region=Region.from_mask(mask), noise=1)
+    found = measured(hole, region=Region.from_mask(mask), noise=1, mesh_error=mesh_error)
+    assert "the strain at edges of the region is not resolved" in caplog.text
     x, y = found.nodes.T
     rim = np.hypot(x - MIDDLE, y - MIDDLE) < RADIUS + 3
     peak = rim & (np.abs(x - MIDDLE) < RADIUS / 4)
@@ -115,9 +119,11 @@ def test_the_error_at_the_rim_of_a_hole_and_of_the_peak_strain_is_stated() -> No
     for name, index, truth in (("strain", 0, true[0]), ("displacement", slice(None), true[1])):
         error = getattr(found, name)[:, index] - truth
         noise, missed = (getattr(found, f"{name}_{kind}")[:, index] for kind in ("std", "error"))
-        ratio = [np.sqrt(np.mean(error[here] ** 2) / np.mean((noise**2 + missed**2)[here])) for here in (rim, peak)]
+        both = noise**2 + np.nan_to_num(missed) ** 2
+        ratio = [np.sqrt(np.mean(error[here] ** 2) / np.mean(both[here])) for here in (rim, peak)]
         assert ratio[0] < AT_RIM, name
-        assert np.mean(error[rim] ** 2) > 2 * np.mean(noise[rim] ** 2), name  # there is something to state
+        if mesh_error:
+            assert np.mean(error[rim] ** 2) > 2 * np.mean(noise[rim] ** 2), name  # there is something to state
         if name == "strain":
             assert ratio[1] < 1, name
 

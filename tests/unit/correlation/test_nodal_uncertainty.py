@@ -96,7 +96,9 @@ def test_elements_of_any_size_state_their_error(size):
 
 
 @pytest.mark.parametrize(("wave", "apart", "mesh_error"), [(0, 0, True), (0.5, 0, False), (0, 0.1, False)])
-def test_the_uncertainty_turns_with_the_surface(wave, apart, mesh_error):
+def test_the_uncertainty_turns_with_the_surface(wave, apart, mesh_error, monkeypatch):
+    # what the recovery misses near edges turns as slopes do, not as noise
+    monkeypatch.setattr("rgbmidic.pipeline.sequence.with_one_sided_error", lambda _, found: found)
     random, (y, x), options = np.random.default_rng(0), np.mgrid[:121, :121].astype(float), {"element_size": 16}
     streaks = np.stack([gaussian_filter(random.normal(size=x.shape), (1.5, 4.0)) for _ in range(2)])
     streaks *= 40 / streaks.std()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from nodal_tests import COVARIANCE, MESH, dense_correlation
 
-from rgbmidic.correlation.recovery import quadratic_fit
+from rgbmidic.correlation.recovery import at_free_boundary, quadratic_fit
 from rgbmidic.fields import Nodal, Places, ProfileLine, StrainGauges, at_pixels, make_probe
 from rgbmidic.fields.interpolation import PointSum
 from rgbmidic.mesh import Region, Tri3Mesh
@@ -29,6 +29,7 @@ def naive(mesh: Tri3Mesh, values: FloatArray, point: FloatArray, has_data: np.nd
     """The definition, corner by corner and node by node."""
     fits = [one.toarray() for one in quadratic_fit(mesh, has_data[mesh.elements].all(axis=1))]
     places, total = Places.of(mesh, point), 0.0
+    edge = at_free_boundary(mesh, has_data[mesh.elements].all(axis=1))
     for node, shape in zip(mesh.elements[places.element[0]], places.barycentric[0], strict=True):
         slope, areas = np.zeros(2), 0.0
         for element, area in zip(mesh.elements, mesh.areas, strict=True):
@@ -39,7 +40,10 @@ def naive(mesh: Tri3Mesh, values: FloatArray, point: FloatArray, has_data: np.nd
                 sx, sy, xx, xy, yy = (np.nan_to_num(values) @ one[other] for one in fits[1:])
                 slope += area * np.array([sx + xx * x + xy * y, sy + xy * x + yy * y])
                 areas += area
-        total += shape * (values[node] + slope @ (point - mesh.nodes[node]) / (2 * max(areas, 1e-9)))
+        slope /= max(areas, 1e-9)
+        if edge[node]:
+            slope = (slope + [np.nan_to_num(values) @ one[node] for one in fits[1:3]]) / 2
+        total += shape * (values[node] + slope @ (point - mesh.nodes[node]) / 2)
     return float(total)
 
 

@@ -207,7 +207,7 @@ def test_a_result_of_the_last_schema_is_refused_in_one_line_and_can_be_overwritt
     with pytest.raises(ResultError) as told:
         Result.open(out)
     assert str(told.value) == (
-        f"{out} has schema version 10, written by rgbmidic 0.0; this rgbmidic {__version__} reads schema version 12: "
+        f"{out} has schema version 10, written by rgbmidic 0.0; this rgbmidic {__version__} reads schema version 13: "
         "read it with the version that wrote it, or measure the test again"
     )
     make_result(out, frames=1, overwrite=True)
@@ -257,7 +257,7 @@ def test_damage_of_each_part_is_told(tmp_path: Path) -> None:
     assert "not a result folder" in damaged("provenance.json", None)
     assert "damaged" in damaged("provenance.json", b"{")
     assert "schema" in damaged("provenance.json", b"[]")
-    assert "schema version 13" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 13}')
+    assert "schema version 14" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 14}')
     assert "schema version 3" in damaged("provenance.json", b'{"schema": "rgbmidic-result", "schema_version": 3}')
     whole = make_result(tmp_path / "whole").provenance
     for part, odd in {"frames": [1], "lights": [1], "settings": {"a": 1}, "references": ["a"], "inputs": None}.items():
@@ -317,6 +317,7 @@ def test_every_quantity_of_a_solution_is_taken_from_it() -> None:
         displacement=values.random((nodes, 2)),
         displacement_std=values.random((nodes, 2)),
         bias_std=values.random((nodes, 2)),
+        edge_std=values.random((nodes, 2)),
         strain=values.random((nodes, 3)),
         strain_std=values.random((nodes, 3)),
         displacement_error=values.random((nodes, 2)),
@@ -339,6 +340,7 @@ def test_every_quantity_of_a_solution_is_taken_from_it() -> None:
     np.testing.assert_array_equal(np.stack([record.exx, record.eyy, record.exy], axis=1), single["strain"])
     np.testing.assert_array_equal(np.stack([record.exx_std, record.eyy_std, record.exy_std], 1), single["strain_std"])
     np.testing.assert_array_equal(record.v_bias_std, solution.bias_std[:, 1].astype(np.float32))
+    np.testing.assert_array_equal(record.v_edge_std, solution.edge_std[:, 1].astype(np.float32))
     np.testing.assert_array_equal(record.v_mesh_error, solution.displacement_error[:, 1].astype(np.float32))
     np.testing.assert_array_equal(record.exy_mesh_error, solution.strain_error[:, 2].astype(np.float32))
     for name in ("node_status", "light_fraction", "misfit", "rigid", "residual", "weight_fraction", "history"):

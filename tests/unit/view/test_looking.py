@@ -221,6 +221,8 @@ def test_fields_are_those_of_the_table_in_the_units_of_the_reader(result):
     bias = np.where(np.isfinite(record.u_std), 0.5 * np.nan_to_num(record.u_bias_std), np.nan)
     for found in (fields.read("u_bias_std", 3).values, fields.physical.frame(3)["u_bias_std"]):
         np.testing.assert_allclose(found, bias)
+    for found in (fields.read("u_edge_std", 3).values, fields.physical.frame(3)["u_edge_std"]):
+        np.testing.assert_allclose(found, 0.5 * record.u_edge_std)
     np.testing.assert_array_equal(fields.read("node_status", 3).values, record.node_status)
     np.testing.assert_allclose(fields.read("e1", 3).values, fields.physical.frame(3)["e1"])
     fraction = fields.read("fraction of green", 3).values
