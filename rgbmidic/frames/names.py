@@ -12,7 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Self
 
-from rgbmidic.errors import FrameError, disk_faults, legible
+from rgbmidic.errors import FrameError, convert_disk_errors, printable
 from rgbmidic.frames.formats import advice, known_formats
 from rgbmidic.frames.stacks import split_dataset
 
@@ -43,7 +43,7 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
     """
     text, dataset = split_dataset(pattern)
     place = Path(base) / text
-    with disk_faults(FrameError, f"the frames {pattern} cannot be looked for"):
+    with convert_disk_errors(FrameError, f"the frames {pattern} cannot be looked for"):
         if place.is_dir():
             found = sorted(file for file in place.iterdir() if file.name[0] != ".")
             endings = {ending for known in known_formats() for ending in known.endings}
@@ -127,7 +127,7 @@ class NamedFiles:
     @property
     def listed(self) -> str:
         """The first and the last names."""
-        names = [legible(path.name) for path in self.paths]
+        names = [printable(path.name) for path in self.paths]
         return ", ".join(names if len(names) <= 5 else (*names[:3], "...", names[-1]))
 
 

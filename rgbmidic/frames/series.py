@@ -18,7 +18,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
+from rgbmidic.errors import ConfigurationError, FrameError, InputError, printable
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.formats import known_formats, open_source
 from rgbmidic.frames.images import write_tiff
@@ -100,7 +100,7 @@ class FrameSeries:
         stacks = any(len(source) > 1 for sources in self.lights for source in sources)
         for source in (one for sources in self.lights for one in (sources if stacks else sources[:1])):
             for remark in source.remarks:
-                found.setdefault(remark, []).append(legible(source.path.name))
+                found.setdefault(remark, []).append(printable(source.path.name))
         more = {remark: f" and {len(names) - 1} more" if len(names) > 1 else "" for remark, names in found.items()}
         return tuple(f"{names[0]}{more[remark]}: {remark}" for remark, names in found.items())
 
@@ -212,7 +212,7 @@ class FrameSeries:
         """
         in_part = window is not None and not window.is_whole
         sources = [source for source, _ in self._locate(index)]
-        return {legible(one.path): file_fingerprint(one.path) if in_part else one.fingerprint for one in sources}
+        return {printable(one.path): file_fingerprint(one.path) if in_part else one.fingerprint for one in sources}
 
     def fingerprint(self, unread: Collection[str] = ()) -> tuple[str, tuple[str, ...]]:
         """Return the SHA-256 of names and sampled content of all files, and the names of those that count without it.
@@ -233,7 +233,7 @@ class FrameSeries:
         """
         digest, without = hashlib.sha256(), []
         for source in (source for sources in self.lights for source in sources):
-            name, content = legible(source.path.name), "unread"
+            name, content = printable(source.path.name), "unread"
             if name not in unread:
                 with suppress(FrameError):
                     content = file_fingerprint(source.path)

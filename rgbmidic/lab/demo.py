@@ -33,7 +33,7 @@ from rgbmidic.results import Result
 from rgbmidic.results.files import writing
 from rgbmidic.results.physical import Physical
 from rgbmidic.settings import ScaleSettings, TestSettings, read_test
-from rgbmidic.typing import FloatArray, FloatImage, Progress
+from rgbmidic.typing import FloatArray, FloatImage, ProgressCallback
 
 _SCENE = """\
 # The paper's sphere (82.5 mm) turning about its front point under a red, a green and a blue lamp, all at once.
@@ -116,7 +116,7 @@ def run_demo(
     out: Path,
     report: Callable[[str], None],
     calibrate: Callable[[Path], None],
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     *,
     size: int = 448,
     angles: Sequence[float] = ANGLES,

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import MappingProxyType
 from urllib.parse import quote
 
-from rgbmidic.errors import InputError, optional
+from rgbmidic.errors import InputError, import_optional
 from rgbmidic.results.files import writing
 
 ADDRESS = "https://raw.githubusercontent.com"
@@ -97,7 +97,7 @@ def cache_folder() -> Path:
         pooch (extra ``sample``) is not installed.
     """
     stated = os.environ.get("RGBMIDIC_SAMPLES")
-    return Path(stated) if stated else Path(optional("pooch", "sample").os_cache("rgbmidic"))
+    return Path(stated) if stated else Path(import_optional("pooch", "sample").os_cache("rgbmidic"))
 
 
 def write_sample(name: str, folder: Path, report: Callable[[str], None] = lambda _: None) -> Sample:
@@ -141,7 +141,7 @@ def write_sample(name: str, folder: Path, report: Callable[[str], None] = lambda
 
 def _fetch(sample: Sample, file: SampleFile, report: Callable[[str], None]) -> Path:
     """The file in the cache, fetched where it is not there or not what was published."""
-    pooch = optional("pooch", "sample")
+    pooch = import_optional("pooch", "sample")
     url = f"{ADDRESS}/{sample.repository}/{sample.commit}/{quote(file.path)}"
     place = cache_folder() / sample.name
     if not (place / file.name).is_file():

@@ -21,7 +21,7 @@ import numpy as np
 from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.correlation import NodeStatus, Start, Status
 from rgbmidic.correlation.solution import rank
-from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError, optional
+from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError, import_optional
 from rgbmidic.pipeline.frame import Measured, Updated, attempt, failed_frame
 from rgbmidic.pipeline.plan import STRIDE, Plan, is_key, parent
 from rgbmidic.results import FrameRecord
@@ -210,7 +210,7 @@ class Cluster:
     """The workers of a Dask cluster; what a lost one was doing is done again by another."""
 
     def __init__(self, plan: Plan, address: str) -> None:
-        distributed = optional("distributed", "cluster")
+        distributed = import_optional("distributed", "cluster")
         # what becomes of the cluster is reported here, without its tracebacks; some loggers have levels of their own
         names = [name for name in logging.root.manager.loggerDict if name.startswith(("distributed", "tornado"))]
         self._levels = {log: log.level for log in map(logging.getLogger, names)}

@@ -12,13 +12,13 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from rgbmidic.errors import optional
+from rgbmidic.errors import import_optional
 from rgbmidic.report import style
 from rgbmidic.report.figures import spread
 from rgbmidic.report.page import render
 from rgbmidic.results.comparison import QUANTITIES, WAYS, Comparison, FrameComparison
 from rgbmidic.results.files import write_complete, write_table, writing
-from rgbmidic.text import uncertain
+from rgbmidic.text import format_with_std
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def write_comparison(
     shown = spread(comparison.frames, _LIMITS.shown)
     done: list[FrameComparison] = []
     tables: dict[str, list[dict[str, Any]]] = {TABLE: [], SCALE: []}
-    optional("meshio", "fe")
+    import_optional("meshio", "fe")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
     for made in comparison.each():
@@ -243,7 +243,9 @@ def scale_text(comparison: Comparison, done: Sequence[FrameComparison]) -> str:
     scale, std = comparison.best_scale([made.fit for made in done])
     if not np.isfinite(scale):
         return "no scale is found: the simulation is a rigid motion in all frames, or too few of its nodes have data"
-    text = f"{uncertain(scale, std)} times the simulation fits the measurement best, with any shift and rotation: "
+    text = (
+        f"{format_with_std(scale, std)} times the simulation fits the measurement best, with any shift and rotation: "
+    )
     away, rest = abs(scale - 1) / std if std else np.inf, float(np.median([made.fit.chi_square for made in done]))
     if away <= 2:
         text += "1 is within two standard uncertainties"

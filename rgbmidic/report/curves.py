@@ -17,7 +17,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.report import style
 from rgbmidic.report.figures import field_colours, spread
 from rgbmidic.results import QUANTITIES, Channels, Histories, History, Maps, Profile, Wave
-from rgbmidic.text import uncertain
+from rgbmidic.text import format_with_std
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -366,7 +366,7 @@ def wave_text(profile: Profile, wave: Wave) -> str:
         speed, std, unit = speed / 1000, std / 1000, "m/s"
     fit = f"chi-square {front.chi_square:.3g} of {front.freedom}"
     level = f" at {wave.level}" if wave.what == "front" else ""
-    return f"{wave.what} of {profile.field.symbol}{level}: {uncertain(speed, std, unit)} ({fit})"
+    return f"{wave.what} of {profile.field.symbol}{level}: {format_with_std(speed, std, unit)} ({fit})"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic._kernels.picture import paint_field
-from rgbmidic.errors import InputError, ResultError, RgbmidicError, optional
+from rgbmidic.errors import InputError, ResultError, RgbmidicError, import_optional
 from rgbmidic.report import style
 from rgbmidic.report.curves import Curve
 from rgbmidic.report.figures import field_colours, picture_limits, spread
@@ -243,7 +243,7 @@ def write_movie(
     check_file(out, overwrite=overwrite)
     chosen, constants = movie.chosen, movie.constants
     canvas = _Canvas(movie)
-    exe = "" if ending == ".gif" else str(optional("imageio_ffmpeg", "movie").get_ffmpeg_exe())
+    exe = "" if ending == ".gif" else str(import_optional("imageio_ffmpeg", "movie").get_ffmpeg_exe())
     parts = max(1, min(processes, len(chosen) // constants.few))
 
     def pages() -> Iterator[Page]:

@@ -19,7 +19,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import ResultError, disk_faults
+from rgbmidic.errors import ResultError, convert_disk_errors
 from rgbmidic.settings import regular
 from rgbmidic.typing import AnyArray
 
@@ -177,7 +177,7 @@ def remove_parts(folder: Path, names: str) -> None:
 
 def writing(path: Path | str) -> AbstractContextManager[None]:
     """Turn an error of the disk inside the block into a `ResultError` that names the file."""
-    return disk_faults(ResultError, f"{path} cannot be written")
+    return convert_disk_errors(ResultError, f"{path} cannot be written")
 
 
 def may_live(holder: dict[str, Any]) -> bool:

@@ -27,7 +27,7 @@ from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.physical import Physical, displacements, frame_times, reference_frames, shared_part
 from rgbmidic.results.result import Result
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
-from rgbmidic.text import rounded
+from rgbmidic.text import format_value
 from rgbmidic.typing import AnyArray, FloatArray, IntArray
 
 
@@ -93,8 +93,8 @@ def history_rows(histories: Histories) -> tuple[list[str], list[list[str]]]:
         ends = (known.argmin(), known.argmax(), len(known) - 1) if known.size else ()
         typical = float(np.median(std[np.isfinite(std)])) if np.isfinite(std).any() else math.nan
         place = np.fmax(std, typical)  # a reference frame is known to rounding only: that is not the test's uncertainty
-        texts = [rounded(known[end], place[end]) for end in ends] or ["-"] * 3
-        rows.append([quantity.name, quantity.unit, *texts, rounded(typical, typical), f"{known.size}"])
+        texts = [format_value(known[end], place[end]) for end in ends] or ["-"] * 3
+        rows.append([quantity.name, quantity.unit, *texts, format_value(typical, typical), f"{known.size}"])
     return ["quantity", "unit", "smallest", "largest", "last", "uncertainty", "frames"], rows
 
 

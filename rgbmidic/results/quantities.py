@@ -15,7 +15,7 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.fields.units import Units
-from rgbmidic.text import rounded, uncertain
+from rgbmidic.text import format_value, format_with_std
 from rgbmidic.timing import STAGES
 
 Kind = Literal["displacement", "strain", "positive", "fraction", "angle", "codes"]
@@ -145,8 +145,8 @@ class Quantity:
         if self.codes:
             return self.codes[int(value)]
         if self.group == "Uncertainty":
-            return f"{rounded(value, value)} {self.unit}".rstrip()
-        return uncertain(value, std, self.unit)
+            return f"{format_value(value, value)} {self.unit}".rstrip()
+        return format_with_std(value, std, self.unit)
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int | None, ...]:
         """Return the shape in one frame for these sizes of ``"node"`` and ``"light"``; None for an open axis.

@@ -22,12 +22,12 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Protocol, TypeVar
 
 import numpy as np
 
-from rgbmidic.errors import AnotherTestError, InputError, ResultError, disk_faults
+from rgbmidic.errors import AnotherTestError, InputError, ResultError, convert_disk_errors
 from rgbmidic.results.files import npy_array, npy_bytes, write_complete
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
 from rgbmidic.results.quantities import QUANTITIES
 from rgbmidic.settings import regular
-from rgbmidic.text import Described
+from rgbmidic.text import HtmlRepr
 from rgbmidic.typing import BoolArray, IntArray
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ class Quantities:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameRecord(Quantities, Described):
+class FrameRecord(Quantities, HtmlRepr):
     """The result of one frame; every quantity of `rgbmidic.results.QUANTITIES` is an attribute, such as ``record.u``.
 
     Attributes
@@ -345,7 +345,7 @@ class FrameTable:
             The folder cannot be read.
         """
         folder, written = path / FRAMES, np.full(count, -1, dtype=np.int64)
-        with disk_faults(ResultError, f"{folder} cannot be read"):
+        with convert_disk_errors(ResultError, f"{folder} cannot be read"):
             for frame, file in record_files(folder).items():
                 with suppress(FileNotFoundError, IndexError):  # discarded just now, or of no frame
                     written[frame] = file.stat().st_mtime_ns

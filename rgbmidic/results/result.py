@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import InputError, ResultError, optional
+from rgbmidic.errors import InputError, ResultError, import_optional
 from rgbmidic.results.files import read_arrays, read_json, write_json
 from rgbmidic.results.provenance import PROVENANCE, PUT_BACK, digest, fingerprint, now, read_provenance, sealed
 from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED
@@ -20,7 +20,7 @@ from rgbmidic.results.records import FrameRecord, FrameTable, Quantities
 from rgbmidic.results.warnings import of_frames
 from rgbmidic.settings import read_section
 from rgbmidic.settings.schema import section_kinds
-from rgbmidic.text import Described
+from rgbmidic.text import HtmlRepr
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class Portable:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Result(Portable, Quantities, Described):
+class Result(Portable, Quantities, HtmlRepr):
     """The result of a test, for post-processing.
 
     `Result.open` opens a result folder, also during a run, and reads only the mesh and which frames there are. The
@@ -343,7 +343,7 @@ class Result(Portable, Quantities, Described):
         ResultError
             A frame is damaged; raised when a value of it is read.
         """
-        dataset: xr.Dataset = optional("rgbmidic.results.dataset", "xarray").to_dataset(self, scale)
+        dataset: xr.Dataset = import_optional("rgbmidic.results.dataset", "xarray").to_dataset(self, scale)
         return dataset
 
     def _quantity(self, name: str, /) -> AnyArray:

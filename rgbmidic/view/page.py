@@ -19,7 +19,7 @@ from rgbmidic.report.style import embedded
 from rgbmidic.results import Result
 from rgbmidic.results.histories import history_csv
 from rgbmidic.settings import ChannelSettings, ProbeSettings
-from rgbmidic.text import uncertain
+from rgbmidic.text import format_with_std
 from rgbmidic.view.address import BESIDE, OVER, SCALE, UNCERTAINTY, Mark, Steps, ViewState
 from rgbmidic.view.constants import VIEWER
 from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
@@ -207,7 +207,7 @@ class ResultPage:
                 self._offer_fields()
             scale, told = self.shown.scale, ""
             if scale and not self.view.camera and scale.mm_per_pixel is not None:
-                told = uncertain(scale.mm_per_pixel, scale.mm_per_pixel_std, "mm/px")
+                told = format_with_std(scale.mm_per_pixel, scale.mm_per_pixel_std, "mm/px")
             self.parts.scaled.text = told
         except RgbmidicError as error:
             self.parts.scaled.text = warning(str(error))

@@ -32,7 +32,7 @@ from rgbmidic.results import (
 )
 from rgbmidic.results.histories import read_histories
 from rgbmidic.settings import ProbeSettings, ScaleSettings
-from rgbmidic.text import rounded
+from rgbmidic.text import format_value
 
 FIELDS = ("u", "exx", "e1", "direction", "equivalent", "u_velocity")
 STATED = re.compile(r"(\S+) ± (\d\S*?)(?=[\s<,;)]|$)")
@@ -108,8 +108,8 @@ def test_histories_have_one_name_and_one_unit_in_picture_table_and_page(result: 
     )
     assert len(stated) >= 4
     for value, std in stated:
-        assert std == rounded(float(std), float(std))
-        assert value == rounded(float(value), float(std))
+        assert std == format_value(float(std), float(std))
+        assert value == format_value(float(value), float(std))
 
 
 def test_no_number_with_an_uncertainty_is_written_but_by_one_function() -> None:

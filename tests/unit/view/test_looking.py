@@ -27,7 +27,7 @@ from rgbmidic.report.style import time_axis
 from rgbmidic.results import QUANTITIES, FrameRecord, Maps, MapValues, Result, ResultStore
 from rgbmidic.results.histories import read_histories, write_histories
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, TestSettings
-from rgbmidic.text import rounded, uncertain
+from rgbmidic.text import format_value, format_with_std
 from rgbmidic.view import curves
 from rgbmidic.view.address import (
     CLOCKS,
@@ -333,8 +333,8 @@ def test_the_label_of_a_probe_is_its_history_in_that_frame_and_the_pointer_state
             assert label(shown, f"{name}_std", kind, *PLACES[kind]) == f"{mean}: {maps.all[f'{name}_std'].text(std)}"
     for name, of_gauge, unit in (("u", "extension", " mm"), ("exx", "strain", "")):
         value, std = history("gauge", of_gauge)
-        assert label(shown, name, "gauge", *PLACES["gauge"]) == f" {of_gauge}: {uncertain(value, std)}{unit}"
-        assert label(shown, f"{name}_std", "gauge", *PLACES["gauge"]) == f" {of_gauge}: {rounded(std, std)}{unit}"
+        assert label(shown, name, "gauge", *PLACES["gauge"]) == f" {of_gauge}: {format_with_std(value, std)}{unit}"
+        assert label(shown, f"{name}_std", "gauge", *PLACES["gauge"]) == f" {of_gauge}: {format_value(std, std)}{unit}"
     assert label(shown, "misfit", "gauge", *PLACES["gauge"]) == ""
     for name in ("exx", "eyy", "exy", "e1", "e2", "equivalent"):
         for kind in ("region", "circle"):
