@@ -35,7 +35,7 @@ def demo(out: Annotated[Path, Option(help="Output folder; must be empty or new."
     note(f"6 of 7: measurement on it: rgbmidic run {out / 'test' / 'plate.toml'}, with [scale] camera = camera.json")
     plate = run_plate(out / "test", truth)
     note(f"7 of 7: pictures of the result in {out / 'figures'}")
-    write_figures(Maps.of(Result.open(out / "result")), out / "figures", (len(rows),), processes=threads())
+    write_figures(Maps.from_result(Result.open(out / "result")), out / "figures", (len(rows),), processes=threads())
     columns = ["angle", "three lights", "red alone", "green alone", "blue alone", "at nodes", "stated u_std"]
     lines = []
     for row in rows:

@@ -198,13 +198,13 @@ def movie(
 ) -> None:
     """Write a movie of one field or several side by side, over the reference image or the raw frames."""
     from rgbmidic._kernels.threads import threads
-    from rgbmidic.report import Curve, Movie, write_movie
+    from rgbmidic.report import Curve, FieldMovie, write_movie
 
     if over not in ("reference", "frame"):
         raise InputError(f"--over is reference or frame, not {over!r}")
     if curve is None and (column is not None or offset):
         raise InputError("--column and --offset are of a --curve FILE, which is not stated")
-    field_movie = Movie(
+    field_movie = FieldMovie(
         maps=source.maps(derived),
         fields=tuple(name.strip() for name in field.split(",")),
         frames=source.frames(frames),

@@ -84,7 +84,7 @@ def batch(
     """
     from rgbmidic.pipeline import batch as series
     from rgbmidic.report import REPORT, write_batch_page, write_report
-    from rgbmidic.results.files import writing
+    from rgbmidic.results.files import write_errors
 
     if table is not None and len(tests) != 1:
         raise InputError(f"--table goes with one TEST.toml, the template, not with {len(tests)}")
@@ -92,7 +92,7 @@ def batch(
     low, high = command.read_pair(elastic, "--elastic")
     if not 0 <= low < high:
         raise InputError(f"--elastic is a smaller and a larger strain, not {elastic}")
-    with writing(out):
+    with write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         series.check_summary(out, overwrite=overwrite)
 
@@ -145,7 +145,7 @@ def _conclude(result: Result, start_time: float, *, draw: bool, processes: int =
 
     remove_pictures(result.path)
     if draw:
-        write_figures(Maps.of(result), result.path / "figures", processes=processes or threads())
+        write_figures(Maps.from_result(result), result.path / "figures", processes=processes or threads())
     _print_summary(result, time.perf_counter() - start_time)
     failed = [index for index in result.deformed if result.status[index] != 0]
     if unread := int(result.unread.sum()):
@@ -188,7 +188,7 @@ def _print_summary(result: Result, seconds: float) -> None:
         word: int((result.status[deformed] == code).sum()) for code, word in enumerate(QUANTITIES["status"].codes)
     }
     words = [f"{count} {word}" for word, count in status_counts.items() if count or word != "not converged"]
-    measured_fractions = [float((status == 0).mean()) for status in result.each("node_status", deformed)]
+    measured_fractions = [float((status == 0).mean()) for status in result.iterate("node_status", deformed)]
     rows = {"frames": f"{len(deformed)} deformed: {', '.join(words)}", "nodes": f"{len(result.nodes)}"}
     if measured_fractions:
         rows["nodes"] += f", {sum(measured_fractions) / len(measured_fractions):.1%} measured"
@@ -205,7 +205,7 @@ def _print_summary(result: Result, seconds: float) -> None:
             f"{finite.mean():.0%} of what determines the nodes" if finite.size else "-"
         )
     stage_seconds = (
-        [seconds for seconds in result.each("seconds", deformed) if seconds[0] == seconds[0]]
+        [seconds for seconds in result.iterate("seconds", deformed) if seconds[0] == seconds[0]]
         if measured_fractions
         else []
     )

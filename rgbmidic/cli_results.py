@@ -94,7 +94,9 @@ def view(
     Ctrl-C ends the server. Options that state properties of frames are for raw frames only.
     """
     serve = import_optional("rgbmidic.view", "view").serve
-    serve(path, port=port, browser=browser, tell=lambda address: print(address, flush=True), statement=statement)
+    serve(
+        path, port=port, browser=browser, report_address=lambda address: print(address, flush=True), statement=statement
+    )
 
 
 @app.command()
@@ -123,7 +125,7 @@ def compare(
     from rgbmidic.mesh import read_mesh
     from rgbmidic.report.comparison import PAGE, comparison_files, scale_text, write_comparison
     from rgbmidic.results.comparison import Comparison, measured_mesh
-    from rgbmidic.results.simulation import Simulation, place
+    from rgbmidic.results.simulation import Simulation, find_placement
 
     if rigid not in ("tell", "remove"):
         raise InputError(f'--rigid is tell or remove, not "{rigid}"')
@@ -131,7 +133,7 @@ def compare(
         raise InputError(f"--mesh is for a .csv with numbers of nodes; {fe} has a mesh of its own")
     point_pairs = [command.read_coordinates(text, "--points", "X_MM,Y_MM:X_PX,Y_PX") for text in points or ()]
     frame_indices, result, scale = command.read_frames(frames), source.result, source.scale()
-    placement = place(result, scale=scale, pairs=point_pairs)
+    placement = find_placement(result, scale=scale, point_pairs=point_pairs)
     fe_mesh = measured_mesh(result) if mesh is None else read_mesh(mesh, unit=unit)
     simulation = Simulation.read(fe, mesh=fe_mesh, unit=unit, field=field, interval=interval, offset=offset)
     comparison = Comparison(

@@ -352,7 +352,7 @@ class ResultSource:
         from rgbmidic.results import Maps
 
         choices = dict(derived)
-        return Maps.of(self.result, self.scale(px=choices.pop("px")), **choices)
+        return Maps.from_result(self.result, self.scale(px=choices.pop("px")), **choices)
 
     def frames(self, text: str) -> list[int] | None:
         """Return the measured frames among those that ``--frames`` states; None if it is empty."""

@@ -230,7 +230,7 @@ def _figure(study: ResolutionStudy) -> Figure:
             axes[-1].legend(title="elements", loc="best")
 
     count = 3 if any(one.gauges for one in study.sizes) else 1
-    return draw_figure(draw, count=count, aspect=1.4, beside=NUMBERS)
+    return draw_figure(draw, count=count, aspect=1.4, right_room=NUMBERS)
 
 
 def _draw_errors(axis: Axes, study: ResolutionStudy) -> None:

@@ -16,7 +16,7 @@ from types import MappingProxyType
 from urllib.parse import quote
 
 from rgbmidic.errors import InputError, import_optional
-from rgbmidic.results.files import writing
+from rgbmidic.results.files import write_errors
 
 ADDRESS = "https://raw.githubusercontent.com"
 """Where GitHub gives a file of a repository at a commit."""
@@ -129,7 +129,7 @@ def write_sample(name: str, folder: Path, report: Callable[[str], None] = lambda
         raise InputError(f"{folder} is already there; state another folder: rgbmidic sample {name} FOLDER")
     sample = SAMPLES[name]
     kept = [_fetch(sample, file, report) for file in sample.files]
-    with writing(folder):
+    with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for file in kept:
             shutil.copyfile(file, folder / file.name)

@@ -25,7 +25,7 @@ from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError, impor
 from rgbmidic.pipeline.frame import Measured, Updated, attempt, failed_frame
 from rgbmidic.pipeline.plan import STRIDE, Plan, is_key, parent
 from rgbmidic.results import FrameRecord
-from rgbmidic.results.warnings import collected
+from rgbmidic.results.warnings import collect_messages
 
 logger = logging.getLogger(__name__)
 
@@ -275,6 +275,6 @@ def _measure_elsewhere(plan: Plan, index: int, start: Start, updated: Updated) -
     """Measure a frame in a worker of a cluster, on one thread; nobody reads its log."""
     cv2.setNumThreads(1)
     set_threads(1)
-    with collected() as messages:
+    with collect_messages() as messages:
         found = attempt(plan, index, start, updated)
     return Measured(record=found.record, messages=tuple(messages))

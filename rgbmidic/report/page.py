@@ -17,7 +17,7 @@ def render(template: str, folder: Path = _TEMPLATES, **values: Any) -> str:
     """Fill a template in.
 
     It has three filters beside those of jinja2: ``code`` writes words between backquotes as code, ``gaps`` writes a
-    paragraph on one line and marks words between brackets, ``embedded`` makes the address of a picture of a figure; and
+    paragraph on one line and marks words between brackets, ``data_url`` makes the address of a picture of a figure; and
     `rgbmidic.text.format_value` and `format_with_std`.
 
     Parameters
@@ -47,7 +47,7 @@ def render(template: str, folder: Path = _TEMPLATES, **values: Any) -> str:
     environment.filters |= {
         "code": lambda text: Markup(re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(text)))),
         "gaps": lambda text: Markup(re.sub(r"(\[[^\]]*\])", r"<mark>\1</mark>", " ".join(escape(text).split()))),
-        "embedded": style.embedded,
+        "data_url": style.data_url,
     }
     environment.globals |= {"format_value": format_value, "format_with_std": format_with_std}
     return printable(environment.get_template(template).render(values))

@@ -260,7 +260,9 @@ def _measure_of(*ends: str, light: str = "light") -> Callable[..., Result]:
         names = [f"f{index}" for index in range(1 + len(ends))]
         origin = Origin(nodes=np.zeros((4, 2)), elements=[[0, 1, 2]], names=names, lights=[light])
         store = ResultStore.create(out, origin, overwrite=True)
-        good = FrameRecord.of(nodes=4, lights=1, status=0, node_status=[0, 0, 0, 1], light_fraction=np.ones((4, 1)))
+        good = FrameRecord.from_values(
+            nodes=4, lights=1, status=0, node_status=[0, 0, 0, 1], light_fraction=np.ones((4, 1))
+        )
         for index, reason in enumerate(("", *ends)):
             failed = FrameRecord.failed(reason, nodes=4, lights=1, unread=reason == "torn")
             store.write_frame(index, failed if reason else good)

@@ -206,4 +206,4 @@ def _finish(axis: Axes, inspection: Inspection, title: str) -> None:
     if not inspection.region.all():
         places = np.arange(left + 0.5, right), np.arange(top + 0.5, bottom)
         axis.contour(*places, inspection.region, [0.5], colors=["#f2c037"], linewidths=0.8)
-    finish_picture(axis, (left, right), (top, bottom), first=axis.get_subplotspec().is_first_col())  # type: ignore[union-attr]
+    finish_picture(axis, (left, right), (top, bottom), has_y_label=axis.get_subplotspec().is_first_col())  # type: ignore[union-attr]

@@ -23,7 +23,7 @@ from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import Frame
 from rgbmidic.lab.virtual.rendering import render
-from rgbmidic.results.files import writing
+from rgbmidic.results.files import write_errors
 from rgbmidic.scene.camera import Camera, Light, green_signs, mosaic_samples
 from rgbmidic.scene.scene import DatasetSettings, Plate, Scene, State, Target, read_scene
 from rgbmidic.scene.surface import Finish, Surface
@@ -100,7 +100,7 @@ def _check_output(scene: Scene, out: Path) -> None:
             raise InputError(f"a light's name becomes a folder's: letters, digits, - and _ only, not {light.name!r}")
         if light.name in ("all", "dark"):
             raise InputError(f"a light cannot be called {light.name!r}: that is the name of a folder of captures")
-    with writing(out):
+    with write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         taken = any(out.iterdir())
     if taken:

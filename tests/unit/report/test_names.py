@@ -51,7 +51,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
 
 @pytest.mark.parametrize("scale", SCALES, ids=["px", "mm", "mm known, px asked"])
 def test_a_field_has_one_name_and_one_unit(result: Result, scale: ScaleSettings | None, tmp_path: Path) -> None:
-    maps = Maps.of(result, scale)
+    maps = Maps.from_result(result, scale)
     length = "mm" if scale is not None and scale.unit == "mm" else "px"
     data = result.to_xarray(scale)
     export_result(result, "csv", tmp_path / "all.csv", scale=scale)
@@ -98,7 +98,7 @@ def test_histories_have_one_name_and_one_unit_in_picture_table_and_page(result: 
         re.sub(r"data:image[^\"]*|<svg.*?</svg>", "", (tmp_path / "page.html").read_text(), flags=re.DOTALL)
     )
     for name in ("u", "v", "exx", "eyy", "exy"):
-        field = Maps.of(result).field(f"{name}_std")
+        field = Maps.from_result(result).field(f"{name}_std")
         assert f"<tr><td>{field.symbol}</td><td>{field.unit or 1}</td>" in page
     printed = " ".join(cell for row in history_rows(histories)[1] for cell in row)
     stated = (
