@@ -16,25 +16,25 @@ _LONG_WORD, _LONGEST = re.compile(r"\S{1000,}"), 4000
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
 
-def legible(name: str | os.PathLike[str]) -> str:
-    r"""A file's name as text that can be printed and stored: bytes that are not UTF-8 as ``\xff``."""
+def printable(name: str | os.PathLike[str]) -> str:
+    r"""Return a file's name as text that can be printed and stored: bytes that are not UTF-8 as ``\xff``."""
     return os.fspath(name).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def disk_reason(error: OSError) -> str:
-    """Why a file cannot be opened, read or written, in a few words."""
+    """Return in a few words why a file cannot be opened, read or written."""
     if error.errno not in (errno.EMFILE, errno.ENFILE):
         return error.strerror or str(error)
     return f"{error.strerror}: this process may open no more (ulimit -n shows the limit and raises it)"
 
 
 def first_line(error: Exception) -> str:
-    """First line of what another library's error says; the error's name where it says nothing, as a MemoryError."""
+    """Return the first line of another library's message; the error's name if it has none, as a MemoryError."""
     return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
-def shortened(line: str) -> str:
-    """Return a message without what no reader needs of a long word, or of a long text."""
+def shorten(line: str) -> str:
+    """Shorten long words of a message, and a message of more than some 4,000 characters."""
     line = _LONG_WORD.sub(lambda word: f"{word[0][:100]}...{word[0][-40:]} ({len(word[0])} characters)", line)
     if len(line) > _LONGEST:
         line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 4 :]} (shortened from {len(line)} characters)"
@@ -49,7 +49,7 @@ class RgbmidicError(Exception):
     """
 
     def __init__(self, message: str = "") -> None:
-        super().__init__(shortened(_CONTROL.sub(lambda found: ascii(found[0])[1:-1], legible(message))))
+        super().__init__(shorten(_CONTROL.sub(lambda match: ascii(match[0])[1:-1], printable(message))))
 
 
 class InputError(RgbmidicError, ValueError):
@@ -81,16 +81,16 @@ class AnotherTestError(ResultError):
 
 
 @contextmanager
-def disk_faults(kind: type[RgbmidicError], what: str) -> Iterator[None]:
-    """Turn what the disk refuses inside the block into an error of a `kind`: `what` could not be done, and why."""
+def convert_disk_errors(error_type: type[RgbmidicError], failure: str) -> Iterator[None]:
+    """Convert an OSError inside the block into an `error_type` that states the `failure` and its reason."""
     try:
         yield
     except OSError as error:
-        raise kind(f"{what}: {disk_reason(error)}") from None
+        raise error_type(f"{failure}: {disk_reason(error)}") from None
 
 
-def optional(module: str, extra: str) -> Any:
-    """A module that needs packages of an extra.
+def import_optional(module: str, extra: str) -> Any:
+    """Import a module that needs the packages of an extra.
 
     Raises
     ------

@@ -136,7 +136,9 @@ def compared_plates(
 
     def record(index: int) -> FrameRecord:
         (u, v), (u_std, v_std) = solutions[index].displacement.T, solutions[index].displacement_std.T
-        return FrameRecord.of(nodes=len(nodes), lights=3, number=index, status=0, u=u, v=v, u_std=u_std, v_std=v_std)
+        return FrameRecord.from_values(
+            nodes=len(nodes), lights=3, number=index, status=0, u=u, v=v, u_std=u_std, v_std=v_std
+        )
 
     mesh = {"nodes": nodes, "elements": solutions[0].elements, "references": []}
     result = make_result(folder / "result", frames=draws, record=record, **mesh)
@@ -144,5 +146,5 @@ def compared_plates(
     made = {}
     for modulus in moduli:
         wrong = replace(simulation, displacement=simulation.displacement / modulus)
-        made[modulus] = list(Comparison(result, wrong, PLACEMENT, frames=range(draws)).each())
+        made[modulus] = list(Comparison(result, wrong, PLACEMENT, frames=range(draws)).iterate())
     return made

@@ -10,7 +10,7 @@ from rgbmidic.report.figures import (
     residual_figure,
 )
 from rgbmidic.report.gallery import REPORT, remove_pictures, write_figures, write_maps
-from rgbmidic.report.movie import Movie, write_movie
+from rgbmidic.report.movie import FieldMovie, write_movie
 from rgbmidic.report.page import render
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
 
@@ -19,8 +19,8 @@ __all__ = [
     "REPORT",
     "STYLE",
     "Curve",
+    "FieldMovie",
     "MapDrawer",
-    "Movie",
     "brightness_figure",
     "convergence_figure",
     "finish_plot",

@@ -19,7 +19,7 @@ from rgbmidic._version import __version__
 from rgbmidic.correlation import NodeStatus, Solution, Status
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, FrameRecord, Result, ResultStore
-from rgbmidic.results.records import Quantities
+from rgbmidic.results.records import QuantityAttributes
 from rgbmidic.settings import CalibrationSettings, FrameSettings, RegionSettings, TestSettings
 
 
@@ -46,7 +46,7 @@ def test_result_gives_every_frame_back(tmp_path: Path) -> None:
     assert len(result) == 4
     np.testing.assert_array_equal(result.nodes, MESH.nodes)
     np.testing.assert_array_equal(result.elements, MESH.elements)
-    stackable = [name for name, quantity in QUANTITIES.items() if quantity.stackable]
+    stackable = [name for name, quantity in QUANTITIES.items() if quantity.is_stackable]
     assert {"u", "v", "u_std", "v_std", "status", "node_status", "iterations", "residual"} <= set(stackable)
     for name in stackable:
         expected = np.array([getattr(record, name) for record in records])
@@ -54,7 +54,7 @@ def test_result_gives_every_frame_back(tmp_path: Path) -> None:
         assert getattr(result, name).dtype == QUANTITIES[name].dtype, name
     np.testing.assert_array_equal(result.strain[..., 2], result.exy)
     np.testing.assert_array_equal(result.strain_std[..., 0], result.exx_std)
-    for record, history in zip(records, result.each("history"), strict=True):
+    for record, history in zip(records, result.iterate("history"), strict=True):
         np.testing.assert_array_equal(history, record.history)
     assert result.reasons == tuple(record.reason for record in records)
     assert result.names == ("frame 0", "frame 1", "frame 2", "frame 3")
@@ -227,12 +227,12 @@ def test_the_deformed_frames_are_those_that_are_no_reference(tmp_path: Path) -> 
     assert make_result(tmp_path / "none", frames=2, references=()).deformed == (0, 1)
     result = make_result(tmp_path / "untold", frames=3)
     assert result.deformed == (1, 2)
-    assert [u[0] for u in result.each("u", result.deformed)] == pytest.approx(result.u[1:, 0].tolist(), nan_ok=True)
+    assert [u[0] for u in result.iterate("u", result.deformed)] == pytest.approx(result.u[1:, 0].tolist(), nan_ok=True)
 
 
 def test_result_and_record_have_the_attributes_that_the_table_declares() -> None:
-    stacked = {name for name, one in QUANTITIES.items() if one.stackable or one.estimated}
-    assert {name for name in vars(Quantities) if name[0] != "_"} == stacked
+    stacked = {name for name, one in QUANTITIES.items() if one.is_stackable or one.is_estimated}
+    assert {name for name in vars(QuantityAttributes) if name[0] != "_"} == stacked
     assert {name for one in FrameRecord.__mro__ for name in vars(one)} >= QUANTITIES.keys()
 
 
@@ -299,12 +299,12 @@ def test_failed_record_measures_nothing_and_says_why() -> None:
 @pytest.mark.parametrize("name", ["u", "rigid", "history"])
 def test_record_of_wrong_shape_is_refused(name: str) -> None:
     with pytest.raises(InputError, match=name):
-        FrameRecord.of(nodes=3, lights=2, **{name: np.zeros((3, 4, 5))})
+        FrameRecord.from_values(nodes=3, lights=2, **{name: np.zeros((3, 4, 5))})
 
 
 def test_record_of_an_unknown_quantity_is_refused() -> None:
     with pytest.raises(InputError, match="unknown: w"):
-        FrameRecord.of(nodes=3, lights=2, w=np.zeros(3))
+        FrameRecord.from_values(nodes=3, lights=2, w=np.zeros(3))
     with pytest.raises(AttributeError, match="'w'"):
         _ = FrameRecord.failed("", nodes=3, lights=2).w
 
