@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
+from rgbmidic.renamed import refuse_old_names
+
 _LONG_WORD, _LONGEST = re.compile(r"\S{1000,}"), 4000
 """Characters that no name of a file or key has (Linux allows 255 for a name), and a screenful of them."""
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
@@ -103,3 +105,6 @@ def import_optional(module: str, extra: str) -> Any:
         if (error.name or "").startswith("rgbmidic"):
             raise
         raise InputError(f'this needs the package {error.name}: pip install "rgbmidic[{extra}]"') from None
+
+
+__getattr__ = refuse_old_names(__name__)

@@ -260,7 +260,7 @@ def _write_npz(physical: ResultInUnits, file: BinaryIO) -> None:
                 continue
             blank = quantity.unmeasured(result.table.sizes)
             head = {"descr": blank.dtype.str, "fortran_order": False, "shape": (len(result), *blank.shape)}
-            with archive.open(f"{quantity.name}.npy", "w", force_zip64=True) as member:
+            with archive.open(f"{quantity.file_name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array_header_1_0(member, head)
                 for value in result.iterate(quantity.name):  # one frame at a time is in memory
                     member.write(np.asarray(value, dtype=blank.dtype).tobytes())

@@ -304,9 +304,8 @@ class ResultInUnits(Portable):
     def quantities(self) -> dict[str, ResultQuantity]:
         """Entries of what `frame` returns: the stackable quantities of the table, and strain; lengths in `units`."""
         stored = [entry for entry in QUANTITIES.values() if entry.is_stackable and entry.name != "time_ns"]
-        stored = [
-            entry for entry in stored if not self.is_strain(entry.name)
-        ]  # small strain gives way to finite strain
+        # small strain gives way to finite strain
+        stored = [entry for entry in stored if not self.is_strain(entry.file_name)]
         return {entry.name: entry.with_units(self.units) for entry in (*stored, *STRAIN, *ELEMENT_STRAIN)}
 
     def is_strain(self, name: str) -> bool:
