@@ -48,6 +48,11 @@ class RgbmidicError(Exception):
 
     The message is one line: line ends and other control characters, which come from damaged files and from other
     libraries, stand in it as ``\n``, ``\x1b``. What it quotes of a file is cut where it is longer than a reader needs.
+
+    Examples
+    --------
+    >>> issubclass(InputError, RgbmidicError) and issubclass(InputError, ValueError)
+    True
     """
 
     def __init__(self, message: str = "") -> None:

@@ -233,6 +233,12 @@ def export_result(
         The format is unknown, or nodemaps are asked for where the scale is not known.
     ResultError
         The file exists, the folder of nodemaps is not empty, its folder does not, or a frame of the result is damaged.
+
+    Examples
+    --------
+    >>> export_result(Result.open("my_result"), "csv", "fields.csv", overwrite=True)
+    >>> Path("fields.csv").read_text().split(",")[:3]
+    ['frame', 'number', 'name']
     """
     out = Path(out)
     if to not in EXPORT_FORMATS:

@@ -96,6 +96,13 @@ class Maps(Portable):
         the engineering strain; other strains do not depend on it.
     window
         Frames that a rate is taken over, as ``probes.window``.
+
+    Examples
+    --------
+    >>> maps = Maps.from_result(Result.open("my_result"))
+    >>> exx = maps.read("exx", 1)
+    >>> exx.values.shape == exx.std.shape == (len(maps.result.nodes),)
+    True
     """
 
     result: Result

@@ -200,6 +200,15 @@ def read_profile(maps: Maps, field: str, endpoints: Sequence[float], frames: Seq
     ------
     InputError
         There is no such field or frame, it has no uncertainty, or half of the line is outside the mesh.
+
+    Examples
+    --------
+    >>> from rgbmidic.results import Result
+    >>> maps = Maps.from_result(Result.open("my_result"))
+    >>> (x0, y0), (x1, y1) = maps.result.nodes.min(axis=0), maps.result.nodes.max(axis=0)
+    >>> profile = read_profile(maps, "u", (x0, (y0 + y1) / 2, x1, (y0 + y1) / 2))
+    >>> profile.values.shape == (len(profile.frames), len(profile.positions))
+    True
     """
     profile = Profile(maps, field, endpoints, np.flatnonzero(maps.result.finished) if frames is None else frames)
     profile.fill(maps, range(len(profile.frames)))

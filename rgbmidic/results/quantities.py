@@ -57,6 +57,11 @@ class ResultQuantity:
         Heading under which maps list it.
     kind
         Kind of the values, which sets colours and format.
+
+    Examples
+    --------
+    >>> QUANTITIES["u_std"].unit, QUANTITIES["status"].codes
+    ('px', ('converged', 'not converged', 'failed'))
     """
 
     name: str

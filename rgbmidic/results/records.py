@@ -134,6 +134,11 @@ class FrameRecord(QuantityAttributes, HtmlRepr):
     ------
     InputError
         A quantity is missing, unknown or has another shape.
+
+    Examples
+    --------
+    >>> FrameRecord.failed("too dark", nodes=2, lights=1).u
+    array([nan, nan])
     """
 
     values: Mapping[str, Any]

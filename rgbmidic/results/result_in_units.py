@@ -116,6 +116,11 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     -------
     ndarray, shape (T,), or None
         In seconds, NaN for frames that are not measured yet; None where no time is known.
+
+    Examples
+    --------
+    >>> frame_times(Result.open("my_result"), ScaleSettings(frame_rate=100.0))[:2].tolist()
+    [0.0, 0.01]
     """
     scale = result.section(ScaleSettings) if scale is None else scale
     finished = result.finished
@@ -163,6 +168,11 @@ def common_variance_fraction(result: Result) -> float:
     Returns
     -------
     float
+
+    Examples
+    --------
+    >>> common_variance_fraction(Result.open("my_result"))  # one frame is the reference
+    0.5
     """
     return reference_fraction(len(result.setting("frames", "reference", [0])))
 
