@@ -88,7 +88,7 @@ def history(
     px: command.Pixels = False,
     overwrite: command.Overwrite = False,
 ) -> None:
-    """Displacement, strain and rates over time at points, over areas and along gauges: table, picture and CSV file.
+    """Write displacement, strain and rates over time at points, over areas, along gauges: table, picture, CSV file.
 
     Positions are in px on the reference; an option of a position may be given several times.
     """
@@ -136,7 +136,7 @@ def profile(
     level: Annotated[str, Option(help="Value at which the front is, such as -0.005, or part of the peak; 50%.")] = "",
     overwrite: command.Overwrite = False,
 ) -> None:
-    """A field along a line in every frame: table, position-time picture, curves, and the speed of a front or peak."""
+    """Read a field along a line in every frame: table, position-time picture, curves, speed of a front or peak."""
     from rgbmidic.report import profile_figure, save_figure, wave_text
     from rgbmidic.results import read_profile, write_profile
     from rgbmidic.results.files import check_file

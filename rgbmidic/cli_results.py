@@ -117,7 +117,7 @@ def compare(
     rigid: Annotated[str, Option(help="Rigid motion: tell (report it) or remove.")] = "tell",
     overwrite: command.Overwrite = False,
 ) -> None:
-    """Measured minus simulated displacement and strain, in mm and in units of the stated uncertainty.
+    """Compare measured and simulated displacement and strain, in mm and in units of the stated uncertainty.
 
     Page, tables and the fields at the simulation's nodes are written into a folder.
     """
@@ -168,7 +168,7 @@ def scale(
     point_std: Annotated[float, Option(metavar="PX", help="Uncertainty of each point, px.")] = 0.5,
     photographed: Any = None,
 ) -> None:
-    """Millimetres per pixel of the first light's image, with its uncertainty, from two points and their distance."""
+    """Compute mm per pixel of the first light's image, with its uncertainty, from two points and their distance."""
     from rgbmidic.fields import Units
 
     x0, y0, x1, y1 = command.read_coordinates(points, "the points", "X0,Y0:X1,Y1")

@@ -6,10 +6,12 @@ Every message says what is wrong, what is allowed and what was given, and names 
 import errno
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import Any
+
+from rgbmidic.renamed import refuse_old_names
 
 _LONG_WORD, _LONGEST = re.compile(r"\S{1000,}"), 4000
 """Characters that no name of a file or key has (Linux allows 255 for a name), and a screenful of them."""
@@ -46,6 +48,11 @@ class RgbmidicError(Exception):
 
     The message is one line: line ends and other control characters, which come from damaged files and from other
     libraries, stand in it as ``\n``, ``\x1b``. What it quotes of a file is cut where it is longer than a reader needs.
+
+    Examples
+    --------
+    >>> issubclass(InputError, RgbmidicError) and issubclass(InputError, ValueError)
+    True
     """
 
     def __init__(self, message: str = "") -> None:
@@ -105,11 +112,4 @@ def import_optional(module: str, extra: str) -> Any:
         raise InputError(f'this needs the package {error.name}: pip install "rgbmidic[{extra}]"') from None
 
 
-def renamed_attributes(owner: str, **new_names: str) -> Callable[[Any, str], NoReturn]:
-    """Return a `__getattr__` for the class `owner` whose error answers an old name with the new one."""
-
-    def report_new_name(_: Any, name: str) -> NoReturn:
-        reason = f"is now {owner}.{new_names[name]}" if name in new_names else "does not exist"
-        raise AttributeError(f"{owner}.{name} {reason}")
-
-    return report_new_name
+__getattr__ = refuse_old_names(__name__)

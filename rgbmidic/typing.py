@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError, RgbmidicError
+from rgbmidic.renamed import refuse_old_names
 
 AnyArray = npt.NDArray[Any]
 FloatArray = npt.NDArray[np.float64]
@@ -50,3 +51,6 @@ def as_numbers(
     if not (is_lossless and shape_matches and np.isfinite(array).all()):
         raise error(f"{requirement}; given is {reprlib.repr(values)}")
     return array
+
+
+__getattr__ = refuse_old_names(__name__)

@@ -28,7 +28,7 @@ def smooth_record(index: int) -> FrameRecord:
     u, v = 0.002 * index * (x - 60), 0.001 * index * (y - 40)
     both = {"u": u, "v": v, "u_std": np.full(NODES, 0.01), "v_std": np.full(NODES, 0.02)}
     more = {
-        "exx": np.full(NODES, 0.002 * index),
+        "nodal_exx": np.full(NODES, 0.002 * index),
         "misfit": np.ones(NODES),
         "light_fraction": np.full((NODES, 3), 1 / 3),
     }
@@ -42,7 +42,7 @@ def random_record(seed: int) -> FrameRecord:
     random = np.random.default_rng(seed)
     blank = random.random(NODES) < 0.2
     values = {
-        name: np.where(blank, np.nan, random.normal(0, 1e-3 if name.startswith("e") else 3, NODES))
+        name: np.where(blank, np.nan, random.normal(0, 1e-3 if name.startswith("nodal_e") else 3, NODES))
         for name, quantity in QUANTITIES.items()
         if quantity.axes == ("node",)
     }

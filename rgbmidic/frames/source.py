@@ -14,11 +14,13 @@ from typing import ClassVar, TypeVar
 from rgbmidic.errors import FrameError, convert_disk_errors, printable
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.metadata import CameraMetadata, MovieHeader, StoredFrame, damaged_file, raw_frame
+from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import FrameSettings, require_regular_file
 
 _T = TypeVar("_T")
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameSource(ABC):
     """A file of one frame or several, read in any order; frames count from 0.

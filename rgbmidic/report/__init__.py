@@ -1,5 +1,6 @@
 """Figures, reports and pages of text and pictures of a result."""
 
+from rgbmidic.renamed import refuse_old_names
 from rgbmidic.report.curves import Curve, history_figure, profile_figure, wave_text
 from rgbmidic.report.document import write_batch_page, write_report
 from rgbmidic.report.figures import (
@@ -37,3 +38,6 @@ __all__ = [
     "write_movie",
     "write_report",
 ]
+
+
+__getattr__ = refuse_old_names(__name__)

@@ -262,7 +262,7 @@ def scale_figure(comparison: Comparison, frame_comparisons: Sequence[FrameCompar
 
 
 def scale_text(comparison: Comparison, frame_comparisons: Sequence[FrameComparison]) -> str:
-    """Say what the best-fitting scale of all frames is, and what it means for a modulus."""
+    """Return the best-fitting scale of all frames as text, and its meaning for a modulus."""
     scale, std = comparison.best_scale([frame_comparison.fit for frame_comparison in frame_comparisons])
     if not np.isfinite(scale):
         return "no scale is found: the simulation is a rigid motion in all frames, or too few of its nodes have data"

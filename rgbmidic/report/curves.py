@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.renamed import state_new_names
 from rgbmidic.report import style
 from rgbmidic.report.figures import field_colours, select_evenly
 from rgbmidic.results import QUANTITIES, Channels, Histories, History, Maps, Profile, Wave
@@ -375,6 +376,7 @@ def wave_text(profile: Profile, wave: Wave) -> str:
     return f"{wave.feature} of {profile.field.symbol}{level}: {format_with_std(speed, std, unit)} ({fit})"
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Curve:
     """A quantity over time that is shown beside the maps.

@@ -61,6 +61,11 @@ def brightness_figure(result: Result) -> Figure:
     -------
     Figure
         The figure, one line per light.
+
+    Examples
+    --------
+    >>> len(brightness_figure(Result.open("my_result")).axes)
+    2
     """
     gain, offset = np.moveaxis(result.brightness, -1, 0)
     return _over_frames(result, {"gain": gain, "offset (grey levels)": offset})
@@ -78,6 +83,11 @@ def residual_figure(result: Result) -> Figure:
     -------
     Figure
         The figure, one line per light.
+
+    Examples
+    --------
+    >>> len(residual_figure(Result.open("my_result")).axes)
+    2
     """
     return _over_frames(result, {"residual": result.residual, "mean fraction in the nodes": result.mean_light_fraction})
 
@@ -94,6 +104,11 @@ def convergence_figure(result: Result) -> Figure:
     -------
     Figure
         The figure, one line per deformed frame.
+
+    Examples
+    --------
+    >>> len(convergence_figure(Result.open("my_result")).axes)
+    1
     """
     from matplotlib import colormaps
     from matplotlib.colors import Normalize
@@ -153,6 +168,12 @@ class MapDrawer:
         The fields of the result.
     dpi
         Pixels per inch that all figures are written with; the axes are then drawn once. None: not known.
+
+    Examples
+    --------
+    >>> drawer = MapDrawer(Maps.from_result(Result.open("my_result")))
+    >>> len(drawer.fields(1, ("u", "v")).axes)
+    2
     """
 
     def __init__(self, maps: Maps, dpi: int | None = None) -> None:

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from rgbmidic._kernels.picture import paint_field
 from rgbmidic.errors import InputError, ResultError, RgbmidicError, import_optional
+from rgbmidic.renamed import state_new_names
 from rgbmidic.report import style
 from rgbmidic.report.curves import Curve
 from rgbmidic.report.figures import field_colours, picture_limits, select_evenly
@@ -84,6 +85,7 @@ class _Panel:
         return np.asarray(red | green << 8 | blue << 16 | np.uint32(0xFF000000))
 
 
+@state_new_names
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FieldMovie:
     """A movie of nodal fields, side by side; blank where not measured.

@@ -33,6 +33,11 @@ def render(template: str, folder: Path = _TEMPLATES, **values: Any) -> str:
     -------
     str
         The page.
+
+    Examples
+    --------
+    >>> render("batch.html", header=["test", "status"], rows=[], links=[], version="1").startswith("<!")
+    True
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
     from markupsafe import Markup, escape

@@ -3,6 +3,7 @@
 from rgbmidic.fields import History
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
+from rgbmidic.renamed import refuse_old_names
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
 from rgbmidic.results.histories import Histories, history_rows, write_histories
@@ -43,3 +44,6 @@ __all__ = [
     "write_histories",
     "write_profile",
 ]
+
+
+__getattr__ = refuse_old_names(__name__)

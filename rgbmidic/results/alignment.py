@@ -112,7 +112,7 @@ class Alignment:
         return offsets, np.where(varies, xy - x * y, 0) / np.sqrt(np.where(varies, variances[0] * variances[1], 1))
 
     def correlation(self, offset: float) -> float:
-        """Correlation coefficient at an offset (s) that is added to the channel's times, by `_values`; 0 if too few."""
+        """Return the correlation coefficient at an offset (s) of the channel's times, by `_values`; 0 if too few."""
         shifted = self._values(offset)
         valid = np.isfinite(shifted)
         values, history = shifted[valid], self.history[valid]

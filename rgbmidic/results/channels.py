@@ -15,6 +15,7 @@ from typing import Self
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.renamed import state_new_names
 from rgbmidic.results.alignment import MIN_CORRELATION, MIN_FRAMES, Alignment
 from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import FloatArray
@@ -28,6 +29,7 @@ _DECIMAL = re.compile(r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:e[+-]?\d+)?|nan", re.IGNO
 _UNIT = re.compile(r".*[\s_(\[](kN|N)[)\]]?")
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Channels:
     """Analog channels recorded beside a test: values at their times.

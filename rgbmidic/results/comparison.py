@@ -27,6 +27,7 @@ from rgbmidic.correlation.constants import USUAL
 from rgbmidic.errors import InputError
 from rgbmidic.fields import NodalCovariance, Places, StrainGauges, strain_of_gradient
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh
+from rgbmidic.renamed import refuse_old_names, state_new_names
 from rgbmidic.results.quantities import FAILED
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import common_variance_fraction, frame_times, rectification_of
@@ -147,6 +148,7 @@ class FrameComparison:
         return np.asarray(self.difference(variant, name) / self.std[name])
 
 
+@state_new_names
 class Comparison:
     """A result and a simulation of the same test, compared frame by frame.
 
@@ -494,3 +496,6 @@ def _match_times(
             "--offset between both clocks, or other --frames"
         )
     return np.clip(clock, start, end), tuple(frames_inside), frames_outside
+
+
+__getattr__ = refuse_old_names(__name__)

@@ -16,7 +16,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from rgbmidic.results.maps import Maps
-from rgbmidic.results.quantities import QUANTITIES, SHARED
+from rgbmidic.results.quantities import QUANTITIES, SHARED, STRAIN
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import DISPLACEMENT_QUANTITIES, ResultInUnits, frame_times
 from rgbmidic.settings import ScaleSettings
@@ -43,7 +43,8 @@ class _LazyQuantity(BackendArray):
 
     def __init__(self, result: Result, names: tuple[str, ...], maps: Maps | None = None) -> None:
         self.result, self.names, self.maps = result, names, maps
-        self.blank = QUANTITIES[names[0]].unmeasured(result.table.sizes)
+        entries = {**QUANTITIES, **{entry.name: entry for entry in STRAIN}}
+        self.blank = entries[names[0]].unmeasured(result.table.sizes)
         self.dtype = self.blank.dtype
         self.shape = (len(result), *self.blank.shape, *([len(names)] if len(names) > 1 else []))
 
@@ -83,7 +84,11 @@ def to_dataset(result: Result, scale: ScaleSettings | None = None) -> xr.Dataset
     plane = "" if physical.rectified.camera is None else "on the plane of the specimen"
     for name, entry in QUANTITIES.items():
         dimension = _NUMBERED_AXES[name][0] if name in _NUMBERED_AXES else ""
-        if not entry.is_stackable or name.removesuffix("_std") in _COMPONENTS or name in ("number", "time_ns"):
+        if (
+            not entry.is_stackable
+            or entry.file_name.removesuffix("_std") in _COMPONENTS
+            or name in ("number", "time_ns")
+        ):
             continue
         axes = ("frame", *(axis if isinstance(axis, str) else dimension for axis in entry.axes))
         is_displacement = name in DISPLACEMENT_QUANTITIES

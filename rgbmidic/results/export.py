@@ -233,6 +233,12 @@ def export_result(
         The format is unknown, or nodemaps are asked for where the scale is not known.
     ResultError
         The file exists, the folder of nodemaps is not empty, its folder does not, or a frame of the result is damaged.
+
+    Examples
+    --------
+    >>> export_result(Result.open("my_result"), "csv", "fields.csv", overwrite=True)
+    >>> Path("fields.csv").read_text().split(",")[:3]
+    ['frame', 'number', 'name']
     """
     out = Path(out)
     if to not in EXPORT_FORMATS:
@@ -260,7 +266,7 @@ def _write_npz(physical: ResultInUnits, file: BinaryIO) -> None:
                 continue
             blank = quantity.unmeasured(result.table.sizes)
             head = {"descr": blank.dtype.str, "fortran_order": False, "shape": (len(result), *blank.shape)}
-            with archive.open(f"{quantity.name}.npy", "w", force_zip64=True) as member:
+            with archive.open(f"{quantity.file_name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array_header_1_0(member, head)
                 for value in result.iterate(quantity.name):  # one frame at a time is in memory
                     member.write(np.asarray(value, dtype=blank.dtype).tobytes())

@@ -176,6 +176,13 @@ def read_histories(
     InputError
         A probe is outside the region, or measured in no frame; too few frames for rates; the times of the
         frames are not known, or have none in common with those of the channels; the channels are not usable.
+
+    Examples
+    --------
+    >>> result = Result.open("my_result")
+    >>> histories = read_histories(result, ProbeSettings(points=(tuple(result.nodes.mean(axis=0)),)))
+    >>> [history.name for history in histories.quantities]
+    ['point_1_u', 'point_1_v']
     """
     if not probes.kind_coordinates and probes.rigid_motion == "none":
         raise InputError("no probe is stated: give one on the command line, such as --point X,Y, or in [probes]")

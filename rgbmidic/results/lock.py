@@ -1,4 +1,4 @@
-"""Claims on a result folder: files that name a process that writes into it, and the frames that it writes."""
+"""Locks of a result folder: files that name a process that writes into it, and the frames that it writes."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ lets one be first. A process of an array looks at a folder in some ms."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameLock:
-    """A claim that this process holds; other processes of copies cannot release it.
+    """A lock on frames that this process holds; copies in other processes cannot release it.
 
     Attributes
     ----------
     file
-        The file of the claim.
+        The file of the lock.
     process
-        Who holds it.
+        Number of the process that holds it.
     """
 
     file: Path
@@ -41,12 +41,12 @@ class FrameLock:
 
     @classmethod
     def acquire(cls, folder: Path, frames: range) -> Self:
-        """Claim frames (consecutive) of a folder; claims that dead processes of this host left are removed.
+        """Lock frames (consecutive) of a folder; locks that dead processes of this host left are removed.
 
         Raises
         ------
         ResultError
-            Another run holds some of them, or the claim cannot be written.
+            Another run holds some of them, or the lock cannot be written.
         """
         for pause in _PAUSES:
             file = folder / f"in_use.{secrets.token_hex(8)}.json"
@@ -70,12 +70,12 @@ class FrameLock:
         )
 
     def check(self) -> None:
-        """Refuse to write into a folder that no longer has this claim: another one lies in its place.
+        """Refuse to write into a folder that no longer has this lock: another one lies in its place.
 
         Raises
         ------
         ResultError
-            The claim is gone.
+            The lock is gone.
         """
         if not self.file.exists():
             raise ResultError(
@@ -84,14 +84,14 @@ class FrameLock:
             )
 
     def release(self) -> None:
-        """Remove the claim, so that other processes can write the frames."""
+        """Remove the lock, so that other processes can write the frames."""
         if self.process == os.getpid():
             with write_errors(self.file):
                 self.file.unlink(missing_ok=True)
 
 
 def _conflicting_locks(lock_file: Path, frames: range) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Yield the claims of other processes on any of these frames; one that cannot be read is on all of them."""
+    """Yield the locks of other processes on any of these frames; one that cannot be read is on all of them."""
     for file in lock_file.parent.glob("in_use.*.json"):
         if file == lock_file:
             continue

@@ -21,6 +21,7 @@ from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.renamed import state_new_names
 from rgbmidic.results.quantities import DERIVED, ERROR_QUANTITIES, UNKNOWN_TIME, UV, ResultQuantity, map_quantities
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.results.result_in_units import (
@@ -47,6 +48,7 @@ _NODES_PER_BATCH = 4096
 """Nodes whose rates are computed at once: 25 MB of results at the default window."""
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapValues:
     """A field in one frame.
@@ -72,6 +74,7 @@ class MapValues:
         return np.asarray(np.abs(self.values) < 2 * self.std)
 
 
+@state_new_names
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Maps(Portable):
     """The nodal fields of a result.
@@ -93,6 +96,13 @@ class Maps(Portable):
         the engineering strain; other strains do not depend on it.
     window
         Frames that a rate is taken over, as ``probes.window``.
+
+    Examples
+    --------
+    >>> maps = Maps.from_result(Result.open("my_result"))
+    >>> exx = maps.read("exx", 1)
+    >>> exx.values.shape == exx.std.shape == (len(maps.result.nodes),)
+    True
     """
 
     result: Result

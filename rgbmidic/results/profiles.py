@@ -13,6 +13,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields import ProfileLine
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
 from rgbmidic.fields.units import column
+from rgbmidic.renamed import state_new_names
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.maps import Maps
 from rgbmidic.results.quantities import UV
@@ -20,6 +21,7 @@ from rgbmidic.results.result_in_units import common_variance_fraction, frame_tim
 from rgbmidic.typing import AnyArray, FloatArray
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Wave:
     """A front or peak along a profile, in the profile's units.
@@ -39,6 +41,7 @@ class Wave:
     front: Front
 
 
+@state_new_names
 class Profile:
     """A field along a line in some frames; its values are NaN until `fill` reads them.
 
@@ -197,6 +200,15 @@ def read_profile(maps: Maps, field: str, endpoints: Sequence[float], frames: Seq
     ------
     InputError
         There is no such field or frame, it has no uncertainty, or half of the line is outside the mesh.
+
+    Examples
+    --------
+    >>> from rgbmidic.results import Result
+    >>> maps = Maps.from_result(Result.open("my_result"))
+    >>> (x0, y0), (x1, y1) = maps.result.nodes.min(axis=0), maps.result.nodes.max(axis=0)
+    >>> profile = read_profile(maps, "u", (x0, (y0 + y1) / 2, x1, (y0 + y1) / 2))
+    >>> profile.values.shape == (len(profile.frames), len(profile.positions))
+    True
     """
     profile = Profile(maps, field, endpoints, np.flatnonzero(maps.result.finished) if frames is None else frames)
     profile.fill(maps, range(len(profile.frames)))

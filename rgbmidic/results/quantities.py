@@ -15,12 +15,14 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.fields.units import Units
+from rgbmidic.renamed import state_new_names
 from rgbmidic.text import format_value, format_with_std
 from rgbmidic.timing import STAGES
 
 Kind = Literal["displacement", "strain", "positive", "fraction", "angle", "codes"]
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True)
 class ResultQuantity:
     """An entry of the table: what a name stands for, of every frame or of all together, kept or derived.
@@ -55,6 +57,11 @@ class ResultQuantity:
         Heading under which maps list it.
     kind
         Kind of the values, which sets colours and format.
+
+    Examples
+    --------
+    >>> QUANTITIES["u_std"].unit, QUANTITIES["status"].codes
+    ('px', ('converged', 'not converged', 'failed'))
     """
 
     name: str
@@ -71,6 +78,11 @@ class ResultQuantity:
     order: int = 0
     group: str = "Quality"
     kind: Kind = "strain"
+
+    @property
+    def file_name(self) -> str:
+        """Name of its array in records and npz files: the small strain of the nodes has no prefix there."""
+        return self.name.removeprefix("nodal_")
 
     @property
     def uncertainty(self) -> ResultQuantity:
@@ -295,15 +307,15 @@ _TABLE = (
     ResultQuantity("u_bias_std", _NODE, "px", "bias_std.0", _BIAS.format("u"), kind="positive"),
     ResultQuantity("v_bias_std", _NODE, "px", "bias_std.1", _BIAS.format("v"), kind="positive"),
     *with_uncertainty(
-        ResultQuantity("exx", _NODE, "", "strain.0", f"small strain in x: {_NODAL_SLOPE}"),
-        ResultQuantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_NODAL_SLOPE}"),
-        ResultQuantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_NODAL_SLOPE}"),
+        ResultQuantity("nodal_exx", _NODE, "", "strain.0", f"small strain in x: {_NODAL_SLOPE}"),
+        ResultQuantity("nodal_eyy", _NODE, "", "strain.1", f"small strain in y: {_NODAL_SLOPE}"),
+        ResultQuantity("nodal_exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_NODAL_SLOPE}"),
     ),
     ResultQuantity("u_mesh_error", _ESTIMATED, "px", "displacement_error.0", _DISCRETISATION.format("u")),
     ResultQuantity("v_mesh_error", _ESTIMATED, "px", "displacement_error.1", _DISCRETISATION.format("v")),
-    ResultQuantity("exx_mesh_error", _ESTIMATED, "", "strain_error.0", _DISCRETISATION.format("exx")),
-    ResultQuantity("eyy_mesh_error", _ESTIMATED, "", "strain_error.1", _DISCRETISATION.format("eyy")),
-    ResultQuantity("exy_mesh_error", _ESTIMATED, "", "strain_error.2", _DISCRETISATION.format("exy")),
+    ResultQuantity("nodal_exx_mesh_error", _ESTIMATED, "", "strain_error.0", _DISCRETISATION.format("nodal_exx")),
+    ResultQuantity("nodal_eyy_mesh_error", _ESTIMATED, "", "strain_error.1", _DISCRETISATION.format("nodal_eyy")),
+    ResultQuantity("nodal_exy_mesh_error", _ESTIMATED, "", "strain_error.2", _DISCRETISATION.format("nodal_exy")),
     ResultQuantity("match", (), "", "",
         "median correlation coefficient of the elements with their reference, for the light that matches best; NaN "
         "without `frames.update_reference`"),
@@ -416,11 +428,11 @@ ELEMENT_STRAIN = tuple(
     )
     for entry in STRAIN[:3]
 )
-COMPONENTS = ("u", "v", "exx", "eyy", "exy")
+COMPONENTS = ("u", "v", "nodal_exx", "nodal_eyy", "nodal_exy")
 ERROR_QUANTITIES = {
     f"{name}_{suffix}": ResultQuantity(
         f"{name}_{suffix}", _NODE, "px" if name in UV else "", "",
-        description.format(name if name in UV else f"the small strain {name} of the nodes"),
+        description.format(name if name in UV else f"the small strain {name}"),
         symbol=f"{name}_{suffix}", base_quantities=(name,), group="Uncertainty", kind="positive",
     )
     for suffix, description in (
@@ -429,7 +441,7 @@ ERROR_QUANTITIES = {
     )
     for name in COMPONENTS
 }  # fmt: skip
-_FINER_MESH = "largest discretisation error over the noise of u, v, exx, eyy, exy: above 1 a finer mesh is needed"
+_FINER_MESH = "largest discretisation error over the noise of u, v and the small strain: above 1 a finer mesh is needed"
 ERROR_QUANTITIES["finer_mesh"] = ResultQuantity(
     "finer_mesh", _NODE, "", "", _FINER_MESH, symbol="finer_mesh", base_quantities=COMPONENTS, kind="positive"
 )
@@ -458,7 +470,7 @@ def map_quantities(units: Units, lights: tuple[str, ...], *, with_error: bool) -
     stored = [
         replace(entry, symbol=name, description=", ".join(entry.codes) or entry.description)
         for name, entry in QUANTITIES.items()
-        if entry.axes == _NODE and name not in derived_names
+        if entry.axes == _NODE and entry.file_name not in derived_names
     ]
     description, names = QUANTITIES["light_fraction"].description, [f"fraction of {light}" for light in lights]
     fractions = [ResultQuantity(name, _NODE, "", "", description, symbol=name, kind="fraction") for name in names]

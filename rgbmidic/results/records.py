@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Protocol, TypeVar
 import numpy as np
 
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, convert_disk_errors
+from rgbmidic.renamed import state_new_names
 from rgbmidic.results.files import npy_array, npy_bytes, write_complete
 from rgbmidic.results.provenance import PROVENANCE, RESTORE_REMEDY
 from rgbmidic.results.quantities import QUANTITIES
@@ -53,7 +54,7 @@ def _layout(names: tuple[str, ...]) -> tuple[dict[str, bytes], struct.Struct, st
     Returns the name of each array in the archive, by its quantity; the directory, its end, and the comment without its
     checksum; and what is read of them: method, CRC-32, bytes and place of every array, run and frame.
     """
-    files = {name: f"{name}.npy".encode() for name in names}
+    files = {name: f"{QUANTITIES[name].file_name}.npy".encode() for name in names}
     directory_format = "".join(f"4s6H3I5H2I{len(file)}s" for file in files.values())
     fields_format = "".join(f"10xH4x2I18xI{len(file)}x" for file in files.values())
     return files, struct.Struct(f"<{directory_format}4s4H2IH16sQ"), struct.Struct(f"<{fields_format}{_END_BYTES}x16sQ")
@@ -96,17 +97,17 @@ class QuantityAttributes:
     v_std = _Attribute()
     u_bias_std = _Attribute()
     v_bias_std = _Attribute()
-    exx = _Attribute()
-    eyy = _Attribute()
-    exy = _Attribute()
-    exx_std = _Attribute()
-    eyy_std = _Attribute()
-    exy_std = _Attribute()
+    nodal_exx = _Attribute()
+    nodal_eyy = _Attribute()
+    nodal_exy = _Attribute()
+    nodal_exx_std = _Attribute()
+    nodal_eyy_std = _Attribute()
+    nodal_exy_std = _Attribute()
     u_mesh_error = _Attribute()
     v_mesh_error = _Attribute()
-    exx_mesh_error = _Attribute()
-    eyy_mesh_error = _Attribute()
-    exy_mesh_error = _Attribute()
+    nodal_exx_mesh_error = _Attribute()
+    nodal_eyy_mesh_error = _Attribute()
+    nodal_exy_mesh_error = _Attribute()
     match = _Attribute()
     best_match = _Attribute()
     misfit = _Attribute()
@@ -117,6 +118,7 @@ class QuantityAttributes:
     seconds = _Attribute()
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameRecord(QuantityAttributes, HtmlRepr):
     """The result of one frame; every quantity of `rgbmidic.results.QUANTITIES` is an attribute, such as ``record.u``.
@@ -132,6 +134,11 @@ class FrameRecord(QuantityAttributes, HtmlRepr):
     ------
     InputError
         A quantity is missing, unknown or has another shape.
+
+    Examples
+    --------
+    >>> FrameRecord.failed("too dark", nodes=2, lights=1).u
+    array([nan, nan])
     """
 
     values: Mapping[str, Any]

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError, ResultError, import_optional
+from rgbmidic.renamed import state_new_names
 from rgbmidic.results.files import read_arrays, read_json, write_json
 from rgbmidic.results.provenance import (
     PROVENANCE,
@@ -54,6 +55,7 @@ class Portable:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
+@state_new_names
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Result(Portable, QuantityAttributes, HtmlRepr):
     """The result of a test, for post-processing.
@@ -200,7 +202,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
             f"frames: {len(self)}, {done} measured" if done < len(self) else f"frames: {len(self)}",
             f"mesh:   {len(self.nodes)} nodes, {len(self.elements)} elements",
             f"lights: {lights}",
-            "read:   result.u (T, N), .u_std, .strain, .misfit, ...; .frame(i), .each(name), .to_xarray()",
+            "read:   result.u (T, N), .u_std, .nodal_strain, .misfit, ...; .frame(i), .each(name), .to_xarray()",
         ]
         return "\n".join(lines)
 
@@ -361,14 +363,14 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
         return stacked
 
     @property
-    def strain(self) -> FloatArray:
-        """Small strain (exx, eyy, exy), shape (T, N, 3)."""
-        return np.stack([self.exx, self.eyy, self.exy], axis=-1)
+    def nodal_strain(self) -> FloatArray:
+        """Small strain (exx, eyy, exy) of the nodes, shape (T, N, 3): no gauge, and no finite strain."""
+        return np.stack([self.nodal_exx, self.nodal_eyy, self.nodal_exy], axis=-1)
 
     @property
-    def strain_std(self) -> FloatArray:
-        """Standard uncertainty of `strain`, shape (T, N, 3)."""
-        return np.stack([self.exx_std, self.eyy_std, self.exy_std], axis=-1)
+    def nodal_strain_std(self) -> FloatArray:
+        """Standard uncertainty of `nodal_strain`, shape (T, N, 3)."""
+        return np.stack([self.nodal_exx_std, self.nodal_eyy_std, self.nodal_exy_std], axis=-1)
 
     @property
     def reasons(self) -> tuple[str, ...]:

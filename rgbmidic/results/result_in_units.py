@@ -116,6 +116,11 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     -------
     ndarray, shape (T,), or None
         In seconds, NaN for frames that are not measured yet; None where no time is known.
+
+    Examples
+    --------
+    >>> frame_times(Result.open("my_result"), ScaleSettings(frame_rate=100.0))[:2].tolist()
+    [0.0, 0.01]
     """
     scale = result.section(ScaleSettings) if scale is None else scale
     finished = result.finished
@@ -163,6 +168,11 @@ def common_variance_fraction(result: Result) -> float:
     Returns
     -------
     float
+
+    Examples
+    --------
+    >>> common_variance_fraction(Result.open("my_result"))  # one frame is the reference
+    0.5
     """
     return reference_fraction(len(result.setting("frames", "reference", [0])))
 
@@ -304,9 +314,8 @@ class ResultInUnits(Portable):
     def quantities(self) -> dict[str, ResultQuantity]:
         """Entries of what `frame` returns: the stackable quantities of the table, and strain; lengths in `units`."""
         stored = [entry for entry in QUANTITIES.values() if entry.is_stackable and entry.name != "time_ns"]
-        stored = [
-            entry for entry in stored if not self.is_strain(entry.name)
-        ]  # small strain gives way to finite strain
+        # small strain gives way to finite strain
+        stored = [entry for entry in stored if not self.is_strain(entry.file_name)]
         return {entry.name: entry.with_units(self.units) for entry in (*stored, *STRAIN, *ELEMENT_STRAIN)}
 
     def is_strain(self, name: str) -> bool:

@@ -25,6 +25,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.interpolation import Places
 from rgbmidic.frames.names import NamedFiles
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh, read_mesh
+from rgbmidic.renamed import refuse_old_names, state_new_names
 from rgbmidic.results.result import Result
 from rgbmidic.results.result_in_units import placement_of, rectification_of
 from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, require_regular_file
@@ -41,6 +42,7 @@ _COMPONENTS = tuple(
 _TIMES = {"time": 1.0, "time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6}
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Simulation:
     """Displacement that a simulation has at its nodes, over time.
@@ -337,3 +339,6 @@ def _subcentroids(divisions: int) -> FloatArray:
     down = [(i + 2 / 3, j + 2 / 3) for i in range(divisions - 1) for j in range(divisions - 1 - i)]
     first_coordinate, second_coordinate = np.array(up + down).T / divisions
     return np.stack([first_coordinate, second_coordinate, 1 - first_coordinate - second_coordinate], axis=1)
+
+
+__getattr__ = refuse_old_names(__name__)

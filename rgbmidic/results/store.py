@@ -50,6 +50,15 @@ class ResultStore:
         Number of frames of the test.
     sizes
         Number of nodes (``"node"``) and of lights (``"light"``) of every frame.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> origin = Origin(nodes=[[0, 0], [9, 0], [0, 9]], elements=[[0, 1, 2]], names=["a.png"], lights=["red"])
+    >>> with ResultStore.create(f"{mkdtemp()}/result", origin) as store:
+    ...     store.write_frame(0, FrameRecord.failed("too dark", nodes=3, lights=1))
+    >>> store.finished()
+    array([ True])
     """
 
     path: Path

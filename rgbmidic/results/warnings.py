@@ -25,7 +25,7 @@ def join_frame_warnings(texts: Iterable[tuple[int, Sequence[str]]], names: Seque
 
     Examples
     --------
-    >>> of_frames([(0, []), (1, ["dark"]), (2, ["dark", "late"]), (4, ["dark"])], ["a.png"] * 5)
+    >>> join_frame_warnings([(0, []), (1, ["dark"]), (2, ["dark", "late"]), (4, ["dark"])], ["a.png"] * 5)
     ['frames 1 to 2, 4 (a.png, ...): dark', 'frame 2 (a.png): late']
     """
     frames: dict[str, list[int]] = {}

@@ -495,7 +495,7 @@ def test_the_discretisation_error_is_kept_where_it_is_asked_for(movie: Path, tmp
         known = [bool(values.size) for values in result.iterate("u_mesh_error")]
         assert known == [asked is True or (asked == "key" and frame in (0, 16, 17)) for frame in range(18)]
     assert np.array_equal(kept[True].u, kept[False].u, equal_nan=True)
-    assert kept["key"].exx_mesh_error.shape == kept["key"].u.shape
+    assert kept["key"].nodal_exx_mesh_error.shape == kept["key"].u.shape
     maps, plain = Maps.from_result(kept[True]), Maps.from_result(kept[False])
     assert "finer_mesh" not in plain.quantities
     total, error = (maps.read(f"u_{name}", 17).values for name in ("total", "mesh_error"))

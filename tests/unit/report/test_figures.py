@@ -276,7 +276,9 @@ def test_pictures_are_of_frames_that_were_measured(tmp_path: Path) -> None:
 def test_displacements_are_in_mm_where_the_scale_is_known(tmp_path: Path) -> None:
     scale = {"mm_per_pixel": 0.05, "mm_per_pixel_std": 0.001}
     settings = TestSettings.from_mapping({**SETTINGS, "scale": scale})
-    record = FrameRecord.from_values(nodes=NODES, lights=len(LIGHTS), u=X, v=Y, u_std=X / 100, v_std=Y / 100, exx=X)
+    record = FrameRecord.from_values(
+        nodes=NODES, lights=len(LIGHTS), u=X, v=Y, u_std=X / 100, v_std=Y / 100, nodal_exx=X
+    )
     result = make_result(tmp_path / "out", frames=1, record=lambda index: record, settings=settings)
     u, v, *_ = _maps(result, 0, "displacement").axes
     assert (u.get_title(), v.get_title()) == ("u (mm)", "v (mm)")
@@ -369,7 +371,9 @@ def test_numbers_under_a_narrow_map_do_not_touch(tmp_path: Path) -> None:
     tall = Tri3Mesh.from_region(Region.from_rectangle((4010, 5, 4110, 1175), (1200, 4200)), 20)
     origin = make_origin(1, nodes=tall.nodes, elements=tall.elements)
     with ResultStore.create(tmp_path / "out", origin) as store:
-        store.write_frame(0, FrameRecord.from_values(nodes=len(tall.nodes), lights=len(LIGHTS), exx=tall.nodes[:, 0]))
+        store.write_frame(
+            0, FrameRecord.from_values(nodes=len(tall.nodes), lights=len(LIGHTS), nodal_exx=tall.nodes[:, 0])
+        )
     _numbers(_maps(Result.open(tmp_path / "out"), 0, "strain"))
 
 

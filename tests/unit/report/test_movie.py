@@ -118,7 +118,7 @@ def test_over_raw_frames_the_field_lies_where_the_specimen_is(tmp_path: Path) ->
             "u_std": np.ones(NODES),
             "v_std": np.ones(NODES),
         }
-        rest = {"exx": np.zeros(NODES), "misfit": np.ones(NODES), "light_fraction": np.full((NODES, 3), 1 / 3)}
+        rest = {"nodal_exx": np.zeros(NODES), "misfit": np.ones(NODES), "light_fraction": np.full((NODES, 3), 1 / 3)}
         return FrameRecord.from_values(
             nodes=NODES, lights=3, number=index, status=0, node_status=np.zeros(NODES), **both, **rest
         )

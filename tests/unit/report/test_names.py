@@ -43,7 +43,7 @@ SCALES = (None, ScaleSettings(mm_per_pixel=0.05), ScaleSettings(mm_per_pixel=0.0
 def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     def record(index: int) -> FrameRecord:
         smooth = smooth_record(index)
-        std = dict.fromkeys(("exx_std", "eyy_std", "exy_std"), np.full(NODES, 1e-3))
+        std = dict.fromkeys(("nodal_exx_std", "nodal_eyy_std", "nodal_exy_std"), np.full(NODES, 1e-3))
         return FrameRecord(values={**smooth.values, "time_ns": index * 1_000_000, **std}, sizes=smooth.sizes)
 
     return make_result(tmp_path_factory.mktemp("names") / "out", frames=6, record=record)

@@ -52,8 +52,8 @@ def test_result_gives_every_frame_back(tmp_path: Path) -> None:
         expected = np.array([getattr(record, name) for record in records])
         np.testing.assert_array_equal(getattr(result, name), expected, err_msg=name)
         assert getattr(result, name).dtype == QUANTITIES[name].dtype, name
-    np.testing.assert_array_equal(result.strain[..., 2], result.exy)
-    np.testing.assert_array_equal(result.strain_std[..., 0], result.exx_std)
+    np.testing.assert_array_equal(result.nodal_strain[..., 2], result.nodal_exy)
+    np.testing.assert_array_equal(result.nodal_strain_std[..., 0], result.nodal_exx_std)
     for record, history in zip(records, result.iterate("history"), strict=True):
         np.testing.assert_array_equal(history, record.history)
     assert result.reasons == tuple(record.reason for record in records)
@@ -191,9 +191,9 @@ def test_a_record_is_an_npz_file(tmp_path: Path) -> None:
     with zipfile.ZipFile(file) as archive:
         assert archive.testzip() is None
     with np.load(file) as arrays:
-        assert list(arrays) == list(QUANTITIES)
-        for name in QUANTITIES:
-            np.testing.assert_array_equal(arrays[name], getattr(record, name), err_msg=name)
+        assert list(arrays) == [entry.file_name for entry in QUANTITIES.values()]
+        for name, entry in QUANTITIES.items():
+            np.testing.assert_array_equal(arrays[entry.file_name], getattr(record, name), err_msg=name)
 
 
 def test_a_result_of_the_last_schema_is_refused_in_one_line_and_can_be_overwritten(tmp_path: Path) -> None:
@@ -238,7 +238,7 @@ def test_result_and_record_have_the_attributes_that_the_table_declares() -> None
 
 def test_only_what_stacks_is_an_attribute(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out")
-    assert {"u", "exy_std", "brightness", "nodes"} <= set(dir(result))
+    assert {"u", "nodal_exy_std", "brightness", "nodes"} <= set(dir(result))
     for name in ("history", "weights_thumbnail", "reason", "bogus"):
         assert name not in dir(result)
         with pytest.raises(AttributeError, match=name):
@@ -336,11 +336,15 @@ def test_every_quantity_of_a_solution_is_taken_from_it() -> None:
     np.testing.assert_array_equal(np.stack([record.u, record.v], axis=1), solution.displacement)
     single = {name: getattr(solution, name).astype(np.float32) for name in ("displacement_std", "strain", "strain_std")}
     np.testing.assert_array_equal(np.stack([record.u_std, record.v_std], axis=1), single["displacement_std"])
-    np.testing.assert_array_equal(np.stack([record.exx, record.eyy, record.exy], axis=1), single["strain"])
-    np.testing.assert_array_equal(np.stack([record.exx_std, record.eyy_std, record.exy_std], 1), single["strain_std"])
+    np.testing.assert_array_equal(
+        np.stack([record.nodal_exx, record.nodal_eyy, record.nodal_exy], axis=1), single["strain"]
+    )
+    np.testing.assert_array_equal(
+        np.stack([record.nodal_exx_std, record.nodal_eyy_std, record.nodal_exy_std], 1), single["strain_std"]
+    )
     np.testing.assert_array_equal(record.v_bias_std, solution.bias_std[:, 1].astype(np.float32))
     np.testing.assert_array_equal(record.v_mesh_error, solution.displacement_error[:, 1].astype(np.float32))
-    np.testing.assert_array_equal(record.exy_mesh_error, solution.strain_error[:, 2].astype(np.float32))
+    np.testing.assert_array_equal(record.nodal_exy_mesh_error, solution.strain_error[:, 2].astype(np.float32))
     for name in ("node_status", "light_fraction", "misfit", "rigid", "residual", "weight_fraction", "history"):
         single = np.asarray(getattr(solution, name), dtype=QUANTITIES[name].dtype)
         np.testing.assert_array_equal(getattr(record, name), single, err_msg=name)
