@@ -29,7 +29,7 @@ def stages(work: Callable[[], object], repeats: int) -> tuple[dict[str, float], 
 
     def counted(kernel: threads.Kernel, *arguments: Any) -> Any:
         begin, found = time.process_time(), call(kernel, *arguments)
-        if (on := timing._on.get()) is not None and kernel.over is not None:
+        if (on := timing._current.get()) is not None and kernel.over is not None:
             shared[on[0]] += time.process_time() - begin
         return found
 
@@ -38,7 +38,7 @@ def stages(work: Callable[[], object], repeats: int) -> tuple[dict[str, float], 
     work()
     for _ in range(repeats):
         shared.update(dict.fromkeys(shared, 0.0))
-        with timing.timed() as seconds:
+        with timing.record_stages() as seconds:
             work()
         best = min(best, (sum(seconds.values()), dict(seconds), dict(shared)), key=lambda one: one[0])
     threads.Kernel.__call__ = call

@@ -15,9 +15,9 @@ from results import make_result
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.results import FrameRecord, Maps
 from rgbmidic.settings import TestSettings
-from rgbmidic.view.address import ViewState
-from rgbmidic.view.picture import Overlay, Window, paint, palette
-from rgbmidic.view.shown import ShownFields
+from rgbmidic.view.fields import FieldsInView
+from rgbmidic.view.picture import ImageWindow, Overlay, paint, palette
+from rgbmidic.view.url_state import ViewState
 
 from .tables import table
 
@@ -30,19 +30,19 @@ def viewer(quick: bool) -> Iterator[dict[str, object]]:
     """Processor time of the viewer's server for a frame that was not shown before: reading a field with its
     uncertainty, and painting it on 1100 x 700 pixels of the screen; median of ten frames."""
     picture = np.random.default_rng(0).integers(0, 255, (SIDE, SIDE), dtype=np.uint8)
-    window = Window(left=0, top=0, right=SIDE, bottom=SIDE, width=1100, height=700).fitted()
+    window = ImageWindow(x_min=0, y_min=0, x_max=SIDE, y_max=SIDE, width=1100, height=700).fit_aspect()
     for size in (120,) if quick else (40, 12):
         mesh = Tri3Mesh.from_region(Region.from_rectangle((0, 0, SIDE - 1, SIDE - 1), (SIDE, SIDE)), size)
         fields = np.random.default_rng(1).normal(size=(2, len(mesh.nodes)))
 
         def record(index: int, fields: np.ndarray = fields) -> FrameRecord:
             named = dict(zip(("u", "v"), fields, strict=True)) | {f"{name}_std": abs(fields[0]) + 0.1 for name in "uv"}
-            return FrameRecord.of(nodes=fields.shape[1], lights=3, number=index, status=0, **named)
+            return FrameRecord.from_values(nodes=fields.shape[1], lights=3, number=index, status=0, **named)
 
         with tempfile.TemporaryDirectory() as folder:
             parts = {"nodes": mesh.nodes, "elements": mesh.elements, "references": []}
             made = make_result(Path(folder) / "result", frames=FRAMES, record=record, **parts)
-            maps, colours = Maps.of(made), palette("viridis")
+            maps, colours = Maps.from_result(made), palette("viridis")
             for name in ("u", "exx"):
                 times = []
                 for index in range(FRAMES):
@@ -53,7 +53,7 @@ def viewer(quick: bool) -> Iterator[dict[str, object]]:
                         "nodes": mesh.nodes,
                         "elements": mesh.elements,
                         "values": values.values,
-                        "ends": (-1.0, 1.0),
+                        "colour_range": (-1.0, 1.0),
                     }
                     paint(window, picture, Overlay(colours=colours, **over))
                     times.append((read - start, time.process_time() - read))
@@ -77,7 +77,7 @@ def viewer_latency(quick: bool) -> Iterator[dict[str, object]]:
 
     def record(index: int) -> FrameRecord:
         named = dict(zip(("u", "v"), fields, strict=True)) | {f"{name}_std": abs(fields[0]) + 0.1 for name in "uv"}
-        return FrameRecord.of(nodes=len(mesh.nodes), lights=1, number=index, status=0, **named)
+        return FrameRecord.from_values(nodes=len(mesh.nodes), lights=1, number=index, status=0, **named)
 
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder)
@@ -88,9 +88,9 @@ def viewer_latency(quick: bool) -> Iterator[dict[str, object]]:
         settings = TestSettings.from_mapping({"frames": stated, "region": region}, base)
         parts = {"nodes": mesh.nodes, "elements": mesh.elements, "lights": ["light"], "settings": settings}
         made = make_result(base / "result", frames=count, record=record, **parts)
-        window = Window(left=0, top=0, right=COLUMNS, bottom=ROWS, width=1100, height=700).fitted()
+        window = ImageWindow(x_min=0, y_min=0, x_max=COLUMNS, y_max=ROWS, width=1100, height=700).fit_aspect()
         for ahead in (False, True):
-            shown, times = ShownFields(made, ViewState(field="exx", over="deformed", frame=0)), list[float]()
+            shown, times = FieldsInView(made, ViewState(field="exx", over="deformed", frame=0)), list[float]()
             for frame in range(count):
                 shown.view = replace(shown.view, frame=frame)
                 start = time.process_time()

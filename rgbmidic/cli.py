@@ -26,8 +26,11 @@ class _Grouped(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands heading by heading."""
         limit = formatter.width - 6 - max(map(len, self.commands))
-        for heading, part in _GROUPS.items():
-            names = [typer.main.get_command_name(one.callback.__name__) for one in part.app.registered_commands]
+        for heading, module in _GROUPS.items():
+            names = [
+                typer.main.get_command_name(registered.callback.__name__)
+                for registered in module.app.registered_commands
+            ]
             with formatter.section(heading):
                 formatter.write_dl([(name, self.commands[name].get_short_help_str(limit)) for name in names])
 
@@ -50,11 +53,11 @@ def _rgbmidic(
     if version:
         print(f"rgbmidic {__version__}")
     else:
-        command.help_where_alone(context)
+        command.print_help_without_command(context)
 
 
-for part in _GROUPS.values():
-    app.add_typer(part.app)
+for module in _GROUPS.values():
+    app.add_typer(module.app)
 
 if __name__ == "__main__":
     main()

@@ -11,7 +11,7 @@ from typer import Argument, Option
 
 from rgbmidic import command
 from rgbmidic._version import __version__
-from rgbmidic.command import Out, Overwrite, Test, note, print_table, progress_of
+from rgbmidic.command import Out, Overwrite, Test, note, print_table, progress_bar
 from rgbmidic.errors import InputError
 
 app = typer.Typer()
@@ -26,8 +26,8 @@ def demo(out: Annotated[Path, Option(help="Output folder; must be empty or new."
     from rgbmidic.report import write_figures
     from rgbmidic.results import Maps, Result
 
-    started = time.perf_counter()
-    with progress_of("demo") as progress:
+    start_time = time.perf_counter()
+    with progress_bar("demo") as progress:
         rows = run_demo(out, note, _calibrate_demo, progress)
     note("5 of 7: a flat plate, tilted, behind a lens that distorts, and photographs of a chessboard")
     truth = write_plate(out / "test")
@@ -35,7 +35,7 @@ def demo(out: Annotated[Path, Option(help="Output folder; must be empty or new."
     note(f"6 of 7: measurement on it: rgbmidic run {out / 'test' / 'plate.toml'}, with [scale] camera = camera.json")
     plate = run_plate(out / "test", truth)
     note(f"7 of 7: pictures of the result in {out / 'figures'}")
-    write_figures(Maps.of(Result.open(out / "result")), out / "figures", (len(rows),), processes=threads())
+    write_figures(Maps.from_result(Result.open(out / "result")), out / "figures", (len(rows),), processes=threads())
     columns = ["angle", "three lights", "red alone", "green alone", "blue alone", "at nodes", "stated u_std"]
     lines = []
     for row in rows:
@@ -45,12 +45,14 @@ def demo(out: Annotated[Path, Option(help="Output folder; must be empty or new."
     print_table(title, columns, lines)
     columns = ["plate", "lens and plane", "one scale", "stated", "strain, lens and plane", "one scale", "stated"]
     lines = []
-    for one in plate:
-        micrometres = [f"{1e3 * value:.2f}" for value in (*one.displacement_mm, one.stated_mm)]
-        lines.append([one.motion, *micrometres, *(f"{1e6 * value:.0f}" for value in (*one.strain, one.stated_strain))])
+    for case in plate:
+        micrometres = [f"{1e3 * value:.2f}" for value in (*case.displacement_mm, case.stated_mm)]
+        lines.append(
+            [case.motion, *micrometres, *(f"{1e6 * value:.0f}" for value in (*case.strain, case.stated_strain))]
+        )
     title = "Displacement error, um, and strain error, 1e-6, against the exact truth (a flat plate tilted by 5 degrees)"
     print_table(title, columns, lines)
-    print(f"pictures: {out / 'figures'}   result: {out / 'result'}   {time.perf_counter() - started:.0f} s")
+    print(f"pictures: {out / 'figures'}   result: {out / 'result'}   {time.perf_counter() - start_time:.0f} s")
 
 
 def _calibrate_demo(test: Path) -> None:
@@ -70,16 +72,19 @@ def _calibrate_demo(test: Path) -> None:
 
 
 def _calibrate_demo_camera(test: Path) -> None:
-    """Lens and plane from the demo's photographs, as `rgbmidic-calibrate camera` computes them."""
+    """Calibrate lens and plane from the demo's photographs, as `rgbmidic-calibrate camera` computes them."""
     from rgbmidic.settings import FrameSettings
     from rgbmidic_calibration.jobs import calibrate_camera
     from rgbmidic_calibration.target import Target
 
-    stated = FrameSettings(path=("photographs",), kind="monochrome", white_level=65535)
-    found = calibrate_camera(
-        stated, Target.parse("chessboard:9x7:5mm"), lens=str(test / "target/*.png"), plane=str(test / "plane/*.png")
+    frame_settings = FrameSettings(path=("photographs",), kind="monochrome", white_level=65535)
+    estimate = calibrate_camera(
+        frame_settings,
+        Target.parse("chessboard:9x7:5mm"),
+        lens=str(test / "target/*.png"),
+        plane=str(test / "plane/*.png"),
     )
-    found.camera.write(test / "camera.json")
+    estimate.camera.write(test / "camera.json")
 
 
 @app.command()
@@ -92,13 +97,16 @@ def sample(
 
     if not name:
         columns = ["sample", "MB", "licence", "source", "shows"]
-        rows = [[s.name, f"{s.bytes / 1e6:.1f}", s.licence, s.source, s.shows] for s in SAMPLES.values()]
+        rows = [
+            [entry.name, f"{entry.bytes / 1e6:.1f}", entry.licence, entry.source, entry.shows]
+            for entry in SAMPLES.values()
+        ]
         print_table("real files of others, fetched from their sources and checked by SHA-256", columns, rows)
         return
     out = folder or Path(name)
-    written = write_sample(name, out, note)
-    print(f"{written.shows}\nlicence: {written.licence}   source: {written.source}")
-    print(f"try: cd {out} && {written.command}")
+    dataset = write_sample(name, out, note)
+    print(f"{dataset.shows}\nlicence: {dataset.licence}   source: {dataset.source}")
+    print(f"try: cd {out} && {dataset.command}")
 
 
 @app.command()
@@ -106,7 +114,7 @@ def virtual(scene: Annotated[Path, Argument(metavar="SCENE.toml", help="Scene to
     """Render a virtual test: raw frames, calibration captures and the exact truth."""
     from rgbmidic.lab.virtual.dataset import write_dataset
 
-    with progress_of("rendering") as progress:
+    with progress_bar("rendering") as progress:
         write_dataset(scene, out, progress)
 
 
@@ -124,24 +132,24 @@ def plan(
     from rgbmidic.scene.scene import read_scene
 
     check_folder(out, planning.FILES, overwrite=overwrite)
-    made = make_plan(read_scene(scene))
-    motion = planning.out_of_plane_error(made, distance)
-    proposals = {"colours exchanged": propose_colours(made), "lamps moved": propose_lamps(made)}
-    planning.write_plan(made, proposals, out, distance=distance, overwrite=overwrite)
+    lamp_plan = make_plan(read_scene(scene))
+    motion = planning.out_of_plane_error(lamp_plan, distance)
+    proposals = {"colours exchanged": propose_colours(lamp_plan), "lamps moved": propose_lamps(lamp_plan)}
+    planning.write_plan(lamp_plan, proposals, out, distance=distance, overwrite=overwrite)
     title = "fraction of the field where lights reflect, all of them do, and only one or none is clean"
-    print_table(title, *planning.zone_rows(made), planning.ZONE_WORDS)
+    print_table(title, *planning.zone_rows(lamp_plan), planning.ZONE_WORDS)
     uncertainty = "standard uncertainty to expect over the field, px"
-    print_table(uncertainty, *planning.uncertainty_rows(made), planning.UNCERTAINTY_WORDS)
-    better = {name: proposed for name, proposed in proposals.items() if proposed.gain > 1}
-    for name, lamps in {"lamps as they are": made, **better}.items():
+    print_table(uncertainty, *planning.uncertainty_rows(lamp_plan), planning.UNCERTAINTY_WORDS)
+    better = {name: proposal for name, proposal in proposals.items() if proposal.gain > 1}
+    for name, lamps in {"lamps as they are": lamp_plan, **better}.items():
         print_table(f"{name}: {planning.summary(lamps)}", *planning.lamp_rows(lamps))
     if not better:
         print("no better place was found for the lamps")
-    unseen = "" if motion["unseen_mm"] is None else f"; below {motion['unseen_mm']:.2g} mm the noise hides it"
+    noise_limit = "" if motion["unseen_mm"] is None else f"; below {motion['unseen_mm']:.2g} mm the noise hides it"
     print(
         f"out-of-plane motion at {motion['stand_off_mm']:g} mm reads as strain, {motion['strain_per_mm']:.2e} per mm:"
     )
-    print(f"  {motion['edge_px_per_mm']:.2g} px per mm at the field's edge{unseen}")
+    print(f"  {motion['edge_px_per_mm']:.2g} px per mm at the field's edge{noise_limit}")
     print(f"plan: {out / 'plan.json'}   picture: {out / 'plan.png'}")
 
 
@@ -205,13 +213,13 @@ def inspect(
             raise InputError("a TEST.toml stands for the frames of its reference: give it alone, or frames and --test")
         test, frames = frames[0], []
     settings = None if test is None else read_test(test)
-    with progress_of("inspecting") as progress:
+    with progress_bar("inspecting") as progress:
         inspection = inspect_files(
             frames,
             test=settings,
             calibration=calibration,
             frame=state_frames(settings, count=max(len(frames), 1), **statement),
-            region=command.read_place(region, "--region", "X0,Y0,X1,Y1") if region else None,
+            region=command.read_coordinates(region, "--region", "X0,Y0,X1,Y1") if region else None,
             element_size=element_size,
             accept=tuple(accept) if accept else None,
             progress=progress,
@@ -222,9 +230,11 @@ def inspect(
     print(f"{inspection.name}: {inspection.kind}, {columns} x {rows} px\n")
     print_table("samples in the region, fractions of the full scale", *report.channel_rows(inspection))
     print_table("lights", *report.light_rows(inspection))
-    known = "" if inspection.noise_known else " (noise estimated, not calibrated)"
+    noise_note = "" if inspection.noise_known else " (noise estimated, not calibrated)"
     size = f"elements of {inspection.element_size:g} px"
-    print_table(f"standard uncertainty of u and v to expect{known}, px, {size}", *report.uncertainty_rows(inspection))
+    print_table(
+        f"standard uncertainty of u and v to expect{noise_note}, px, {size}", *report.uncertainty_rows(inspection)
+    )
     for finding in inspection.findings:
         print(f"warning: {finding.text}")
     if out is not None:
@@ -249,18 +259,18 @@ def resolution(
     if out is not None:
         check_folder(out, report.FILES, overwrite=overwrite)
     settings = read_test(test)
-    chosen = command.read_frames(frames) or []
+    frame_indices = command.read_frames(frames) or []
     lengths = command.read_lengths(gauges, "--gauges")
-    asked = command.read_lengths(sizes, "--sizes")
-    with progress_of("resolution") as progress:
-        study = study_sizes(settings, asked, gauges=lengths or None, frames=chosen, progress=progress)
+    element_sizes = command.read_lengths(sizes, "--sizes")
+    with progress_bar("resolution") as progress:
+        study = study_sizes(settings, element_sizes, gauges=lengths or None, frames=frame_indices, progress=progress)
     static = f"{study.static} static frames" if study.static else "no static frames: noise is as stated, not measured"
     print(f"key frame {study.frame}: {study.name}; speckle {study.speckle:.1f} px; {static}\n")
     print_table("elements, rms over the nodes of the key frame", *report.size_rows(study), report.SIZE_WORDS)
     print_table("virtual strain gauges", *report.gauge_rows(study), report.GAUGE_WORDS)
-    for one in study.sizes:
-        if one.reason:
-            note(f"warning: elements of {one.element_size:g} px: {one.reason}")
+    for size in study.sizes:
+        if size.reason:
+            note(f"warning: elements of {size.element_size:g} px: {size.reason}")
     if out is not None:
         report.write_study(study, out, overwrite=overwrite)
         print(

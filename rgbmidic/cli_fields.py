@@ -10,11 +10,11 @@ import typer
 from typer import Option
 
 from rgbmidic import command
-from rgbmidic.errors import InputError, optional
+from rgbmidic.errors import InputError, import_optional
 
 app = typer.Typer()
 
-_PLACES = {
+_POSITION_OPTIONS = {
     "points": ("--point", "X,Y", "Displacement of a point."),
     "lines": ("--line", "X0,Y0:X1,Y1", "Mean displacement along a line."),
     "circles": ("--circle", "X,Y:R", "Mean displacement and strain over a circle."),
@@ -25,8 +25,8 @@ _PLACES = {
     "cracks": ("--crack", "X0,Y0:X1,Y1", "Opening and sliding of a crack of the mesh."),
     "tips": ("--tip", "X,Y:R0,R1", "Stress intensity factors of a crack tip."),
 }
-"""Keys of ``[probes]`` with the option, the form of a place and the help."""
-_TIP: dict[str, Any] = {
+"""Keys of ``[probes]`` with the option, the form of a position and the help."""
+_TIP_OPTIONS: dict[str, Any] = {
     "youngs_modulus": Annotated[float | None, Option(metavar="MPA", help="For --tip.")],
     "poissons_ratio": Annotated[float | None, Option(help="For --tip.")],
     "plane": Annotated[str | None, Option(help="For --tip: stress or strain.")],
@@ -36,10 +36,10 @@ _TIP: dict[str, Any] = {
 """Keys of ``[probes]`` that are of a crack's tip."""
 _PROBE_OPTIONS: dict[str, Any] = {
     **{
-        key: Annotated[list[str] | None, Option(option, metavar=form, help=text)]
-        for key, (option, form, text) in _PLACES.items()
+        key: Annotated[list[str] | None, Option(option, metavar=template, help=text)]
+        for key, (option, template, text) in _POSITION_OPTIONS.items()
     },
-    **_TIP,
+    **_TIP_OPTIONS,
     "measure": command.Measure,
     "window": Annotated[int | None, Option(help="Frames that a rate is taken over, 4 or more; 0: no rates.")],
     "rigid_motion": Annotated[str | None, Option("--rigid", help="Rigid motion: none, tell (report) or remove.")],
@@ -57,38 +57,38 @@ _Frames = Annotated[str, Option(help="Only these, such as 0,5,10:200; by default
 
 
 def _read_channels(options: dict[str, Any]) -> dict[str, Any]:
-    """The keys of ``[channels]`` that the options state; of the three clocks only one is kept."""
-    stated = {key: value for key, value in options.items() if value is not None}
-    if (pair := stated.get("align")) is not None:
-        stated["align"] = tuple(part.strip() for part in pair.split("="))
-        if len(stated["align"]) != 2 or not all(stated["align"]):
-            raise InputError(f"--align is CHANNEL=COLUMN, such as force_kN=gauge_1_strain, not {pair!r}")
+    """Return the keys of ``[channels]`` that the options state; of the three clocks only one is kept."""
+    keys = {key: value for key, value in options.items() if value is not None}
+    if (alignment := keys.get("align")) is not None:
+        keys["align"] = tuple(name.strip() for name in alignment.split("="))
+        if len(keys["align"]) != 2 or not all(keys["align"]):
+            raise InputError(f"--align is CHANNEL=COLUMN, such as force_kN=gauge_1_strain, not {alignment!r}")
     clocks = {"offset": 0.0, "trigger": None, "align": None}
-    return (clocks if clocks.keys() & stated else {}) | stated
+    return (clocks if clocks.keys() & keys else {}) | keys
 
 
 def _read_probes(options: dict[str, Any]) -> dict[str, Any]:
-    """The keys of ``[probes]`` that the options state, the places as numbers."""
-    places = {
-        key: tuple(command.read_place(text, option, form) for text in options[key] or ())
-        for key, (option, form, _) in _PLACES.items()
+    """Return the keys of ``[probes]`` that the options state, positions as numbers."""
+    positions = {
+        key: tuple(command.read_coordinates(text, option, template) for text in options[key] or ())
+        for key, (option, template, _) in _POSITION_OPTIONS.items()
     }
-    return {key: value for key, value in {**options, **places}.items() if value is not None}
+    return {key: value for key, value in {**options, **positions}.items() if value is not None}
 
 
 @app.command()
-@command.opened_result
-@command.gather("probes", _PROBE_OPTIONS, _read_probes)
-@command.gather("channels", _CHANNEL_OPTIONS, _read_channels)
+@command.result_options
+@command.collect_options("probes", _PROBE_OPTIONS, _read_probes)
+@command.collect_options("channels", _CHANNEL_OPTIONS, _read_channels)
 def history(
-    opened: command.Opened,
+    source: command.ResultSource,
     probes: dict[str, Any],
     channels: dict[str, Any],
     out: Annotated[Path | None, Option(help="CSV file to write; a picture gets its name. Else printed only.")] = None,
     px: command.Pixels = False,
     overwrite: command.Overwrite = False,
 ) -> None:
-    """Displacement, strain and rates over time at points, over areas and along gauges: table, picture and CSV file.
+    """Write displacement, strain and rates over time at points, over areas, along gauges: table, picture, CSV file.
 
     Positions are in px on the reference; an option of a position may be given several times.
     """
@@ -98,34 +98,34 @@ def history(
     from rgbmidic.results.histories import read_histories
     from rgbmidic.settings import ChannelSettings, ProbeSettings
 
-    for file in (out, command.picture_beside(out)) if out else ():
+    for file in (out, command.picture_path(out)) if out else ():
         check_file(file, overwrite=overwrite)
-    result, settings = opened.result, opened.settings
-    kept = result.section(ProbeSettings) if settings is None else settings.probes
-    if (asked := sorted(_TIP.keys() & probes.keys())) and not (probes.get("tips") or kept.tips):
-        raise InputError(f"--{asked[0].replace('_', '-')} is of a crack's tip, and none is stated: --tip X,Y:R0,R1")
-    added = {key: (*getattr(kept, key), *probes[key]) for key in _PLACES}
+    result, settings = source.result, source.settings
+    probe_settings = result.section(ProbeSettings) if settings is None else settings.probes
+    if (tip_keys := sorted(_TIP_OPTIONS.keys() & probes.keys())) and not (probes.get("tips") or probe_settings.tips):
+        raise InputError(f"--{tip_keys[0].replace('_', '-')} is of a crack's tip, and none is stated: --tip X,Y:R0,R1")
+    positions = {key: (*getattr(probe_settings, key), *probes[key]) for key in _POSITION_OPTIONS}
     histories = read_histories(
         result,
-        replace(kept, **(probes | added)),
-        scale=opened.scale(px=px),
+        replace(probe_settings, **(probes | positions)),
+        scale=source.scale(px=px),
         channels=replace(result.section(ChannelSettings) if settings is None else settings.channels, **channels),
     )
     if out is not None:
         write_histories(histories, out, overwrite=overwrite)
-        save_figure(history_figure(histories), command.picture_beside(out))
+        save_figure(history_figure(histories), command.picture_path(out))
     for remark in histories.remarks:
         command.note(f"note: {remark}")
     command.print_table(f"{len(histories.frames)} frames", *history_rows(histories))
     if out is not None:
-        print(f"table: {out}   picture: {command.picture_beside(out)}")
+        print(f"table: {out}   picture: {command.picture_path(out)}")
 
 
 @app.command()
-@command.opened_result
+@command.result_options
 @command.derived_options
 def profile(
-    opened: command.Opened,
+    source: command.ResultSource,
     line: Annotated[str, Option(metavar="X0,Y0:X1,Y1", help="Ends of the line on the reference, px.")],
     out: Annotated[Path, Option(help="CSV file to write; a picture gets the same name.")],
     derived: dict[str, Any],
@@ -136,27 +136,30 @@ def profile(
     level: Annotated[str, Option(help="Value at which the front is, such as -0.005, or part of the peak; 50%.")] = "",
     overwrite: command.Overwrite = False,
 ) -> None:
-    """A field along a line in every frame: table, position-time picture, curves, and the speed of a front or peak."""
+    """Read a field along a line in every frame: table, position-time picture, curves, speed of a front or peak."""
     from rgbmidic.report import profile_figure, save_figure, wave_text
     from rgbmidic.results import read_profile, write_profile
     from rgbmidic.results.files import check_file
     from rgbmidic.results.profiles import arrivals_file
 
-    picture, place = command.picture_beside(out), command.read_place(line, "--line", "X0,Y0:X1,Y1")
+    picture, endpoints = command.picture_path(out), command.read_coordinates(line, "--line", "X0,Y0:X1,Y1")
     for file in (out, picture, *([arrivals_file(out)] if speed else [])):
         check_file(file, overwrite=overwrite)
     if level and speed != "front":
         raise InputError("--level is of --speed front, which is not stated")
-    read = read_profile(opened.maps(derived), field, place, opened.frames(frames))
-    shown, there = command.read_frames(curves, "--curves") or [], list(read.frames)
-    if beyond := [frame for frame in shown if frame not in there]:
-        raise InputError(f"--curves {curves}: frames {beyond} are not among those read, {there[0]} to {there[-1]}")
-    rows = [there.index(frame) for frame in dict.fromkeys(shown)]
-    wave = read.wave(speed, level or "50%") if speed else None
-    write_profile(read, out, wave, overwrite=overwrite)
-    save_figure(profile_figure(read, wave, rows), picture)
+    field_profile = read_profile(source.maps(derived), field, endpoints, source.frames(frames))
+    curve_frames, profile_frames = command.read_frames(curves, "--curves") or [], list(field_profile.frames)
+    if absent_frames := [frame for frame in curve_frames if frame not in profile_frames]:
+        raise InputError(
+            f"--curves {curves}: frames {absent_frames} are not among those read, "
+            f"{profile_frames[0]} to {profile_frames[-1]}"
+        )
+    rows = [profile_frames.index(frame) for frame in dict.fromkeys(curve_frames)]
+    wave = field_profile.wave(speed, level or "50%") if speed else None
+    write_profile(field_profile, out, wave, overwrite=overwrite)
+    save_figure(profile_figure(field_profile, wave, rows), picture)
     if wave is not None:
-        print(f"{wave_text(read, wave)}; arrival times: {arrivals_file(out)}")
+        print(f"{wave_text(field_profile, wave)}; arrival times: {arrivals_file(out)}")
         if wave.arrivals.cut.any():
             command.note(
                 f"note: at {wave.arrivals.cut.sum()} of {len(wave.arrivals.cut)} positions the field still rises in "
@@ -171,10 +174,10 @@ def profile(
 
 
 @app.command()
-@command.opened_result
+@command.result_options
 @command.derived_options
 def movie(
-    opened: command.Opened,
+    source: command.ResultSource,
     out: Annotated[Path, Option(help="File to write: .mp4, .webm or .gif.")],
     derived: dict[str, Any],
     field: Annotated[str, Option(help="Fields side by side, such as u,exx,velocity.")] = "u",
@@ -195,23 +198,25 @@ def movie(
 ) -> None:
     """Write a movie of one field or several side by side, over the reference image or the raw frames."""
     from rgbmidic._kernels.threads import threads
-    from rgbmidic.report import Curve, Movie, write_movie
+    from rgbmidic.report import Curve, FieldMovie, write_movie
 
     if over not in ("reference", "frame"):
         raise InputError(f"--over is reference or frame, not {over!r}")
     if curve is None and (column is not None or offset):
         raise InputError("--column and --offset are of a --curve FILE, which is not stated")
-    shown = Movie(
-        maps=opened.maps(derived),
+    field_movie = FieldMovie(
+        maps=source.maps(derived),
         fields=tuple(name.strip() for name in field.split(",")),
-        frames=opened.frames(frames),
+        frames=source.frames(frames),
         limits=command.read_pair(range_, "--range") if range_ else None,
-        images=optional("rgbmidic.view.picture", "view").RawPictures(result=opened.result) if over == "frame" else None,
+        images=import_optional("rgbmidic.view.picture", "view").RawPictures(result=source.result)
+        if over == "frame"
+        else None,
         curve=None if curve is None else Curve.read(curve, column, offset),
         colours=colours,
         opacity=opacity,
         width=width,
     )
-    with command.progress_of("movie") as progress:
-        write_movie(shown, out, fps=fps, processes=workers or threads(), overwrite=overwrite, progress=progress)
+    with command.progress_bar("movie") as progress:
+        write_movie(field_movie, out, fps=fps, processes=workers or threads(), overwrite=overwrite, progress=progress)
     print(out)

@@ -12,7 +12,7 @@ import typer
 from typer import Argument, Option
 
 from rgbmidic import command
-from rgbmidic.command import Draw, Out, Overwrite, Test, Workers, note, progress_of
+from rgbmidic.command import Draw, Out, Overwrite, Test, Workers, note, progress_bar
 from rgbmidic.errors import InputError
 
 if TYPE_CHECKING:
@@ -39,26 +39,26 @@ def run(
     from rgbmidic.pipeline import measure
     from rgbmidic.settings import read_range, read_test
 
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     settings = read_test(test)
-    chosen = read_range(frames, "--frames") if frames else None
+    frame_range = read_range(frames, "--frames") if frames else None
     if overwrite and (resume or frames):
         raise InputError("--overwrite begins anew, --resume and --frames go on: state one of them")
-    with progress_of("measuring") as progress, _continuation_hint(test, out, frames, resume=resume):
+    with progress_bar("measuring") as progress, _continuation_hint(test, out, frames, resume=resume):
         result = measure(
             settings,
             out,
             overwrite=overwrite,
             resume=resume,
             retry_failed=retry_failed,
-            frames=chosen,
+            frames=frame_range,
             workers=workers or None,
             scheduler=scheduler,
             timings=timings,
             progress=progress,
         )
-    if chosen is None:
-        _conclude(result, started, draw=draw, processes=workers)
+    if frame_range is None:
+        _conclude(result, start_time, draw=draw, processes=workers)
     else:
         print(f"frames {frames} are measured; when all frames are: rgbmidic finish {out}")
 
@@ -84,26 +84,26 @@ def batch(
     """
     from rgbmidic.pipeline import batch as series
     from rgbmidic.report import REPORT, write_batch_page, write_report
-    from rgbmidic.results.files import writing
+    from rgbmidic.results.files import write_errors
 
     if table is not None and len(tests) != 1:
         raise InputError(f"--table goes with one TEST.toml, the template, not with {len(tests)}")
-    chosen = series.read_tests(tests) if table is None else series.read_table(tests[0], table)
+    test_readers = series.read_tests(tests) if table is None else series.read_table(tests[0], table)
     low, high = command.read_pair(elastic, "--elastic")
     if not 0 <= low < high:
         raise InputError(f"--elastic is a smaller and a larger strain, not {elastic}")
-    with writing(out):
+    with write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         series.check_summary(out, overwrite=overwrite)
 
-    def conclude(result: Result, settings: TestSettings, measured: bool) -> None:
-        if reports and (measured or not (result.path / REPORT).is_file()):
+    def conclude(result: Result, settings: TestSettings, is_new: bool) -> None:
+        if reports and (is_new or not (result.path / REPORT).is_file()):
             write_report(result, result.path / REPORT, settings=settings, overwrite=True)
 
     outcomes = []
-    with progress_of("batch") as progress:
+    with progress_bar("batch") as progress:
         for outcome in series.run_batch(
-            chosen,
+            test_readers,
             out,
             workers=workers or None,
             elastic=(low, high),
@@ -127,12 +127,12 @@ def finish(
     """Finish a result that was measured in parts: check that no frame is missing, and draw it."""
     from rgbmidic.results import Result, finish_result
 
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     finish_result(result)
-    _conclude(Result.open(result), started, draw=draw)
+    _conclude(Result.open(result), start_time, draw=draw)
 
 
-def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0) -> None:
+def _conclude(result: Result, start_time: float, *, draw: bool, processes: int = 0) -> None:
     """Draw a finished result and print the status of its frames.
 
     The drawing uses as many processes as cores if no number is stated. The command fails if more than half of the
@@ -145,17 +145,17 @@ def _conclude(result: Result, started: float, *, draw: bool, processes: int = 0)
 
     remove_pictures(result.path)
     if draw:
-        write_figures(Maps.of(result), result.path / "figures", processes=processes or threads())
-    _print_summary(result, time.perf_counter() - started)
+        write_figures(Maps.from_result(result), result.path / "figures", processes=processes or threads())
+    _print_summary(result, time.perf_counter() - start_time)
     failed = [index for index in result.deformed if result.status[index] != 0]
     if unread := int(result.unread.sum()):
         note(f"note: frames that could not be read: {unread}; --resume tries them again")
     if not result.deformed:
         raise typer.Exit(command.fail("every frame is one of the reference: there is no deformed one"))
     if len(failed) > len(result.deformed) / 2:
-        first = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}"
+        first_failure = f"the first, {result.names[failed[0]]}: {result.frame(failed[0]).reason}"
         count = f"{len(failed)} of {len(result.deformed)} deformed frames failed or did not converge"
-        raise typer.Exit(command.fail(f"{count}; {first}"))
+        raise typer.Exit(command.fail(f"{count}; {first_failure}"))
 
 
 @contextmanager
@@ -163,16 +163,16 @@ def _continuation_hint(test: Path, out: Path, frames: str, *, resume: bool) -> I
     """Print how to continue when the run is interrupted, by Ctrl-C or by SIGTERM, if it wrote anything."""
     from rgbmidic.results.provenance import PROVENANCE
 
-    def begun() -> bytes:
+    def provenance_bytes() -> bytes:
         return file.read_bytes() if (file := out / PROVENANCE).is_file() else b""
 
-    before_it = begun()
+    initial_bytes = provenance_bytes()
     try:
         yield
     except KeyboardInterrupt:
-        if frames or resume or begun() != before_it:
-            part = f"--frames {frames}" if frames else "--resume"
-            note(f"go on with: rgbmidic run {test} --out {out} {part}")
+        if frames or resume or provenance_bytes() != initial_bytes:
+            option = f"--frames {frames}" if frames else "--resume"
+            note(f"go on with: rgbmidic run {test} --out {out} {option}")
         else:
             note("nothing was begun: run the same command again")
         raise
@@ -184,29 +184,37 @@ def _print_summary(result: Result, seconds: float) -> None:
     from rgbmidic.timing import STAGES
 
     deformed = list(result.deformed)
-    ends = {word: int((result.status[deformed] == code).sum()) for code, word in enumerate(QUANTITIES["status"].codes)}
-    words = [f"{count} {word}" for word, count in ends.items() if count or word != "not converged"]
-    measured = [float((status == 0).mean()) for status in result.each("node_status", deformed)]
+    status_counts = {
+        word: int((result.status[deformed] == code).sum()) for code, word in enumerate(QUANTITIES["status"].codes)
+    }
+    words = [f"{count} {word}" for word, count in status_counts.items() if count or word != "not converged"]
+    measured_fractions = [float((status == 0).mean()) for status in result.iterate("node_status", deformed)]
     rows = {"frames": f"{len(deformed)} deformed: {', '.join(words)}", "nodes": f"{len(result.nodes)}"}
-    if measured:
-        rows["nodes"] += f", {sum(measured) / len(measured):.1%} measured"
-    if chosen := result.provenance.get("element_size"):
-        rows["mesh"] = f"{chosen['element_size']:g} px: {chosen['reason']}"
+    if measured_fractions:
+        rows["nodes"] += f", {sum(measured_fractions) / len(measured_fractions):.1%} measured"
+    if element_size := result.provenance.get("element_size"):
+        rows["mesh"] = f"{element_size['element_size']:g} px: {element_size['reason']}"
     if refinement := result.provenance.get("refinement"):
         rows["refined"] = refinement
     if (count := len(result.setting("frames", "reference", [0]))) > 1:
         gain = ((1 + 1 / count) / 2) ** 0.5
         rows["mean"] = f"of {count} frames is the reference: camera noise counts {gain:.2f} of what it does with one"
     for light, fraction in zip(result.lights, result.mean_light_fraction[deformed].T, strict=True):
-        known = fraction[fraction == fraction]
+        finite = fraction[fraction == fraction]
         rows[light if light.startswith("light ") else f"light {light}"] = (
-            f"{known.mean():.0%} of what determines the nodes" if known.size else "-"
+            f"{finite.mean():.0%} of what determines the nodes" if finite.size else "-"
         )
-    timed = [seconds for seconds in result.each("seconds", deformed) if seconds[0] == seconds[0]] if measured else []
-    if timed:  # the mean time of a frame and what each stage takes of it
-        mean = sum(timed) / len(timed)
-        parts = ", ".join(f"{name} {part:.0%}" for name, part in zip(STAGES, mean / mean.sum(), strict=True))
-        rows["frame"] = f"{mean.sum():.2f} s: {parts}"
+    stage_seconds = (
+        [seconds for seconds in result.iterate("seconds", deformed) if seconds[0] == seconds[0]]
+        if measured_fractions
+        else []
+    )
+    if stage_seconds:  # the mean time of a frame and what each stage takes of it
+        mean = sum(stage_seconds) / len(stage_seconds)
+        stage_texts = ", ".join(
+            f"{name} {stage_fraction:.0%}" for name, stage_fraction in zip(STAGES, mean / mean.sum(), strict=True)
+        )
+        rows["frame"] = f"{mean.sum():.2f} s: {stage_texts}"
     rows |= {"time": f"{seconds:.1f} s", "result": str(result.path)}
     width = max(map(len, rows)) + 2
     for name, text in rows.items():

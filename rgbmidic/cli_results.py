@@ -9,16 +9,16 @@ import typer
 from typer import Argument, Option
 
 from rgbmidic import command
-from rgbmidic.errors import InputError, optional
+from rgbmidic.errors import InputError, import_optional
 
 app = typer.Typer()
 
 
 @app.command()
-@command.opened_result
+@command.result_options
 @command.derived_options
 def figures(
-    opened: command.Opened,
+    source: command.ResultSource,
     derived: dict[str, Any],
     out: Annotated[Path | None, Option(help="Folder for the pictures; by default RESULT/figures.")] = None,
     frames: Annotated[str, Option(help="Such as 0,5,10:20; by default three frames.")] = "",
@@ -29,24 +29,28 @@ def figures(
     from rgbmidic._kernels.threads import threads
     from rgbmidic.report import write_figures, write_maps
 
-    chosen, folder, settings = command.read_frames(frames), out or opened.result.path / "figures", opened.settings
+    frame_indices, folder, settings = (
+        command.read_frames(frames),
+        out or source.result.path / "figures",
+        source.settings,
+    )
     if derived["measure"] is None and settings is not None:
         derived["measure"] = settings.probes.measure
-    maps = opened.maps(derived)
+    maps = source.maps(derived)
     if field:
-        files = write_maps(maps, [name.strip() for name in field.split(",")], folder, chosen, hatched=hatch)
+        files = write_maps(maps, [name.strip() for name in field.split(",")], folder, frame_indices, hatched=hatch)
     elif hatch:
         raise InputError("--hatch needs a --field")
     else:
-        files = write_figures(maps, folder, chosen, processes=threads())
+        files = write_figures(maps, folder, frame_indices, processes=threads())
     for file in files:
         print(file)
 
 
 @app.command()
-@command.opened_result
+@command.result_options
 def export(
-    opened: command.Opened,
+    source: command.ResultSource,
     out: Annotated[Path, Option(help="File to write; for crackpy a folder.")],
     to: Annotated[str, Option(help="Format: npz, csv, hdf5 or crackpy.")] = "npz",
     overwrite: command.Overwrite = False,
@@ -54,13 +58,13 @@ def export(
     """Write a result for another program: ParaView, MATLAB, xarray, a spreadsheet, CrackPy."""
     from rgbmidic.results import export_result
 
-    export_result(opened.result, to, out, scale=opened.scale(), overwrite=overwrite)
+    export_result(source.result, to, out, scale=source.scale(), overwrite=overwrite)
 
 
 @app.command()
-@command.opened_result
+@command.result_options
 def report(
-    opened: command.Opened,
+    source: command.ResultSource,
     out: Annotated[Path | None, Option(help="HTML file; by default RESULT/report.html.")] = None,
     frames: Annotated[str, Option(help="Frames to show as maps, such as 0,5,10:20.")] = "",
     overwrite: command.Overwrite = False,
@@ -68,10 +72,10 @@ def report(
     """Write the report of a test: one HTML page that can be printed."""
     from rgbmidic.report import REPORT, write_report
 
-    file, chosen = out or opened.result.path / REPORT, command.read_frames(frames)
+    file, frame_indices = out or source.result.path / REPORT, command.read_frames(frames)
     if not file.suffix:
         file = file.with_name(f"{file.name}.html")
-    write_report(opened.result, file, settings=opened.settings, frames=chosen, overwrite=overwrite)
+    write_report(source.result, file, settings=source.settings, frames=frame_indices, overwrite=overwrite)
     print(file)
 
 
@@ -89,14 +93,16 @@ def view(
 
     Ctrl-C ends the server. Options that state properties of frames are for raw frames only.
     """
-    serve = optional("rgbmidic.view", "view").serve
-    serve(path, port=port, browser=browser, tell=lambda address: print(address, flush=True), statement=statement)
+    serve = import_optional("rgbmidic.view", "view").serve
+    serve(
+        path, port=port, browser=browser, report_address=lambda address: print(address, flush=True), statement=statement
+    )
 
 
 @app.command()
-@command.opened_result
+@command.result_options
 def compare(
-    opened: command.Opened,
+    source: command.ResultSource,
     fe: Annotated[Path, Option(help="Simulation: .vtu, .pvd or a folder of such files, or .csv by node numbers.")],
     out: command.Out,
     mesh: Annotated[Path | None, Option(help="Mesh file with the nodes of a .csv.")] = None,
@@ -111,7 +117,7 @@ def compare(
     rigid: Annotated[str, Option(help="Rigid motion: tell (report it) or remove.")] = "tell",
     overwrite: command.Overwrite = False,
 ) -> None:
-    """Measured minus simulated displacement and strain, in mm and in units of the stated uncertainty.
+    """Compare measured and simulated displacement and strain, in mm and in units of the stated uncertainty.
 
     Page, tables and the fields at the simulation's nodes are written into a folder.
     """
@@ -119,35 +125,42 @@ def compare(
     from rgbmidic.mesh import read_mesh
     from rgbmidic.report.comparison import PAGE, comparison_files, scale_text, write_comparison
     from rgbmidic.results.comparison import Comparison, measured_mesh
-    from rgbmidic.results.simulation import Simulation, place
+    from rgbmidic.results.simulation import Simulation, find_placement
 
     if rigid not in ("tell", "remove"):
         raise InputError(f'--rigid is tell or remove, not "{rigid}"')
     if mesh is not None and fe.suffix.lower() != ".csv":
         raise InputError(f"--mesh is for a .csv with numbers of nodes; {fe} has a mesh of its own")
-    pairs = [command.read_place(text, "--points", "X_MM,Y_MM:X_PX,Y_PX") for text in points or ()]
-    chosen, result, scale = command.read_frames(frames), opened.result, opened.scale()
-    placement = place(result, scale=scale, pairs=pairs)
-    numbered = measured_mesh(result) if mesh is None else read_mesh(mesh, unit=unit)
-    simulation = Simulation.read(fe, mesh=numbered, unit=unit, field=field, interval=interval, offset=offset)
-    comparison = Comparison(result, simulation, placement, scale=scale, frames=chosen, remove_rigid=rigid == "remove")
+    point_pairs = [command.read_coordinates(text, "--points", "X_MM,Y_MM:X_PX,Y_PX") for text in points or ()]
+    frame_indices, result, scale = command.read_frames(frames), source.result, source.scale()
+    placement = find_placement(result, scale=scale, point_pairs=point_pairs)
+    fe_mesh = measured_mesh(result) if mesh is None else read_mesh(mesh, unit=unit)
+    simulation = Simulation.read(fe, mesh=fe_mesh, unit=unit, field=field, interval=interval, offset=offset)
+    comparison = Comparison(
+        result, simulation, placement, scale=scale, frames=frame_indices, remove_rigid=rigid == "remove"
+    )
     check_folder(out, comparison_files(comparison), overwrite=overwrite)
-    with command.progress_of("comparing") as progress:
-        done = write_comparison(comparison, out, progress)
+    with command.progress_bar("comparing") as progress:
+        frame_comparisons = write_comparison(comparison, out, progress)
     command.note(f"placed: {placement.summary()}")
     headings = ["frame", "scale", "uncertainty", "chi-square at nodes", "levelled", "after the scale"]
     rows = []
-    for made in done:
-        squares = [made.agreement[way, "displacement"].chi_square for way in ("nodes", "levelled")]
-        numbers = (made.fit.scale, made.fit.scale_std, *squares, made.fit.chi_square)
-        rows.append([f"{made.frame}", *(f"{number:.4g}" for number in numbers)])
-    command.print_table(f"{len(done)} frames against {fe}", headings, rows)
-    print(scale_text(comparison, done))
+    for frame_comparison in frame_comparisons:
+        squares = [frame_comparison.agreement[variant, "displacement"].chi_square for variant in ("nodes", "levelled")]
+        numbers = (
+            frame_comparison.fit.scale,
+            frame_comparison.fit.scale_std,
+            *squares,
+            frame_comparison.fit.chi_square,
+        )
+        rows.append([f"{frame_comparison.frame}", *(f"{number:.4g}" for number in numbers)])
+    command.print_table(f"{len(frame_comparisons)} frames against {fe}", headings, rows)
+    print(scale_text(comparison, frame_comparisons))
     print(f"page: {out / PAGE}")
 
 
 @app.command()
-@command.gather("photographed", command.TARGET_LIGHT_OPTIONS, command.read_target_lights)
+@command.collect_options("photographed", command.TARGET_LIGHT_OPTIONS, command.read_target_lights)
 def scale(
     points: Annotated[str, Argument(metavar="X0,Y0:X1,Y1", help="Two points with a known distance, px.")],
     length: Annotated[float, Option(metavar="MM", help="Their distance in mm.")],
@@ -155,15 +168,15 @@ def scale(
     point_std: Annotated[float, Option(metavar="PX", help="Uncertainty of each point, px.")] = 0.5,
     photographed: Any = None,
 ) -> None:
-    """Millimetres per pixel of the first light's image, with its uncertainty, from two points and their distance."""
+    """Compute mm per pixel of the first light's image, with its uncertainty, from two points and their distance."""
     from rgbmidic.fields import Units
 
-    x0, y0, x1, y1 = command.read_place(points, "the points", "X0,Y0:X1,Y1")
-    ends: Any = [[x0, y0], [x1, y1]]
+    x0, y0, x1, y1 = command.read_coordinates(points, "the points", "X0,Y0:X1,Y1")
+    endpoints: Any = [[x0, y0], [x1, y1]]
     factor, remark = None, "the image that the points are of; results are in px of the first light's (--light)"
     if photographed is not None:
-        ends, factor = photographed.on_first_light(ends)
+        endpoints, factor = photographed.on_first_light(endpoints)
         remark = f"the image of light {photographed.first}, from points in that of {' + '.join(photographed.names)}"
-    units = Units.from_points(ends, length, length_std=length_std, point_std=point_std, factor=factor)
+    units = Units.from_points(endpoints, length, length_std=length_std, point_std=point_std, factor=factor)
     print(f"# mm per px of {remark}")
     print(f"[scale]\nmm_per_pixel = {units.mm_per_pixel:.6g}\nmm_per_pixel_std = {units.mm_per_pixel_std:.2g}")

@@ -27,7 +27,7 @@ from rich.console import Console
 from typer import Argument, Option
 from typer.core import TyperGroup
 
-from rgbmidic.errors import ConfigurationError, InputError, RgbmidicError, disk_reason, shortened
+from rgbmidic.errors import ConfigurationError, InputError, RgbmidicError, disk_reason, shorten
 
 if TYPE_CHECKING:
     from rgbmidic.illumination.calibration import TargetLights
@@ -74,7 +74,7 @@ TARGET_LIGHT_OPTIONS: dict[str, Any] = {
 
 
 def read_target_lights(options: Mapping[str, Any]) -> TargetLights | None:
-    """The lights that `TARGET_LIGHT_OPTIONS` state, with their calibration; None where they state nothing.
+    """Return the lights that `TARGET_LIGHT_OPTIONS` state, with their calibration; None if they state nothing.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def read_target_lights(options: Mapping[str, Any]) -> TargetLights | None:
 
         origin = None
         if crop is not None:
-            x, y = read_place(crop, "--crop-origin", "X,Y")
+            x, y = read_coordinates(crop, "--crop-origin", "X,Y")
             if min(x, y) < 0 or x % 1 or y % 1:
                 raise ConfigurationError(f"--crop-origin takes whole numbers from 0, not {crop!r}")
             origin = (int(x), int(y))
@@ -97,13 +97,13 @@ def read_target_lights(options: Mapping[str, Any]) -> TargetLights | None:
     if names:
         raise ConfigurationError("--light needs --calibration, the file whose registration has that light")
     if file is not None or crop is not None:
-        stated = "--calibration" if file is not None else "--crop-origin"
-        raise ConfigurationError(f"{stated} is of use only with --light, the light of the photograph: state it too")
+        option = "--calibration" if file is not None else "--crop-origin"
+        raise ConfigurationError(f"{option} is of use only with --light, the light of the photograph: state it too")
     return None
 
 
 def application(name: str, cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
-    """An application whose help is plain text and whose errors `main` reports."""
+    """Make an application whose help is plain text and whose errors `main` reports."""
     return typer.Typer(
         name=name,
         cls=cls,
@@ -122,7 +122,7 @@ def main(app: typer.Typer) -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # names that are no text, as standard error prints them
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False, markup=False)
-    handler.addFilter(Once())
+    handler.addFilter(OnceFilter())
     loggers = [logging.getLogger(name) for name in ("rgbmidic", "rgbmidic_calibration")]
     for logger in loggers:  # not the root: other libraries talk to programmers
         logger.addHandler(handler)
@@ -132,8 +132,8 @@ def main(app: typer.Typer) -> None:
     sys.exit(status)
 
 
-class Once(logging.Filter):
-    """Lets a text through once: what is repeated for another mesh or file of the same test is one line."""
+class OnceFilter(logging.Filter):
+    """A filter that passes each text once: a message repeated for another mesh or file of a test is one line."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -147,8 +147,10 @@ class Once(logging.Filter):
 
 
 def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> int:
-    """Run a command; its exit status: 0, 1 where it failed, 2 where the input is wrong, 130 where it was stopped."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, which a background job ignores
+    """Run a command and return its exit status: 0, 1 if it failed, 2 if the input is wrong, 130 if it was stopped."""
+    previous_handler = signal.signal(
+        signal.SIGTERM, signal.default_int_handler
+    )  # as Ctrl-C, which a background job ignores
     try:
         status = app(args=arguments, standalone_mode=False) or 0
         if status != INTERRUPTED:  # typer's own answer to Ctrl-C
@@ -169,33 +171,33 @@ def execute(app: typer.Typer, arguments: list[str], *, debug: bool = False) -> i
             return fail(disk_reason(error))
         return fail(f"{type(error).__name__}: {error} (run again with --debug for the details)")
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, previous_handler)
 
 
 def fail(message: str, status: int = FAILURE) -> int:
-    """Print an error as one line; gives the status back."""
-    print(f"error: {shortened(' '.join(message.split()))}", file=sys.stderr)
+    """Print an error as one line and return the status."""
+    print(f"error: {shorten(' '.join(message.split()))}", file=sys.stderr)
     return status
 
 
-def help_where_alone(context: typer.Context) -> None:
-    """Print the help of a group of commands where none of them is named."""
+def print_help_without_command(context: typer.Context) -> None:
+    """Print the help of a group of commands if none of them was given."""
     if context.invoked_subcommand is None:
         print(context.get_help())
 
 
-def gather(
-    name: str, options: Mapping[str, Any], read: Callable[[dict[str, Any]], Any], **defaults: Any
+def collect_options(
+    name: str, options: Mapping[str, Any], convert: Callable[[dict[str, Any]], Any], **defaults: Any
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Decorator of a command whose parameter `name` is asked for as several options.
+    """Make a decorator of a command whose parameter `name` is built from several options.
 
     Parameters
     ----------
     name
-        Parameter of the command; it gets what `read` makes of the options.
+        Parameter of the command; it gets the value that `convert` returns for the options.
     options
         Annotated type of every option by its key.
-    read
+    convert
         Function of the options' values by key.
     **defaults
         Values of options that are left out, None where none is given here; ``REQUIRED`` for one that may not be.
@@ -203,58 +205,58 @@ def gather(
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         @wraps(function)
-        def gathering(**values: Any) -> None:
-            given = {key: values.pop(key) for key in options}
-            function(**values, **{name: read(given)})
+        def wrapper(**values: Any) -> None:
+            option_values = {key: values.pop(key) for key in options}
+            function(**values, **{name: convert(option_values)})
 
         signature = inspect.signature(function, eval_str=True)
-        asked: list[inspect.Parameter] = []
+        parameters: list[inspect.Parameter] = []
         for parameter in signature.parameters.values():
-            parts = options if parameter.name == name else {parameter.name: parameter.annotation}
+            hints = options if parameter.name == name else {parameter.name: parameter.annotation}
             kind = inspect.Parameter.KEYWORD_ONLY
-            for key, hint in parts.items():
+            for key, hint in hints.items():
                 default = defaults.get(key) if parameter.name == name else parameter.default
-                asked.append(inspect.Parameter(key, kind, default=default, annotation=hint))
-        gathering.__annotations__ = {parameter.name: parameter.annotation for parameter in asked}
-        vars(gathering)["__signature__"] = signature.replace(parameters=asked)
-        return gathering
+                parameters.append(inspect.Parameter(key, kind, default=default, annotation=hint))
+        wrapper.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        vars(wrapper)["__signature__"] = signature.replace(parameters=parameters)
+        return wrapper
 
     return decorate
 
 
-def read_place(text: str, option: str, form: str) -> tuple[float, ...]:
-    """The finite numbers that are stated in a `form` such as ``"X0,Y0:X1,Y1"``, or with commas between all of them.
+def read_coordinates(text: str, option: str, template: str) -> tuple[float, ...]:
+    """Return the finite numbers of a `template` such as ``"X0,Y0:X1,Y1"``, or with commas between all of them.
 
     Raises
     ------
     InputError
         They are not of that form.
     """
-    forms = (form, form.replace(":", ","), form.replace("Y0,X1", "Y0:X1"))
-    shapes = [[part.count(",") for part in one.split(":")] for one in (*forms, text)]
+    templates = (template, template.replace(":", ","), template.replace("Y0,X1", "Y0:X1"))
+    comma_counts = [[group.count(",") for group in pattern.split(":")] for pattern in (*templates, text)]
     numbers = _numbers(text.replace(":", ","))
-    if not numbers or shapes[-1] not in shapes[:-1] or not all(map(math.isfinite, numbers)):
-        unit = " in px" if "X" in form and "MM" not in form else ""
-        raise InputError(f"{option} is {form}{unit}, such as {_EXAMPLES[form]}, not {text!r}")
+    if not numbers or comma_counts[-1] not in comma_counts[:-1] or not all(map(math.isfinite, numbers)):
+        unit = " in px" if "X" in template and "MM" not in template else ""
+        raise InputError(f"{option} is {template}{unit}, such as {_EXAMPLES[template]}, not {text!r}")
     return numbers
 
 
 def read_pair(text: str, option: str) -> tuple[float, float]:
-    """The two finite numbers of ``LOW:HIGH``; an `InputError` where it is something else."""
-    low, high = read_place(text, option, "LOW:HIGH")
+    """Return the two finite numbers of ``LOW:HIGH``; an `InputError` where it is something else."""
+    low, high = read_coordinates(text, option, "LOW:HIGH")
     return low, high
 
 
 def _numbers(text: str) -> tuple[float, ...]:
-    """Numbers with commas between them; none where it is something else."""
+    """Return the numbers between commas; an empty tuple if the text is something else."""
     try:
-        return tuple(float(part) for part in text.split(","))
+        return tuple(float(token) for token in text.split(","))
     except ValueError:
         return ()
 
 
 def read_frames(text: str, option: str = "--frames") -> list[int] | None:
-    """The indices of frames that an option states, such as ``"0,5,10:20"`` (10 to 19); None where it states none.
+    """Return the indices of frames that an option states, such as ``"0,5,10:20"`` (10 to 19); None if it is empty.
 
     Raises
     ------
@@ -263,9 +265,9 @@ def read_frames(text: str, option: str = "--frames") -> list[int] | None:
     """
     if not text:
         return None
-    parts = [re.fullmatch(r"\s*(\d{1,15})\s*(?::\s*(\d{1,15})\s*)?", part) for part in text.split(",")]
-    ranges = [range(int(part[1]), int(part[2] or int(part[1]) + 1)) for part in parts if part]
-    if len(ranges) < len(parts) or not all(ranges) or sum(map(len, ranges)) > 10**7:  # more are a slip
+    matches = [re.fullmatch(r"\s*(\d{1,15})\s*(?::\s*(\d{1,15})\s*)?", token) for token in text.split(",")]
+    ranges = [range(int(match[1]), int(match[2] or int(match[1]) + 1)) for match in matches if match]
+    if len(ranges) < len(matches) or not all(ranges) or sum(map(len, ranges)) > 10**7:  # more are a slip
         raise InputError(f"{option} are indices and ranges such as 0,5,10:20 (10 to 19), not {text!r}")
     return [*chain(*ranges)]
 
@@ -282,25 +284,25 @@ _EXAMPLES = {
 }
 
 
-def picture_beside(table: Path) -> Path:
-    """The picture of a table's name; an `InputError` where that is the table itself, which it would replace."""
+def picture_path(table: Path) -> Path:
+    """Return the path of the picture beside a table; an `InputError` if that is the table itself."""
     if table.suffix.lower() == ".png":
         raise InputError(f"--out is the table, such as {table.with_suffix('.csv').name}, not {table.name!r}")
     return table.with_suffix(".png")
 
 
 def read_lengths(text: str, option: str) -> tuple[float, ...]:
-    """Different positive lengths in px with commas between them; an `InputError` where it is something else."""
+    """Return different positive lengths in px between commas; an `InputError` if the text is something else."""
     values = _numbers(text)
-    wrong = len(set(values)) < len(values) or not all(math.isfinite(value) and value > 0 for value in values)
-    if wrong or (text.strip() and not values):
-        form = "different lengths in px with commas between them, such as 10,16,25"
-        raise InputError(f"{option} are {form}, not {text!r}")
+    is_invalid = len(set(values)) < len(values) or not all(math.isfinite(value) and value > 0 for value in values)
+    if is_invalid or (text.strip() and not values):
+        requirement = "different lengths in px with commas between them, such as 10,16,25"
+        raise InputError(f"{option} are {requirement}, not {text!r}")
     return values
 
 
 def read_statement(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of `FRAME_OPTIONS` that are stated, as `rgbmidic.settings.FrameSettings` takes them.
+    """Return the values of `FRAME_OPTIONS` that are stated, as `rgbmidic.settings.FrameSettings` takes them.
 
     Raises
     ------
@@ -311,12 +313,12 @@ def read_statement(options: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in values.items() if value is not None}
 
 
-frame_options = gather("statement", FRAME_OPTIONS, read_statement)
+frame_options = collect_options("statement", FRAME_OPTIONS, read_statement)
 """Decorator of a command whose parameter `statement` holds what the `FRAME_OPTIONS` state."""
 
 
 def read_shape(text: str | None) -> tuple[int, int] | None:
-    """Rows and columns that ``--shape ROWSxCOLUMNS`` states (a comma will do as well); None where nothing is stated.
+    """Return the rows and columns of ``--shape ROWSxCOLUMNS`` (a comma will do as well); None if it is empty.
 
     Raises
     ------
@@ -332,44 +334,44 @@ def read_shape(text: str | None) -> tuple[int, int] | None:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Opened:
-    """A result that a command reads, and the settings that stand in place of those it keeps, if any are stated."""
+class ResultSource:
+    """A result that a command reads, and the settings that replace those stored in it, if any are stated."""
 
     result: Result
     settings: TestSettings | None
 
     def scale(self, *, px: bool = False) -> ScaleSettings | None:
-        """The scale of these settings, with lengths in px though it may be known; None: that of the result."""
+        """Return the scale of these settings, with lengths in px if `px`; None: that of the result."""
         from rgbmidic.settings import ScaleSettings
 
         scale = None if self.settings is None else self.settings.scale
         return replace(scale or self.result.section(ScaleSettings), unit="px") if px else scale
 
     def maps(self, derived: Mapping[str, Any]) -> Maps:
-        """The fields of the result, as the options of `derived_options` derive them."""
+        """Return the fields of the result, derived as the options of `derived_options` state."""
         from rgbmidic.results import Maps
 
         choices = dict(derived)
-        return Maps.of(self.result, self.scale(px=choices.pop("px")), **choices)
+        return Maps.from_result(self.result, self.scale(px=choices.pop("px")), **choices)
 
     def frames(self, text: str) -> list[int] | None:
-        """The measured ones of the frames that ``--frames`` states; None where it states none."""
-        if (asked := read_frames(text)) is None:
+        """Return the measured frames among those that ``--frames`` states; None if it is empty."""
+        if (indices := read_frames(text)) is None:
             return None
-        result, there = self.result, f"{self.result.path} has frames 0 to {len(self.result) - 1}"
-        if max(asked) >= len(result):
-            raise InputError(f"--frames {text}: {there}")
-        if not (chosen := [frame for frame in asked if result.finished[frame]]):
-            raise InputError(f"--frames {text}: none of them is measured; {there}")
-        return chosen
+        result, available = self.result, f"{self.result.path} has frames 0 to {len(self.result) - 1}"
+        if max(indices) >= len(result):
+            raise InputError(f"--frames {text}: {available}")
+        if not (measured_indices := [frame for frame in indices if result.finished[frame]]):
+            raise InputError(f"--frames {text}: none of them is measured; {available}")
+        return measured_indices
 
 
-def _open(options: Mapping[str, Any]) -> Opened:
+def _open_result(options: Mapping[str, Any]) -> ResultSource:
     from rgbmidic.results import Result
     from rgbmidic.settings import read_test
 
     result, test = Result.open(options["result"], partial=options["partial"]), options["test"]
-    return Opened(result=result, settings=None if test is None else read_test(test))
+    return ResultSource(result=result, settings=None if test is None else read_test(test))
 
 
 _RESULT_OPTIONS: dict[str, Any] = {
@@ -380,8 +382,8 @@ _RESULT_OPTIONS: dict[str, Any] = {
     ],
     "partial": Annotated[bool, Option("--partial", help="Use the finished frames of an interrupted run.")],
 }
-opened_result = gather("opened", _RESULT_OPTIONS, _open, result=REQUIRED, partial=False)
-"""Decorator of a command whose parameter `opened` is the result that it reads."""
+result_options = collect_options("source", _RESULT_OPTIONS, _open_result, result=REQUIRED, partial=False)
+"""Decorator of a command whose parameter `source` is the result that it reads."""
 
 _DERIVED: dict[str, Any] = {
     "gauge": Annotated[float | None, Option("--gauge-length", "--gauge", help="Virtual strain gauge, px.")],
@@ -391,7 +393,7 @@ _DERIVED: dict[str, Any] = {
     "window": Annotated[int | None, Option(help="Frames that a rate is taken over, 4 or more.")],
     "px": Pixels,
 }
-derived_options = gather("derived", _DERIVED, dict, rigid_removed=False, px=False)
+derived_options = collect_options("derived", _DERIVED, dict, rigid_removed=False, px=False)
 """Decorator of a command whose parameter `derived` states how fields are derived, as `rgbmidic.results.Maps.of`."""
 
 
@@ -400,8 +402,10 @@ def note(text: str) -> None:
     messages.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
-def print_table(title: str, headings: list[str], rows: list[list[str]], words: Mapping[str, str] | None = None) -> None:
-    """Print a table on stdout, and below it what words of its heading mean.
+def print_table(
+    title: str, headings: list[str], rows: list[list[str]], glossary: Mapping[str, str] | None = None
+) -> None:
+    """Print a table on stdout, and below it a glossary of its headings.
 
     It is as wide as it needs to be: where the terminal has fewer columns it breaks the lines, and nothing is cut off.
     """
@@ -414,17 +418,17 @@ def print_table(title: str, headings: list[str], rows: list[list[str]], words: M
         table.add_row(*row)
     print(title)
     Console(soft_wrap=True, width=400, markup=False).print(table)  # a name may have brackets
-    for heading, meaning in (words or {}).items():
-        print(f"  {heading}: {meaning}")
+    for heading, explanation in (glossary or {}).items():
+        print(f"  {heading}: {explanation}")
     print()
 
 
 @contextmanager
-def progress_of(what: str) -> Iterator[Callable[[int, int, str], None]]:
-    """A bar on stderr, and the function that moves it: frames done, their total, a line about the last one.
+def progress_bar(task_name: str) -> Iterator[Callable[[int, int, str], None]]:
+    """Show a progress bar on stderr and yield the function that moves it: frames done, their total, a last line.
 
-    Nothing is shown where nobody watches: an error stays one line, a log file stays short. A first run is told why it
-    takes longer.
+    Nothing is shown if stderr is no terminal: an error stays one line, a log file stays short. A note says why the
+    first run takes longer.
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -435,10 +439,17 @@ def progress_of(what: str) -> Iterator[Callable[[int, int, str], None]]:
             "first run on this machine: kernels are compiled for its processor as they are needed, in all 15 to 40 s; "
             "later runs take them from a cache"
         )
-    rate, last = TextColumn("{task.fields[rate]}"), TextColumn("{task.fields[line]}", markup=False)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), rate, TimeRemainingColumn(), last)
+    rate, last_line = TextColumn("{task.fields[rate]}"), TextColumn("{task.fields[line]}", markup=False)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        rate,
+        TimeRemainingColumn(),
+        last_line,
+    )
     with Progress(*columns, console=messages, transient=True, disable=not messages.is_terminal) as bar:
-        task = bar.add_task(what, total=None, line="", rate="")
+        task = bar.add_task(task_name, total=None, line="", rate="")
 
         def move(done: int, total: int, line: str) -> None:
             speed = bar.tasks[task].speed

@@ -10,11 +10,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from rgbmidic.errors import ResultError, RgbmidicError, disk_faults
+from rgbmidic.errors import ResultError, RgbmidicError, convert_disk_errors
 
 
 def write_complete(
-    path: Path, write: Callable[[BinaryIO], object], *, new: bool = False, error: type[RgbmidicError] = ResultError
+    path: Path,
+    write: Callable[[BinaryIO], object],
+    *,
+    exclusive: bool = False,
+    error: type[RgbmidicError] = ResultError,
 ) -> None:
     """Write a file under another name and rename it when all of it is written; else nothing is left of it.
 
@@ -26,7 +30,7 @@ def write_complete(
         The file.
     write
         Writes its content.
-    new
+    exclusive
         Whether a file of this name stays as it is, also one that another process writes at the same time; else it is
         replaced.
     error
@@ -39,11 +43,11 @@ def write_complete(
     """
     temporary = path.with_name(f"{path.name}.{socket.gethostname()}.{threading.get_ident()}.{os.getpid()}.part")
     try:
-        with disk_faults(error, f"{path} cannot be written"), temporary.open("w+b") as file:
+        with convert_disk_errors(error, f"{path} cannot be written"), temporary.open("w+b") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-            if new:
+            if exclusive:
                 try:
                     path.hardlink_to(temporary)
                 except OSError:  # it is there; or the disk has no links, where nobody else starts at the same time

@@ -6,35 +6,37 @@ Every message says what is wrong, what is allowed and what was given, and names 
 import errno
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import Any
+
+from rgbmidic.renamed import refuse_old_names
 
 _LONG_WORD, _LONGEST = re.compile(r"\S{1000,}"), 4000
 """Characters that no name of a file or key has (Linux allows 255 for a name), and a screenful of them."""
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
 
-def legible(name: str | os.PathLike[str]) -> str:
-    r"""A file's name as text that can be printed and stored: bytes that are not UTF-8 as ``\xff``."""
+def printable(name: str | os.PathLike[str]) -> str:
+    r"""Return a file's name as text that can be printed and stored: bytes that are not UTF-8 as ``\xff``."""
     return os.fspath(name).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def disk_reason(error: OSError) -> str:
-    """Why a file cannot be opened, read or written, in a few words."""
+    """Return in a few words why a file cannot be opened, read or written."""
     if error.errno not in (errno.EMFILE, errno.ENFILE):
         return error.strerror or str(error)
     return f"{error.strerror}: this process may open no more (ulimit -n shows the limit and raises it)"
 
 
 def first_line(error: Exception) -> str:
-    """First line of what another library's error says; the error's name where it says nothing, as a MemoryError."""
+    """Return the first line of another library's message; the error's name if it has none, as a MemoryError."""
     return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
-def shortened(line: str) -> str:
-    """Return a message without what no reader needs of a long word, or of a long text."""
+def shorten(line: str) -> str:
+    """Shorten long words of a message, and a message of more than some 4,000 characters."""
     line = _LONG_WORD.sub(lambda word: f"{word[0][:100]}...{word[0][-40:]} ({len(word[0])} characters)", line)
     if len(line) > _LONGEST:
         line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 4 :]} (shortened from {len(line)} characters)"
@@ -46,10 +48,15 @@ class RgbmidicError(Exception):
 
     The message is one line: line ends and other control characters, which come from damaged files and from other
     libraries, stand in it as ``\n``, ``\x1b``. What it quotes of a file is cut where it is longer than a reader needs.
+
+    Examples
+    --------
+    >>> issubclass(InputError, RgbmidicError) and issubclass(InputError, ValueError)
+    True
     """
 
     def __init__(self, message: str = "") -> None:
-        super().__init__(shortened(_CONTROL.sub(lambda found: ascii(found[0])[1:-1], legible(message))))
+        super().__init__(shorten(_CONTROL.sub(lambda match: ascii(match[0])[1:-1], printable(message))))
 
 
 class InputError(RgbmidicError, ValueError):
@@ -81,16 +88,16 @@ class AnotherTestError(ResultError):
 
 
 @contextmanager
-def disk_faults(kind: type[RgbmidicError], what: str) -> Iterator[None]:
-    """Turn what the disk refuses inside the block into an error of a `kind`: `what` could not be done, and why."""
+def convert_disk_errors(error_type: type[RgbmidicError], failure: str) -> Iterator[None]:
+    """Convert an OSError inside the block into an `error_type` that states the `failure` and its reason."""
     try:
         yield
     except OSError as error:
-        raise kind(f"{what}: {disk_reason(error)}") from None
+        raise error_type(f"{failure}: {disk_reason(error)}") from None
 
 
-def optional(module: str, extra: str) -> Any:
-    """A module that needs packages of an extra.
+def import_optional(module: str, extra: str) -> Any:
+    """Import a module that needs the packages of an extra.
 
     Raises
     ------
@@ -105,11 +112,4 @@ def optional(module: str, extra: str) -> Any:
         raise InputError(f'this needs the package {error.name}: pip install "rgbmidic[{extra}]"') from None
 
 
-def renamed_attributes(owner: str, **new_names: str) -> Callable[[Any, str], NoReturn]:
-    """Return a `__getattr__` for the class `owner` whose error answers an old name with the new one."""
-
-    def report_new_name(_: Any, name: str) -> NoReturn:
-        reason = f"is now {owner}.{new_names[name]}" if name in new_names else "does not exist"
-        raise AttributeError(f"{owner}.{name} {reason}")
-
-    return report_new_name
+__getattr__ = refuse_old_names(__name__)

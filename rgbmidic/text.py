@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from html import escape
 
-_PLAIN = range(-3, 9)
+_FIXED_POINT_DECIMALS = range(-3, 9)
 """Decimals of a number that is written without a power of ten: from whole thousands to the eighth decimal."""
 
 
-def rounded(value: float, std: float) -> str:
+def format_value(value: float, std: float) -> str:
     """Write a number to the place of the second digit of its standard uncertainty (GUM, 7.2.6); it may be its own.
 
     Parameters
@@ -29,20 +29,20 @@ def rounded(value: float, std: float) -> str:
     if not (math.isfinite(std) and std > 0):
         return f"{value:.4g}"
     decimals = 1 - int(f"{std:.1e}".partition("e")[2])  # of the uncertainty as it is rounded: 0.0996 is 0.10
-    if decimals in _PLAIN:
+    if decimals in _FIXED_POINT_DECIMALS:
         value = round(value, decimals) + 0.0  # no "-0.00"
         return f"{value:.{max(decimals, 0)}f}"
     digits = int(f"{value:.1e}".partition("e")[2]) + decimals if value else 0
     return f"{value:.{max(digits, 0)}e}"
 
 
-def uncertain(value: float, std: float, unit: str = "") -> str:
+def format_with_std(value: float, std: float, unit: str = "") -> str:
     """Write a number with its standard uncertainty and unit, such as ``"0.1433 ± 0.0022 mm"``.
 
     Parameters
     ----------
     value, std
-        As of `rounded`; a value without uncertainty is written alone.
+        As in `format_value`; a value without uncertainty is written alone.
     unit
         Empty for none.
 
@@ -52,18 +52,18 @@ def uncertain(value: float, std: float, unit: str = "") -> str:
     """
     if not math.isfinite(value):
         return "-"
-    known = math.isfinite(std) and std > 0
-    return " ".join(filter(None, [rounded(value, std), f"± {rounded(std, std)}" if known else "", unit]))
+    has_std = math.isfinite(std) and std > 0
+    return " ".join(filter(None, [format_value(value, std), f"± {format_value(std, std)}" if has_std else "", unit]))
 
 
-class Described:
-    """An object that shows itself in a few lines: a title, then ``name: value``; notebooks make a table of them."""
+class HtmlRepr:
+    """An object whose ``repr`` is a title and lines ``name: value``; notebooks show it as a table."""
 
     __slots__ = ()
 
     def _repr_html_(self) -> str:
         title, *lines = repr(self).splitlines()
-        parts = (line.partition(":") for line in lines)
+        cells = (line.partition(":") for line in lines)
         cell = '<td style="text-align: left">'
-        rows = "".join(f"<tr>{cell}{escape(name)}</td>{cell}{escape(value)}</td></tr>" for name, _, value in parts)
+        rows = "".join(f"<tr>{cell}{escape(name)}</td>{cell}{escape(value)}</td></tr>" for name, _, value in cells)
         return f"<div><code>{escape(title)}</code><table>{rows}</table></div>"

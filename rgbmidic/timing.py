@@ -18,47 +18,47 @@ STAGES = ("reading", "separation", "preparation", "search", "weights", "equation
 reference and the weights from it; Hessian and factors; Gauss-Newton; the field and its uncertainty; all other work."""
 
 
-_on: ContextVar[tuple[str, dict[str, float]] | None] = ContextVar("on", default=None)
-"""Stage that is on, and the seconds of all."""
+_current: ContextVar[tuple[str, dict[str, float]] | None] = ContextVar("on", default=None)
+"""Present stage, and the seconds of all stages."""
 
 
 @contextmanager
-def timed(wanted: bool = True) -> Iterator[dict[str, float]]:
-    """Measure the seconds of every stage within the block; the dict is complete at its end, empty unless `wanted`."""
-    if not wanted:
+def record_stages(enabled: bool = True) -> Iterator[dict[str, float]]:
+    """Measure the seconds of every stage within the block; the dict is complete at its end, empty unless `enabled`."""
+    if not enabled:
         yield {}
         return
     seconds = dict.fromkeys(STAGES, 0.0)
-    token = _on.set(("rest", seconds))
+    token = _current.set(("rest", seconds))
     try:
         with stage("rest"):
             yield seconds
     finally:
-        _on.reset(token)
+        _current.reset(token)
 
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
     """Count the time within the block, or of the function decorated, to a stage of `STAGES`."""
-    if (outer := _on.get()) is None:
+    if (current := _current.get()) is None:
         yield
         return
-    _, seconds = outer
-    token, started, counted = _on.set((name, seconds)), time.perf_counter(), sum(seconds.values())
+    _, seconds = current
+    token, start_time, seconds_before = _current.set((name, seconds)), time.perf_counter(), sum(seconds.values())
     try:
         yield
     finally:  # without what the stages within have counted
-        seconds[name] += time.perf_counter() - started - (sum(seconds.values()) - counted)
-        _on.reset(token)
+        seconds[name] += time.perf_counter() - start_time - (sum(seconds.values()) - seconds_before)
+        _current.reset(token)
 
 
-def each(name: str, items: Iterable[T]) -> Iterator[T]:
+def timed_items(name: str, items: Iterable[T]) -> Iterator[T]:
     """Yield the items; the time to find the next one counts to a stage, the time of its use does not."""
-    left = iter(items)
+    iterator = iter(items)
     while True:
         with stage(name):
             try:
-                found = next(left)
+                item = next(iterator)
             except StopIteration:
                 return
-        yield found
+        yield item

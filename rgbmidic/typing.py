@@ -1,4 +1,4 @@
-"""Types of the annotations: arrays, whose shapes a docstring tells, and callbacks; and how input becomes an array."""
+"""Types of the annotations: arrays, whose shapes are in docstrings, and callbacks; input as arrays of numbers."""
 
 import reprlib
 from collections.abc import Callable
@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.errors import InputError, RgbmidicError
+from rgbmidic.renamed import refuse_old_names
 
 AnyArray = npt.NDArray[Any]
 FloatArray = npt.NDArray[np.float64]
@@ -17,13 +18,13 @@ FloatImage = npt.NDArray[np.float32]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 """Indices, and labels of nodes and elements."""
-Progress = Callable[[int, int, str], None]
+ProgressCallback = Callable[[int, int, str], None]
 """Called with the number of things done, their total and a line about the last one."""
 
 
 def as_numbers(
     values: npt.ArrayLike,
-    needed: str,
+    requirement: str,
     shape: tuple[int | None, ...],
     *,
     dtype: npt.DTypeLike = np.float64,
@@ -34,17 +35,22 @@ def as_numbers(
     Raises
     ------
     RgbmidicError
-        It is an `error` that states what was `needed` and what was given: no numbers, another shape, not finite, or
-        not to be had in that type.
+        It is an `error` that states the `requirement` and the input: no numbers, another shape, not finite, or not
+        representable in that type.
     """
     try:
-        given = np.asarray(values)
+        original = np.asarray(values)
         with np.errstate(invalid="ignore"):  # what the type does not hold differs
-            array = given.astype(dtype) if given.dtype.kind in "buifO" else np.empty(0)
-        same = bool((array == given).all()) if array.shape == given.shape else False
+            array = original.astype(dtype) if original.dtype.kind in "buifO" else np.empty(0)
+        is_lossless = bool((array == original).all()) if array.shape == original.shape else False
     except (TypeError, ValueError, OverflowError):
-        array, same = np.empty(0), False
-    fits = len(array.shape) == len(shape) and all(b is None or a == b for a, b in zip(array.shape, shape, strict=True))
-    if not (same and fits and np.isfinite(array).all()):
-        raise error(f"{needed}; given is {reprlib.repr(values)}")
+        array, is_lossless = np.empty(0), False
+    shape_matches = len(array.shape) == len(shape) and all(
+        expected is None or length == expected for length, expected in zip(array.shape, shape, strict=True)
+    )
+    if not (is_lossless and shape_matches and np.isfinite(array).all()):
+        raise error(f"{requirement}; given is {reprlib.repr(values)}")
     return array
+
+
+__getattr__ = refuse_old_names(__name__)

@@ -87,9 +87,9 @@ def alarm() -> Iterator[None]:
 @pytest.fixture
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures and movies that nobody looks at are drawn with a third of the resolution."""
-    savefig, movie = Figure.savefig, report.Movie
+    savefig, movie = Figure.savefig, report.FieldMovie
     monkeypatch.setattr(Figure, "savefig", lambda figure, *to, **how: savefig(figure, *to, **how | {"dpi": 50}))
-    monkeypatch.setattr(report, "Movie", lambda **shown: movie(**shown | {"width": 480}))
+    monkeypatch.setattr(report, "FieldMovie", lambda **shown: movie(**shown | {"width": 480}))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

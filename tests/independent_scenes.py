@@ -21,7 +21,7 @@ from rgbmidic import Tri3Mesh, measure
 from rgbmidic.fields import Nodal, NodalCovariance, Places, at_nodes, at_pixels
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.results.physical import MOVED
+from rgbmidic.results.result_in_units import DISPLACEMENT_QUANTITIES
 from rgbmidic.settings import CalibrationSettings, FrameSettings, RegionSettings, TestSettings
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.captures import Captures
@@ -97,7 +97,7 @@ def figures(scene: str, out: Path) -> Figures:
     )
     result = measure(settings, out / "result", workers=1)
     mesh = Tri3Mesh(nodes=result.nodes, elements=result.elements)
-    nodal = Nodal.of(np.stack([np.asarray(getattr(result, name)) for name in MOVED]))
+    nodal = Nodal.of(np.stack([np.asarray(getattr(result, name)) for name in DISPLACEMENT_QUANTITIES]))
     found: Figures = {}
     for quantity, errors, stds in compared(mesh, nodal, truth):
         for frame, error, std in list(zip(number, errors, stds, strict=True))[1:]:

@@ -138,7 +138,7 @@ def compared_plates(
         (u, v), (u_std, v_std) = solutions[index].displacement.T, solutions[index].displacement_std.T
         edge_std = solutions[index].edge_std
         stated = {"u_std": u_std, "v_std": v_std} | dict(zip(("u_edge_std", "v_edge_std"), edge_std.T, strict=True))
-        return FrameRecord.of(nodes=len(nodes), lights=3, number=index, status=0, u=u, v=v, **stated)
+        return FrameRecord.from_values(nodes=len(nodes), lights=3, number=index, status=0, u=u, v=v, **stated)
 
     mesh = {"nodes": nodes, "elements": solutions[0].elements, "references": []}
     result = make_result(folder / "result", frames=draws, record=record, **mesh)
@@ -146,5 +146,5 @@ def compared_plates(
     made = {}
     for modulus in moduli:
         wrong = replace(simulation, displacement=simulation.displacement / modulus)
-        made[modulus] = list(Comparison(result, wrong, PLACEMENT, frames=range(draws)).each())
+        made[modulus] = list(Comparison(result, wrong, PLACEMENT, frames=range(draws)).iterate())
     return made

@@ -14,7 +14,7 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.report import render
 from rgbmidic.report.document import ReportConstants
 from rgbmidic.results import QUANTITIES, FrameRecord, Origin, Result, ResultStore
-from rgbmidic.results.physical import Physical
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.timing import STAGES
 
 LIGHTS = ("red", "green", "blue")
@@ -28,11 +28,13 @@ def smooth_record(index: int) -> FrameRecord:
     u, v = 0.002 * index * (x - 60), 0.001 * index * (y - 40)
     both = {"u": u, "v": v, "u_std": np.full(NODES, 0.01), "v_std": np.full(NODES, 0.02)}
     more = {
-        "exx": np.full(NODES, 0.002 * index),
+        "nodal_exx": np.full(NODES, 0.002 * index),
         "misfit": np.ones(NODES),
         "light_fraction": np.full((NODES, 3), 1 / 3),
     }
-    return FrameRecord.of(nodes=NODES, lights=3, number=index, status=0, node_status=np.zeros(NODES), **both, **more)
+    return FrameRecord.from_values(
+        nodes=NODES, lights=3, number=index, status=0, node_status=np.zeros(NODES), **both, **more
+    )
 
 
 def random_record(seed: int) -> FrameRecord:
@@ -40,13 +42,13 @@ def random_record(seed: int) -> FrameRecord:
     random = np.random.default_rng(seed)
     blank = random.random(NODES) < 0.2
     values = {
-        name: np.where(blank, np.nan, random.normal(0, 1e-3 if name.startswith("e") else 3, NODES))
+        name: np.where(blank, np.nan, random.normal(0, 1e-3 if name.startswith("nodal_e") else 3, NODES))
         for name, quantity in QUANTITIES.items()
         if quantity.axes == ("node",)
     }
     for name in (name for name in values if name.endswith("_std")):
         values[name] = np.where(blank, np.nan, random.uniform(0.01, 0.02, NODES))
-    estimated = [name for name, quantity in QUANTITIES.items() if quantity.estimated]
+    estimated = [name for name, quantity in QUANTITIES.items() if quantity.is_estimated]
     values |= {name: random.uniform(0.01, 0.02, NODES * (seed % 2)) for name in estimated}
     pictures = random.integers(0, 256, (2, 3, 8, 12)).astype(np.uint8) if seed % 2 == 0 else (None, None)
     history = 0.5 * 0.1 ** np.arange(1 + seed % 5)
@@ -78,7 +80,7 @@ def random_record(seed: int) -> FrameRecord:
         "reflection_thumbnail": pictures[1],
     }
     assert values.keys() == QUANTITIES.keys()
-    return FrameRecord.of(nodes=NODES, lights=len(LIGHTS), **values)
+    return FrameRecord.from_values(nodes=NODES, lights=len(LIGHTS), **values)
 
 
 def corrupt(result: Result, frame: int) -> Path:
@@ -114,6 +116,11 @@ def make_origin(frames: int, **options: Any) -> Origin:
 
 def analysis_rows(result: Result) -> dict[str, str]:
     """The rows of a report's table of the analysis."""
-    given = {"physical": Physical.of(result), "constants": ReportConstants(), "reference": "", "noise": ""}
+    given = {
+        "physical": ResultInUnits.from_result(result),
+        "constants": ReportConstants(),
+        "reference": "",
+        "noise": "",
+    }
     rows = re.findall("<tr><td>(.*?)</td><td>(.*?)</td></tr>", render("analysis.html", **given))
     return {name: html.unescape(text) for name, text in rows}

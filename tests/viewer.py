@@ -57,13 +57,13 @@ def serving(path: Path, **statement: object) -> Iterator[str]:
     """A viewer in a thread of its own; its address."""
     from tornado.ioloop import IOLoop
 
-    from rgbmidic.view.server import start
+    from rgbmidic.view.server import start_server
 
     told: Queue = Queue()
 
     def run() -> None:
         asyncio.set_event_loop(asyncio.new_event_loop())
-        server, address = start(path, statement=statement)
+        server, address = start_server(path, statement=statement)
         told.put((IOLoop.current(), address))
         IOLoop.current().start()
         server.stop()

@@ -46,7 +46,7 @@ def _root(
     context: typer.Context, debug: Annotated[bool, Option("--debug", help="Show where an error occurs.")] = False
 ) -> None:
     """Calibrate a colour camera and its lamps for rgbmidic. The laboratory procedure: calibration/README.md."""
-    command.help_where_alone(context)
+    command.print_help_without_command(context)
 
 
 def _frame_settings(options: Mapping[str, Any]) -> FrameSettings:
@@ -133,17 +133,17 @@ def _distance(text: str) -> tuple[tuple[float, ...], float]:
     """Ends (x0, y0, x1, y1) in px and length in mm of ``X0,Y0:X1,Y1=MM``; a `ConfigurationError` for anything else."""
     ends, _, length = text.partition("=")
     try:
-        return command.read_place(ends, "--distance", "X0,Y0:X1,Y1"), float(length.removesuffix("mm"))
+        return command.read_coordinates(ends, "--distance", "X0,Y0:X1,Y1"), float(length.removesuffix("mm"))
     except (InputError, ValueError):
         form = "X0,Y0:X1,Y1=MM, such as 120,85:840,85=25"
         raise ConfigurationError(f"--distance is {form}, not {text!r}") from None
 
 
 def _region(text: str | None) -> tuple[float, ...] | None:
-    return command.read_place(text, "--region", "X0,Y0,X1,Y1") if text else None
+    return command.read_coordinates(text, "--region", "X0,Y0,X1,Y1") if text else None
 
 
-_takes_captures = command.gather("captures", CAPTURE_OPTIONS, _capture_finder, light=command.REQUIRED)
+_takes_captures = command.collect_options("captures", CAPTURE_OPTIONS, _capture_finder, light=command.REQUIRED)
 
 
 def _writes_file(name: str, hint: Any, default: str | None = None) -> Callable[[Command], Command]:
@@ -156,7 +156,7 @@ def _writes_file(name: str, hint: Any, default: str | None = None) -> Callable[[
         return path
 
     defaults = {name: default and Path(default), "overwrite": False}
-    return command.gather(name, {name: hint, "overwrite": Overwrite}, read, **defaults)
+    return command.collect_options(name, {name: hint, "overwrite": Overwrite}, read, **defaults)
 
 
 @app.command()
@@ -184,7 +184,7 @@ def crosstalk(
 
 @app.command()
 @_writes_file("out", Out, "noise.json")
-@command.gather("user_metadata", command.FRAME_OPTIONS, _frame_settings)
+@command.collect_options("user_metadata", command.FRAME_OPTIONS, _frame_settings)
 def noise(
     dark: Annotated[str, Option(help="Dark frames, at least two: lens capped, exposure time of the test.")],
     flat: Annotated[
@@ -226,8 +226,8 @@ def registration(
 
 
 @app.command()
-@command.gather("user_metadata", command.FRAME_OPTIONS, _frame_settings)
-@command.gather("target_lights", command.TARGET_LIGHT_OPTIONS, command.read_target_lights)
+@command.collect_options("user_metadata", command.FRAME_OPTIONS, _frame_settings)
+@command.collect_options("target_lights", command.TARGET_LIGHT_OPTIONS, command.read_target_lights)
 def camera(
     user_metadata: Any,
     target_lights: Any,
@@ -283,7 +283,7 @@ def camera(
 
 
 @app.command()
-@command.gather("captures", CAPTURE_OPTIONS, _capture_finder)
+@command.collect_options("captures", CAPTURE_OPTIONS, _capture_finder)
 def check(
     file: Annotated[Path, Argument(help="Calibration file, or camera file with --distance.")],
     captures: Any,

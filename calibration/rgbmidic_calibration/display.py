@@ -19,7 +19,7 @@ from rgbmidic.illumination.crosstalk import Crosstalk, Sensitivities
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import CameraNoise
 from rgbmidic.report.style import literal, save_figure
-from rgbmidic.text import uncertain
+from rgbmidic.text import format_with_std
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.crosstalk import CHANNELS, CrosstalkEstimate
 from rgbmidic_calibration.design import Design, Lamp
@@ -89,7 +89,7 @@ def verdict(checks: Sequence[Check]) -> None:
     figures = [check for check in checks if check.name]
     for item in figures:
         word = "[green]passed[/]" if item.passed else "[bold red]failed[/]"
-        figure = uncertain(item.value, item.std, item.unit)
+        figure = format_with_std(item.value, item.std, item.unit)
         table.add_row(escape(item.name), figure, f"{item.limit:g} {item.unit}", word)
     doubts = [check.text for check in reported(checks) if not check.name]
     sums = (escape(item.text) for item in figures if item.text)
@@ -179,7 +179,7 @@ def _registration(result: Registration) -> Table:
     for index, name in enumerate(result.lights[1:], start=1):
         values = result.parameters[index] * factors
         std = None if result.covariance is None else np.sqrt(np.diag(result.covariance[index])) * factors
-        table.add_row(escape(name), *map(uncertain, values, np.zeros_like(values) if std is None else std))
+        table.add_row(escape(name), *map(format_with_std, values, np.zeros_like(values) if std is None else std))
     return table
 
 
@@ -188,12 +188,12 @@ def _matrix(result: Crosstalk) -> tuple[Table, str]:
     heads = ("channel", *result.lights)
     table, std = _table("Crosstalk: camera channels = A . lights (± standard uncertainty)", heads), result.std
     for row, values in enumerate(result.matrix):
-        cells = map(uncertain, values, np.where(values == 1, 0, 0 if std is None else std[row]))
+        cells = map(format_with_std, values, np.where(values == 1, 0, 0 if std is None else std[row]))
         table.add_row(CHANNELS[row] if len(result.matrix) == 3 else str(row + 1), *cells)
     table.add_section()
     if (difference := result.green_difference) is not None:
         std = np.zeros_like(difference) if result.green_difference_std is None else result.green_difference_std
-        table.add_row("G red rows - blue rows", *map(uncertain, difference, std))
+        table.add_row("G red rows - blue rows", *map(format_with_std, difference, std))
         for name, figures in (("checkerboard if equal", difference), ("  with both rows of G", std)):
             amplitudes = 100 * np.abs(result.checkerboard(figures)).max(axis=0)
             table.add_row(f"{name}, %", *(f"{value:.2g}" for value in amplitudes))
@@ -221,7 +221,7 @@ def _noise(result: CameraNoise) -> tuple[Table, str]:
         ("PRNU, %", result.prnu),
     )
     for name, quantity in rows:
-        table.add_row(name, *map(uncertain, quantity.value, quantity.std))
+        table.add_row(name, *map(format_with_std, quantity.value, quantity.std))
     table.add_row("dynamic range, dB", *(f"{value:.1f}" for value in result.dynamic_range))
     counts = [f"{sum(kind == name for *_, kind in result.defects)} {name}" for name in ("hot", "dead")]
     return table, f"pixels to distrust: {', '.join(counts)}"

@@ -282,7 +282,7 @@ def quantities() -> str:
         for name, entry in entries.items():
             sizes = (*first, *(str(_SIZES.get(str(axis), axis)) for axis in entry.axes))
             shape = f"({', '.join(sizes)}{',' * (len(sizes) == 1)})"
-            rows.append((f"`{name}`", shape, entry.dtype.__name__.rstrip("_"), entry.unit, entry.meaning))
+            rows.append((f"`{name}`", shape, entry.dtype.__name__.rstrip("_"), entry.unit, entry.description))
     rows.append(("`names`, `lights`", "(T,), (k,)", "str", "", "names of the frames and of the lights"))
     return table(("name", "shape", "type", "unit", "meaning"), rows)
 

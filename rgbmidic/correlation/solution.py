@@ -16,7 +16,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.text import Described, rounded, uncertain
+from rgbmidic.text import HtmlRepr, format_value, format_with_std
 from rgbmidic.typing import BoolArray, FloatArray
 
 NO_MATCH = "the images do not match anywhere in the region"
@@ -48,7 +48,7 @@ class NodeStatus(IntEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Solution(Described):
+class Solution(HtmlRepr):
     """Displacement field of one frame.
 
     Attributes
@@ -127,7 +127,7 @@ class Solution(Described):
         for name, values, std in zip("uv", self.displacement.T, self.displacement_std.T, strict=True):
             if (known := values[np.isfinite(values)]).size:
                 spread = float(np.median(std[np.isfinite(std)])) if np.isfinite(std).any() else np.nan
-                least, most = rounded(known.min(), spread), uncertain(known.max(), spread, "px")
+                least, most = format_value(known.min(), spread), format_with_std(known.max(), spread, "px")
                 lines.append(f"{name}:      {least} to {most} (median)")
         return "\n".join(lines)
 

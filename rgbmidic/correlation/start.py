@@ -27,7 +27,7 @@ from rgbmidic.correlation.solution import NO_MATCH, Solution, Status, rank
 from rgbmidic.correlation.solve import solve
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import SolverSettings
-from rgbmidic.timing import each
+from rgbmidic.timing import timed_items
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage, IntArray
 
 
@@ -427,7 +427,7 @@ def track(
     best: Solution | None = None
     surest = 0.0
     last = [] if start.displacement is None else [FoundStart(displacement=start.displacement, confidence=np.nan)]
-    searched = each("search", search.starts(reference, deformed, start.displacement))
+    searched = timed_items("search", search.starts(reference, deformed, start.displacement))
     for number, found in enumerate(chain(last, searched)):
         surest = float(np.fmax(surest, found.confidence))
         if found.confidence < search.needed:

@@ -10,7 +10,7 @@ from rgbmidic.fields.probes import Area, Mean, make_probe
 from rgbmidic.fields.profiles import ProfileLine
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, shortest_gauge, strain_of, strain_of_gradient
 from rgbmidic.fields.units import Units
-from rgbmidic.text import rounded, uncertain
+from rgbmidic.text import format_value, format_with_std
 
 __all__ = [
     "MEASURES",
@@ -38,15 +38,15 @@ __all__ = [
     "crack_jump",
     "difference_std",
     "field_rms",
+    "format_value",
+    "format_with_std",
     "frame_covariance",
     "high_pass",
     "make_probe",
     "rates",
     "reference_fraction",
-    "rounded",
     "shortest_gauge",
     "strain_of",
     "strain_of_gradient",
     "stress_intensity",
-    "uncertain",
 ]

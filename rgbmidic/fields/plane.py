@@ -25,7 +25,7 @@ from rgbmidic.illumination.calibration import read_document, write_document
 from rgbmidic.illumination.images import Registration
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.settings import ScaleSettings
-from rgbmidic.text import uncertain
+from rgbmidic.text import format_with_std
 from rgbmidic.typing import FloatArray, as_numbers
 
 logger = logging.getLogger(__name__)
@@ -365,9 +365,13 @@ class CameraCalibration:
         str
         """
         (scale, scale_std), (tilt, tilt_std) = self.scale(self.centre), self.tilt_deg
-        known = f"tilt {uncertain(tilt, tilt_std, 'degrees')}" if np.isfinite(tilt) else "tilt not known without a lens"
+        known = (
+            f"tilt {format_with_std(tilt, tilt_std, 'degrees')}"
+            if np.isfinite(tilt)
+            else "tilt not known without a lens"
+        )
         light = f" of light {first}'s image" if (first := self.details.get("first_light")) else ""
-        return f"{uncertain(scale, scale_std, 'mm per px')}{light} in the middle of the frame, {known}"
+        return f"{format_with_std(scale, scale_std, 'mm per px')}{light} in the middle of the frame, {known}"
 
     def jacobian_std(self, points: FloatArray) -> FloatArray:
         """Standard uncertainty (N,) that the calibration leaves in a displacement of one px at points (N, 2), mm.

@@ -24,7 +24,7 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.interpolation import Places
 from rgbmidic.fields.nodal import NodalCovariance
 from rgbmidic.fields.strain import StrainGauges
-from rgbmidic.text import uncertain
+from rgbmidic.text import format_with_std
 from rgbmidic.typing import BoolArray, FloatArray
 
 ARRIVALS = ("front", "peak")
@@ -563,7 +563,7 @@ def fit_front(
     spread = spread * max(chi_square / freedom, 1)
     start_std, slope_std = np.sqrt(np.diag(spread))
     if not abs(slope) > _CONSTANTS.travels * slope_std:
-        differ = uncertain(*(part * np.ptp(positions[used]) for part in (slope, slope_std)))
+        differ = format_with_std(*(part * np.ptp(positions[used]) for part in (slope, slope_std)))
         raise InputError(
             f"no front travels along the line: the arrival times differ by {differ} between its ends "
             f"(chi-square {chi_square:.3g} of {freedom}); "

@@ -8,6 +8,7 @@ from rgbmidic.frames.metadata import StoredFrame
 from rgbmidic.frames.names import list_frames
 from rgbmidic.frames.series import FrameSeries, open_series
 from rgbmidic.frames.source import FrameSource, MovieSource, file_fingerprint, file_hash
+from rgbmidic.renamed import refuse_old_names
 
 __all__ = [
     "ChannelFrame",
@@ -31,3 +32,5 @@ __all__ = [
     "write_dng",
     "write_tiff",
 ]
+
+__getattr__ = refuse_old_names(__name__)

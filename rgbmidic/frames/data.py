@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from rgbmidic.arguments import check_fields
 from rgbmidic.errors import InputError
+from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import BAYER_PATTERNS
 from rgbmidic.typing import FloatArray
 
@@ -18,6 +19,7 @@ SECOND = 10**9
 """Nanoseconds in a second."""
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Window:
     """The part of a frame that is read and worked on.

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Self
 
 from rgbmidic.arguments import checked
-from rgbmidic.errors import FrameError, disk_faults, legible
+from rgbmidic.errors import FrameError, convert_disk_errors, printable
 from rgbmidic.frames.formats import advice, frame_formats
 from rgbmidic.frames.stacks import split_dataset
 
@@ -45,7 +45,7 @@ def list_frames(pattern: str | Path, base: Path | str = ".") -> tuple[Path, ...]
     """
     text, dataset = split_dataset(pattern)
     full_path = Path(base) / text
-    with disk_faults(FrameError, f"the frames {pattern} cannot be looked for"):
+    with convert_disk_errors(FrameError, f"the frames {pattern} cannot be looked for"):
         if full_path.is_dir():
             candidates = sorted(file for file in full_path.iterdir() if file.name[0] != ".")
             endings = {ending for frame_format in frame_formats() for ending in frame_format.endings}
@@ -129,7 +129,7 @@ class NamedFiles:
     @property
     def first_and_last(self) -> str:
         """The first and the last names."""
-        names = [legible(path.name) for path in self.paths]
+        names = [printable(path.name) for path in self.paths]
         return ", ".join(names if len(names) <= 5 else (*names[:3], "...", names[-1]))
 
 

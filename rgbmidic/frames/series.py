@@ -18,7 +18,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
+from rgbmidic.errors import ConfigurationError, FrameError, InputError, printable
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.formats import frame_formats, open_source
 from rgbmidic.frames.images import write_tiff
@@ -104,7 +104,7 @@ class FrameSeries:
             representative for sources in self.lights for representative in (sources if stacks else sources[:1])
         ):
             for remark in source.remarks:
-                names_by_remark.setdefault(remark, []).append(legible(source.path.name))
+                names_by_remark.setdefault(remark, []).append(printable(source.path.name))
         suffix = {
             remark: f" and {len(names) - 1} more" if len(names) > 1 else "" for remark, names in names_by_remark.items()
         }
@@ -219,7 +219,9 @@ class FrameSeries:
         is_windowed = window is not None and not window.is_whole
         sources = [source for source, _ in self._locate(index)]
         return {
-            legible(frame_source.path): file_fingerprint(frame_source.path) if is_windowed else frame_source.fingerprint
+            printable(frame_source.path): file_fingerprint(frame_source.path)
+            if is_windowed
+            else frame_source.fingerprint
             for frame_source in sources
         }
 
@@ -242,7 +244,7 @@ class FrameSeries:
         """
         digest, without = hashlib.sha256(), []
         for source in (source for sources in self.lights for source in sources):
-            name, content = legible(source.path.name), "unread"
+            name, content = printable(source.path.name), "unread"
             if name not in unread:
                 with suppress(FrameError):
                     content = file_fingerprint(source.path)

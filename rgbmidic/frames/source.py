@@ -11,14 +11,16 @@ from functools import lru_cache, wraps
 from pathlib import Path
 from typing import ClassVar, TypeVar
 
-from rgbmidic.errors import FrameError, disk_faults, legible
+from rgbmidic.errors import FrameError, convert_disk_errors, printable
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Recording, Window
 from rgbmidic.frames.metadata import CameraMetadata, MovieHeader, StoredFrame, damaged_file, raw_frame
+from rgbmidic.renamed import state_new_names
 from rgbmidic.settings import FrameSettings, require_regular_file
 
 _T = TypeVar("_T")
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameSource(ABC):
     """A file of one frame or several, read in any order; frames count from 0.
@@ -84,7 +86,7 @@ class FrameSource(ABC):
         -------
         str
         """
-        return legible(self.path.name)
+        return printable(self.path.name)
 
     def read(self, index: int, window: Window | None = None) -> Mosaic | ChannelFrame:
         """Read frame `index`, or a part of it.
@@ -194,7 +196,7 @@ class MovieSource(FrameSource):
         -------
         str
         """
-        return f"{legible(self.path.name)} frame {index}"
+        return f"{printable(self.path.name)} frame {index}"
 
     def _shape(self) -> tuple[int, int]:
         return self._header().shape
@@ -210,7 +212,7 @@ class MovieSource(FrameSource):
 @contextmanager
 def _require_file(path: Path) -> Iterator[None]:
     """Check that there is something to read; what the disk refuses becomes a FrameError."""
-    with disk_faults(FrameError, f"{path} cannot be read"):
+    with convert_disk_errors(FrameError, f"{path} cannot be read"):
         if path.is_symlink() and not path.exists():
             raise FrameError(f"frame file not found: {path} is a link to {path.readlink()}, which does not exist")
         if not require_regular_file(path).is_file():
@@ -229,7 +231,7 @@ def cache_by_file(parse: Callable[[Path], _T]) -> Callable[[Path | str], _T]:
 
     @wraps(parse)
     def parse_current(path: Path | str) -> _T:
-        with disk_faults(FrameError, f"{path} cannot be read"):
+        with convert_disk_errors(FrameError, f"{path} cannot be read"):
             status = Path(path).stat()
             return parse_cached(Path(path), status.st_size, status.st_mtime_ns)
 

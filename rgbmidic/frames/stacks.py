@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rgbmidic.errors import FrameError, first_line, legible
+from rgbmidic.errors import FrameError, first_line, printable
 from rgbmidic.frames.data import Integers, Recording, even_times
 from rgbmidic.frames.metadata import (
     MAX_BYTES,
@@ -122,7 +122,7 @@ class Hdf5File(MovieSource):
 
     def name(self, index: int) -> str:
         """Return the name of a frame: file, dataset where one is named, and the frame's index."""
-        return f"{legible(self.path.name)}{self.dataset and ':'}{self.dataset} frame {index}"
+        return f"{printable(self.path.name)}{self.dataset and ':'}{self.dataset} frame {index}"
 
     def _header(self) -> _Dataset:
         stacks = _hdf5_stacks(self.path)

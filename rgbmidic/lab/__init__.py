@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rgbmidic._version import __version__
 from rgbmidic.errors import ResultError
-from rgbmidic.results.files import write_json, write_text, writing
+from rgbmidic.results.files import write_errors, write_json, write_text
 from rgbmidic.settings.conversion import to_plain
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def write_findings(out: Path, files: Sequence[str], *contents: dict[str, Any] | 
 
     check_folder(out, files, overwrite=overwrite)
     for path, content in zip((out / name for name in files), contents, strict=True):
-        with writing(path):
+        with write_errors(path):
             out.mkdir(parents=True, exist_ok=True)
             if isinstance(content, dict):
                 write_json(path, content)

@@ -30,10 +30,10 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline import Plan, Separation, correlate, measure
 from rgbmidic.pipeline.resolution import rms
 from rgbmidic.results import Result
-from rgbmidic.results.files import writing
-from rgbmidic.results.physical import Physical
+from rgbmidic.results.files import write_errors
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ScaleSettings, TestSettings, read_test
-from rgbmidic.typing import FloatArray, FloatImage, Progress
+from rgbmidic.typing import FloatArray, FloatImage, ProgressCallback
 
 _SCENE = """\
 # The paper's sphere (82.5 mm) turning about its front point under a red, a green and a blue lamp, all at once.
@@ -116,7 +116,7 @@ def run_demo(
     out: Path,
     report: Callable[[str], None],
     calibrate: Callable[[Path], None],
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     *,
     size: int = 448,
     angles: Sequence[float] = ANGLES,
@@ -247,7 +247,7 @@ def write_plate(test: Path) -> CameraCalibration:
         (test / name).parent.mkdir(exist_ok=True)
         levels = 65535 * (0.05 + 0.8 * values + random.normal(0, 0.0025, values.shape))
         _, content = cv2.imencode(".png", np.round(levels).clip(0, 65535).astype(np.uint16).reshape(_PLATE_SHAPE))
-        with writing(test / name):  # OpenCV itself opens no non-ASCII names on Windows
+        with write_errors(test / name):  # OpenCV itself opens no non-ASCII names on Windows
             (test / name).write_bytes(content.tobytes())
 
     def board(name: str, turns: Sequence[float], position: tuple[float, float, float]) -> None:
@@ -280,7 +280,7 @@ def run_plate(test: Path, truth: CameraCalibration) -> list[PlateRow]:
     """Measure the plate of `write_plate` by `test`/camera.json and plate.toml, and compare with the `truth`."""
     result = measure(read_test(test / "plate.toml"), test.parent / "plate_result")
     positions, scale = truth.to_mm(result.nodes), truth.scale(truth.centre)[0]
-    scales = (Physical.of(result), Physical.of(result, ScaleSettings(mm_per_pixel=scale)))
+    scales = (ResultInUnits.from_result(result), ResultInUnits.from_result(result, ScaleSettings(mm_per_pixel=scale)))
     rows = []
     for index, (name, (shift, stretch)) in enumerate(PLATE_MOTIONS.items(), start=1):
         exact = positions * np.array([stretch, 0.0]) + np.array(shift)

@@ -268,5 +268,5 @@ def _draw_field(axis: Axes, plan: LampPlan) -> None:
     axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor="k", linewidth=0.9))
     height, width = plan.scene.camera.shape
     subplot = axis.get_subplotspec()
-    finish_picture(axis, (-0.5, width - 0.5), (-0.5, height - 0.5), first=subplot.is_first_col())  # type: ignore[union-attr]
+    finish_picture(axis, (-0.5, width - 0.5), (-0.5, height - 0.5), has_y_label=subplot.is_first_col())  # type: ignore[union-attr]
     axis.label_outer()

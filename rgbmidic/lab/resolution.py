@@ -245,7 +245,7 @@ def _figure(study: ResolutionStudy) -> Figure:
             axes[-1].legend(title="elements", loc="best")
 
     count = 3 if any(size.gauges for size in study.sizes) else 1
-    return draw_figure(draw, count=count, aspect=1.4, beside=NUMBERS)
+    return draw_figure(draw, count=count, aspect=1.4, right_room=NUMBERS)
 
 
 def _draw_errors(axis: Axes, study: ResolutionStudy) -> None:

@@ -15,8 +15,8 @@ from pathlib import Path
 from types import MappingProxyType
 from urllib.parse import quote
 
-from rgbmidic.errors import InputError, optional
-from rgbmidic.results.files import writing
+from rgbmidic.errors import InputError, import_optional
+from rgbmidic.results.files import write_errors
 
 ADDRESS = "https://raw.githubusercontent.com"
 """Address at which GitHub gives a file of a repository at a commit."""
@@ -97,7 +97,7 @@ def cache_folder() -> Path:
         pooch (extra ``sample``) is not installed.
     """
     folder = os.environ.get("RGBMIDIC_SAMPLES")
-    return Path(folder) if folder else Path(optional("pooch", "sample").os_cache("rgbmidic"))
+    return Path(folder) if folder else Path(import_optional("pooch", "sample").os_cache("rgbmidic"))
 
 
 def write_sample(name: str, folder: Path, report: Callable[[str], None] = lambda _: None) -> Sample:
@@ -129,7 +129,7 @@ def write_sample(name: str, folder: Path, report: Callable[[str], None] = lambda
         raise InputError(f"{folder} is already there; state another folder: rgbmidic sample {name} FOLDER")
     sample = SAMPLES[name]
     cached = [_fetch(sample, file, report) for file in sample.files]
-    with writing(folder):
+    with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for file in cached:
             shutil.copyfile(file, folder / file.name)
@@ -141,7 +141,7 @@ def write_sample(name: str, folder: Path, report: Callable[[str], None] = lambda
 
 def _fetch(sample: Sample, file: SampleFile, report: Callable[[str], None]) -> Path:
     """Return the file in the cache, fetched where it is not there or not what was published."""
-    pooch = optional("pooch", "sample")
+    pooch = import_optional("pooch", "sample")
     url = f"{ADDRESS}/{sample.repository}/{sample.commit}/{quote(file.path)}"
     cache_path = cache_folder() / sample.name
     if not (cache_path / file.name).is_file():

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import InputError, renamed_attributes
+from rgbmidic.errors import InputError
+from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, IntArray, as_numbers
 
 ROUNDING = 1e-4
@@ -17,6 +18,7 @@ ROUNDING = 1e-4
 Nastran 1e-6 to 1e-5 (derived)."""
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FiniteElementMesh:
     """The planar part of a finite-element mesh, as three-node triangles.
@@ -66,9 +68,6 @@ class FiniteElementMesh:
     axes: tuple[int, int] = (0, 1)
     unit_mm: float = 1.0
     numbering: str = "labels of the file"
-
-    if not TYPE_CHECKING:  # mypy would accept any name
-        __getattr__ = renamed_attributes("FiniteElementMesh", part="subset")
 
     def __post_init__(self) -> None:
         """Check the arrays, convert them to their types and order the corners."""

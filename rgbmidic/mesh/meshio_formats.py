@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from rgbmidic.errors import InputError, optional
+from rgbmidic.errors import InputError, import_optional
 from rgbmidic.mesh.mesh_file import CORNERS, MAX_BYTES, MeshContent, limit_size, require_unique
 from rgbmidic.mesh.vtu import NUMBERS, entity_labels
 from rgbmidic.typing import IntArray
@@ -27,7 +27,7 @@ FORMATS = {".vtk": "vtk", ".xdmf": "xdmf", ".mesh": "medit", ".avs": "avsucd", "
 
 def read_with_meshio(path: Path, kind: str) -> MeshContent:
     """Read a file of one of meshio's formats, and the labels that it leaves out."""
-    reader = optional(f"meshio.{kind}", "fe")
+    reader = import_optional(f"meshio.{kind}", "fe")
     messages = io.StringIO()
     _check_limits(path, kind)
     with warnings.catch_warnings(), redirect_stderr(messages):

@@ -19,7 +19,7 @@ from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.finite_elements import FiniteElementMesh
 from rgbmidic.mesh.region import Region
 from rgbmidic.mesh.tri3 import Tri3Mesh
-from rgbmidic.text import uncertain
+from rgbmidic.text import format_with_std
 from rgbmidic.typing import FloatArray, as_numbers
 
 logger = logging.getLogger(__name__)
@@ -286,7 +286,9 @@ class Placement:
         str
         """
         angle_deg = np.degrees(np.arctan2(self.matrix[1, 0], self.matrix[0, 0]))
-        scale = f"{uncertain(self.mm_per_pixel, self.mm_per_pixel_std, 'mm per px')}, " if self.mm_per_pixel else ""
+        scale = (
+            f"{format_with_std(self.mm_per_pixel, self.mm_per_pixel_std, 'mm per px')}, " if self.mm_per_pixel else ""
+        )
         fit = f"{len(self.pairs)} pairs, residuals {self.rms:.2g} px rms"
         return f"{scale}x axis at {angle_deg:.2f} degrees, y axis {'up' if self.reflected else 'down'}; {fit}"
 

@@ -6,13 +6,14 @@ import logging
 import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import RegionError, renamed_attributes
+from rgbmidic.errors import RegionError
+from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, as_numbers
 
 logger = logging.getLogger(__name__)
@@ -21,6 +22,7 @@ MAX_COORDINATE = 1_000_000
 """Coordinates of images are within so many px: OpenCV's fixed-point ones end at 8 million."""
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Region:
     """The pixels to measure.
@@ -46,9 +48,6 @@ class Region:
     mask: BoolArray
     rectangle: tuple[float, float, float, float] | None = None
     origin: tuple[int, int] = (0, 0)
-
-    if not TYPE_CHECKING:  # mypy would accept any name
-        __getattr__ = renamed_attributes("Region", part="crop")
 
     def __post_init__(self) -> None:
         """Check the mask."""

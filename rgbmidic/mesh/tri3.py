@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,15 +17,17 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from rgbmidic._kernels.mesh import colour_nodes
-from rgbmidic.errors import InputError, RegionError, renamed_attributes
+from rgbmidic.errors import InputError, RegionError
 from rgbmidic.mesh.finite_elements import orient_elements
 from rgbmidic.mesh.outline_mesh import EDGES, edge_keys, outline_mesh
 from rgbmidic.mesh.region import Region
+from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
 
 
+@state_new_names
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tri3Mesh:
     """Triangles on the reference image. Its arrays are not writable, because derived quantities are cached.
@@ -61,16 +63,6 @@ class Tri3Mesh:
     size: float = field(init=False)
     sizes: FloatArray = field(init=False)
     is_graded: bool = field(init=False)
-
-    if not TYPE_CHECKING:  # mypy would accept any name
-        __getattr__ = renamed_attributes(
-            "Tri3Mesh",
-            part="submesh",
-            places="observation_points",
-            nearest="nearest_nodes",
-            beside="adjacent_nodes",
-            one_of_copies="merged_index",
-        )
 
     def __post_init__(self) -> None:
         """Check nodes and elements, order the corners and derive the areas."""

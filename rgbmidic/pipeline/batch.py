@@ -25,7 +25,7 @@ import numpy as np
 from rgbmidic.errors import AnotherTestError, InputError, ResultError, RgbmidicError
 from rgbmidic.pipeline.resolution import Progress
 from rgbmidic.pipeline.run import measure
-from rgbmidic.results import Histories, Maps, Result, shared_part
+from rgbmidic.results import Histories, Maps, Result, common_variance_fraction
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.provenance import is_result
@@ -237,7 +237,7 @@ def _values(result: Result, settings: TestSettings, elastic: tuple[float, float]
 
 def _peaks(result: Result, settings: TestSettings) -> Iterator[tuple[str, float]]:
     """Yield the peaks over the frames of fields, each that 99 % of the nodes do not exceed, with its uncertainty."""
-    maps = Maps.of(result, settings.scale, measure=settings.probes.measure)
+    maps = Maps.from_result(result, settings.scale, measure=settings.probes.measure)
     frames = [frame for frame in result.deformed if result.finished[frame]]
     for name in ("magnitude", "e1", "equivalent"):
         peaks = []
@@ -266,7 +266,7 @@ def _probed(result: Result, settings: TestSettings, elastic: tuple[float, float]
         if quantity.std is not None:
             yield f"peak_{quantity.column}_std", float(quantity.std[at])
     if read.stress_strain is not None:
-        found = modulus(read, *elastic, shared_part(result))
+        found = modulus(read, *elastic, common_variance_fraction(result))
         yield from zip(("modulus_MPa", "modulus_MPa_std"), found, strict=True)
 
 

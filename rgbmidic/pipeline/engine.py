@@ -21,11 +21,11 @@ import numpy as np
 from rgbmidic._kernels.threads import set_threads, threads
 from rgbmidic.correlation import NodeStatus, Start, Status
 from rgbmidic.correlation.solution import rank
-from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError, optional
+from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError, import_optional
 from rgbmidic.pipeline.frame import Measured, Updated, attempt, failed_frame
 from rgbmidic.pipeline.plan import STRIDE, Plan, is_key, parent
 from rgbmidic.results import FrameRecord
-from rgbmidic.results.warnings import collected
+from rgbmidic.results.warnings import collect_messages
 
 logger = logging.getLogger(__name__)
 
@@ -210,7 +210,7 @@ class Cluster:
     """The workers of a Dask cluster; what a lost one was doing is done again by another."""
 
     def __init__(self, plan: Plan, address: str) -> None:
-        distributed = optional("distributed", "cluster")
+        distributed = import_optional("distributed", "cluster")
         # what becomes of the cluster is reported here, without its tracebacks; some loggers have levels of their own
         names = [name for name in logging.root.manager.loggerDict if name.startswith(("distributed", "tornado"))]
         self._levels = {log: log.level for log in map(logging.getLogger, names)}
@@ -275,6 +275,6 @@ def _measure_elsewhere(plan: Plan, index: int, start: Start, updated: Updated) -
     """Measure a frame in a worker of a cluster, on one thread; nobody reads its log."""
     cv2.setNumThreads(1)
     set_threads(1)
-    with collected() as messages:
+    with collect_messages() as messages:
         found = attempt(plan, index, start, updated)
     return Measured(record=found.record, messages=tuple(messages))

@@ -43,7 +43,7 @@ from rgbmidic.pipeline.suitability import (
     unsteady,
 )
 from rgbmidic.results import FrameRecord
-from rgbmidic.timing import stage, timed
+from rgbmidic.timing import record_stages, stage
 from rgbmidic.typing import FloatArray, FloatImage
 
 logger = logging.getLogger(__name__)
@@ -103,7 +103,7 @@ def measure_frame(plan: Plan, index: int, start: Start, updated: Updated = ()) -
 def attempt(plan: Plan, index: int, start: Start, updated: Updated = ()) -> Measured:
     """Measure a frame as `measure_frame`, which gives the record alone."""
     try:
-        with timed(plan.timings) as seconds:
+        with record_stages(plan.timings) as seconds:
             values = solve_frame(plan, index, start, _reference_of(plan, updated))
         record = FrameRecord.from_solution(**values, seconds=list(seconds.values()) or None)
         return Measured(record=record, solution=values["solution"])

@@ -27,8 +27,8 @@ from rgbmidic.pipeline.suitability import light_levels
 from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM
-from rgbmidic.results.result import listed, read_shared
-from rgbmidic.results.warnings import collected, of_frames
+from rgbmidic.results.result import list_frames, read_shared
+from rgbmidic.results.warnings import collect_messages, join_frame_warnings
 from rgbmidic.settings import TestSettings, read_test
 from rgbmidic.weights import LightWeights
 
@@ -123,7 +123,7 @@ def measure(
     given: dict[str, Any] = {"source": source, "separation": separation, "weights": weights, "mesh": mesh}
     begun = (resume or frames is not None) and (Path(out) / PROVENANCE).exists()
     kept = read_provenance(Path(out)) if begun else {}
-    with collected() as before:
+    with collect_messages() as before:
         plan = replace(_plan_of(settings, given, kept, Path(out)), timings=timings)
     warnings = list(dict.fromkeys(text for level, text in before if level >= logging.WARNING))
     plan = replace(plan, notes={**plan.notes, "warnings": warnings})
@@ -152,11 +152,11 @@ def measure(
         if not schedule.done:
             with closing(open_workers(plan, min(workers, len(places)), scheduler)) as others:
                 schedule.run(others)
-        table = store.table().each(["status", "reason", "warnings"], places)
+        table = store.table().iterate(["status", "reason", "warnings"], places)
         texts = ((place, messages(kept)) for place, kept in zip(places, table, strict=True))
-        for line in of_frames(texts, origin.names):
+        for line in join_frame_warnings(texts, origin.names):
             logger.warning("%s", line)
-        with collected() as together:
+        with collect_messages() as together:
             _tell_repeated(plan, store, places, origin.names)
         if frames is None:
             store.finish([text for _, text in together])
@@ -199,7 +199,7 @@ class _Folder:
         Where a frame failed all before it are finished, since a key frame that fails waits for the one before it.
         """
         names = ("u", "v", "node_status", "reference_updates", "best_match")
-        for kept in self._store.table().each(names, range(place, -1, -1)):
+        for kept in self._store.table().iterate(names, range(place, -1, -1)):
             if (kept["node_status"] == NodeStatus.MEASURED).any():
                 return following(self._plan, kept, Start(displacement=None))
         return Start(displacement=None)
@@ -211,7 +211,7 @@ class _Folder:
         mesh, lights, chosen = self._plan.reference.mesh, len(self._plan.images.names), self._plan.series.selected
         blank, found = Solution.failed(mesh, lights, "", np.zeros(0)), []
         names = [*chain(*_OF_NODES.values()), "node_status", "rigid"]
-        for place, kept in zip(places, self._store.table().each(names, places), strict=True):
+        for place, kept in zip(places, self._store.table().iterate(names, places), strict=True):
             arrays: dict[str, Any] = {"node_status": kept["node_status"], "rigid": kept["rigid"].astype(np.float64)}
             for name, parts in _OF_NODES.items():
                 arrays[name] = np.stack([kept[part] for part in parts], axis=1, dtype=np.float64)
@@ -242,7 +242,7 @@ def _take_back(plan: Plan, store: ResultStore, names: Sequence[str], *, retry_fa
     changed, readable, tries = list[int](), list[int](), [2] * len(names)
     for place, there in enumerate(table.finished.tolist()):
         try:
-            kept = next(table.each(["status", "unread", "tries"], [place] if there else []))
+            kept = next(table.iterate(["status", "unread", "tries"], [place] if there else []))
         except (ResultError, StopIteration):  # damaged, or not there: whatever it was
             changed.append(place)
             continue
@@ -255,16 +255,16 @@ def _take_back(plan: Plan, store: ResultStore, names: Sequence[str], *, retry_fa
         if retry_failed and kept["status"] == Status.FAILED:
             changed.append(place)
     if lost:
-        logger.warning("lost to damage and measured again: %s", listed(lost, names))
+        logger.warning("lost to damage and measured again: %s", list_frames(lost, names))
     if readable:
-        again_for = listed(readable, names)
+        again_for = list_frames(readable, names)
         logger.warning("measured again with what started from it, since it can be read now: %s", again_for)
     store.discard({*lost, *dependants([*changed, *readable], tries)})
 
 
 def _tell_repeated(plan: Plan, store: ResultStore, places: range, names: Sequence[str]) -> None:
     """Warn of frames with the samples of the frame before or of the reference, bit for bit."""
-    sums = [kept["checksum"] for kept in store.table().each(["checksum"], places)]
+    sums = [kept["checksum"] for kept in store.table().iterate(["checksum"], places)]
     pairs = zip(places[1:], sums[1:], sums, strict=False)
     repeated = [place for place, mine, before in pairs if mine == before != NO_CHECKSUM]
     chosen, references = plan.series.selected, plan.settings.frames.reference
@@ -277,13 +277,13 @@ def _tell_repeated(plan: Plan, store: ResultStore, places: range, names: Sequenc
             logger.warning(
                 "frames are the reference, bit for bit, which camera noise makes impossible; their displacement of 0 "
                 "is not measured: %s; were frames lost and filled up, or files copied?",
-                listed(copies, names),
+                list_frames(copies, names),
             )
     if repeated:
         what = "all frames repeat" if len(repeated) == len(places) - 1 else "frames that repeat"
         logger.warning(
-            f"{what} the one before, bit for bit, which camera noise makes impossible: {listed(repeated, names)}; were "
-            "frames lost and filled up, or files copied?"
+            f"{what} the one before, bit for bit, which camera noise makes impossible: {list_frames(repeated, names)}; "
+            "were frames lost and filled up, or files copied?"
         )
 
 

@@ -1,5 +1,6 @@
 """Figures, reports and pages of text and pictures of a result."""
 
+from rgbmidic.renamed import refuse_old_names
 from rgbmidic.report.curves import Curve, history_figure, profile_figure, wave_text
 from rgbmidic.report.document import write_batch_page, write_report
 from rgbmidic.report.figures import (
@@ -10,7 +11,7 @@ from rgbmidic.report.figures import (
     residual_figure,
 )
 from rgbmidic.report.gallery import REPORT, remove_pictures, write_figures, write_maps
-from rgbmidic.report.movie import Movie, write_movie
+from rgbmidic.report.movie import FieldMovie, write_movie
 from rgbmidic.report.page import render
 from rgbmidic.report.style import STYLE, finish_plot, save_figure
 
@@ -19,8 +20,8 @@ __all__ = [
     "REPORT",
     "STYLE",
     "Curve",
+    "FieldMovie",
     "MapDrawer",
-    "Movie",
     "brightness_figure",
     "convergence_figure",
     "finish_plot",
@@ -37,3 +38,6 @@ __all__ = [
     "write_movie",
     "write_report",
 ]
+
+
+__getattr__ = refuse_old_names(__name__)

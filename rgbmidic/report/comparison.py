@@ -12,13 +12,13 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from rgbmidic.errors import optional
+from rgbmidic.errors import import_optional
 from rgbmidic.report import style
-from rgbmidic.report.figures import spread
+from rgbmidic.report.figures import select_evenly
 from rgbmidic.report.page import render
-from rgbmidic.results.comparison import QUANTITIES, WAYS, Comparison, FrameComparison
-from rgbmidic.results.files import write_complete, write_table, writing
-from rgbmidic.text import uncertain
+from rgbmidic.results.comparison import COMPARED_QUANTITIES, VARIANTS, Comparison, FrameComparison
+from rgbmidic.results.files import write_complete, write_errors, write_table
+from rgbmidic.text import format_with_std
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -30,37 +30,37 @@ PAGE, TABLE, SCALE, INDEX = "comparison.html", "comparison.csv", "scale.csv", "c
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparisonConstants:
-    """What a comparison shows, and where it begins to doubt the simulation.
+    """Limits of a comparison: frames shown, and ratios above which it warns.
 
     Attributes
     ----------
-    shown
+    map_count
         Frames of which maps are shown at most.
-    reach
+    colour_reach
         Ratios to the standard uncertainty at the ends of the colours: beyond lies one in 16,000 of a right simulation.
-    unlikely
+    min_probability
         Probability of chi-square under which a warning names the frame. Chosen.
-    rigid
+    max_rigid_ratio
         Standard uncertainties of a rigid motion above which a warning names the frame. Chosen.
-    shape
+    max_chi_square
         Chi-square of what the best scale leaves above which the shape differs: 1.2 times the stated uncertainty, more
         than that is wrong by in any scene of docs/explanation/uncertainty.md.
     """
 
-    shown: int = 2
-    reach: float = 4.0
-    unlikely: float = 0.01
-    rigid: float = 4.0
-    shape: float = 1.5
+    map_count: int = 2
+    colour_reach: float = 4.0
+    min_probability: float = 0.01
+    max_rigid_ratio: float = 4.0
+    max_chi_square: float = 1.5
 
 
 _LIMITS = ComparisonConstants()
-_GROUPS = {"displacement": QUANTITIES[:2], "strain": QUANTITIES[2:]}
+_GROUPS = {"displacement": COMPARED_QUANTITIES[:2], "strain": COMPARED_QUANTITIES[2:]}
 _TITLES = {"nodes": "at the nodes", "levelled": "levelled"}
 
 
 def comparison_files(comparison: Comparison) -> list[str]:
-    """Names of the files that `write_comparison` writes."""
+    """Return the names of the files that `write_comparison` writes."""
     return [PAGE, TABLE, SCALE, INDEX, *(_state(frame) for frame in comparison.frames)]
 
 
@@ -98,37 +98,48 @@ def write_comparison(
     ResultError
         A file cannot be written, or a frame of the result is damaged.
     """
-    shown = spread(comparison.frames, _LIMITS.shown)
-    done: list[FrameComparison] = []
+    map_frames = select_evenly(comparison.frames, _LIMITS.map_count)
+    frame_comparisons: list[FrameComparison] = []
     tables: dict[str, list[dict[str, Any]]] = {TABLE: [], SCALE: []}
-    optional("meshio", "fe")
-    with writing(out):
+    import_optional("meshio", "fe")
+    with write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
-    for made in comparison.each():
-        _write_state(comparison, made, out / _state(made.frame))
-        done.append(made if made.frame in shown else replace(made, measured={}, std={}, simulated={}))
-        number, clock = int(comparison.result.number[made.frame]), "time_s" if comparison.timed else "time_frame"
-        head = {"frame": made.frame, "number": number, clock: made.time}
-        for (way, name), one in made.agreement.items():
-            what = {"way": way, "quantity": name, "unit": "1" if name[0] == "e" else "mm"}
-            tables[TABLE].append(head | what | asdict(one))
-        fit, names = made.fit, ("rigid_u_mm", "rigid_v_mm", "rigid_rotation_deg")
+    for frame_comparison in comparison.iterate():
+        _write_state(comparison, frame_comparison, out / _state(frame_comparison.frame))
+        frame_comparisons.append(
+            frame_comparison
+            if frame_comparison.frame in map_frames
+            else replace(frame_comparison, measured={}, std={}, simulated={})
+        )
+        number, clock = (
+            int(comparison.result.number[frame_comparison.frame]),
+            "time_s" if comparison.has_times else "time_frame",
+        )
+        head = {"frame": frame_comparison.frame, "number": number, clock: frame_comparison.time}
+        for (variant, name), entry in frame_comparison.agreement.items():
+            labels = {"way": variant, "quantity": name, "unit": "1" if name[0] == "e" else "mm"}
+            tables[TABLE].append(head | labels | asdict(entry))
+        fit, names = frame_comparison.fit, ("rigid_u_mm", "rigid_v_mm", "rigid_rotation_deg")
         rigid = zip(names, fit.rigid.tolist(), fit.rigid_std.tolist(), strict=True)
         row = head | {"scale": fit.scale, "scale_std": fit.scale_std}
         row |= {key: number for name, value, std in rigid for key, number in ((name, value), (f"{name}_std", std))}
         tables[SCALE].append(row | {"chi_square_of_the_rest": fit.chi_square})
         if progress is not None:
-            progress(len(done), len(comparison.frames), "frames")
-    sets = "".join(f'<DataSet timestep="{one.time:.12g}" file={quoteattr(_state(one.frame))}/>' for one in done)
-    index = f'<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1"><Collection>{sets}</Collection></VTKFile>'
+            progress(len(frame_comparisons), len(comparison.frames), "frames")
+    datasets = "".join(
+        f'<DataSet timestep="{entry.time:.12g}" file={quoteattr(_state(entry.frame))}/>' for entry in frame_comparisons
+    )
+    index = (
+        f'<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1"><Collection>{datasets}</Collection></VTKFile>'
+    )
     for name, rows in tables.items():
         write_complete(out / name, partial(write_table, head=rows[0], rows=[row.values() for row in rows]))
-    for name, text in {INDEX: index, PAGE: _page(comparison, done)}.items():
+    for name, text in {INDEX: index, PAGE: _page(comparison, frame_comparisons)}.items():
         write_complete(out / name, methodcaller("write", text.encode()))
-    return done
+    return frame_comparisons
 
 
-def _write_state(comparison: Comparison, made: FrameComparison, path: Path) -> None:
+def _write_state(comparison: Comparison, frame_comparison: FrameComparison, path: Path) -> None:
     """Write one frame as VTU: the measurement at the simulation's nodes, the simulation, and their difference."""
     import meshio
 
@@ -136,23 +147,28 @@ def _write_state(comparison: Comparison, made: FrameComparison, path: Path) -> N
     flat = np.zeros(len(mesh.points))
 
     def vectors(group: str, value_of: Callable[[str], FloatArray]) -> FloatArray:
-        parts = [value_of(name) for name in _GROUPS[group]]
-        return np.column_stack([*parts, *[flat] * (3 - len(parts))])
+        components = [value_of(name) for name in _GROUPS[group]]
+        return np.column_stack([*components, *[flat] * (3 - len(components))])
 
     fields: dict[str, Any] = {"node_number": mesh.node_numbers}
     for group in _GROUPS:
-        fields[group] = vectors(group, made.measured.__getitem__)
-        fields[f"{group}_std"] = vectors(group, made.std.__getitem__)
-        for way in WAYS:
-            fields[f"{group}_simulated_{way}"] = vectors(group, made.simulated[way].__getitem__)
-            fields[f"{group}_ratio_{way}"] = vectors(group, partial(made.ratio, way))
+        fields[group] = vectors(group, frame_comparison.measured.__getitem__)
+        fields[f"{group}_std"] = vectors(group, frame_comparison.std.__getitem__)
+        for variant in VARIANTS:
+            fields[f"{group}_simulated_{variant}"] = vectors(group, frame_comparison.simulated[variant].__getitem__)
+            fields[f"{group}_ratio_{variant}"] = vectors(group, partial(frame_comparison.ratio, variant))
     points, cells = np.column_stack([mesh.points, flat]), {"element_number": [mesh.element_numbers]}
-    written = meshio.Mesh(points, [("triangle", mesh.elements)], point_data=fields, cell_data=cells)
-    write_complete(path, lambda file: meshio.vtu.write(file.name, written))
+    output_mesh = meshio.Mesh(points, [("triangle", mesh.elements)], point_data=fields, cell_data=cells)
+    write_complete(path, lambda file: meshio.vtu.write(file.name, output_mesh))
 
 
 def difference_figure(
-    comparison: Comparison, made: FrameComparison, names: Sequence[str], way: str, *, ratio: bool = False
+    comparison: Comparison,
+    frame_comparison: FrameComparison,
+    names: Sequence[str],
+    variant: str,
+    *,
+    ratio: bool = False,
 ) -> Figure:
     """Draw measured minus simulated at the simulation's nodes, y up; blank where there are no data.
 
@@ -160,12 +176,12 @@ def difference_figure(
     ----------
     comparison
         The comparison.
-    made
+    frame_comparison
         One of its frames.
     names
-        Of the `QUANTITIES`, a panel each.
-    way
-        One of the `WAYS`.
+        Of the `COMPARED_QUANTITIES`, a panel each.
+    variant
+        One of the `VARIANTS`.
     ratio
         Whether in units of the standard uncertainty, from -4 to 4; else in mm or strain.
     """
@@ -177,100 +193,125 @@ def difference_figure(
 
     def draw(axes: list[Axes]) -> None:
         for axis, name in zip(axes, names, strict=True):
-            values, unit, reach = made.ratio(way, name), " in uncertainties", _LIMITS.reach
+            values, unit, reach = frame_comparison.ratio(variant, name), " in uncertainties", _LIMITS.colour_reach
             if not ratio:
-                values, unit = made.difference(way, name), "" if name[0] == "e" else " (mm)"
-                ordinary = style.ordinary_values(values, made.std[name])
-                reach = max(np.abs(style.colour_range(ordinary))) if ordinary.size else 1.0
-            norm, known = Normalize(-reach, reach), np.isfinite(values)
-            whole = known[mesh.elements].all(axis=1)
-            if whole.any():
-                drawn = Triangulation(mesh.points[:, 0], mesh.points[:, 1], mesh.elements, ~whole)
-                axis.tripcolor(drawn, np.where(known, values, 0), cmap="RdBu_r", norm=norm, shading="gouraud")
-            style.add_colour_bar(axis, norm, "RdBu_r", shown=values[known])
-            style.finish_picture(axis, (low[0], high[0]), (high[1], low[1]), first=axis is axes[0], unit="mm")
-            axis.set_title(f"{name}{unit}, {_TITLES[way]}")
+                values, unit = frame_comparison.difference(variant, name), "" if name[0] == "e" else " (mm)"
+                colour_values = style.ordinary_values(values, frame_comparison.std[name])
+                reach = max(np.abs(style.colour_range(colour_values))) if colour_values.size else 1.0
+            norm, finite = Normalize(-reach, reach), np.isfinite(values)
+            has_data = finite[mesh.elements].all(axis=1)
+            if has_data.any():
+                triangulation = Triangulation(mesh.points[:, 0], mesh.points[:, 1], mesh.elements, ~has_data)
+                axis.tripcolor(triangulation, np.where(finite, values, 0), cmap="RdBu_r", norm=norm, shading="gouraud")
+            style.add_colour_bar(axis, norm, "RdBu_r", values=values[finite])
+            style.finish_picture(axis, (low[0], high[0]), (high[1], low[1]), has_y_label=axis is axes[0], unit="mm")
+            axis.set_title(f"{name}{unit}, {_TITLES[variant]}")
 
     aspect = float(np.ptp([low[1], high[1]]) / np.ptp([low[0], high[0]]))
-    return style.draw_figure(draw, count=len(names), aspect=aspect, beside=style.BAR)
+    return style.draw_figure(draw, count=len(names), aspect=aspect, right_room=style.BAR)
 
 
-def histogram_figure(made: FrameComparison) -> Figure:
+def histogram_figure(frame_comparison: FrameComparison) -> Figure:
     """Draw how often each ratio of difference to standard uncertainty occurs, both ways, and what a Gaussian has."""
 
     def draw(axes: list[Axes]) -> None:
         bins = np.linspace(-6, 6, 49)  # what lies beyond is counted in the outermost ones
         middles, width = (bins[1:] + bins[:-1]) / 2, bins[1] - bins[0]
         for axis, (title, names) in zip(axes, _GROUPS.items(), strict=True):
-            for way, colour in zip(WAYS, ("vermillion", "blue"), strict=True):
-                ratios = np.concatenate([made.ratio(way, name) for name in names])
+            for variant, colour in zip(VARIANTS, ("vermillion", "blue"), strict=True):
+                ratios = np.concatenate([frame_comparison.ratio(variant, name) for name in names])
                 ratios = ratios[np.isfinite(ratios)]
                 counts = np.histogram(np.clip(ratios, bins[0], bins[-1]), bins)[0] / max(len(ratios), 1) / width
-                axis.stairs(counts, bins, color=style.OKABE_ITO[colour], label=_TITLES[way], linewidth=1.2)
+                axis.stairs(counts, bins, color=style.OKABE_ITO[colour], label=_TITLES[variant], linewidth=1.2)
             axis.plot(middles, np.exp(-(middles**2) / 2) / np.sqrt(2 * np.pi), "k--", linewidth=1, label="expected")
             axis.set_title(title)
             style.finish_plot(axis, "difference over its standard uncertainty", "density")
         axes[-1].legend(loc="upper right")
 
-    return style.draw_figure(draw, count=2, aspect=0.7, beside=style.NUMBERS)
+    return style.draw_figure(draw, count=2, aspect=0.7, right_room=style.NUMBERS)
 
 
-def scale_figure(comparison: Comparison, done: Sequence[FrameComparison]) -> Figure:
+def scale_figure(comparison: Comparison, frame_comparisons: Sequence[FrameComparison]) -> Figure:
     """Draw the best-fitting scale of the simulation and chi-square over the frames."""
-    frames = np.array([made.frame for made in done])
-    times, label = style.time_axis(np.array([made.time for made in done]) if comparison.timed else None, frames)
+    frames = np.array([frame_comparison.frame for frame_comparison in frame_comparisons])
+    times, label = style.time_axis(
+        np.array([frame_comparison.time for frame_comparison in frame_comparisons]) if comparison.has_times else None,
+        frames,
+    )
 
     def draw(axes: list[Axes]) -> None:
-        scale, std = np.array([(made.fit.scale, made.fit.scale_std) for made in done]).T
+        scale, std = np.array(
+            [(frame_comparison.fit.scale, frame_comparison.fit.scale_std) for frame_comparison in frame_comparisons]
+        ).T
         axes[0].errorbar(times, scale, 2 * std, fmt="o-", markersize=2.5, linewidth=1, color=style.OKABE_ITO["blue"])
         axes[0].axhline(1, color="0.4", linewidth=0.8, linestyle="--")
-        style.finish_plot(axes[0], label, "scale of the simulation", whole=not comparison.timed)
-        for way, colour in zip(WAYS, ("vermillion", "blue"), strict=True):
+        style.finish_plot(axes[0], label, "scale of the simulation", integer_ticks=not comparison.has_times)
+        for variant, colour in zip(VARIANTS, ("vermillion", "blue"), strict=True):
             for name, line in (("displacement", "-"), ("eyy", ":")):
-                values = [made.agreement[way, name].chi_square for made in done]
+                values = [
+                    frame_comparison.agreement[variant, name].chi_square for frame_comparison in frame_comparisons
+                ]
                 look: dict[str, Any] = {"linestyle": line, "color": style.OKABE_ITO[colour], "linewidth": 1}
-                axes[1].plot(times, values, marker="o", markersize=2.5, label=f"{name}, {_TITLES[way]}", **look)
+                axes[1].plot(times, values, marker="o", markersize=2.5, label=f"{name}, {_TITLES[variant]}", **look)
         axes[1].axhline(1, color="0.4", linewidth=0.8, linestyle="--")
         axes[1].set_ylim(bottom=0)
-        style.finish_plot(axes[1], label, "chi-square per degree of freedom", whole=not comparison.timed)
+        style.finish_plot(axes[1], label, "chi-square per degree of freedom", integer_ticks=not comparison.has_times)
         axes[1].legend(loc="best", fontsize=7)
 
-    return style.draw_figure(draw, count=2, aspect=0.75, beside=style.NUMBERS)
+    return style.draw_figure(draw, count=2, aspect=0.75, right_room=style.NUMBERS)
 
 
-def scale_text(comparison: Comparison, done: Sequence[FrameComparison]) -> str:
-    """Say what the best-fitting scale of all frames is, and what it means for a modulus."""
-    scale, std = comparison.best_scale([made.fit for made in done])
+def scale_text(comparison: Comparison, frame_comparisons: Sequence[FrameComparison]) -> str:
+    """Return the best-fitting scale of all frames as text, and its meaning for a modulus."""
+    scale, std = comparison.best_scale([frame_comparison.fit for frame_comparison in frame_comparisons])
     if not np.isfinite(scale):
         return "no scale is found: the simulation is a rigid motion in all frames, or too few of its nodes have data"
-    text = f"{uncertain(scale, std)} times the simulation fits the measurement best, with any shift and rotation: "
-    away, rest = abs(scale - 1) / std if std else np.inf, float(np.median([made.fit.chi_square for made in done]))
-    if away <= 2:
+    text = (
+        f"{format_with_std(scale, std)} times the simulation fits the measurement best, with any shift and rotation: "
+    )
+    deviation, residual_chi_square = (
+        abs(scale - 1) / std if std else np.inf,
+        float(np.median([frame_comparison.fit.chi_square for frame_comparison in frame_comparisons])),
+    )
+    if deviation <= 2:
         text += "1 is within two standard uncertainties"
     else:
-        text += f"{away:.1f} standard uncertainties from 1; where the loads are right, divide the moduli by it"
-    if rest > _LIMITS.shape:
-        text += f"; the shape differs (chi-square of what is left: {rest:.3g}), which this uncertainty does not hold"
+        text += f"{deviation:.1f} standard uncertainties from 1; where the loads are right, divide the moduli by it"
+    if residual_chi_square > _LIMITS.max_chi_square:
+        text += (
+            f"; the shape differs (chi-square of what is left: {residual_chi_square:.3g}), which this uncertainty does "
+            "not hold"
+        )
     return text
 
 
-def _page(comparison: Comparison, done: Sequence[FrameComparison]) -> str:
+def _page(comparison: Comparison, frame_comparisons: Sequence[FrameComparison]) -> str:
     unlikely = {
-        name: [made.frame for made in done if made.agreement["levelled", name].probability < _LIMITS.unlikely]
-        for name in ("displacement", *QUANTITIES[2:])
+        name: [
+            frame_comparison.frame
+            for frame_comparison in frame_comparisons
+            if frame_comparison.agreement["levelled", name].probability < _LIMITS.min_probability
+        ]
+        for name in ("displacement", *COMPARED_QUANTITIES[2:])
     }
-    rigid = [(made.frame, (np.abs(made.fit.rigid) > _LIMITS.rigid * made.fit.rigid_std).any()) for made in done]
+    rigid = [
+        (
+            frame_comparison.frame,
+            (np.abs(frame_comparison.fit.rigid) > _LIMITS.max_rigid_ratio * frame_comparison.fit.rigid_std).any(),
+        )
+        for frame_comparison in frame_comparisons
+    ]
     return render(
         "comparison.html",
         comparison=comparison,
-        done=done,
+        frame_comparisons=frame_comparisons,
         simulation=Path(comparison.simulation.name).name,
-        scale=scale_text(comparison, done),
+        scale=scale_text(comparison, frame_comparisons),
         limits=_LIMITS,
         unlikely=unlikely,
-        moved=[frame for frame, moves in rigid if moves],
-        heads=[entry.name.replace("_", " ") for entry in fields(next(iter(done[0].agreement.values())))],
-        values=lambda one: asdict(one).values(),
+        moved_frames=[frame for frame, is_moved in rigid if is_moved],
+        heads=[entry.name.replace("_", " ") for entry in fields(next(iter(frame_comparisons[0].agreement.values())))],
+        values=lambda agreement: asdict(agreement).values(),
         groups=_GROUPS.values(),
         titles=_TITLES,
         scale_figure=scale_figure,

@@ -20,50 +20,50 @@ from rgbmidic.report.page import render
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, Maps, Result, speckle_diameter
 from rgbmidic.results.files import check_file, write_text
 from rgbmidic.results.histories import read_histories
-from rgbmidic.results.physical import Physical
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings, SetupSettings, TestSettings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportConstants:
-    """How much a report shows, and where its warnings begin.
+    """Sizes of a report, and the limits of its warnings.
 
     Attributes
     ----------
-    histories
+    history_frames
         Frames that the time histories are drawn from at most: a panel is some 450 pixels wide, two for each.
-    shown
+    map_frames
         Frames of which maps are shown where none are named: first third, second third and end of a test.
-    keys
+    key_frames
         Key frames in a strip: as many as a page is wide with panels of 4 cm.
-    listed
+    max_listed
         Failed frames that are listed with their reason: half a page.
-    panels
+    panels_per_picture
         Panels of the histories of the probes in a picture: as many fill a page of A4.
-    fewest
+    min_profile_frames
         Frames from which position against time is a picture: fewer are single stripes.
     finest_nodes, finest_gauge
         Spatial resolution of the displacement at the nodes, in elements, and of a virtual strain gauge's strain, in its
         lengths (`rgbmidic.lab.resolution.cut_offs`).
-    no_data, misfit, excess
+    max_no_data, max_misfit, max_noise_ratio
         Largest fraction of nodes without data, median misfit (1 is ordinary), and noise of static frames over the
         stated uncertainty, that are not warned of. Chosen.
-    blur
+    max_blur
         The same of the px that a node moves during the exposure: the speckle's gradient is resolved to 1 px.
     """
 
-    histories: int = 200
-    shown: int = 3
-    keys: int = 5
-    listed: int = 20
-    panels: int = 4
-    fewest: int = 10
+    history_frames: int = 200
+    map_frames: int = 3
+    key_frames: int = 5
+    max_listed: int = 20
+    panels_per_picture: int = 4
+    min_profile_frames: int = 10
     finest_nodes: float = 2.2
     finest_gauge: float = 2.6
-    no_data: float = 0.1
-    misfit: float = 2.0
-    excess: float = 1.5
-    blur: float = 1.0
+    max_no_data: float = 0.1
+    max_misfit: float = 2.0
+    max_noise_ratio: float = 1.5
+    max_blur: float = 1.0
 
 
 def speckle_size(result: Result) -> float | None:
@@ -75,9 +75,9 @@ def speckle_size(result: Result) -> float | None:
     if result.reference is None:
         return None
     nodes = result.nodes - result.reference_origin
-    (left, top), (right, bottom) = nodes.min(axis=0).astype(int), nodes.max(axis=0).astype(int) + 1
-    parts = result.reference[:, max(top, 0) : bottom, max(left, 0) : right].astype(np.float32)
-    sizes = [size for part in parts if (size := speckle_diameter(part)) is not None]
+    (x_min, y_min), (x_max, y_max) = nodes.min(axis=0).astype(int), nodes.max(axis=0).astype(int) + 1
+    images = result.reference[:, max(y_min, 0) : y_max, max(x_min, 0) : x_max].astype(np.float32)
+    sizes = [size for image in images if (size := speckle_diameter(image)) is not None]
     return float(np.median(sizes)) if sizes else None
 
 
@@ -122,18 +122,20 @@ def write_report(
     setup = result.section(SetupSettings) if settings is None else settings.setup
     probes = result.section(ProbeSettings) if settings is None else settings.probes
     channels = result.section(ChannelSettings) if settings is None else settings.channels
-    physical = Physical.of(result, None if settings is None else settings.scale)
+    physical = ResultInUnits.from_result(result, None if settings is None else settings.scale)
     for frame in frames or ():
         result.frame(frame)  # an error of one is raised before the long work
-    constants, kept = ReportConstants(), result.provenance
-    history = curves.TimeHistory(physical, figures.spread(figures.shown_frames(result), constants.histories))
+    constants, provenance = ReportConstants(), result.provenance
+    history = curves.TimeHistory(
+        physical, figures.select_evenly(figures.frames_to_draw(result), constants.history_frames)
+    )
     if frames is None:
-        measured = figures.spread(figures.measured_frames(result), constants.shown)
-        frames = sorted({*measured, history.farthest})
+        sampled_frames = figures.select_evenly(figures.measured_frames(result), constants.map_frames)
+        frames = sorted({*sampled_frames, history.farthest})
     maps = figures.MapDrawer(Maps(result=result, physical=physical), style.PAGE_DPI)
-    exposure, speckle = kept.get("exposure_ns"), speckle_size(result)
-    ends = result.status[list(result.deformed)]
-    odd = [index for index in result.deformed if result.status[index] != 0 and result.finished[index]]
+    exposure, speckle = provenance.get("exposure_ns"), speckle_size(result)
+    statuses = result.status[list(result.deformed)]
+    unconverged = [index for index in result.deformed if result.status[index] != 0 and result.finished[index]]
     text = render(
         "report.html",
         constants=constants,
@@ -142,66 +144,76 @@ def write_report(
         isfinite=np.isfinite,
         result=result,
         physical=physical,
-        stated=asdict(setup),
+        setup=asdict(setup),
         probes=probes,
-        shown=frames,
+        map_frames=frames,
         maps=maps,
         history=history,
-        measured=history.fractions[:, 0],
+        measured_fraction=history.fractions[:, 0],
         floor=noise_floor(physical),
         histories=read_histories(result, probes, scale=physical.scale, channels=channels)
         if probes.kind_coordinates
         else None,
         lines=_lines(maps.maps, probes, constants),
-        when=partial(_when, physical),
+        frame_label=partial(_frame_label, physical),
         rate=_frame_rate(physical),
         exposure=None if exposure is None else f"{exposure / 1000:g} µs",
         blur=1e-9 * (exposure or 0) * history.fastest if physical.units.timed else 0,
         speckle=None if speckle is None else physical.in_units(speckle),
         missing=int((~result.finished).sum()),
-        endings={word: int((ends == code).sum()) for code, word in enumerate(QUANTITIES["status"].codes)},
-        troubled=list(zip((result.names[index] for index in odd), result.each("reason", odd), strict=True)),
+        endings={word: int((statuses == code).sum()) for code, word in enumerate(QUANTITIES["status"].codes)},
+        unconverged=list(
+            zip((result.names[index] for index in unconverged), result.iterate("reason", unconverged), strict=True)
+        ),
     )
     write_text(out, text)
 
 
-def _frame_rate(physical: Physical) -> tuple[float | None, str]:
-    """Frame rate that `frame_times` follows, and where it is from; None where the frames have times of their own."""
+def _frame_rate(physical: ResultInUnits) -> tuple[float | None, str]:
+    """Return the frame rate that `frame_times` follows, and its source; None if the frames have time stamps."""
     result = physical.result
-    recorded = result.provenance.get("frame_rate"), "by the camera's file"
-    stated = (physical.scale or result.section(ScaleSettings)).frame_rate, "as stated"
-    stamped = (result.time_ns[result.finished] != UNKNOWN_TIME).all()
-    return next((rate for rate in ([recorded] if stamped else [stated, recorded]) if rate[0]), (None, ""))
+    camera_rate = result.provenance.get("frame_rate"), "by the camera's file"
+    settings_rate = (physical.scale or result.section(ScaleSettings)).frame_rate, "as stated"
+    has_time_stamps = (result.time_ns[result.finished] != UNKNOWN_TIME).all()
+    return next(
+        (rate for rate in ([camera_rate] if has_time_stamps else [settings_rate, camera_rate]) if rate[0]), (None, "")
+    )
 
 
 def _lines(maps: Maps, probes: ProbeSettings, constants: ReportConstants) -> Iterator[dict[str, Any]]:
     """Yield position against time along the lines of the probes, else through the middle of the region."""
     from rgbmidic.results.profiles import read_profile
 
-    measured, nodes = figures.measured_frames(maps.result), maps.result.nodes
-    if not maps.physical.units.timed or len(measured) < constants.fewest:
+    measured_frames, nodes = figures.measured_frames(maps.result), maps.result.nodes
+    if not maps.physical.units.timed or len(measured_frames) < constants.min_profile_frames:
         return
     middle, (wide, tall) = (nodes.min(axis=0) + nodes.max(axis=0)) / 2, np.ptp(nodes, axis=0) / 2
     reach = np.array([wide, 0.0] if wide >= tall else [0.0, tall])
     lines = {"the longer side of the region, through its middle": (*(middle - reach), *(middle + reach))}
-    if stated := [place for kind, place in probes.kind_coordinates if kind == "line"]:
-        lines = {f"line_{number}": place for number, place in enumerate(stated, 1)}
-    frames = figures.spread(measured, constants.histories)
-    for name, place in lines.items():
-        x0, y0, x1, y1 = place
+    if line_positions := [position for kind, position in probes.kind_coordinates if kind == "line"]:
+        lines = {f"line_{number}": position for number, position in enumerate(line_positions, 1)}
+    frames = figures.select_evenly(measured_frames, constants.history_frames)
+    for name, position in lines.items():
+        x0, y0, x1, y1 = position
         field = "exx" if abs(x1 - x0) >= abs(y1 - y0) else "eyy"
-        where = f"{name}, from ({x0:.0f}, {y0:.0f}) to ({x1:.0f}, {y1:.0f}) px"
-        line = {"field": field, "where": where, "drawn": len(frames), "measured": len(measured), "error": None}
+        description = f"{name}, from ({x0:.0f}, {y0:.0f}) to ({x1:.0f}, {y1:.0f}) px"
+        line = {
+            "field": field,
+            "where": description,
+            "drawn": len(frames),
+            "measured": len(measured_frames),
+            "error": None,
+        }
         try:
-            yield line | {"figure": curves.profile_figure(read_profile(maps, field, place, frames))}
+            yield line | {"figure": curves.profile_figure(read_profile(maps, field, position, frames))}
         except InputError as error:
             yield line | {"error": error}
 
 
-def _when(physical: Physical, frame: int) -> str:
+def _frame_label(physical: ResultInUnits, frame: int) -> str:
     """Name a frame, with its time where it is known."""
-    at = f" at {style.time_text(physical.times[frame], physical.times)}" if physical.units.timed else ""
-    return f"frame {frame} ({physical.result.names[frame]}){at}"
+    time_note = f" at {style.time_text(physical.times[frame], physical.times)}" if physical.units.timed else ""
+    return f"frame {frame} ({physical.result.names[frame]}){time_note}"
 
 
 def write_batch_page(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rgbmidic.report import style
-from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Maps, Quantity, Result
+from rgbmidic.results import QUANTITIES, REFLECTING, FrameRecord, Maps, Result, ResultQuantity
 from rgbmidic.results.quantities import FAILED
 from rgbmidic.typing import AnyArray, FloatArray
 
@@ -30,7 +30,7 @@ _COLOURS = {"positive": "plasma", "fraction": "cividis", "angle": "twilight"}
 """Colours of the kinds of fields; all others have viridis."""
 
 
-def shown_frames(result: Result) -> tuple[int, ...]:
+def frames_to_draw(result: Result) -> tuple[int, ...]:
     """Select the deformed frames that are measured; else all that are measured; else all of the test."""
     finished = result.finished
     deformed = tuple(index for index in result.deformed if finished[index])
@@ -38,15 +38,15 @@ def shown_frames(result: Result) -> tuple[int, ...]:
 
 
 def measured_frames(result: Result) -> tuple[int, ...]:
-    """Select those of `shown_frames` that did not fail; all of them where all failed."""
-    shown = shown_frames(result)
-    ends = zip(shown, result.each("status", shown), strict=True)
-    return tuple(frame for frame, end in ends if end != FAILED) or shown
+    """Select those of `frames_to_draw` that did not fail; all of them where all failed."""
+    candidates = frames_to_draw(result)
+    statuses = zip(candidates, result.iterate("status", candidates), strict=True)
+    return tuple(frame for frame, status in statuses if status != FAILED) or candidates
 
 
-def spread(frames: Sequence[int], most: int) -> tuple[int, ...]:
-    """Select at most `most` of the frames, evenly spaced up to the last one."""
-    return tuple(sorted({frames[int(i)] for i in np.linspace(len(frames) - 1, 0, min(most, len(frames))).round()}))
+def select_evenly(frames: Sequence[int], max_count: int) -> tuple[int, ...]:
+    """Select at most `max_count` of the frames, evenly spaced up to the last one."""
+    return tuple(sorted({frames[int(i)] for i in np.linspace(len(frames) - 1, 0, min(max_count, len(frames))).round()}))
 
 
 def brightness_figure(result: Result) -> Figure:
@@ -61,6 +61,11 @@ def brightness_figure(result: Result) -> Figure:
     -------
     Figure
         The figure, one line per light.
+
+    Examples
+    --------
+    >>> len(brightness_figure(Result.open("my_result")).axes)
+    2
     """
     gain, offset = np.moveaxis(result.brightness, -1, 0)
     return _over_frames(result, {"gain": gain, "offset (grey levels)": offset})
@@ -78,6 +83,11 @@ def residual_figure(result: Result) -> Figure:
     -------
     Figure
         The figure, one line per light.
+
+    Examples
+    --------
+    >>> len(residual_figure(Result.open("my_result")).axes)
+    2
     """
     return _over_frames(result, {"residual": result.residual, "mean fraction in the nodes": result.mean_light_fraction})
 
@@ -94,19 +104,26 @@ def convergence_figure(result: Result) -> Figure:
     -------
     Figure
         The figure, one line per deformed frame.
+
+    Examples
+    --------
+    >>> len(convergence_figure(Result.open("my_result")).axes)
+    1
     """
     from matplotlib import colormaps
     from matplotlib.colors import Normalize
 
-    shown = shown_frames(result)
-    frames = shown[:: math.ceil(len(shown) / 100)]  # more lines cover each other
-    named = len(frames) <= 8  # in a legend, which then fills half the height; else a colour bar
+    drawable_frames = frames_to_draw(result)
+    frames = drawable_frames[:: math.ceil(len(drawable_frames) / 100)]  # more lines cover each other
+    has_legend = len(frames) <= 8  # in a legend, which then fills half the height; else a colour bar
 
     def draw(axes: list[Axes]) -> None:
         (axis,), norm = axes, Normalize(frames[0], frames[-1])
-        colours = style.CURVES if named else [colormaps["viridis"](norm(frame)) for frame in frames]
+        colours = style.CURVES if has_legend else [colormaps["viridis"](norm(frame)) for frame in frames]
         looks = zip(cycle(colours), cycle(style.MARKERS), cycle(style.LINES), strict=False)
-        for frame, history, (colour, marker, line) in zip(frames, result.each("history", frames), looks, strict=False):
+        for frame, history, (colour, marker, line) in zip(
+            frames, result.iterate("history", frames), looks, strict=False
+        ):
             look: dict[str, Any] = {"color": colour, "marker": marker, "markersize": 3, "linestyle": line}
             name = style.literal(result.names[frame])
             axis.plot(np.arange(1, len(history) + 1), history, linewidth=1, label=name, **look)
@@ -114,17 +131,17 @@ def convergence_figure(result: Result) -> Figure:
             axis.axhline(tolerance, color="0.4", linewidth=0.8, linestyle="--", label="tolerance")
         axis.set_yscale("log")
         style.finish_plot(axis, "iteration", "largest motion of a measured node (px)")
-        if named:
+        if has_legend:
             axis.legend(loc="upper right")
         else:
             style.add_colour_bar(axis, norm, "viridis", label="frame")
 
-    return style.draw_figure(draw, count=1, aspect=0.6, beside=style.GAP if named else style.BAR)
+    return style.draw_figure(draw, count=1, aspect=0.6, right_room=style.GAP if has_legend else style.BAR)
 
 
 def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
     """Draw a panel per quantity (T, k), with one line per light over the deformed frames."""
-    frames = list(shown_frames(result))
+    frames = list(frames_to_draw(result))
 
     def draw(axes: list[Axes]) -> None:
         for axis, (label, values) in zip(axes, panels.items(), strict=True):
@@ -137,7 +154,7 @@ def _over_frames(result: Result, panels: Mapping[str, FloatArray]) -> Figure:
             style.finish_plot(axis, "frame", label)
         axes[-1].legend(loc="best")
 
-    return style.draw_figure(draw, count=len(panels), aspect=0.75, beside=style.NUMBERS)
+    return style.draw_figure(draw, count=len(panels), aspect=0.75, right_room=style.NUMBERS)
 
 
 class MapDrawer:
@@ -151,6 +168,12 @@ class MapDrawer:
         The fields of the result.
     dpi
         Pixels per inch that all figures are written with; the axes are then drawn once. None: not known.
+
+    Examples
+    --------
+    >>> drawer = MapDrawer(Maps.from_result(Result.open("my_result")))
+    >>> len(drawer.fields(1, ("u", "v")).axes)
+    2
     """
 
     def __init__(self, maps: Maps, dpi: int | None = None) -> None:
@@ -161,15 +184,15 @@ class MapDrawer:
         self._figures: dict[int, Figure] = {}
         low, high = result.nodes.min(axis=0), result.nodes.max(axis=0)
         step = float((high - low).max()) / 450  # as many pixels as the panels of two maps have at 150 dpi
-        x, y = (np.arange(start + step / 2, end, step) for start, end in zip(low, high, strict=True))
+        x, y = (np.arange(start + step / 2, stop, step) for start, stop in zip(low, high, strict=True))
         self._grid = np.meshgrid(x, y)
         self._extent = (low[0], low[0] + step * len(x), low[1] + step * len(y), low[1])
         # matplotlib finds elements on meshes without two nodes at one place: those of a crack's sides count as one
-        nodes, place = np.unique(result.nodes, axis=0, return_inverse=True)
-        closed = Triangulation(nodes[:, 0], nodes[:, 1], place.reshape(-1)[result.elements])
+        nodes, node_index = np.unique(result.nodes, axis=0, return_inverse=True)
+        triangulation = Triangulation(nodes[:, 0], nodes[:, 1], node_index.reshape(-1)[result.elements])
         self._points = np.stack(self._grid, axis=-1)
-        element = np.asarray(closed.get_trifinder()(*self._grid), dtype=np.int64).ravel()  # -1: of none
-        self._places = maps.places(self._points.reshape(-1, 2), element)
+        element = np.asarray(triangulation.get_trifinder()(*self._grid), dtype=np.int64).ravel()  # -1: of none
+        self._points_in_elements = maps.points_in_elements(self._points.reshape(-1, 2), element)
 
     def discretisation(self, frame: int) -> Figure | None:
         """Draw noise and discretisation error together, and where a finer mesh is needed.
@@ -189,7 +212,7 @@ class MapDrawer:
         InputError, ResultError
             As `fields`.
         """
-        if "finer_mesh" not in self.maps.all or not np.isfinite(self.maps.read("u_total", frame).values).any():
+        if "finer_mesh" not in self.maps.quantities or not np.isfinite(self.maps.read("u_total", frame).values).any():
             return None
         return self.fields(frame, ("u_total", "v_total", "finer_mesh"))
 
@@ -222,32 +245,35 @@ class MapDrawer:
 
         panels = []
         for name in names:
-            read = self.maps.read(name, frame)
-            panels.append((self.maps.field(name), read.values, read.std))
-            if std and np.isfinite(read.std).any():
-                panels.append((self.maps.field(f"{name}_std"), read.std, np.full_like(read.std, np.nan)))
+            map_values = self.maps.read(name, frame)
+            panels.append((self.maps.field(name), map_values.values, map_values.std))
+            if std and np.isfinite(map_values.std).any():
+                panels.append((self.maps.field(f"{name}_std"), map_values.std, np.full_like(map_values.std, np.nan)))
         if len(panels) not in self._figures:
             self._figures[len(panels)] = self._panels(len(panels))
-        figure, kept = self._figures[len(panels)], int(self._dpi is None and self.result.reference is not None)
+        figure, reference_count = (
+            self._figures[len(panels)],
+            int(self._dpi is None and self.result.reference is not None),
+        )
         title = _frame_title(self.result, frame, self.result.frame(frame))
-        how = "; ".join(filter(None, dict.fromkeys(self.maps.how(name) for name in names)))
-        figure.texts[0].update({"text": f"{title}\n{how}" if how else title, "fontsize": 8 if how else 10})
+        note = "; ".join(filter(None, dict.fromkeys(self.maps.processing_note(name) for name in names)))
+        figure.texts[0].update({"text": f"{title}\n{note}" if note else title, "fontsize": 8 if note else 10})
         with mpl.rc_context(style.STYLE):
             for axis, (field, values, uncertainty) in zip(figure.axes, panels, strict=True):
-                drawn = (*axis.lines, *axis.patches, *axis.texts, *axis.artists, *axis.collections)
-                for artist in (*axis.images[kept:], *drawn):
+                artists = (*axis.lines, *axis.patches, *axis.texts, *axis.artists, *axis.collections)
+                for artist in (*axis.images[reference_count:], *artists):
                     artist.remove()
-                ordinary = style.ordinary_values(values, uncertainty)
-                norm = style.colour_scale(ordinary, positive=field.logarithmic) if ordinary.size else None
-                norm = Normalize(*field.ends) if field.ends else norm
-                self._show(axis, values, norm, field)
+                colour_values = style.ordinary_values(values, uncertainty)
+                norm = style.colour_scale(colour_values, positive=field.is_logarithmic) if colour_values.size else None
+                norm = Normalize(*field.fixed_range) if field.fixed_range else norm
+                self._show_field(axis, values, norm, field)
                 axis.set_title(style.literal(field.label))
                 if hatched and np.isfinite(uncertainty).any():
-                    doubtful = self._places.linear(np.abs(values) - 2 * uncertainty)
+                    margin = self._points_in_elements.linear(np.abs(values) - 2 * uncertainty)
                     with np.errstate(invalid="ignore"):
                         axis.contourf(
                             *self._grid,
-                            doubtful.reshape(self._grid[0].shape),
+                            margin.reshape(self._grid[0].shape),
                             levels=[-np.inf, 0],
                             hatches=["////"],
                             colors="none",
@@ -293,7 +319,7 @@ class MapDrawer:
             As `fields`.
         """
         excluded = 1 - self.result.frame(frame).weights_thumbnail / 255
-        return self._shaded(frame, excluded, excluded, "{:.1%} excluded") if excluded.any() else None
+        return self._shaded_figure(frame, excluded, excluded, "{:.1%} excluded") if excluded.any() else None
 
     def reflections(self, frame: int) -> Figure | None:
         """Draw the reflection index of each light in a frame.
@@ -315,7 +341,7 @@ class MapDrawer:
             As `fields`.
         """
         index = self.result.frame(frame).reflection_thumbnail / 255
-        return self._shaded(frame, index, index > REFLECTING, "reflects on {:.1%}") if index.size else None
+        return self._shaded_figure(frame, index, index > REFLECTING, "reflects on {:.1%}") if index.size else None
 
     def strip(self, name: str, frames: Sequence[int], label: str) -> Figure:
         """Draw small maps of one field in several frames, side by side, in the same colours.
@@ -335,25 +361,27 @@ class MapDrawer:
         """
         field, (x, y) = self.maps.field(name), picture_limits(self.result, self.result.nodes)
         maps, physical = {frame: self.maps.read(name, frame).values for frame in frames}, self.maps.physical
-        every = np.concatenate([*maps.values()])
-        known = every[np.isfinite(every)]
-        norm = style.colour_scale(known) if known.size else None
+        all_values = np.concatenate([*maps.values()])
+        finite_values = all_values[np.isfinite(all_values)]
+        norm = style.colour_scale(finite_values) if finite_values.size else None
 
         def draw(axes: list[Axes]) -> None:
             for axis, (frame, values) in zip(axes, maps.items(), strict=False):
-                self._show(axis, values, norm, field, bar=axis is axes[-2])
-                at = f", {style.time_text(physical.times[frame], physical.times)}" if physical.units.timed else ""
-                axis.set_title(f"frame {frame}{at}")
-                style.finish_picture(axis, x, y, first=axis is axes[0], unit=self._unit, factor=self._factor)
+                self._show_field(axis, values, norm, field, bar=axis is axes[-2])
+                time_note = (
+                    f", {style.time_text(physical.times[frame], physical.times)}" if physical.units.timed else ""
+                )
+                axis.set_title(f"frame {frame}{time_note}")
+                style.finish_picture(axis, x, y, has_y_label=axis is axes[0], unit=self._unit, factor=self._factor)
             axes[-1].set_axis_off()  # room for the colour bar
 
         aspect = np.ptp(y) / np.ptp(x)
-        return style.draw_figure(draw, count=len(maps) + 1, aspect=max(aspect, 0.5), beside=style.GAP, title=label)
+        return style.draw_figure(draw, count=len(maps) + 1, aspect=max(aspect, 0.5), right_room=style.GAP, title=label)
 
-    def _shaded(self, frame: int, cover: FloatArray, counted: AnyArray, words: str) -> Figure | None:
+    def _shaded_figure(self, frame: int, cover: FloatArray, flags: AnyArray, caption: str) -> Figure | None:
         """Show the reference of each light around the mesh, shaded by a reduced picture (k, h, w) of one frame.
 
-        The `words` state the mean of what is `counted` (k, h, w) over the part that is shown. None where no reference
+        The `caption` state the mean of what is `flags` (k, h, w) over the part that is shown. None where no reference
         was kept.
         """
         result = self.result
@@ -361,22 +389,24 @@ class MapDrawer:
             return None
         record = result.frame(frame)
         step, origin = -(-reference.shape[1] // cover.shape[1]), result.reference_origin
-        moved = result.nodes + np.stack([record.u, record.v], axis=1)
-        x, y = picture_limits(result, np.concatenate([result.nodes, moved[np.isfinite(moved).all(axis=1)]]))
+        deformed = result.nodes + np.stack([record.u, record.v], axis=1)
+        x, y = picture_limits(result, np.concatenate([result.nodes, deformed[np.isfinite(deformed).all(axis=1)]]))
         columns, rows = (
-            slice(int((low - first + 0.5) // step), math.ceil((high - first + 0.5) / step))
-            for (low, high), first in zip((x, y), origin, strict=True)
+            slice(int((low - offset + 0.5) // step), math.ceil((high - offset + 0.5) / step))
+            for (low, high), offset in zip((x, y), origin, strict=True)
         )
 
         def draw(axes: list[Axes]) -> None:
-            for axis, image, light, part, share in zip(axes, reference, result.lights, cover, counted, strict=True):
+            for axis, image, light, mask, light_flags in zip(axes, reference, result.lights, cover, flags, strict=True):
                 style.show_image(axis, image, origin)
-                style.shade(axis, part, step, origin, style.LIGHT_COLOURS.get(light))
-                axis.set_title(style.literal(f"{light}: {words.format(share[rows, columns].mean())}"))
-                style.finish_picture(axis, x, y, first=axis is axes[0], unit=self._unit, factor=self._factor)
+                style.shade(axis, mask, step, origin, style.LIGHT_COLOURS.get(light))
+                axis.set_title(style.literal(f"{light}: {caption.format(light_flags[rows, columns].mean())}"))
+                style.finish_picture(axis, x, y, has_y_label=axis is axes[0], unit=self._unit, factor=self._factor)
 
         title = f"{_frame_title(result, frame, record)}, over the reference image"
-        return style.draw_figure(draw, count=len(cover), aspect=np.ptp(y) / np.ptp(x), beside=style.GAP, title=title)
+        return style.draw_figure(
+            draw, count=len(cover), aspect=np.ptp(y) / np.ptp(x), right_room=style.GAP, title=title
+        )
 
     def _panels(self, count: int) -> Figure:
         """Draw what is the same in all figures of `count` maps: axes and reference image."""
@@ -387,46 +417,46 @@ class MapDrawer:
             for axis in axes:
                 if reference is not None:
                     style.show_image(axis, reference, result.reference_origin)
-                style.finish_picture(axis, x, y, first=axis is axes[0], unit=self._unit, factor=self._factor)
+                style.finish_picture(axis, x, y, has_y_label=axis is axes[0], unit=self._unit, factor=self._factor)
 
-        figure = style.draw_figure(draw, count=count, aspect=np.ptp(y) / np.ptp(x), beside=style.BAR, title=" ")
+        figure = style.draw_figure(draw, count=count, aspect=np.ptp(y) / np.ptp(x), right_room=style.BAR, title=" ")
         if self._dpi is not None:
             style.freeze_axes(figure, self._dpi)
         return figure
 
-    def _raster(self, values: FloatArray, field: Quantity) -> FloatArray:
+    def _rasterise(self, values: FloatArray, field: ResultQuantity) -> FloatArray:
         """Evaluate a nodal field between the nodes; NaN where one of those around has no data.
 
         Where values between nodes mean nothing it is that of the nearest one.
         """
         from scipy.spatial import cKDTree
 
-        read = self._places.read if field.signed else self._places.linear
-        picture = read(values).reshape(self._grid[0].shape)
+        interpolate = self._points_in_elements.read if field.is_signed else self._points_in_elements.linear
+        picture = interpolate(values).reshape(self._grid[0].shape)
         if field.stepped:
             picture = np.where(np.isfinite(picture), values[cKDTree(self.result.nodes).query(self._points)[1]], np.nan)
         return np.asarray(picture)
 
-    def _show(
-        self, axis: Axes, values: FloatArray, norm: Normalize | None, field: Quantity, *, bar: bool = True
+    def _show_field(
+        self, axis: Axes, values: FloatArray, norm: Normalize | None, field: ResultQuantity, *, bar: bool = True
     ) -> None:
         """Show nodal values and their colour bar; a code has one colour in every picture."""
         from matplotlib.colors import ListedColormap
 
-        known = values[np.isfinite(values)]
-        if norm is None or not known.size:
+        finite = values[np.isfinite(values)]
+        if norm is None or not finite.size:
             box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
             axis.text(0.5, 0.5, "nothing measured", transform=axis.transAxes, ha="center", va="center", bbox=box)
             return
         codes = len(field.codes)
         colours = ListedColormap(style.STATUS_COLOURS[:codes]) if codes else field_colours(field)
-        picture = self._raster(values, field)
+        picture = self._rasterise(values, field)
         axis.imshow(picture, extent=self._extent, cmap=colours, norm=norm, interpolation="nearest")
         if bar:
-            style.add_colour_bar(axis, norm, colours, shown=known, names=field.codes)
+            style.add_colour_bar(axis, norm, colours, values=finite, names=field.codes)
 
 
-def field_colours(field: Quantity) -> str:
+def field_colours(field: ResultQuantity) -> str:
     """Return the name of matplotlib's colours of a field."""
     return _COLOURS.get(field.kind, "viridis")
 
@@ -435,14 +465,14 @@ def picture_limits(result: Result, points: FloatArray) -> tuple[tuple[float, flo
     """Return the limits in x and in y of a picture around points (N, 2), inside the image."""
     low, high = style.view_limits(points)
     if result.reference is not None:
-        first, size = np.array(result.reference_origin), np.array(result.reference.shape[:0:-1])
-        low, high = (np.clip(end, first - 0.5, first + size - 0.5) for end in (low, high))
+        origin, size = np.array(result.reference_origin), np.array(result.reference.shape[:0:-1])
+        low, high = (np.clip(limit, origin - 0.5, origin + size - 0.5) for limit in (low, high))
     return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
 
 
 def _frame_title(result: Result, frame: int, record: FrameRecord) -> str:
     """Return the title of a frame: number, file, status, iterations, fraction of nodes without data."""
-    blank = np.isnan(record.u).mean()
-    missing = f", {blank:.1%} of the nodes not measured" if blank else ""
-    end = QUANTITIES["status"].codes[record.status]
-    return f"frame {frame}: {style.literal(result.names[frame])} ({end}, {record.iterations} iterations{missing})"
+    missing_fraction = np.isnan(record.u).mean()
+    missing = f", {missing_fraction:.1%} of the nodes not measured" if missing_fraction else ""
+    outcome = QUANTITIES["status"].codes[record.status]
+    return f"frame {frame}: {style.literal(result.names[frame])} ({outcome}, {record.iterations} iterations{missing})"

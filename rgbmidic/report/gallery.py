@@ -20,35 +20,35 @@ from rgbmidic.report.figures import (
     convergence_figure,
     measured_frames,
     residual_figure,
-    spread,
+    select_evenly,
 )
 from rgbmidic.results import Maps, Result
-from rgbmidic.results.files import remove_parts, writing
+from rgbmidic.results.files import remove_partial_files, write_errors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 REPORT = "report.html"
 """Name of the report that lies in a result's folder."""
-_OF_TEST: Mapping[str, Callable[[Result], Figure]] = {
+_TEST_FIGURES: Mapping[str, Callable[[Result], Figure]] = {
     "convergence": convergence_figure,
     "residual": residual_figure,
     "brightness": brightness_figure,
 }
-_OF_FRAME: Mapping[str, Callable[[MapDrawer, int], Figure | None]] = {
+_FRAME_FIGURES: Mapping[str, Callable[[MapDrawer, int], Figure | None]] = {
     **{kind: partial(MapDrawer.fields, names=names) for kind, names in MAPS.items()},
     "fractions": lambda maps, frame: maps.fractions(frame) if len(maps.result.lights) > 1 else None,
     "masks": MapDrawer.masks,
     "discretisation": MapDrawer.discretisation,
     "reflections": MapDrawer.reflections,
 }
-_NAMES = re.compile(rf"({'|'.join(_OF_TEST)}|({'|'.join(_OF_FRAME)}|map_.+)_[0-9]{{6,}})\.png")
+_NAMES = re.compile(rf"({'|'.join(_TEST_FIGURES)}|({'|'.join(_FRAME_FIGURES)}|map_.+)_[0-9]{{6,}})\.png")
 _Picture = tuple[str, int | None]
 """Kind of a picture, and its frame if it is of one."""
 
 
 def write_figures(
-    maps: Maps, folder: Path | str, frames: Sequence[int] | None = None, *, processes: int = 1, few: int = 20
+    maps: Maps, folder: Path | str, frames: Sequence[int] | None = None, *, processes: int = 1, min_pictures: int = 20
 ) -> tuple[Path, ...]:
     """Write figures of convergence, residual and brightness, and of some frames maps, masks and reflections.
 
@@ -64,7 +64,7 @@ def write_figures(
     processes
         Number of processes that draw, this one included. With more than one, a script that calls this function must
         be importable (``if __name__ == "__main__":``).
-    few
+    min_pictures
         Pictures below which another process does not pay. Measured: it starts in 1 to 2 s, a picture takes 0.15 s.
 
     Returns
@@ -80,27 +80,32 @@ def write_figures(
         The result is damaged, the folder cannot be written, or a process that draws is ended.
     """
     folder, result = Path(folder), maps.result
-    with writing(folder):
+    with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        remove_parts(folder, "*")
-    frames = _shown(result) if frames is None else frames
+        remove_partial_files(folder, "*")
+    frames = _default_frames(result) if frames is None else frames
     for frame in frames:
         result.frame(frame)  # an error of one is raised before the first picture
-    pictures: list[_Picture] = [(kind, None) for kind in _OF_TEST]
-    pictures += [(kind, frame) for frame in frames for kind in _OF_FRAME]
-    parts = max(1, min(processes, len(pictures) // few))
+    pictures: list[_Picture] = [(kind, None) for kind in _TEST_FIGURES]
+    pictures += [(kind, frame) for frame in frames for kind in _FRAME_FIGURES]
+    process_count = max(1, min(processes, len(pictures) // min_pictures))
     # Ctrl-C reaches all processes: the others end silently, this one reports it
-    ended = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    with ProcessPoolExecutor(parts, multiprocessing.get_context("spawn"), initializer=ended) as pool:
-        others = [pool.submit(_draw, maps, folder, pictures[part::parts]) for part in range(1, parts)]
-        drawn = {*_draw(maps, folder, pictures[::parts])}
+    restore_interrupt = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with ProcessPoolExecutor(
+        process_count, multiprocessing.get_context("spawn"), initializer=restore_interrupt
+    ) as pool:
+        futures = [
+            pool.submit(_draw, maps, folder, pictures[process_index::process_count])
+            for process_index in range(1, process_count)
+        ]
+        files = {*_draw(maps, folder, pictures[::process_count])}
         try:
-            drawn.update(*(other.result() for other in others))
+            files.update(*(future.result() for future in futures))
         except BrokenExecutor:
             raise ResultError(
                 f"a process that drew pictures into {folder} was ended; draw them anew: rgbmidic figures {result.path}"
             ) from None
-    return tuple(file for picture in pictures if (file := _file(folder, *picture)) in drawn)
+    return tuple(file for picture in pictures if (file := _file(folder, *picture)) in files)
 
 
 def write_maps(
@@ -132,29 +137,29 @@ def write_maps(
         The result is damaged, or the folder cannot be written.
     """
     folder, drawer = Path(folder), MapDrawer(maps, style.DPI)
-    chosen = _shown(maps.result) if frames is None else frames
-    pictures = [(name, frame) for name in names for frame in chosen]
+    frame_indices = _default_frames(maps.result) if frames is None else frames
+    pictures = [(name, frame) for name in names for frame in frame_indices]
     for name, frame in pictures:
         maps.read(name, frame)  # an error of one is raised before the first picture
-    with writing(folder):
+    with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        remove_parts(folder, "*")
+        remove_partial_files(folder, "*")
     files = [_file(folder, f"map_{name.replace(' ', '_')}", frame) for name, frame in pictures]
     for file, (name, frame) in zip(files, pictures, strict=True):
         style.save_figure(drawer.fields(frame, [name], std=True, hatched=hatched), file)
     return tuple(files)
 
 
-def _shown(result: Result) -> tuple[int, ...]:
+def _default_frames(result: Result) -> tuple[int, ...]:
     """Select the three frames that get pictures where none are named, as in the report."""
-    return spread(measured_frames(result), 3)
+    return select_evenly(measured_frames(result), 3)
 
 
-def _draw(shown: Maps, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
+def _draw(field_maps: Maps, folder: Path, pictures: Sequence[_Picture]) -> list[Path]:
     """Write pictures one after the other, so that only one is in memory; return the files of those that exist."""
-    files, maps = [], MapDrawer(shown, style.DPI)
+    files, drawer = [], MapDrawer(field_maps, style.DPI)
     for kind, frame in pictures:
-        figure = _OF_TEST[kind](shown.result) if frame is None else _OF_FRAME[kind](maps, frame)
+        figure = _TEST_FIGURES[kind](field_maps.result) if frame is None else _FRAME_FIGURES[kind](drawer, frame)
         if figure is not None:
             files.append(_file(folder, kind, frame))
             style.save_figure(figure, files[-1])
@@ -178,7 +183,7 @@ def remove_pictures(folder: Path | str) -> None:
     ResultError
         One of them cannot be removed.
     """
-    drawn = [file for file in (Path(folder) / "figures").glob("*.png") if _NAMES.fullmatch(file.name)]
-    for file in (*drawn, Path(folder) / REPORT):
-        with writing(file):
+    figure_files = [file for file in (Path(folder) / "figures").glob("*.png") if _NAMES.fullmatch(file.name)]
+    for file in (*figure_files, Path(folder) / REPORT):
+        with write_errors(file):
             file.unlink(missing_ok=True)

@@ -6,9 +6,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from rgbmidic.errors import legible
+from rgbmidic.errors import printable
 from rgbmidic.report import style
-from rgbmidic.text import rounded, uncertain
+from rgbmidic.text import format_value, format_with_std
 
 _TEMPLATES = Path(__file__).with_name("templates")
 
@@ -17,8 +17,8 @@ def render(template: str, folder: Path = _TEMPLATES, **values: Any) -> str:
     """Fill a template in.
 
     It has three filters beside those of jinja2: ``code`` writes words between backquotes as code, ``gaps`` writes a
-    paragraph on one line and marks words between brackets, ``embedded`` makes the address of a picture of a figure; and
-    `rgbmidic.text.rounded` and `uncertain`.
+    paragraph on one line and marks words between brackets, ``data_url`` makes the address of a picture of a figure; and
+    `rgbmidic.text.format_value` and `format_with_std`.
 
     Parameters
     ----------
@@ -33,6 +33,11 @@ def render(template: str, folder: Path = _TEMPLATES, **values: Any) -> str:
     -------
     str
         The page.
+
+    Examples
+    --------
+    >>> render("batch.html", header=["test", "status"], rows=[], links=[], version="1").startswith("<!")
+    True
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
     from markupsafe import Markup, escape
@@ -47,7 +52,7 @@ def render(template: str, folder: Path = _TEMPLATES, **values: Any) -> str:
     environment.filters |= {
         "code": lambda text: Markup(re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(text)))),
         "gaps": lambda text: Markup(re.sub(r"(\[[^\]]*\])", r"<mark>\1</mark>", " ".join(escape(text).split()))),
-        "embedded": style.embedded,
+        "data_url": style.data_url,
     }
-    environment.globals |= {"rounded": rounded, "uncertain": uncertain}
-    return legible(environment.get_template(template).render(values))
+    environment.globals |= {"format_value": format_value, "format_with_std": format_with_std}
+    return printable(environment.get_template(template).render(values))

@@ -66,36 +66,36 @@ class FigureConstants:
 
     Attributes
     ----------
-    width, tallest
+    width, max_height
         Largest width and height of a figure in inches: with text of 9 points it stays legible on a page of A4.
-    below, above
+    axis_room, title_room
         Inches: room for the numbers below a panel, and for its title; two lines and one line of 9 points.
-    least
+    min_panel
         Inches of a panel that still shows something: 3 mm of a page, 20 px of a movie of 960.
     margin
         What is shown around the mesh, as a fraction of its longer side. Chosen: the edge of the mesh stays visible.
-    clipped, wild
+    clip_percent, outlier_margin
         Colours span all values but this percentage at each end, and what lies within this fraction of that span
         beyond. Chosen: a single outlier in a field of 200 nodes does not set the range.
-    doubtful
+    max_std_ratio
         Values whose uncertainty exceeds this multiple of the median do not set the colours: the usual three sigma.
     span
         Colours of a positive quantity end at its median over this and times this: else outliers turn the bulk black.
-    longest
+    max_name
         Letters of a name that are shown: a title has room for twice as many.
     """
 
     width: float = 9.0
-    tallest: float = 9.5
-    below: float = 0.52
-    above: float = 0.3
-    least: float = 0.2
+    max_height: float = 9.5
+    axis_room: float = 0.52
+    title_room: float = 0.3
+    min_panel: float = 0.2
     margin: float = 0.06
-    clipped: float = 0.5
-    wild: float = 0.1
-    doubtful: float = 3.0
+    clip_percent: float = 0.5
+    outlier_margin: float = 0.1
+    max_std_ratio: float = 3.0
     span: float = 4.0
-    longest: int = 60
+    max_name: int = 60
 
 
 FIGURES = FigureConstants()
@@ -106,9 +106,9 @@ def draw_figure(
     *,
     count: int,
     aspect: float,
-    beside: float,
+    right_room: float,
     title: str = "",
-    tallest: float = FIGURES.tallest,
+    max_height: float = FIGURES.max_height,
 ) -> Figure:
     """Draw a figure of panels, side by side, or one below the other when they are flat.
 
@@ -120,11 +120,11 @@ def draw_figure(
         Number of panels.
     aspect
         Height of a panel over its width.
-    beside
+    right_room
         Room right of each panel, in inches: `BAR`, `NUMBERS`, `GAP` or `LEGEND`.
     title
         Title of the figure.
-    tallest
+    max_height
         Largest height of the figure in inches.
 
     Returns
@@ -144,25 +144,27 @@ def draw_figure(
     # placed by numbers: matplotlib's layout engines draw every text several times to find the same
     columns = 1 if aspect < 0.5 and count > 1 else count
     rows = count // columns
-    total, tall = min(FIGURES.width, max(6.0, 4.5 * columns)), FIGURES.below + FIGURES.above
-    width = (total - NUMBERS) / columns - beside
-    highest = (tallest - 2 * GAP) / rows - tall
-    if min(width, highest) < FIGURES.least:
-        wide = (FIGURES.width - NUMBERS) / (beside + FIGURES.least)
-        most = wide if rows == 1 else (tallest - 2 * GAP) / (FIGURES.least + tall)
-        raise InputError(f"one picture has room for {int(most)} panels of this shape, not for {count}: show fewer")
-    height = min(width * aspect, highest)
+    total, panel_margin = min(FIGURES.width, max(6.0, 4.5 * columns)), FIGURES.axis_room + FIGURES.title_room
+    width = (total - NUMBERS) / columns - right_room
+    max_panel_height = (max_height - 2 * GAP) / rows - panel_margin
+    if min(width, max_panel_height) < FIGURES.min_panel:
+        free_width = (FIGURES.width - NUMBERS) / (right_room + FIGURES.min_panel)
+        max_panels = free_width if rows == 1 else (max_height - 2 * GAP) / (FIGURES.min_panel + panel_margin)
+        raise InputError(
+            f"one picture has room for {int(max_panels)} panels of this shape, not for {count}: show fewer"
+        )
+    height = min(width * aspect, max_panel_height)
     heading = 2 * GAP if title else 0.0
-    whole = rows * (height + tall) + heading
+    total_height = rows * (height + panel_margin) + heading
     with mpl.rc_context({**STYLE, "axes.prop_cycle": rcsetup.cycler(color=CURVES)}):
-        figure = Figure(figsize=(total, whole))
-        for place in range(count):
-            x = NUMBERS + place % columns * (width + beside)
-            y = whole - heading - (place // columns + 1) * (height + tall) + FIGURES.below
-            figure.add_axes((x / total, y / whole, width / total, height / whole))
+        figure = Figure(figsize=(total, total_height))
+        for panel_index in range(count):
+            x = NUMBERS + panel_index % columns * (width + right_room)
+            y = total_height - heading - (panel_index // columns + 1) * (height + panel_margin) + FIGURES.axis_room
+            figure.add_axes((x / total, y / total_height, width / total, height / total_height))
         draw(figure.axes)
         if title:
-            figure.suptitle(title, fontsize=10, y=1 - 0.5 * heading / whole, va="center")
+            figure.suptitle(title, fontsize=10, y=1 - 0.5 * heading / total_height, va="center")
     return figure
 
 
@@ -175,18 +177,18 @@ def literal(text: str) -> str:
     from matplotlib.font_manager import findfont, get_font
 
     font = get_font(findfont("DejaVu Sans"))
-    seen = [c if font.get_char_index(ord(c)) else ascii(c)[1:-1] for c in text]
-    if len(seen) > FIGURES.longest:
-        seen = [*seen[: FIGURES.longest // 2], "…", *seen[1 - FIGURES.longest // 2 :]]
-    shown = "".join(seen).replace("$", r"\$")
-    return f" {shown}" if shown.startswith("_") else shown
+    characters = [character if font.get_char_index(ord(character)) else ascii(character)[1:-1] for character in text]
+    if len(characters) > FIGURES.max_name:
+        characters = [*characters[: FIGURES.max_name // 2], "…", *characters[1 - FIGURES.max_name // 2 :]]
+    escaped = "".join(characters).replace("$", r"\$")
+    return f" {escaped}" if escaped.startswith("_") else escaped
 
 
 def time_unit(seconds: FloatArray) -> tuple[float, str]:
     """Return how many of the unit that suits times (T,) a second has, and the unit: ``s``, ``ms``, ``µs`` or ``ns``."""
     reach = float(np.abs(seconds[np.isfinite(seconds)]).max(initial=0))
     units = ((1.0, "s"), (1e3, "ms"), (1e6, "µs"), (1e9, "ns"))
-    return next((pair for pair in units if reach * pair[0] >= 1), units[0])
+    return next((unit for unit in units if reach * unit[0] >= 1), units[0])
 
 
 def time_text(seconds: float, scale: FloatArray) -> str:
@@ -228,31 +230,31 @@ def freeze_axes(figure: Figure, dpi: int) -> None:
     figure.add_artist(Picture()).set_zorder(-1)
 
 
-def resampled(
+def resample(
     image: AnyArray,
     step: tuple[float, float],
-    first: tuple[float, float],
+    start: tuple[float, float],
     size: tuple[int, int],
-    around: int,
+    background: int,
     *,
     nearest: bool = False,
 ) -> npt.NDArray[np.uint8]:
-    """Resample an image on `size` (rows, columns) pixels, `step` (x, y) px apart from the place `first` (x, y) on.
+    """Resample an image on `size` (rows, columns) pixels, `step` (x, y) px apart from the place `start` (x, y) on.
 
-    It is reduced by a whole factor first, against moiré; beyond it lies the grey level `around`.
+    It is reduced by a whole factor first, against moiré; beyond it lies the grey level `background`.
     """
     import cv2
 
     factor = max(1, int(min(step)))
     small: AnyArray = np.asarray(image, dtype=np.uint8)
     if factor > 1:
-        height, width = (side // factor * factor for side in small.shape)
+        height, width = (length // factor * factor for length in small.shape)
         reduced = (width // factor, height // factor)
         small = cv2.resize(small[:height, :width], reduced, interpolation=cv2.INTER_AREA)
-    shift, (across, down), (x, y) = (factor - 1) / 2, step, first
-    to_image = np.array([[across, 0, x - shift], [0, down, y - shift]], dtype=np.float64) / factor
+    shift, (x_step, y_step), (x, y) = (factor - 1) / 2, step, start
+    to_image = np.array([[x_step, 0, x - shift], [0, y_step, y - shift]], dtype=np.float64) / factor
     flags = (cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(small, to_image, size[::-1], flags=flags, borderValue=float(around)), np.uint8)
+    return np.asarray(cv2.warpAffine(small, to_image, size[::-1], flags=flags, borderValue=float(background)), np.uint8)
 
 
 def save_figure(figure: Figure, path: Path | str, *, dpi: int = DPI) -> None:
@@ -275,28 +277,28 @@ def save_figure(figure: Figure, path: Path | str, *, dpi: int = DPI) -> None:
         The file cannot be written.
     """
     path = Path(path)
-    form, formats = path.suffix[1:], figure.canvas.get_supported_filetypes()
-    if form not in formats:
+    extension, formats = path.suffix[1:], figure.canvas.get_supported_filetypes()
+    if extension not in formats:
         raise InputError(f"{path} cannot be written: a figure is one of .{', .'.join(formats)}")
-    options: dict[str, Any] = {"pil_kwargs": _PNG} if form == "png" else {}
-    write_complete(path, lambda file: figure.savefig(file, format=form, dpi=dpi, **options))
+    options: dict[str, Any] = {"pil_kwargs": _PNG} if extension == "png" else {}
+    write_complete(path, lambda file: figure.savefig(file, format=extension, dpi=dpi, **options))
 
 
-def embedded(figure: Figure, *, dpi: int = PAGE_DPI) -> str:
+def data_url(figure: Figure, *, dpi: int = PAGE_DPI) -> str:
     """Return a figure as a data URL (PNG), for pages without files beside them."""
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=dpi, pil_kwargs=_PNG)
     return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
-def colour_range(known: FloatArray) -> tuple[float, float]:
+def colour_range(values: FloatArray) -> tuple[float, float]:
     """Return the ends of the colour bar for finite values (N,): all of them but a few outliers.
 
     The range spans the 0.5 % to 99.5 % quantiles, and what lies within 10 % of that span beyond.
     """
-    core = np.percentile(known, [FIGURES.clipped, 100 - FIGURES.clipped])
-    reach = FIGURES.wild * np.ptp(core)
-    low, high = float(max(known.min(), core[0] - reach)), float(min(known.max(), core[1] + reach))
+    core = np.percentile(values, [FIGURES.clip_percent, 100 - FIGURES.clip_percent])
+    reach = FIGURES.outlier_margin * np.ptp(core)
+    low, high = float(max(values.min(), core[0] - reach)), float(min(values.max(), core[1] + reach))
     return (low, high) if high > low else (low - 1e-9, low + 1e-9)
 
 
@@ -305,12 +307,12 @@ def ordinary_values(values: FloatArray, std: FloatArray) -> FloatArray:
 
     Values whose uncertainty exceeds three times the median are left out, unless none would be left.
     """
-    known = np.isfinite(values)
-    stated = known & np.isfinite(std)
-    if not stated.any():
-        return values[known]
-    kept = known & ~(std > FIGURES.doubtful * np.median(std[stated]))
-    return values[kept if kept.any() else known]
+    finite = np.isfinite(values)
+    has_std = finite & np.isfinite(std)
+    if not has_std.any():
+        return values[finite]
+    selected = finite & ~(std > FIGURES.max_std_ratio * np.median(std[has_std]))
+    return values[selected if selected.any() else finite]
 
 
 def view_limits(points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -320,13 +322,13 @@ def view_limits(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return low - margin, high + margin
 
 
-def colour_scale(known: FloatArray, *, positive: bool = False) -> Normalize:
+def colour_scale(values: FloatArray, *, positive: bool = False) -> Normalize:
     """Return colours over `colour_range`; for a positive quantity logarithmic, around its median."""
     from matplotlib.colors import LogNorm, Normalize
 
     if not positive:
-        return Normalize(*colour_range(known))
-    logarithms = np.log(np.maximum(known, np.finfo(float).tiny))
+        return Normalize(*colour_range(values))
+    logarithms = np.log(np.maximum(values, np.finfo(float).tiny))
     middle, reach = np.median(logarithms), np.log(FIGURES.span)
     return LogNorm(*np.exp(np.clip(colour_range(logarithms), middle - reach, middle + reach)))
 
@@ -338,8 +340,8 @@ def show_image(axis: Axes, image: AnyArray, origin: tuple[int, int] = (0, 0)) ->
     """
     import cv2
 
-    most = axis.get_position().width * cast("Figure", axis.figure).get_figwidth() * DPI
-    scale = min(most / max(image.shape), 1.0)
+    max_pixels = axis.get_position().width * cast("Figure", axis.figure).get_figwidth() * DPI
+    scale = min(max_pixels / max(image.shape), 1.0)
     reduced = cv2.resize(np.asarray(image, dtype=np.float32), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     finite = reduced[np.isfinite(reduced)]
     low, high = np.percentile(finite, [1, 99]) if finite.size else (0, 1)
@@ -348,8 +350,8 @@ def show_image(axis: Axes, image: AnyArray, origin: tuple[int, int] = (0, 0)) ->
 
 
 def _extent(origin: tuple[int, int], columns: int, rows: int) -> tuple[float, float, float, float]:
-    left, top = origin[0] - 0.5, origin[1] - 0.5
-    return left, left + columns, top + rows, top
+    x_min, y_min = origin[0] - 0.5, origin[1] - 0.5
+    return x_min, x_min + columns, y_min + rows, y_min
 
 
 def add_colour_bar(
@@ -358,10 +360,10 @@ def add_colour_bar(
     colour_map: str | Colormap,
     *,
     label: str = "",
-    shown: FloatArray | None = None,
+    values: FloatArray | None = None,
     names: tuple[str, ...] = (),
 ) -> None:
-    """Add a colour bar beside a panel of `draw_figure`, pointed where values `shown` are below or above its colours.
+    """Add a colour bar beside a panel of `draw_figure`, pointed where values `values` are below or above its colours.
 
     Where the values are codes, `names` stand in place of the numbers from 0 on.
 
@@ -373,35 +375,42 @@ def add_colour_bar(
     from matplotlib.transforms import Bbox, TransformedBbox
 
     width = axis.get_position().width * cast("Figure", axis.figure).get_figwidth()
-    left, middle, right = (1 + inches / width for inches in (0.08, 0.14, 0.20))
-    ends = np.asarray([norm.vmin, norm.vmax], dtype=np.float64)
-    scaled = norm(ends if shown is None or not shown.size else shown)
-    pointed = scaled.min() < -1e-9, scaled.max() > 1 + 1e-9  # by more than rounding
+    bar_left, bar_middle, bar_right = (1 + inches / width for inches in (0.08, 0.14, 0.20))
+    limits = np.asarray([norm.vmin, norm.vmax], dtype=np.float64)
+    normalised = norm(limits if values is None or not values.size else values)
+    pointed = normalised.min() < -1e-9, normalised.max() > 1 + 1e-9  # by more than rounding
     low, high = (0.045 * end for end in pointed)  # of the height are points, as matplotlib's
-    outline = [(left, low), (middle, 0), (right, low), (right, 1 - high), (middle, 1), (left, 1 - high)]
+    outline = [
+        (bar_left, low),
+        (bar_middle, 0),
+        (bar_right, low),
+        (bar_right, 1 - high),
+        (bar_middle, 1),
+        (bar_left, 1 - high),
+    ]
     bar = Polygon(outline, transform=axis.transAxes, fill=False, linewidth=0.6, clip_on=False)
     axis.add_patch(bar)
-    place = TransformedBbox(Bbox([[left, 0], [right, 1]]), axis.transAxes)
-    colours = BboxImage(place, cmap=colour_map, origin="lower", interpolation="nearest")
+    bar_box = TransformedBbox(Bbox([[bar_left, 0], [bar_right, 1]]), axis.transAxes)
+    colours = BboxImage(bar_box, cmap=colour_map, origin="lower", interpolation="nearest")
     colours.set_data((np.linspace(-low, 1 - low, 256) / (1 - low - high)).clip(0, 1)[:, None])
     colours.set_clip_path(bar)
     axis.add_artist(colours)
-    numbers = np.arange(len(names)) if names else MaxNLocator(6).tick_values(*ends)
-    numbers = numbers[(numbers >= ends[0]) & (numbers <= ends[1])]
+    numbers = np.arange(len(names)) if names else MaxNLocator(6).tick_values(*limits)
+    numbers = numbers[(numbers >= limits[0]) & (numbers <= limits[1])]
     heights = low + (1 - low - high) * np.asarray(norm(numbers))
     largest = float(np.abs(numbers).max(initial=0))
     power = 3 * math.floor(math.log10(largest) / 3) if largest and not 0.01 <= largest < 1e5 and not names else 0
     if power:  # one for all numbers, as along an axis
-        axis.text(right, 1.03, rf"$\times 10^{{{power}}}$", transform=axis.transAxes, ha="right")
-    end = right + 3.5 / 72 / width  # matplotlib's length of a tick
-    ticks = np.tile([right, end, np.nan], len(numbers)), np.repeat(heights, 3)
+        axis.text(bar_right, 1.03, rf"$\times 10^{{{power}}}$", transform=axis.transAxes, ha="right")
+    end = bar_right + 3.5 / 72 / width  # matplotlib's length of a tick
+    ticks = np.tile([bar_right, end, np.nan], len(numbers)), np.repeat(heights, 3)
     axis.plot(*ticks, "k", linewidth=0.6, transform=axis.transAxes, clip_on=False)
     for number, height in zip(numbers, heights, strict=True):
         text = names[int(number)] if names else f"{number / 10.0**power:.4g}"
         look: dict[str, Any] = {"va": "center_baseline", "fontsize": 6.5 if names else None}
-        axis.text(2 * end - right, height, text, transform=axis.transAxes, **look)
+        axis.text(2 * end - bar_right, height, text, transform=axis.transAxes, **look)
     if label:
-        axis.text(right + 0.55 / width, 0.5, label, transform=axis.transAxes, rotation=90, va="center")
+        axis.text(bar_right + 0.55 / width, 0.5, label, transform=axis.transAxes, rotation=90, va="center")
 
 
 def shade(
@@ -421,7 +430,13 @@ def shade(
 
 
 def finish_picture(
-    axis: Axes, x: tuple[float, float], y: tuple[float, float], *, first: bool, unit: str = "px", factor: float = 1.0
+    axis: Axes,
+    x: tuple[float, float],
+    y: tuple[float, float],
+    *,
+    has_y_label: bool,
+    unit: str = "px",
+    factor: float = 1.0,
 ) -> None:
     """Set the limits of axes at one scale in both directions, y down where y[0] < y[1].
 
@@ -433,16 +448,16 @@ def finish_picture(
     axis.set_xlim(*x)
     axis.set_ylim(y[1], y[0])
     axis.set_xlabel(f"x ({unit})")
-    if first:
+    if has_y_label:
         axis.set_ylabel(f"y ({unit})")
-    axis.tick_params(labelleft=first)
+    axis.tick_params(labelleft=has_y_label)
     axis.yaxis.set_major_locator(FixedLocator(_round_numbers(5, y, factor)))
-    for one in (axis.xaxis, axis.yaxis) if factor != 1 else ():
-        one.set_major_formatter(lambda value, _: f"{factor * value:.6g}")
-    _space_out(axis, 5, whole=False, factor=factor)
+    for coordinate_axis in (axis.xaxis, axis.yaxis) if factor != 1 else ():
+        coordinate_axis.set_major_formatter(lambda value, _: f"{factor * value:.6g}")
+    _space_out(axis, 5, integer_ticks=False, factor=factor)
 
 
-def finish_plot(axis: Axes, x: str, y: str, *, whole: bool = True) -> None:
+def finish_plot(axis: Axes, x: str, y: str, *, integer_ticks: bool = True) -> None:
     """Label the axes of a plot, set as many numbers along x as there is room for, and a light grid.
 
     Parameters
@@ -451,7 +466,7 @@ def finish_plot(axis: Axes, x: str, y: str, *, whole: bool = True) -> None:
         Axes of the plot, with its data drawn.
     x, y
         Labels.
-    whole
+    integer_ticks
         Whether the numbers along x are whole.
     """
     from matplotlib.ticker import ScalarFormatter
@@ -461,12 +476,12 @@ def finish_plot(axis: Axes, x: str, y: str, *, whole: bool = True) -> None:
     axis.ticklabel_format(axis="x", style="plain", useOffset=False)
     if isinstance(axis.yaxis.get_major_formatter(), ScalarFormatter):
         axis.ticklabel_format(axis="y", scilimits=(-2, 3))  # long numbers would reach into the axis' name
-    _space_out(axis, 8, whole=whole)
+    _space_out(axis, 8, integer_ticks=integer_ticks)
     axis.grid(linewidth=0.4, color="0.88")
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def _space_out(axis: Axes, most: int, *, whole: bool, factor: float = 1.0) -> None:
+def _space_out(axis: Axes, max_ticks: int, *, integer_ticks: bool, factor: float = 1.0) -> None:
     """Set as many round numbers along x, of what is `factor` times the axis' own, as there is room for."""
     from matplotlib.ticker import FixedLocator
 
@@ -474,17 +489,19 @@ def _space_out(axis: Axes, most: int, *, whole: bool, factor: float = 1.0) -> No
     room = box.width * width
     if axis.get_aspect() != "auto":
         room = min(room, box.height * height * abs(np.ptp(axis.get_xlim()) / np.ptp(axis.get_ylim())))
-    for count in range(most, 0, -1):
-        places = _round_numbers(count, axis.get_xlim(), factor, whole=whole)
-        axis.xaxis.set_major_locator(FixedLocator(places))
-        numbers = axis.xaxis.get_major_formatter().format_ticks(places)
+    for count in range(max_ticks, 0, -1):
+        ticks = _round_numbers(count, axis.get_xlim(), factor, integer_ticks=integer_ticks)
+        axis.xaxis.set_major_locator(FixedLocator(ticks))
+        numbers = axis.xaxis.get_major_formatter().format_ticks(ticks)
         if sum(0.075 * len(number) + 0.12 for number in numbers) < room:  # inches of a digit, and between two numbers
             break
 
 
-def _round_numbers(most: int, ends: tuple[float, float], factor: float, *, whole: bool = False) -> list[float]:
+def _round_numbers(
+    max_ticks: int, limits: tuple[float, float], factor: float, *, integer_ticks: bool = False
+) -> list[float]:
     """Return at most so many round numbers from end to end, of what is `factor` times the axis' own."""
     from matplotlib.ticker import MaxNLocator
 
-    low, high = sorted(factor * end for end in ends)
-    return [float(number) / factor for number in MaxNLocator(most, integer=whole).tick_values(low, high)]
+    low, high = sorted(factor * limit for limit in limits)
+    return [float(number) / factor for number in MaxNLocator(max_ticks, integer=integer_ticks).tick_values(low, high)]

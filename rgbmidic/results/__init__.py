@@ -3,16 +3,17 @@
 from rgbmidic.fields import History
 from rgbmidic.illumination.images import REFLECTING
 from rgbmidic.illumination.texture import speckle_diameter
+from rgbmidic.renamed import refuse_old_names
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.export import EXPORT_FORMATS, export_result
 from rgbmidic.results.histories import Histories, history_rows, write_histories
 from rgbmidic.results.maps import Maps, MapValues
-from rgbmidic.results.physical import frame_times, placement_of, shared_part
 from rgbmidic.results.profiles import Profile, Wave, read_profile, write_profile
 from rgbmidic.results.provenance import Origin
-from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, Quantity
+from rgbmidic.results.quantities import QUANTITIES, UNKNOWN_TIME, ResultQuantity
 from rgbmidic.results.records import FrameRecord
 from rgbmidic.results.result import Result, finish_result
+from rgbmidic.results.result_in_units import common_variance_fraction, frame_times, placement_of
 from rgbmidic.results.store import ResultStore
 
 __all__ = [
@@ -28,18 +29,21 @@ __all__ = [
     "Maps",
     "Origin",
     "Profile",
-    "Quantity",
     "Result",
+    "ResultQuantity",
     "ResultStore",
     "Wave",
+    "common_variance_fraction",
     "export_result",
     "finish_result",
     "frame_times",
     "history_rows",
     "placement_of",
     "read_profile",
-    "shared_part",
     "speckle_diameter",
     "write_histories",
     "write_profile",
 ]
+
+
+__getattr__ = refuse_old_names(__name__)

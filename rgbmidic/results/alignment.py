@@ -40,12 +40,14 @@ class Alignment:
     history: FloatArray
 
     @classmethod
-    def of(cls, times: FloatArray, values: FloatArray, frame_times: FloatArray, history: FloatArray) -> Alignment:
+    def from_series(
+        cls, times: FloatArray, values: FloatArray, frame_times: FloatArray, history: FloatArray
+    ) -> Alignment:
         """Average a channel that is faster than the frames over their interval, which suppresses its noise."""
         noise = np.nanmedian(np.abs(np.diff(values, 2))) / 0.6745  # of a normal distribution the quartile
         count = int(np.median(np.diff(frame_times)) / np.median(np.diff(times)))
         if 1 < count < len(times) // 2:
-            times, values = (np.convolve(one, np.full(count, 1 / count), "valid") for one in (times, values))
+            times, values = (np.convolve(series, np.full(count, 1 / count), "valid") for series in (times, values))
         return cls(
             times=times,
             values=values,
@@ -60,17 +62,17 @@ class Alignment:
         return float(np.median(np.diff(self.times))), float(np.median(np.diff(self.frame_times)))
 
     @cached_property
-    def independent(self) -> float:
+    def independent_count(self) -> float:
         """Number of frames, or of the channel's values within their times where these are fewer."""
         return len(self.history) / max(1, self.intervals[0] / self.intervals[1])
 
     @cached_property
-    def constant(self) -> float:
+    def constant_variance(self) -> float:
         """Variance up to which a part of the channel counts as constant."""
         return _CONSTANT * float(np.nanvar(self.values))
 
     @cached_property
-    def needed(self) -> int:
+    def min_overlap(self) -> int:
         """Number of frames that must lie within the times of the channel: half of them."""
         return max(len(self.history) // 2, MIN_FRAMES)
 
@@ -87,34 +89,34 @@ class Alignment:
         from scipy.signal import oaconvolve  # half a second to import
 
         step = max(self.intervals) / 2
-        count, last = (int(np.ptp(one) / step) for one in (self.times, self.frame_times))
-        if count + last > _MAX_OFFSETS:
+        channel_steps, frame_steps = (int(np.ptp(array) / step) for array in (self.times, self.frame_times))
+        if channel_steps + frame_steps > _MAX_OFFSETS:
             raise InputError(
-                f"to align the channel with the history, {count + last} offsets would have to be tried, {step:g} s "
-                f"apart; at most {_MAX_OFFSETS} are: state channels.offset"
+                f"to align the channel with the history, {channel_steps + frame_steps} offsets would have to be tried, "
+                f"{step:g} s apart; at most {_MAX_OFFSETS} are: state channels.offset"
             )
-        sampled = np.interp(self.times[0] + step * np.arange(count + 1), self.times, self.values)
+        sampled = np.interp(self.times[0] + step * np.arange(channel_steps + 1), self.times, self.values)
         weight = np.isfinite(sampled).astype(np.float64)
         sampled = np.nan_to_num((sampled - np.nanmean(sampled)) / np.nanstd(sampled))
         history = (self.history - self.history.mean()) / self.history.std()
         frames = np.rint((self.frame_times - self.frame_times[0]) / step).astype(np.int64)
-        powers = [np.bincount(frames, history**power, last + 2)[::-1] for power in range(3)]
-        n = np.maximum(np.rint(oaconvolve(weight, powers[0])), 1)
+        powers = [np.bincount(frames, history**power, frame_steps + 2)[::-1] for power in range(3)]
+        overlap = np.maximum(np.rint(oaconvolve(weight, powers[0])), 1)
         x, xx, y, yy, xy = (
-            oaconvolve(one, powers[power]) / n
-            for one, power in ((sampled, 0), (sampled**2, 0), (weight, 1), (weight, 2), (sampled, 1))
+            oaconvolve(array, powers[power]) / overlap
+            for array, power in ((sampled, 0), (sampled**2, 0), (weight, 1), (weight, 2), (sampled, 1))
         )
         variances = xx - x**2, yy - y**2
-        varies = np.logical_and(*(one > _CONSTANT for one in variances)) & (n >= self.needed)
-        offsets = self.frame_times[0] - self.times[0] + step * (last + 1 - np.arange(len(n)))
+        varies = np.logical_and(*(array > _CONSTANT for array in variances)) & (overlap >= self.min_overlap)
+        offsets = self.frame_times[0] - self.times[0] + step * (frame_steps + 1 - np.arange(len(overlap)))
         return offsets, np.where(varies, xy - x * y, 0) / np.sqrt(np.where(varies, variances[0] * variances[1], 1))
 
     def correlation(self, offset: float) -> float:
-        """Correlation coefficient at an offset (s) that is added to the channel's times, by `_values`; 0 if too few."""
-        moved = self._values(offset)
-        used = np.isfinite(moved)
-        values, history = moved[used], self.history[used]
-        if len(values) < self.needed or not np.var(values) > self.constant or not np.ptp(history):
+        """Return the correlation coefficient at an offset (s) of the channel's times, by `_values`; 0 if too few."""
+        shifted = self._values(offset)
+        valid = np.isfinite(shifted)
+        values, history = shifted[valid], self.history[valid]
+        if len(values) < self.min_overlap or not np.var(values) > self.constant_variance or not np.ptp(history):
             return 0.0
         return float(np.corrcoef(values, history)[0, 1])
 
@@ -126,19 +128,24 @@ class Alignment:
         difference over the interval at which it is the most certain. Infinite where the slope is not above its noise,
         or where a shift in time is not distinct from another factor and constant.
         """
-        moved = self._values(offset)
-        used = np.isfinite(moved)
-        design, history = np.stack([np.ones(len(moved)), moved], axis=1), self.history[used]
-        (_, factor), residual = (found := np.linalg.lstsq(design[used], history)[0]), history - design[used] @ found
-        noise = residual @ residual / (len(history) - 3) * len(self.history) / self.independent
+        shifted = self._values(offset)
+        valid = np.isfinite(shifted)
+        design, history = np.stack([np.ones(len(shifted)), shifted], axis=1), self.history[valid]
+        (_, factor), residual = (fit := np.linalg.lstsq(design[valid], history)[0]), history - design[valid] @ fit
+        noise = residual @ residual / (len(history) - 3) * len(self.history) / self.independent_count
         squares, information = [], 0.0
-        for half in [self.intervals[0] / 2, *(max(self.intervals) * 2.0 ** np.arange(6))]:
-            slope = (self._values(offset - half) - self._values(offset + half)) / (2 * half)
-            both = used & np.isfinite(slope)
-            least = _CONSTANT * slope[both] @ slope[both] + both.sum() * self.variance / (2 * half**2)
-            slope = slope[both] - design[both] @ np.linalg.lstsq(design[both], slope[both])[0]
+        for half_width in [self.intervals[0] / 2, *(max(self.intervals) * 2.0 ** np.arange(6))]:
+            slope = (self._values(offset - half_width) - self._values(offset + half_width)) / (2 * half_width)
+            valid_slopes = valid & np.isfinite(slope)
+            noise_level = _CONSTANT * slope[valid_slopes] @ slope[valid_slopes] + valid_slopes.sum() * self.variance / (
+                2 * half_width**2
+            )
+            slope = (
+                slope[valid_slopes]
+                - design[valid_slopes] @ np.linalg.lstsq(design[valid_slopes], slope[valid_slopes])[0]
+            )
             squares.append(slope @ slope)
-            information = max(information, squares[-1] - least)
+            information = max(information, squares[-1] - noise_level)
         return (
             math.sqrt(noise * max(squares[0], information)) / information / abs(factor) if information > 0 else math.inf
         )
@@ -147,23 +154,27 @@ class Alignment:
         """Interpolate the channel at the frames, its times shifted by an offset; NaN where it has no value."""
         return np.interp(self.frame_times - offset, self.times, self.values, np.nan, np.nan)
 
-    def refined(self, offset: float, reach: float) -> float:
+    def refine_offset(self, offset: float, reach: float) -> float:
         """Return the offset of the best correlation (absolute) within some reach of one, both in s."""
         from scipy.optimize import minimize_scalar
 
         grid = offset + reach * np.linspace(-1, 1, 17)
-        best = grid[np.argmax([abs(self.correlation(one)) for one in grid])]
+        best = grid[np.argmax([abs(self.correlation(candidate)) for candidate in grid])]
         bounds = best - reach / 8, best + reach / 8
-        return float(minimize_scalar(lambda one: -abs(self.correlation(one)), bounds=bounds, method="bounded").x)
+        return float(
+            minimize_scalar(lambda candidate: -abs(self.correlation(candidate)), bounds=bounds, method="bounded").x
+        )
 
-    def others(self, offsets: FloatArray, coefficients: FloatArray) -> FloatArray:
+    def rival_offsets(self, offsets: FloatArray, coefficients: FloatArray) -> FloatArray:
         """Select offsets apart from the best that correlate as well as those beside it.
 
         That is within two standard uncertainties of the difference of two values of Fisher's z.
         """
         scores = np.minimum(np.abs(coefficients), 1 - 1e-9)
-        best, below = int(np.argmax(scores)), np.flatnonzero(scores < MIN_CORRELATION)
-        least = np.arctanh(scores[max(best - 1, 0) : best + 2].min()) - 2 * math.sqrt(2 / (len(self.history) - 3))
-        first, end = np.searchsorted(below, [best, best])
-        scores[(below[first - 1] if first else 0) : (below[end] if end < len(below) else None)] = 0
-        return np.asarray(offsets[np.arctanh(scores) > least])
+        best, weak_indices = int(np.argmax(scores)), np.flatnonzero(scores < MIN_CORRELATION)
+        threshold = np.arctanh(scores[max(best - 1, 0) : best + 2].min()) - 2 * math.sqrt(2 / (len(self.history) - 3))
+        lower, upper = np.searchsorted(weak_indices, [best, best])
+        scores[
+            (weak_indices[lower - 1] if lower else 0) : (weak_indices[upper] if upper < len(weak_indices) else None)
+        ] = 0
+        return np.asarray(offsets[np.arctanh(scores) > threshold])

@@ -15,6 +15,7 @@ from typing import Self
 import numpy as np
 
 from rgbmidic.errors import InputError
+from rgbmidic.renamed import state_new_names
 from rgbmidic.results.alignment import MIN_CORRELATION, MIN_FRAMES, Alignment
 from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import FloatArray
@@ -28,6 +29,7 @@ _DECIMAL = re.compile(r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:e[+-]?\d+)?|nan", re.IGNO
 _UNIT = re.compile(r".*[\s_(\[](kN|N)[)\]]?")
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Channels:
     """Analog channels recorded beside a test: values at their times.
@@ -93,8 +95,8 @@ class Channels:
             raise InputError(
                 f'the channels {path} need a header line: "time_s" (or time_ms, time_us) and the name of each channel'
             )
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise InputError(f"the channels {path} have several columns of one name: {', '.join(twice)}")
+        if duplicates := sorted({name for name in names if names.count(name) > 1}):
+            raise InputError(f"the channels {path} have several columns of one name: {', '.join(duplicates)}")
         if "" in names:
             raise InputError(f"column {names.index('') + 1} of the channels {path} has no name in the header line")
         table = _numbers(path, rows, separator, len(names))
@@ -104,20 +106,20 @@ class Channels:
         values = dict(zip(names[1:], table[:, 1:].T, strict=True))
         channels = cls(path=path, times=times, values=values)
         if trigger is not None:
-            known = np.isfinite(channels.named(trigger))
-            signal, times = channels.named(trigger)[known], times[known]
+            finite = np.isfinite(channels.values_of(trigger))
+            signal, times = channels.values_of(trigger)[finite], times[finite]
             middle = (signal.min() + signal.max()) / 2 if len(signal) else math.nan
-            crossed = np.flatnonzero(np.diff(signal > middle))
-            if not len(crossed):
+            crossings = np.flatnonzero(np.diff(signal > middle))
+            if not len(crossings):
                 raise InputError(f"the trigger {trigger} of the channels {path} is constant: it marks no time")
-            if len(crossed) > 1:
+            if len(crossings) > 1:
                 text = "the trigger %s of %s crosses the middle of its range %d times: the first counts"
-                logger.warning(text, trigger, path, len(crossed))
-            i = int(crossed[0])
+                logger.warning(text, trigger, path, len(crossings))
+            i = int(crossings[0])
             offset = -float(times[i] + (middle - signal[i]) / (signal[i + 1] - signal[i]) * (times[i + 1] - times[i]))
-        return channels.shifted(offset)
+        return channels.with_offset(offset)
 
-    def shifted(self, offset: float) -> Self:
+    def with_offset(self, offset: float) -> Self:
         """Return the channels with an offset (s) added to the times.
 
         Parameters
@@ -131,7 +133,7 @@ class Channels:
         """
         return replace(self, times=self.times + offset, offset=self.offset + offset)
 
-    def named(self, name: str) -> FloatArray:
+    def values_of(self, name: str) -> FloatArray:
         """Return the values (n,) of a channel.
 
         Parameters
@@ -152,7 +154,7 @@ class Channels:
             raise InputError(f'"{name}" is not one of the channels of {self.path}: {", ".join(self.values)}')
         return self.values[name]
 
-    def aligned(self, name: str, times: FloatArray, values: FloatArray) -> tuple[Self, float, float]:
+    def align(self, name: str, times: FloatArray, values: FloatArray) -> tuple[Self, float, float]:
         """Find the offset at which a channel correlates best with a history.
 
         Of every offset that leaves half of the frames within the channel's times, the largest absolute correlation
@@ -182,29 +184,37 @@ class Channels:
         InputError
             There is no such channel, too little of the history is known, or the two do not correlate.
         """
-        signal, there = self.named(name), np.isfinite(values) & np.isfinite(times)
-        at, wanted = times[there], values[there]
-        if len(at) < MIN_FRAMES or not np.ptp(wanted) > 0 or not np.nanstd(signal) > 0:
-            raise InputError(f"{len(at)} values of the history are too few, or constant, to align {name} with")
-        whole, *halves = (
-            Alignment.of(self.times[part], signal[part], at, wanted)
-            for part in (slice(None), slice(None, None, 2), slice(1, None, 2))
+        signal, finite = self.values_of(name), np.isfinite(values) & np.isfinite(times)
+        history_times, history_values = times[finite], values[finite]
+        if len(history_times) < MIN_FRAMES or not np.ptp(history_values) > 0 or not np.nanstd(signal) > 0:
+            raise InputError(
+                f"{len(history_times)} values of the history are too few, or constant, to align {name} with"
+            )
+        alignment, *half_alignments = (
+            Alignment.from_series(self.times[samples], signal[samples], history_times, history_values)
+            for samples in (slice(None), slice(None, None, 2), slice(1, None, 2))
         )
-        offsets, coefficients = whole.coefficients()
-        offset = whole.refined(offsets[np.argmax(np.abs(coefficients))], max(whole.intervals))
-        coefficient = whole.correlation(offset)
+        offsets, coefficients = alignment.coefficients()
+        offset = alignment.refine_offset(offsets[np.argmax(np.abs(coefficients))], max(alignment.intervals))
+        coefficient = alignment.correlation(offset)
         if not abs(coefficient) > MIN_CORRELATION:
             raise InputError(
                 f"the channel {name} of {self.path} correlates with the history by {coefficient:.2f} at best, "
                 f"{MIN_CORRELATION} is needed to align them: state channels.offset"
             )
-        if len(others := whole.others(offsets, coefficients)):
+        if len(rival_offsets := alignment.rival_offsets(offsets, coefficients)):
             text = "the channel %s of %s correlates as well with other offsets of its clock, such as %.6g s"
-            logger.warning(f"{text}: state channels.offset", name, self.path, others[0])
-        even, odd = (half.refined(offset, max(half.intervals)) for half in halves)
-        return self.shifted(offset), math.hypot(whole.std(offset), (even - odd) / math.sqrt(12)), coefficient
+            logger.warning(f"{text}: state channels.offset", name, self.path, rival_offsets[0])
+        even_offset, odd_offset = (
+            half_alignment.refine_offset(offset, max(half_alignment.intervals)) for half_alignment in half_alignments
+        )
+        return (
+            self.with_offset(offset),
+            math.hypot(alignment.std(offset), (even_offset - odd_offset) / math.sqrt(12)),
+            coefficient,
+        )
 
-    def at(self, times: FloatArray) -> dict[str, FloatArray]:
+    def interpolate(self, times: FloatArray) -> dict[str, FloatArray]:
         """Interpolate each channel linearly at the times (T,) of the frames; NaN beyond its values.
 
         Parameters
@@ -221,10 +231,10 @@ class Channels:
         InputError
             No frame lies within the times of the channels.
         """
-        first, last = self.times[[0, -1]]
-        if not ((times >= first) & (times <= last)).any():
+        start, end = self.times[[0, -1]]
+        if not ((times >= start) & (times <= end)).any():
             raise InputError(
-                f"the channels {self.path} span {first:.9g} to {last:.9g} s (offset {self.offset:g} s included), the "
+                f"the channels {self.path} span {start:.9g} to {end:.9g} s (offset {self.offset:g} s included), the "
                 f"frames {np.nanmin(times):.9g} to {np.nanmax(times):.9g} s: state channels.offset (--offset) between "
                 "both clocks"
             )
@@ -248,28 +258,28 @@ class Channels:
         InputError
             There is none, more than one, or its name does not end in its unit.
         """
-        found = {channel: _NEWTONS[unit[1]] for channel in self.values if (unit := _UNIT.fullmatch(channel))}
-        if name is None and len(found) == 1:
-            return next(iter(found.items()))
-        if name is None or name not in found:
-            what = "none is stated" if name is None else f'"{name}" is not one'
+        factors = {channel: _NEWTONS[unit[1]] for channel in self.values if (unit := _UNIT.fullmatch(channel))}
+        if name is None and len(factors) == 1:
+            return next(iter(factors.items()))
+        if name is None or name not in factors:
+            problem = "none is stated" if name is None else f'"{name}" is not one'
             raise InputError(
-                f"a stress needs one channel of {self.path} with a force, whose name ends in _N or _kN; {what}, the "
+                f"a stress needs one channel of {self.path} with a force, whose name ends in _N or _kN; {problem}, the "
                 f"channels are {', '.join(self.values)}"
             )
-        return name, found[name]
+        return name, factors[name]
 
 
 def _numbers(path: Path, rows: list[list[str]], separator: str, count: int) -> FloatArray:
     """Read rows of finite decimal numbers (n, count); an empty field, or nan, is NaN."""
     table, marks = [], set[str]()
     for number, row in enumerate(rows, 2):
-        fields = [part.strip() for part in row]
-        marks.update(mark for part in fields for mark in ".," if mark in part)
+        fields = [cell.strip() for cell in row]
+        marks.update(mark for cell in fields for mark in ".," if mark in cell)
         values = [
-            float(part.replace(",", ".") if separator == ";" else part) if part else math.nan
-            for part in fields
-            if not part or (_DECIMAL.fullmatch(part) and (separator == ";" or "," not in part))
+            float(cell.replace(",", ".") if separator == ";" else cell) if cell else math.nan
+            for cell in fields
+            if not cell or (_DECIMAL.fullmatch(cell) and (separator == ";" or "," not in cell))
         ]
         if len(values) != len(row) or np.isinf(values).any():
             raise InputError(f"row {number} of the channels {path} is not numbers: {reprlib.repr(row)}")

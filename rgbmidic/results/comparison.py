@@ -27,28 +27,29 @@ from rgbmidic.correlation.constants import USUAL
 from rgbmidic.errors import InputError
 from rgbmidic.fields import NodalCovariance, Places, StrainGauges, strain_of_gradient
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh
-from rgbmidic.results.physical import frame_times, rectification_of, shared_part
+from rgbmidic.renamed import refuse_old_names, state_new_names
 from rgbmidic.results.quantities import FAILED
 from rgbmidic.results.result import Result
-from rgbmidic.results.simulation import Levelling, Simulation, places_among
+from rgbmidic.results.result_in_units import common_variance_fraction, frame_times, rectification_of
+from rgbmidic.results.simulation import Levelling, Simulation, label_indices
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
 
-QUANTITIES = ("u", "v", "exx", "eyy", "exy")
+COMPARED_QUANTITIES = ("u", "v", "exx", "eyy", "exy")
 """What is compared: displacement in mm and Green-Lagrange strain, along the axes of the simulation's mesh."""
-WAYS = ("nodes", "levelled")
+VARIANTS = ("nodes", "levelled")
 """The simulation as it is at its nodes, and put through the measurement."""
-_SAME = 1e-6
+_NODE_TOLERANCE = 1e-6
 """Distance over the size of an element under which two nodes are one: rounding of a placement (derived)."""
-_RIGID = 1e-6
+_MIN_DEFORMATION = 1e-6
 """Least squared ratio to the uncertainty, of a node on average, of what is no rigid motion in a simulation (chosen)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agreement:
-    """How one quantity of a frame agrees with the simulation.
+    """Agreement of one quantity of a frame with the simulation.
 
     Attributes
     ----------
@@ -121,9 +122,9 @@ class FrameComparison:
     time
         Of the frame, on the simulation's clock.
     measured, std : mapping of str to ndarray, shape (M,)
-        `QUANTITIES` and their standard uncertainty; NaN where a node has no data.
+        `COMPARED_QUANTITIES` and their standard uncertainty; NaN where a node has no data.
     simulated : mapping of str to mapping
-        The same of the simulation, in each of the `WAYS`.
+        The same of the simulation, in each of the `VARIANTS`.
     agreement : mapping of (str, str) to Agreement
         By way and quantity; "displacement" is u and v together.
     fit
@@ -138,15 +139,16 @@ class FrameComparison:
     agreement: Mapping[tuple[str, str], Agreement]
     fit: Fit
 
-    def difference(self, way: str, name: str) -> FloatArray:
-        """Measured minus simulated (M,)."""
-        return np.asarray(self.measured[name] - self.simulated[way][name])
+    def difference(self, variant: str, name: str) -> FloatArray:
+        """Return measured minus simulated (M,)."""
+        return np.asarray(self.measured[name] - self.simulated[variant][name])
 
-    def ratio(self, way: str, name: str) -> FloatArray:
-        """Difference over its standard uncertainty (M,)."""
-        return np.asarray(self.difference(way, name) / self.std[name])
+    def ratio(self, variant: str, name: str) -> FloatArray:
+        """Return the difference over its standard uncertainty (M,)."""
+        return np.asarray(self.difference(variant, name) / self.std[name])
 
 
+@state_new_names
 class Comparison:
     """A result and a simulation of the same test, compared frame by frame.
 
@@ -196,8 +198,8 @@ class Comparison:
     ) -> None:
         self.result, self.simulation, self.placement, self.remove_rigid = result, simulation, placement, remove_rigid
         times = frame_times(result, scale)
-        self.timed = times is not None
-        self.times, self.frames, self.left_out = _matched(result, simulation, times, frames)
+        self.has_times = times is not None
+        self.times, self.frames, self.frames_outside = _match_times(result, simulation, times, frames)
         self.mesh = Tri3Mesh(nodes=placement.to_mm(result.nodes), elements=result.elements)
         self.simulated_mesh = Tri3Mesh(nodes=simulation.mesh.points, elements=simulation.mesh.elements)
         self.levelling = Levelling(self.mesh, self.simulated_mesh)
@@ -212,47 +214,54 @@ class Comparison:
         """Length of the virtual strain gauges, mm."""
         return self._gauges[0].length
 
-    def each(self) -> Iterator[FrameComparison]:
+    def iterate(self) -> Iterator[FrameComparison]:
         """Compare one frame after the other."""
         return (self.frame(index) for index in self.frames)
 
     def frame(self, index: int) -> FrameComparison:
         """Compare one of the `frames`; errors as `Result.frame`."""
         record, nodes, time = self.result.frame(index), self.result.nodes, float(self.times[index])
-        moved = np.stack([record.u, record.v], axis=1).astype(np.float64)
-        measured = self.placement.vectors_to_mm(nodes, moved).T
-        slopes = self.placement.jacobian(np.where(np.isfinite(moved), nodes + moved, nodes))
+        displacement = np.stack([record.u, record.v], axis=1).astype(np.float64)
+        measured = self.placement.vectors_to_mm(nodes, displacement).T
+        slopes = self.placement.jacobian(np.where(np.isfinite(displacement), nodes + displacement, nodes))
         names = ("u_std", "v_std"), ("u_bias_std", "v_bias_std"), ("u_edge_std", "v_edge_std")
         stds = np.square([[getattr(record, name) for name in pair] for pair in names], dtype=np.float64)
-        whole, bias, missed = np.einsum("nij,sjn->sin", slopes**2, [stds[0], *np.nan_to_num(stds[1:])])
+        variance, bias, edge = np.einsum("nij,sjn->sin", slopes**2, [stds[0], *np.nan_to_num(stds[1:])])
         # a levelled simulation has passed through the recovery, and misses what that does
-        noise, stated = (np.sqrt([np.maximum(one, 0), bias]) for one in (whole - missed, whole))
-        simulated = self.simulation.at(time)
+        noise, stated_std = (np.sqrt([np.maximum(one, 0), bias]) for one in (variance - edge, variance))
+        simulated = self.simulation.interpolate(time)
         levelled = np.where(np.isfinite(measured), self.levelling(simulated), np.nan)
-        fit, rigid, taken = self._fit(index, measured, noise, levelled)
+        fit, rigid, rigid_reduction = self._fit(index, measured, noise, levelled)
         if self.remove_rigid:
             measured = measured - rigid
         gradient = self.simulated_mesh.nodal_gradient(simulated)
         strain = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4))).components
-        values, own = self._at_nodes(measured, stated)
-        ways = {
-            "nodes": (np.concatenate([simulated.T, strain.T]), own),
+        values, nodal_std = self._at_nodes(measured, stated_std)
+        variants = {
+            "nodes": (np.concatenate([simulated.T, strain.T]), nodal_std),
             "levelled": (self._at_nodes(levelled, noise * [[[1]], [[0]]])[0], self._at_nodes(measured, noise)[1]),
         }
-        common = self.relative_std * values * np.array([1, 1, 0, 0, 0])[:, None]
-        std = np.hypot(own[0], common)
+        scale_std = self.relative_std * values * np.array([1, 1, 0, 0, 0])[:, None]
+        std = np.hypot(nodal_std[0], scale_std)
         agreement = {}
-        for way, (of_simulation, errors) in ways.items():
-            for name, rows in {"displacement": [0, 1], **{name: [row] for row, name in enumerate(QUANTITIES)}}.items():
-                left = taken * len(rows) / 2 if self.remove_rigid and max(rows) < 2 else 0.0
-                difference = (values - of_simulation)[rows]
-                agreement[way, name] = self._agreement(rows, difference, errors[:, rows], common[rows], left)
+        for variant, (simulated_values, noise_std) in variants.items():
+            for name, rows in {
+                "displacement": [0, 1],
+                **{name: [row] for row, name in enumerate(COMPARED_QUANTITIES)},
+            }.items():
+                fit_reduction = rigid_reduction * len(rows) / 2 if self.remove_rigid and max(rows) < 2 else 0.0
+                difference = (values - simulated_values)[rows]
+                agreement[variant, name] = self._agreement(
+                    rows, difference, noise_std[:, rows], scale_std[rows], fit_reduction
+                )
         return FrameComparison(
             frame=index,
             time=time,
-            measured=dict(zip(QUANTITIES, values, strict=True)),
-            std=dict(zip(QUANTITIES, std, strict=True)),
-            simulated={way: dict(zip(QUANTITIES, rows, strict=True)) for way, (rows, _) in ways.items()},
+            measured=dict(zip(COMPARED_QUANTITIES, values, strict=True)),
+            std=dict(zip(COMPARED_QUANTITIES, std, strict=True)),
+            simulated={
+                variant: dict(zip(COMPARED_QUANTITIES, rows, strict=True)) for variant, (rows, _) in variants.items()
+            },
             agreement=agreement,
             fit=fit,
         )
@@ -262,13 +271,16 @@ class Comparison:
 
         The fraction of the variance that all frames have in common, the reference's, does not average out.
         """
-        shared, known = shared_part(self.result), [fit for fit in fits if np.isfinite(fit.scale)]
-        information = sum(fit.information for fit in known)
+        common_fraction, usable_fits = (
+            common_variance_fraction(self.result),
+            [fit for fit in fits if np.isfinite(fit.scale)],
+        )
+        information = sum(fit.information for fit in usable_fits)
         if not information:
             return math.nan, math.nan
-        scale = sum(fit.projection for fit in known) / information
-        errors = np.stack([fit.errors for fit in known])
-        variance = (1 - shared) * (errors**2).sum() + shared * (errors.sum(axis=0) ** 2).sum()
+        scale = sum(fit.projection for fit in usable_fits) / information
+        errors = np.stack([fit.errors for fit in usable_fits])
+        variance = (1 - common_fraction) * (errors**2).sum() + common_fraction * (errors.sum(axis=0) ** 2).sum()
         return scale, math.hypot(math.sqrt(variance) / information, scale * self.relative_std)
 
     def _fit(
@@ -280,146 +292,160 @@ class Comparison:
         rigid motion is expected to take of the sum of squared ratios.
         """
         std, bias = noise
-        known = np.isfinite(measured + std + levelled).all(axis=0) & (std > 0).all(axis=0)
-        if known.sum() < 3:
-            logger.warning("frame %d has data at %d nodes that the simulation covers: too few", index, known.sum())
+        valid = np.isfinite(measured + std + levelled).all(axis=0) & (std > 0).all(axis=0)
+        if valid.sum() < 3:
+            logger.warning("frame %d has data at %d nodes that the simulation covers: too few", index, valid.sum())
             return Fit(), np.full(measured.shape, math.nan), 0.0
-        x, y = self.mesh.nodes.T - self.mesh.nodes[known].mean(axis=0)[:, None]
+        x, y = self.mesh.nodes.T - self.mesh.nodes[valid].mean(axis=0)[:, None]
         motions = np.array([[np.ones_like(x), 0 * x], [0 * x, np.ones_like(x)], [-y, x]])
         weighted, ratios, template, relative_bias = (
-            np.where(known, part / np.where(known, std, 1), 0) for part in (motions, measured, levelled, bias)
+            np.where(valid, values / np.where(valid, std, 1), 0) for values in (motions, measured, levelled, bias)
         )
-        one = np.ones(std.shape)
+        ones = np.ones(std.shape)
         flat = weighted.reshape(3, -1)
         inverse = np.linalg.inv(flat @ flat.T)
-        found, simulated = (inverse @ flat @ part.ravel() for part in (ratios, template))
-        motion_errors = self.covariance.errors(weighted, one, relative_bias).reshape(3, -1)
-        spread = motion_errors @ motion_errors.T
-        rest, template = ratios - np.tensordot(found, weighted, 1), template - np.tensordot(simulated, weighted, 1)
-        information, projection = float((template**2).sum()), float((template * rest).sum())
-        rigid, taken = found - simulated, float(np.trace(inverse @ spread))
-        scale, scale_std, by_scale = math.nan, math.nan, 0.0
-        errors = self.covariance.errors(template, one, relative_bias)
-        if information > _RIGID * 2 * known.sum():
+        measured_motion, simulated_motion = (inverse @ flat @ values.ravel() for values in (ratios, template))
+        motion_errors = self.covariance.errors(weighted, ones, relative_bias).reshape(3, -1)
+        motion_covariance = motion_errors @ motion_errors.T
+        residual, template = (
+            ratios - np.tensordot(measured_motion, weighted, 1),
+            template - np.tensordot(simulated_motion, weighted, 1),
+        )
+        information, projection = float((template**2).sum()), float((template * residual).sum())
+        rigid, rigid_reduction = measured_motion - simulated_motion, float(np.trace(inverse @ motion_covariance))
+        scale, scale_std, scale_reduction = math.nan, math.nan, 0.0
+        errors = self.covariance.errors(template, ones, relative_bias)
+        if information > _MIN_DEFORMATION * 2 * valid.sum():
             scale, energy = projection / information, float((errors**2).sum())
             scale_std = math.hypot(math.sqrt(energy) / information, scale * self.relative_std)
-            rest, by_scale = rest - scale * template, energy / information
+            residual, scale_reduction = residual - scale * template, energy / information
         unit = np.array([1, 1, 180 / np.pi])
         fit = Fit(
             scale=scale,
             scale_std=scale_std,
             rigid=rigid * unit,
-            rigid_std=np.sqrt(np.diag(inverse @ spread @ inverse)) * unit,
-            chi_square=float((rest**2).sum() / (2 * known.sum() - taken - by_scale)),
+            rigid_std=np.sqrt(np.diag(inverse @ motion_covariance @ inverse)) * unit,
+            chi_square=float((residual**2).sum() / (2 * valid.sum() - rigid_reduction - scale_reduction)),
             projection=projection,
             information=information,
             errors=errors,
         )
-        return fit, np.tensordot(rigid, motions, 1), taken
+        return fit, np.tensordot(rigid, motions, 1), rigid_reduction
 
     @cached_property
-    def _own(self) -> IntArray:
+    def _matching_nodes(self) -> IntArray:
         """Node (M,) of the measurement that is each of the simulation's, by number and place; -1 where there is none.
 
         All are -1 where the measurement has nodes of its own.
         """
         points, numbers = self.simulation.mesh.points, self.result.node_number
-        own = np.arange(len(points)) if len(points) == len(self.mesh.nodes) else np.full(len(points), -1)
+        nodes = np.arange(len(points)) if len(points) == len(self.mesh.nodes) else np.full(len(points), -1)
         if numbers is not None:
-            own = places_among(numbers, self.simulation.mesh.node_numbers)
-        away = np.abs(self.mesh.nodes[own] - points).max(axis=1)
-        own = np.where(away < _SAME * self.mesh.size, own, -1)
-        return own if len(np.unique(own[own >= 0])) == len(self.mesh.nodes) else np.full(len(points), -1)
+            nodes = label_indices(numbers, self.simulation.mesh.node_numbers)
+        distance = np.abs(self.mesh.nodes[nodes] - points).max(axis=1)
+        nodes = np.where(distance < _NODE_TOLERANCE * self.mesh.size, nodes, -1)
+        return nodes if len(np.unique(nodes[nodes >= 0])) == len(self.mesh.nodes) else np.full(len(points), -1)
 
     @cached_property
-    def _places(self) -> Places:
+    def _simulation_points(self) -> Places:
         """The simulation's nodes in the measurement's mesh."""
-        places = Places.of(self.mesh, self.simulation.mesh.points)
-        if not places.inside.any():
+        points = Places.of(self.mesh, self.simulation.mesh.points)
+        if not points.inside.any():
             raise InputError(f"no node of {self.simulation.name} lies in the region that was measured")
-        return places
+        return points
 
-    def _read(self, has_data: BoolArray | None = None) -> tuple[sp.csr_matrix, BoolArray]:
-        """Matrix (M, N) that reads nodes (N,) with data at the simulation's, and which of these it reaches (M,)."""
+    def _sampling_matrix(self, has_data: BoolArray | None = None) -> tuple[sp.csr_matrix, BoolArray]:
+        """Return the matrix (M, N) that reads nodes (N,) with data at the simulation's, and a mask (M,) of these."""
         valid = np.ones(len(self.mesh.nodes), dtype=bool) if has_data is None else has_data
-        if (same := self._own >= 0).any():
-            entries = np.ones(same.sum()), (np.flatnonzero(same), self._own[same])
-            return sp.csr_matrix(entries, shape=(len(same), len(valid))), same & valid[self._own]
-        return self._places.weights(valid), self._places.measured(valid)
+        if (has_node := self._matching_nodes >= 0).any():
+            entries = np.ones(has_node.sum()), (np.flatnonzero(has_node), self._matching_nodes[has_node])
+            return sp.csr_matrix(entries, shape=(len(has_node), len(valid))), has_node & valid[self._matching_nodes]
+        return self._simulation_points.weights(valid), self._simulation_points.measured(valid)
 
     @cached_property
     def _gauges(self) -> tuple[StrainGauges, sp.csr_matrix]:
         """The shortest strain gauges, and the matrix (M, G) that gives each node of the simulation its own."""
-        read, inside = self._read()
-        if (self._own >= 0).any():
-            return StrainGauges.at_nodes(self.covariance), read
-        gauges = StrainGauges.at_points(self.covariance, self.simulation.mesh.points[inside])
-        return gauges, sp.eye(len(inside), format="csr")[:, inside]
+        sampling, is_inside = self._sampling_matrix()
+        if (self._matching_nodes >= 0).any():
+            return StrainGauges.at_nodes(self.covariance), sampling
+        gauges = StrainGauges.at_points(self.covariance, self.simulation.mesh.points[is_inside])
+        return gauges, sp.eye(len(is_inside), format="csr")[:, is_inside]
 
     @cached_property
     def _correlations(self) -> list[tuple[list[sp.csr_matrix], list[sp.csr_matrix]]]:
-        """Correlations C and K (M, M) between nodes of each of the `QUANTITIES`: of fit and lights' bias.
+        """Correlations C and K (M, M) between nodes of each of the `COMPARED_QUANTITIES`: of fit and lights' bias.
 
         With them their products C C, 2 C K and K K, entry by entry.
         """
-        read, (gauges, given) = self._read()[0], self._gauges
-        x, y = (given @ slope for slope in gauges.slopes)
-        found = []
-        for matrices in ([read], [x], [y], [x, y]):
+        sampling, (gauges, selection) = self._sampling_matrix()[0], self._gauges
+        x, y = (selection @ slope for slope in gauges.slopes)
+        correlations = []
+        for matrices in ([sampling], [x], [y], [x, y]):
             relative = self.covariance.relative(matrices)
             fit, bias = (sp.csr_matrix(root @ root.T) for root in (relative.fit, relative.bias))
-            products = [sp.csr_matrix(one) for one in (fit.multiply(fit), 2 * fit.multiply(bias), bias.multiply(bias))]
-            found.append(([fit, bias], products))
-        return [found[0], *found]
+            products = [
+                sp.csr_matrix(product) for product in (fit.multiply(fit), 2 * fit.multiply(bias), bias.multiply(bias))
+            ]
+            correlations.append(([fit, bias], products))
+        return [correlations[0], *correlations]
 
     def _at_nodes(self, displacement: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Displacement (2, N) and its strain at the simulation's nodes, (5, M), and their noise, (2, 5, M)."""
+        """Return displacement (2, N) and its strain at the simulation's nodes, (5, M), and their noise, (2, 5, M)."""
         has_data = np.asarray(np.isfinite(displacement + noise[0]).all(axis=0))
-        read, measured = self._read(has_data)
-        values, *own = np.full((3, len(QUANTITIES), len(measured)), np.nan)
-        (gauges, given), bias = self._gauges, noise[1]
-        node, gauge = given.nonzero()
-        cases = [(own[0], noise), (own[1], np.stack([bias, bias]))]
-        own[1][:] = 0.0
-        for std, stds in cases if (bias > 0).any() else cases[:1]:
-            for row, (part, *errors) in enumerate(zip(displacement, *stds, strict=True)):
-                factor = read @ self.covariance.factor(*np.where(has_data, errors, 0))
-                values[row] = np.where(measured, read @ np.where(has_data, part, 0), np.nan)
+        sampling, is_measured = self._sampling_matrix(has_data)
+        values, *noise_std = np.full((3, len(COMPARED_QUANTITIES), len(is_measured)), np.nan)
+        (gauges, selection), bias = self._gauges, noise[1]
+        node, gauge = selection.nonzero()
+        noise_cases = [(noise_std[0], noise), (noise_std[1], np.stack([bias, bias]))]
+        noise_std[1][:] = 0.0
+        for std, stds in noise_cases if (bias > 0).any() else noise_cases[:1]:
+            for row, (component, *errors) in enumerate(zip(displacement, *stds, strict=True)):
+                factor = sampling @ self.covariance.factor(*np.where(has_data, errors, 0))
+                values[row] = np.where(is_measured, sampling @ np.where(has_data, component, 0), np.nan)
                 variance = np.asarray(factor.multiply(factor).sum(axis=1)).ravel()
-                std[row] = np.where(measured, np.sqrt(variance), np.nan)
+                std[row] = np.where(is_measured, np.sqrt(variance), np.nan)
             strain = gauges.strain(*displacement, *stds[0], *stds[1])
             values[2:, node], std[2:, node] = strain.components[gauge].T, strain.components_std[gauge].T
-        return values, np.stack(own)
+        return values, np.stack(noise_std)
 
     def _agreement(
-        self, rows: list[int], difference: FloatArray, own: FloatArray, common: FloatArray, taken: float
+        self, rows: list[int], difference: FloatArray, noise_stds: FloatArray, common: FloatArray, fit_reduction: float
     ) -> Agreement:
-        """Compare some rows of the `QUANTITIES`, (r, M) each, of which a fit took a part of the squared ratios.
+        """Compare some rows of the `COMPARED_QUANTITIES`, (r, M) each, of whose squared ratios a fit took some.
 
-        `own` (2, r, M) is their noise, and the part of it that the lights' bias leaves.
+        `noise_stds` (2, r, M) is their noise, and the part of it that the lights' bias leaves.
         """
         from scipy.stats import f as fisher
 
-        std = np.hypot(own[0], common)
-        known = np.isfinite(difference) & (std > 0)
-        count, scale = int(known.sum()), np.where(known, std, 1)
+        std = np.hypot(noise_stds[0], common)
+        valid = np.isfinite(difference) & (std > 0)
+        count, scale = int(valid.sum()), np.where(valid, std, 1)
         if not count:
             return Agreement(values=0)
-        ratio, noise, bias, shared = (np.where(known, part / scale, 0) for part in (difference, *own, common))
-        square = float((shared**2).sum()) ** 2
+        ratio, noise, bias, common_noise = (
+            np.where(valid, values / scale, 0) for values in (difference, *noise_stds, common)
+        )
+        square = float((common_noise**2).sum()) ** 2
         fit = np.sqrt(np.maximum(noise**2 - bias**2, 0))
-        for row, n, m, s in zip(rows, fit, bias, shared, strict=True):
+        for row, fit_row, bias_row, common_row in zip(rows, fit, bias, common_noise, strict=True):
             correlations, products = self._correlations[row]
-            pairs = [(n * n, products[0]), (n * m, products[1]), (m * m, products[2])]
-            pairs += [(2**0.5 * s * std, one) for std, one in zip((n, m), correlations, strict=True)]
-            square += sum(float(std @ one @ std) for std, one in pairs)
-        chi_square, freedom = float((ratio**2).sum() / (count - taken)), count**2 / square
+            weighted_products = [
+                (fit_row * fit_row, products[0]),
+                (fit_row * bias_row, products[1]),
+                (bias_row * bias_row, products[2]),
+            ]
+            weighted_products += [
+                (2**0.5 * common_row * std, matrix)
+                for std, matrix in zip((fit_row, bias_row), correlations, strict=True)
+            ]
+            square += sum(float(std @ matrix @ std) for std, matrix in weighted_products)
+        chi_square, freedom = float((ratio**2).sum() / (count - fit_reduction)), count**2 / square
         return Agreement(
             values=count,
-            mean=float(difference[known].mean()),
-            rms=float(np.sqrt(np.mean(difference[known] ** 2))),
-            std=float(np.median(std[known])),
-            beyond_2=float(np.mean(np.abs(ratio[known]) > 2)),
+            mean=float(difference[valid].mean()),
+            rms=float(np.sqrt(np.mean(difference[valid] ** 2))),
+            std=float(np.median(std[valid])),
+            beyond_2=float(np.mean(np.abs(ratio[valid]) > 2)),
             chi_square=chi_square,
             degrees_of_freedom=freedom,
             probability=float(fisher.sf(chi_square, freedom, len(rows) * self._blocks)),
@@ -430,46 +456,49 @@ def measured_mesh(result: Result) -> FiniteElementMesh | None:
     """Return the part of ``mesh.file`` that a result was measured on; None where it has none."""
     if result.node_number is None or result.element_number is None or result.node_mm is None:
         return None
-    kept = result.provenance["finite_elements"]
+    document = result.provenance["finite_elements"]
     return FiniteElementMesh(
-        name=kept["name"],
+        name=document["name"],
         points=result.node_mm,
         node_numbers=result.node_number,
         elements=result.elements,
         element_numbers=result.element_number,
-        numbering=kept["numbering"],
+        numbering=document["numbering"],
     )
 
 
-def _matched(
-    result: Result, simulation: Simulation, times: FloatArray | None, asked: Sequence[int] | None
+def _match_times(
+    result: Result, simulation: Simulation, times: FloatArray | None, requested: Sequence[int] | None
 ) -> tuple[FloatArray, tuple[int, ...], tuple[int, ...]]:
     """Find the time (T,) of each frame, the frames to compare, and those beyond the simulation's times."""
-    for index in asked or ():
+    for index in requested or ():
         if result.frame(index).status == FAILED:
             raise InputError(f"frame {index} of {result.path} is not measured; compare another one (--frames)")
         if index not in result.deformed:
             raise InputError(f"frame {index} of {result.path} is of the reference, against which nothing has moved")
-    known = [index for index in result.deformed if result.finished[index] and result.status[index] != FAILED]
-    frames = list(known if asked is None else asked)
+    measured_frames = [index for index in result.deformed if result.finished[index] and result.status[index] != FAILED]
+    frames = list(measured_frames if requested is None else requested)
     if not frames:
         raise InputError(f"no deformed frame of {result.path} is measured")
     clock = result.number.astype(np.float64) if times is None else times
     if simulation.times is None:
-        return clock, tuple(frames if asked is not None else frames[-1:]), ()
+        return clock, tuple(frames if requested is not None else frames[-1:]), ()
     if times is None:
         logger.warning("the frames of %s have no times: their numbers count as the simulation's times", result.path)
-    first, last = simulation.times[[0, -1]]
-    slack = _SAME * max(abs(first), abs(last))
-    within = [index for index in frames if first - slack <= clock[index] <= last + slack]
-    beyond = tuple(index for index in frames if index not in within)
-    if not within or (asked is not None and beyond):
+    start, end = simulation.times[[0, -1]]
+    slack = _NODE_TOLERANCE * max(abs(start), abs(end))
+    frames_inside = [index for index in frames if start - slack <= clock[index] <= end + slack]
+    frames_outside = tuple(index for index in frames if index not in frames_inside)
+    if not frames_inside or (requested is not None and frames_outside):
         unit = "s" if times is not None else "frames (their times are not known)"
-        which = f"the frames of {result.path} are at {min(clock[frames]):.9g} to {max(clock[frames]):.9g}"
-        if within:
-            which = f"frame {beyond[0]} is at {clock[beyond[0]]:.9g}"
+        subject = f"the frames of {result.path} are at {min(clock[frames]):.9g} to {max(clock[frames]):.9g}"
+        if frames_inside:
+            subject = f"frame {frames_outside[0]} is at {clock[frames_outside[0]]:.9g}"
         raise InputError(
-            f"{which} {unit}, the simulation {simulation.name} spans {first:.9g} to {last:.9g}: state the "
+            f"{subject} {unit}, the simulation {simulation.name} spans {start:.9g} to {end:.9g}: state the "
             "--offset between both clocks, or other --frames"
         )
-    return np.clip(clock, first, last), tuple(within), beyond
+    return np.clip(clock, start, end), tuple(frames_inside), frames_outside
+
+
+__getattr__ = refuse_old_names(__name__)

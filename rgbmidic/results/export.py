@@ -25,10 +25,10 @@ from rgbmidic._version import __version__
 from rgbmidic.arguments import checked
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.fields.units import column
-from rgbmidic.results.files import check_file, write_complete, write_table, writing
-from rgbmidic.results.physical import Physical, frame_times
-from rgbmidic.results.quantities import FAILED, FINITE_ELEMENTS, QUANTITIES, SHARED, Quantity
+from rgbmidic.results.files import check_file, write_complete, write_errors, write_table
+from rgbmidic.results.quantities import FAILED, FINITE_ELEMENTS, QUANTITIES, SHARED, ResultQuantity
 from rgbmidic.results.result import Result
+from rgbmidic.results.result_in_units import ResultInUnits, frame_times
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray
 
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
 
 _AXES = "x to the right, y down; (0, 0) is the centre of the image's top-left pixel"
 _AXES_UP = "x to the right, y up: y, v, shears and directions are those of the file's root times -1"
-_TURNED = ("exy", "direction")
+_SIGN_CHANGING = ("exy", "direction")
 """Nodal quantities of one number that change their sign with the direction of y; u and v become a vector."""
 
 
-def write_hdf5(physical: Physical, file: BinaryIO) -> None:
+def write_hdf5(physical: ResultInUnits, file: BinaryIO) -> None:
     """Write all frames of a result, one after the other: the memory that is needed is that of one frame.
 
     HDF5 writes through the open file: what the disk refuses is then Python's error. With a file of its own, h5py 3
@@ -63,12 +63,12 @@ def write_hdf5(physical: Physical, file: BinaryIO) -> None:
     """
     sizes = {"node": len(physical.mesh.nodes), "element": len(physical.mesh.elements)}
     sizes["light"] = len(physical.result.lights)
-    frame = sum(entry.unmeasured(sizes).nbytes for entry in physical.quantities.values())
+    frame_bytes = sum(entry.unmeasured(sizes).nbytes for entry in physical.quantities.values())
     # more than enough: y up has a vector of three numbers, a shear and a direction in single precision; 200 bytes of
     # each frame, node, element and light in what all frames share; what HDF5 writes of the arrays themselves
-    frame += 20 * sizes["node"]
-    shared = 200 * (len(physical.result) + sum(sizes.values())) + 1_000_000
-    if shutil.disk_usage(Path(file.name).parent).free < frame * len(physical.result) + shared:
+    frame_bytes += 20 * sizes["node"]
+    shared_bytes = 200 * (len(physical.result) + sum(sizes.values())) + 1_000_000
+    if shutil.disk_usage(Path(file.name).parent).free < frame_bytes * len(physical.result) + shared_bytes:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # before HDF5 itself meets a full disk
     import h5py
 
@@ -78,46 +78,55 @@ def write_hdf5(physical: Physical, file: BinaryIO) -> None:
             _declare(out, physical, entry)
         _declare_grid(out.create_group("VTKHDF"), physical)
         arrays, nodes = {name: out[name] for name in physical.quantities}, sizes["node"]
-        upward = {name: out[f"VTKHDF/PointData/{name}"] for name in ("displacement", *_TURNED)}
+        upward_arrays = {name: out[f"VTKHDF/PointData/{name}"] for name in ("displacement", *_SIGN_CHANGING)}
         for index in range(len(physical.result)):
             values, rows = physical.frame(index), slice(index * nodes, (index + 1) * nodes)
             for name, array in arrays.items():
                 array[index] = values[name]
-            for name in _TURNED:
-                upward[name][rows] = -values[name]
+            for name in _SIGN_CHANGING:
+                upward_arrays[name][rows] = -values[name]
             u, v = values["u"], values["v"]
-            upward["displacement"][rows] = np.stack([u, -v, np.where(np.isfinite(u), 0.0, np.nan)], axis=1)
+            upward_arrays["displacement"][rows] = np.stack([u, -v, np.where(np.isfinite(u), 0.0, np.nan)], axis=1)
 
 
-def _write_shared(out: h5py.File, physical: Physical) -> None:
+def _write_shared(out: h5py.File, physical: ResultInUnits) -> None:
     """Write what all frames have in common: axes, mesh, names and provenance."""
     import h5py
 
     result, mesh, units, text = physical.result, physical.mesh, physical.units, h5py.string_dtype()
-    out.attrs.update({**physical.facts, "axes": _AXES})
+    out.attrs.update({**physical.file_attributes, "axes": _AXES})
     out.create_dataset("provenance", data=json.dumps(dict(result.provenance)), dtype=text)
-    meaning = "time of the frame" if units.timed else "place of the frame, counted from 0"
+    time_description = "time of the frame" if units.timed else "place of the frame, counted from 0"
     (x, y), element = physical.length * mesh.centres.T, ("element",)
-    shared: list[tuple[Quantity, AnyArray | None]] = [
-        (Quantity("time", (), units.time, "", meaning), physical.times),
-        (Quantity("node", (), "", "", "index of the node, as in elements"), np.arange(len(mesh.nodes), dtype=np.int32)),
-        (Quantity("element", (), "", "", "index of the element"), np.arange(len(mesh.elements), dtype=np.int32)),
-        (Quantity("corner", (), "", "", "corner of the element"), np.arange(3, dtype=np.int32)),
-        (Quantity("light", (), "", "", "name of the light"), np.array(result.lights, dtype=text)),
-        (Quantity("name", ("time",), "", "", "name of the frame"), np.array(result.names, dtype=text)),
-        *physical.places,
+    shared: list[tuple[ResultQuantity, AnyArray | None]] = [
+        (ResultQuantity("time", (), units.time, "", time_description), physical.times),
+        (
+            ResultQuantity("node", (), "", "", "index of the node, as in elements"),
+            np.arange(len(mesh.nodes), dtype=np.int32),
+        ),
+        (ResultQuantity("element", (), "", "", "index of the element"), np.arange(len(mesh.elements), dtype=np.int32)),
+        (ResultQuantity("corner", (), "", "", "corner of the element"), np.arange(3, dtype=np.int32)),
+        (ResultQuantity("light", (), "", "", "name of the light"), np.array(result.lights, dtype=text)),
+        (ResultQuantity("name", ("time",), "", "", "name of the frame"), np.array(result.names, dtype=text)),
+        *physical.coordinates,
         *((SHARED[name], getattr(result, name)) for name in ("node_number", "element_number")),
-        (Quantity("elements", ("element", "corner"), "", "", "nodes of the element, counted from 0"), mesh.elements),
-        (Quantity("x_element", element, units.length, "", "middle of the element, to the right"), x),
-        (Quantity("y_element", element, units.length, "", "middle of the element, down"), y),
-        (Quantity("area", element, f"{units.length}^2", "", "area of the element"), physical.length**2 * mesh.areas),
+        (
+            ResultQuantity("elements", ("element", "corner"), "", "", "nodes of the element, counted from 0"),
+            mesh.elements,
+        ),
+        (ResultQuantity("x_element", element, units.length, "", "middle of the element, to the right"), x),
+        (ResultQuantity("y_element", element, units.length, "", "middle of the element, down"), y),
+        (
+            ResultQuantity("area", element, f"{units.length}^2", "", "area of the element"),
+            physical.length**2 * mesh.areas,
+        ),
     ]
     for entry, array in shared:
         if array is not None:
             _add(out, entry, entry.axes, data=array)
 
 
-def _add(out: h5py.File, entry: Quantity, axes: Sequence[str | int], **content: Any) -> h5py.Dataset:
+def _add(out: h5py.File, entry: ResultQuantity, axes: Sequence[str | int], **content: Any) -> h5py.Dataset:
     """Create the array of a quantity along axes whose scales are there; without axes it is itself the scale of one."""
     dataset = out.create_dataset(entry.name, **content)
     dataset.attrs.update(entry.attributes)
@@ -128,12 +137,12 @@ def _add(out: h5py.File, entry: Quantity, axes: Sequence[str | int], **content: 
     return dataset
 
 
-def _declare(out: h5py.File, physical: Physical, entry: Quantity) -> None:
+def _declare(out: h5py.File, physical: ResultInUnits, entry: ResultQuantity) -> None:
     """Create the array of a quantity for all frames, still without content."""
     axes = tuple(axis if isinstance(axis, str) else f"part_of_{axis}" for axis in entry.axes)
     for name, axis in zip(axes, entry.axes, strict=True):
         if name not in out:  # an axis of a fixed length gets its scale when it is first met
-            _add(out, Quantity(name, (), "", "", "index"), (), data=np.arange(int(axis), dtype=np.int32))
+            _add(out, ResultQuantity(name, (), "", "", "index"), (), data=np.arange(int(axis), dtype=np.int32))
     shape = (len(physical.result), *(len(out[axis]) for axis in axes))
     dataset = _add(out, entry, ("time", *axes), shape=shape, dtype=np.dtype(entry.dtype).newbyteorder("<"))
     if physical.is_strain(entry.name):
@@ -142,7 +151,7 @@ def _declare(out: h5py.File, physical: Physical, entry: Quantity) -> None:
         dataset.attrs["gauge"] = "element" if "element" in axes else length
 
 
-def _declare_grid(group: h5py.Group, physical: Physical) -> None:
+def _declare_grid(group: h5py.Group, physical: ResultInUnits) -> None:
     """Write the group that VTK's reader looks for: the mesh, the steps, and the nodal quantities."""
     import h5py
 
@@ -159,30 +168,30 @@ def _declare_grid(group: h5py.Group, physical: Physical) -> None:
     group["Types"] = np.full(elements, 5, dtype=np.uint8)  # VTK's number of a triangle
     for name, count in {"Points": nodes, "Cells": elements, "ConnectivityIds": 3 * elements}.items():
         group[f"NumberOf{name}"] = np.array([count], dtype=np.int64)
-    data, steps, first = group.create_group("PointData"), group.create_group("Steps"), np.zeros(frames, dtype=np.int64)
+    data, steps, zeros = group.create_group("PointData"), group.create_group("Steps"), np.zeros(frames, dtype=np.int64)
     steps.attrs["NSteps"] = frames
     steps["Values"] = physical.times
-    steps["NumberOfParts"] = first + 1
+    steps["NumberOfParts"] = zeros + 1
     for name, shape in {"Part": (-1,), "Point": (-1,), "Cell": (-1, 1), "ConnectivityId": (-1, 1)}.items():
-        steps[f"{name}Offsets"] = first.reshape(shape)
+        steps[f"{name}Offsets"] = zeros.reshape(shape)
     data.create_dataset("displacement", (frames * nodes, 3), "<f4")
     for entry in physical.quantities.values():
         if entry.axes[:1] == ("node",) and entry.name not in ("u", "v"):
-            _declare_nodal(data, group.file[entry.name], turned=entry.name in _TURNED)
+            _declare_nodal(data, group.file[entry.name], flip_sign=entry.name in _SIGN_CHANGING)
     for name in data:
         steps[f"PointDataOffsets/{name}"] = nodes * np.arange(frames, dtype=np.int64)
     if (result := physical.result).node_number is not None:  # the same at every step
-        data["node_number"], steps["PointDataOffsets/node_number"] = result.node_number, first
+        data["node_number"], steps["PointDataOffsets/node_number"] = result.node_number, zeros
         group.create_group("CellData")["element_number"] = result.element_number
-        steps["CellDataOffsets/element_number"] = first
+        steps["CellDataOffsets/element_number"] = zeros
 
 
-def _declare_nodal(data: h5py.Group, source: h5py.Dataset, *, turned: bool) -> None:
-    """Declare a nodal quantity (T, N, ...) of the root as VTK has it, (T N, ...): the same numbers unless `turned`."""
+def _declare_nodal(data: h5py.Group, source: h5py.Dataset, *, flip_sign: bool) -> None:
+    """Declare a nodal quantity (T, N, ...) of the root as VTK has it, (T N, ...): the same values or `flip_sign`."""
     import h5py
 
     name, shape = source.name.strip("/"), (source.shape[0] * source.shape[1], *source.shape[2:])
-    if turned:
+    if flip_sign:
         data.create_dataset(name, shape, source.dtype)
         return
     layout = h5py.VirtualLayout(shape, source.dtype)
@@ -226,56 +235,71 @@ def export_result(
         The format is unknown, or nodemaps are asked for where the scale is not known.
     ResultError
         The file exists, the folder of nodemaps is not empty, its folder does not, or a frame of the result is damaged.
+
+    Examples
+    --------
+    >>> export_result(Result.open("my_result"), "csv", "fields.csv", overwrite=True)
+    >>> Path("fields.csv").read_text().split(",")[:3]
+    ['frame', 'number', 'name']
     """
     out = Path(out)
     if to not in EXPORT_FORMATS:
         raise InputError(f'unknown export format "{to}"; allowed are {", ".join(EXPORT_FORMATS)}')
     if to == "crackpy":
-        _write_nodemaps(Physical.of(result, scale), out, overwrite=overwrite)
+        _write_nodemaps(ResultInUnits.from_result(result, scale), out, overwrite=overwrite)
         return
     check_file(out, overwrite=overwrite)
-    physical = Physical.of(result, scale)
+    physical = ResultInUnits.from_result(result, scale)
     write_complete(out, lambda file: _WRITERS[to](physical, file))
 
 
-def _write_npz(physical: Physical, file: BinaryIO) -> None:
+def _write_npz(physical: ResultInUnits, file: BinaryIO) -> None:
     result = physical.result
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        stated = FINITE_ELEMENTS if result.node_number is not None else ()
-        for name in ("nodes", "elements", "names", "lights", *stated):
+        finite_element_names = FINITE_ELEMENTS if result.node_number is not None else ()
+        for name in ("nodes", "elements", "names", "lights", *finite_element_names):
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(getattr(result, name)), allow_pickle=False)
         times = frame_times(result, physical.scale)
         with archive.open("time_s.npy", "w") as member:
             np.lib.format.write_array(member, np.full(len(result), np.nan) if times is None else times)
         for quantity in QUANTITIES.values():
-            if not quantity.stackable or quantity.name == "time_ns":
+            if not quantity.is_stackable or quantity.name == "time_ns":
                 continue
             blank = quantity.unmeasured(result.table.sizes)
             head = {"descr": blank.dtype.str, "fortran_order": False, "shape": (len(result), *blank.shape)}
-            with archive.open(f"{quantity.name}.npy", "w", force_zip64=True) as member:
+            with archive.open(f"{quantity.file_name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array_header_1_0(member, head)
-                for value in result.each(quantity.name):  # one frame at a time is in memory
+                for value in result.iterate(quantity.name):  # one frame at a time is in memory
                     member.write(np.asarray(value, dtype=blank.dtype).tobytes())
 
 
-def _write_csv(physical: Physical, file: BinaryIO) -> None:
-    result, places, timed = physical.result, physical.places, physical.units.timed
+def _write_csv(physical: ResultInUnits, file: BinaryIO) -> None:
+    result, coordinates, has_times = physical.result, physical.coordinates, physical.units.timed
     fields = {name: entry.unit for name, entry in physical.quantities.items() if entry.axes == ("node",)}
     del fields["node_status"]  # a whole number
     label = [] if result.node_number is None else [result.node_number.tolist()]
-    head = ["frame", "number", "name", *(["time_s"] if timed else []), "status", "node"]
+    head = ["frame", "number", "name", *(["time_s"] if has_times else []), "status", "node"]
     head += [*(["node_number"] if label else []), "node_status"]
-    head += [column(entry.name, entry.unit) for entry, _ in places]
+    head += [column(entry.name, entry.unit) for entry, _ in coordinates]
     head += [column(name, unit) for name, unit in fields.items()]
 
     def rows() -> Iterator[list[object]]:
         for index, seconds in enumerate(physical.times.tolist()):
             values = physical.frame(index)
-            start = [index, values["number"], result.names[index], *([f"{seconds:.12g}"] if timed else [])]
-            numbers = np.column_stack([*(place for _, place in places), *(values[name] for name in fields)])
+            frame_cells = [index, values["number"], result.names[index], *([f"{seconds:.12g}"] if has_times else [])]
+            numbers = np.column_stack(
+                [*(coordinate for _, coordinate in coordinates), *(values[name] for name in fields)]
+            )
             for node, (code, row) in enumerate(zip(values["node_status"].tolist(), numbers.tolist(), strict=True)):
-                yield [*start, values["status"], node, *(known[node] for known in label), code, *row]
+                yield [
+                    *frame_cells,
+                    values["status"],
+                    node,
+                    *(node_numbers[node] for node_numbers in label),
+                    code,
+                    *row,
+                ]
 
     write_table(file, head, rows())
 
@@ -283,7 +307,7 @@ def _write_csv(physical: Physical, file: BinaryIO) -> None:
 _NODEMAP = ("id", "x [mm]", "y [mm]", "z [mm]", "u [mm]", "v [mm]", "w [mm]", "eps_x [%]", "eps_y [%]", "eps_xy [1]")
 
 
-def _write_nodemaps(physical: Physical, folder: Path, *, overwrite: bool) -> None:
+def _write_nodemaps(physical: ResultInUnits, folder: Path, *, overwrite: bool) -> None:
     """Write a nodemap of each frame, as CrackPy 1.2 reads them: NAME_NUMBER.txt, with nothing else in the folder."""
     result = physical.result
     if physical.units.mm_per_pixel is None:
@@ -294,16 +318,16 @@ def _write_nodemaps(physical: Physical, folder: Path, *, overwrite: bool) -> Non
     stem = result.path.resolve().name
     if folder.exists() and not folder.is_dir():
         raise ResultError(f"{folder} already exists and is no folder; nodemaps need one of their own")
-    with writing(folder):
-        there = list(folder.iterdir()) if folder.exists() else []
-        foreign = [file for file in there if not re.fullmatch(rf"{re.escape(stem)}_\d+\.txt", file.name)]
-        if foreign or (there and not overwrite):
+    with write_errors(folder):
+        present_files = list(folder.iterdir()) if folder.exists() else []
+        foreign_files = [file for file in present_files if not re.fullmatch(rf"{re.escape(stem)}_\d+\.txt", file.name)]
+        if foreign_files or (present_files and not overwrite):
             raise ResultError(
-                f"{(foreign or there)[0]} is already there; nodemaps need a folder of their own"
-                + ("" if foreign else ", or overwrite them (overwrite=True, --overwrite)")
+                f"{(foreign_files or present_files)[0]} is already there; nodemaps need a folder of their own"
+                + ("" if foreign_files else ", or overwrite them (overwrite=True, --overwrite)")
             )
         folder.mkdir(parents=True, exist_ok=True)
-        for file in there:
+        for file in present_files:
             file.unlink()
     x, y = physical.length * physical.mesh.nodes.T
     flat = np.zeros(len(x))
@@ -319,6 +343,10 @@ def _write_nodemaps(physical: Physical, folder: Path, *, overwrite: bool) -> Non
         write_complete(folder / f"{stem}_{values['number']}.txt", save)
 
 
-_WRITERS: dict[str, Callable[[Physical, BinaryIO], None]] = {"npz": _write_npz, "csv": _write_csv, "hdf5": write_hdf5}
+_WRITERS: dict[str, Callable[[ResultInUnits, BinaryIO], None]] = {
+    "npz": _write_npz,
+    "csv": _write_csv,
+    "hdf5": write_hdf5,
+}
 EXPORT_FORMATS = (*_WRITERS, "crackpy")
 """Names of the formats that `export_result` writes."""

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rgbmidic.disk import write_complete as write_complete
-from rgbmidic.errors import ResultError, disk_faults
+from rgbmidic.errors import ResultError, convert_disk_errors
 from rgbmidic.settings import require_regular_file
 from rgbmidic.typing import AnyArray
 
@@ -57,20 +57,20 @@ def npy_bytes(array: npt.ArrayLike) -> bytes:
 
 def npy_array(content: bytes) -> AnyArray:
     """Undo `npy_bytes`; content that its header does not fit is an error before memory is taken."""
-    end = 10 + int.from_bytes(content[8:10], "little")
-    shape, fortran, dtype = _npy_parsed(content[:end])
-    return np.frombuffer(content, dtype, offset=end).reshape(shape, order="F" if fortran else "C").copy()
+    header_end = 10 + int.from_bytes(content[8:10], "little")
+    shape, fortran, dtype = _parse_npy_header(content[:header_end])
+    return np.frombuffer(content, dtype, offset=header_end).reshape(shape, order="F" if fortran else "C").copy()
 
 
 @lru_cache(maxsize=256)
 def _npy_header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
-    file, about = io.BytesIO(), {"descr": dtype.str, "fortran_order": False, "shape": shape}
-    np.lib.format.write_array_header_1_0(file, about)
+    file, header = io.BytesIO(), {"descr": dtype.str, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)
     return file.getvalue()
 
 
 @lru_cache(maxsize=256)
-def _npy_parsed(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+def _parse_npy_header(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     file = io.BytesIO(header)
     np.lib.format.read_magic(file)
     return np.lib.format.read_array_header_1_0(file)
@@ -86,14 +86,14 @@ def write_table(file: BinaryIO, head: Iterable[str], rows: Iterable[Iterable[obj
     text.detach()  # leaves the file open for whoever opened it
 
 
-def write_json(path: Path, document: Any, *, new: bool = False) -> None:
-    """Write a JSON file; a `new` one is not written where there is one, also where several processes begin at once."""
-    write_text(path, json.dumps(document, indent=2) + "\n", new=new)
+def write_json(path: Path, document: Any, *, exclusive: bool = False) -> None:
+    """Write a JSON file; if `exclusive`, an existing one stays, also where several processes begin at once."""
+    write_text(path, json.dumps(document, indent=2) + "\n", exclusive=exclusive)
 
 
-def write_text(path: Path, text: str, *, new: bool = False) -> None:
+def write_text(path: Path, text: str, *, exclusive: bool = False) -> None:
     """Write a text file, as `write_complete`."""
-    write_complete(path, lambda file: file.write(text.encode()), new=new)
+    write_complete(path, lambda file: file.write(text.encode()), exclusive=exclusive)
 
 
 def read_json(path: Path) -> Any:
@@ -124,31 +124,31 @@ def check_file(out: Path, *, overwrite: bool) -> None:
     ResultError
         It cannot be written.
     """
-    with writing(out):
+    with write_errors(out):
         if out.exists() and not (overwrite and out.is_file()):
             raise ResultError(
                 f"{out} already exists; choose another name, or overwrite it (overwrite=True, --overwrite)"
             )
         if not out.parent.is_dir():
             raise ResultError(f"{out} cannot be written: there is no folder {out.parent}")
-        remove_parts(out.parent, glob.escape(out.name))
+        remove_partial_files(out.parent, glob.escape(out.name))
 
 
-def remove_parts(folder: Path, names: str) -> None:
+def remove_partial_files(folder: Path, names: str) -> None:
     """Remove what processes of this host that were killed left of files whose `names` match a pattern."""
     host = socket.gethostname()
-    for part in folder.glob(f"{names}.{glob.escape(host)}.*.part"):
-        process = part.name.split(".")[-2]
-        if process.isdecimal() and not may_live({"host": host, "process": int(process)}):
-            part.unlink(missing_ok=True)
+    for partial_file in folder.glob(f"{names}.{glob.escape(host)}.*.part"):
+        process = partial_file.name.split(".")[-2]
+        if process.isdecimal() and not may_be_alive({"host": host, "process": int(process)}):
+            partial_file.unlink(missing_ok=True)
 
 
-def writing(path: Path | str) -> AbstractContextManager[None]:
+def write_errors(path: Path | str) -> AbstractContextManager[None]:
     """Turn an error of the disk inside the block into a `ResultError` that names the file."""
-    return disk_faults(ResultError, f"{path} cannot be written")
+    return convert_disk_errors(ResultError, f"{path} cannot be written")
 
 
-def may_live(holder: dict[str, Any]) -> bool:
+def may_be_alive(holder: dict[str, Any]) -> bool:
     """Report whether the process of a claim or a file may live: False only for one of this host that is found dead."""
     if holder.get("host") != socket.gethostname() or os.name == "nt":  # where signal 0 would end a process
         return True

@@ -24,16 +24,22 @@ from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.fields.units import Units
 from rgbmidic.results.channels import Channels
 from rgbmidic.results.files import check_file, write_complete, write_table
-from rgbmidic.results.physical import Physical, displacements, frame_times, reference_frames, shared_part
 from rgbmidic.results.result import Result
+from rgbmidic.results.result_in_units import (
+    ResultInUnits,
+    common_variance_fraction,
+    displacements,
+    frame_times,
+    reference_frames,
+)
 from rgbmidic.settings import ChannelSettings, ProbeSettings, ScaleSettings
-from rgbmidic.text import rounded
+from rgbmidic.text import format_value
 from rgbmidic.typing import AnyArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Histories:
-    """What probes measure in the frames that there are.
+    """Histories of probes over the measured frames.
 
     Attributes
     ----------
@@ -87,14 +93,20 @@ def history_rows(histories: Histories) -> tuple[list[str], list[list[str]]]:
     """
     rows = []
     for quantity in histories.quantities:
-        places = np.flatnonzero(np.isfinite(quantity.values))
-        known = quantity.values[places]
-        std = np.full(len(known), np.nan) if quantity.std is None else quantity.std[places]
-        ends = (known.argmin(), known.argmax(), len(known) - 1) if known.size else ()
-        typical = float(np.median(std[np.isfinite(std)])) if np.isfinite(std).any() else math.nan
-        place = np.fmax(std, typical)  # a reference frame is known to rounding only: that is not the test's uncertainty
-        texts = [rounded(known[end], place[end]) for end in ends] or ["-"] * 3
-        rows.append([quantity.name, quantity.unit, *texts, rounded(typical, typical), f"{known.size}"])
+        finite_rows = np.flatnonzero(np.isfinite(quantity.values))
+        finite_values = quantity.values[finite_rows]
+        std = np.full(len(finite_values), np.nan) if quantity.std is None else quantity.std[finite_rows]
+        extreme_indices = (
+            (finite_values.argmin(), finite_values.argmax(), len(finite_values) - 1) if finite_values.size else ()
+        )
+        median_std = float(np.median(std[np.isfinite(std)])) if np.isfinite(std).any() else math.nan
+        rounding_std = np.fmax(
+            std, median_std
+        )  # a reference frame is known to rounding only: that is not the test's uncertainty
+        texts = [format_value(finite_values[index], rounding_std[index]) for index in extreme_indices] or ["-"] * 3
+        rows.append(
+            [quantity.name, quantity.unit, *texts, format_value(median_std, median_std), f"{finite_values.size}"]
+        )
     return ["quantity", "unit", "smallest", "largest", "last", "uncertainty", "frames"], rows
 
 
@@ -164,22 +176,29 @@ def read_histories(
     InputError
         A probe is outside the region, or measured in no frame; too few frames for rates; the times of the
         frames are not known, or have none in common with those of the channels; the channels are not usable.
+
+    Examples
+    --------
+    >>> result = Result.open("my_result")
+    >>> histories = read_histories(result, ProbeSettings(points=(tuple(result.nodes.mean(axis=0)),)))
+    >>> [history.name for history in histories.quantities]
+    ['point_1_u', 'point_1_v']
     """
     if not probes.kind_coordinates and probes.rigid_motion == "none":
         raise InputError("no probe is stated: give one on the command line, such as --point X,Y, or in [probes]")
-    physical = Physical.untimed(result, scale)
-    alone = frames_alone(result, physical)
-    rectified, there, units = replace(physical.rectified, units=alone.units), alone.frames, alone.units
-    if not len(there):
+    physical = ResultInUnits.without_times(result, scale)
+    base = empty_histories(result, physical)
+    rectified, frames, units = replace(physical.rectified, units=base.units), base.frames, base.units
+    if not len(frames):
         raise InputError(f"no frame of {result.path} is measured yet")
-    window = probes.window and rate_frames(probes.window, len(there))
-    counts, made = Counter[str](), list[Probe]()
-    for kind, place in probes.kind_coordinates:
+    window = probes.window and rate_frames(probes.window, len(frames))
+    counts, probe_list = Counter[str](), list[Probe]()
+    for kind, position in probes.kind_coordinates:
         counts[kind] += 1
-        made.append(make_probe(physical.covariance, kind, counts[kind], place, probes, rectified))
-    clock = alone.numbers.astype(np.float64) if alone.times is None else alone.times
-    nodal, rigid, speed = _read(physical, there, made, probes.rigid_motion, clock)
-    by_probe = {probe.name: probe.histories(part) for probe, part in zip(made, nodal, strict=True)}
+        probe_list.append(make_probe(physical.covariance, kind, counts[kind], position, probes, rectified))
+    clock = base.numbers.astype(np.float64) if base.times is None else base.times
+    nodal, rigid, speed = _read_probes(physical, frames, probe_list, probes.rigid_motion, clock)
+    by_probe = {probe.name: probe.histories(series) for probe, series in zip(probe_list, nodal, strict=True)}
     for name, histories in by_probe.items():
         if not any(np.isfinite(history.values).any() for history in histories):
             raise InputError(
@@ -187,93 +206,97 @@ def read_histories(
                 "says why); place it elsewhere"
             )
     span = (window - 1) * float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
-    common, references = shared_part(result), reference_frames(result)[there]
-    rate = partial(rates, clock, window=span, common_fraction=common, references=references) if window else None
-    read = [*rigid, *(history for part in by_probe.values() for history in part)]
-    quantities = tuple(quantity for history in read for quantity in in_units(history, units, rate))
-    remarks = [*_remarks(physical, alone, speed, by_probe)]
-    if any(one.name.endswith("_exx") for one in quantities):
+    common_fraction, references = common_variance_fraction(result), reference_frames(result)[frames]
+    compute_rates = (
+        partial(rates, clock, window=span, common_fraction=common_fraction, references=references) if window else None
+    )
+    all_histories = [*rigid, *(history for series in by_probe.values() for history in series)]
+    quantities = tuple(
+        quantity for history in all_histories for quantity in convert_history(history, units, compute_rates)
+    )
+    remarks = [*_remarks(physical, base, speed, by_probe)]
+    if any(quantity.name.endswith("_exx") for quantity in quantities):
         remarks.append(f"exx, eyy, exy, e1, e2: {probes.measure.title()} strain")
     if window:
-        remarks.append(f"rates: {rate_words(probes.window, len(there))}")
-    read_off = replace(alone, quantities=quantities, remarks=tuple(remarks))
-    return with_channels(read_off, channels or ChannelSettings())
+        remarks.append(f"rates: {rate_words(probes.window, len(frames))}")
+    probe_histories = replace(base, quantities=quantities, remarks=tuple(remarks))
+    return with_channels(probe_histories, channels or ChannelSettings())
 
 
-def frames_alone(result: Result, physical: Physical | None = None) -> Histories:
+def empty_histories(result: Result, physical: ResultInUnits | None = None) -> Histories:
     """Return histories of no probe: the measured frames and their times, for channels."""
-    physical = physical or Physical.untimed(result)
-    there, times = np.flatnonzero(result.finished), frame_times(result, physical.scale)
+    physical = physical or ResultInUnits.without_times(result)
+    frames, times = np.flatnonzero(result.finished), frame_times(result, physical.scale)
     return Histories(
-        frames=there,
-        numbers=result.number[there],
-        status=result.status[there],
-        times=None if times is None else times[there],
+        frames=frames,
+        numbers=result.number[frames],
+        status=result.status[frames],
+        times=None if times is None else times[frames],
         units=replace(physical.units, timed=times is not None),
     )
 
 
-def _read(
-    physical: Physical, frames: IntArray, probes: list[Probe], rigid: str, clock: FloatArray
+def _read_probes(
+    physical: ResultInUnits, frames: IntArray, probes: list[Probe], rigid_motion: str, clock: FloatArray
 ) -> tuple[list[Nodal], list[History], FloatArray]:
     """Read the displacements that each probe needs, the rigid motion and the speed (T,) of the fast nodes."""
-    kept: list[list[FloatArray]] = [[] for _ in probes]
+    probe_fields: list[list[FloatArray]] = [[] for _ in probes]
     motions = np.full((len(clock), 3, 2), np.nan)
-    speed, before = np.full(len(clock), np.nan), np.full((2, len(physical.mesh.nodes)), np.nan)
+    speed, previous = np.full(len(clock), np.nan), np.full((2, len(physical.mesh.nodes)), np.nan)
     for row, field in enumerate(displacements(physical.result, physical.rectified, frames.tolist())):
-        moved = np.hypot(*(field[:2] - before))
-        if row and np.isfinite(moved).any():
+        step = np.hypot(*(field[:2] - previous))
+        if row and np.isfinite(step).any():
             # of the fast nodes: single outliers do not count
-            speed[row] = np.nanpercentile(moved, 95) / (clock[row] - clock[row - 1])
-        before = field[:2]
-        if rigid != "none" and np.isfinite(field).all(axis=0).sum() > 1:
+            speed[row] = np.nanpercentile(step, 95) / (clock[row] - clock[row - 1])
+        previous = field[:2]
+        if rigid_motion != "none" and np.isfinite(field).all(axis=0).sum() > 1:
             motion = RigidMotion.of(physical.covariance, *field)
             motions[row] = [*zip(motion.shift, motion.shift_std, strict=True), (motion.rotation, motion.rotation_std)]
-            field = motion.removed(physical.mesh.nodes, field) if rigid == "remove" else field
-        for fields, probe in zip(kept, probes, strict=True):
+            field = motion.removed(physical.mesh.nodes, field) if rigid_motion == "remove" else field
+        for fields, probe in zip(probe_fields, probes, strict=True):
             fields.append(field[:, probe.nodes])
-    nodal = [Nodal.of(np.stack(fields, axis=1)) for fields in kept]
+    nodal = [Nodal.of(np.stack(fields, axis=1)) for fields in probe_fields]
     motions[:, 2] = np.degrees(motions[:, 2])
-    names = {"rigid_u": "px", "rigid_v": "px", "rigid_rotation": "deg"} if rigid != "none" else {}
+    names = {"rigid_u": "px", "rigid_v": "px", "rigid_rotation": "deg"} if rigid_motion != "none" else {}
     histories = [
-        History(name=name, unit=unit, values=motions[:, place, 0], std=motions[:, place, 1])
-        for place, (name, unit) in enumerate(names.items())
+        History(name=name, unit=unit, values=motions[:, component, 0], std=motions[:, component, 1])
+        for component, (name, unit) in enumerate(names.items())
     ]
     return nodal, histories, speed
 
 
-def in_units(history: History, units: Units, rate: Callable[..., Rates] | None) -> Iterator[History]:
+def convert_history(history: History, units: Units, compute_rates: Callable[..., Rates] | None) -> Iterator[History]:
     """Convert a history to the reader's units; add its rates, if asked for, at kinks those of both sides."""
-    length = history.unit == "px"
-    unit = units.length if length else history.unit
+    is_length = history.unit == "px"
+    unit = units.length if is_length else history.unit
 
     def entry(name: str, unit: str, values: FloatArray, std: FloatArray) -> History:
-        values, std = units.lengths(values, std) if length else (values, std)
+        values, std = units.lengths(values, std) if is_length else (values, std)
         return History(name=name, unit=unit, values=values, std=std)
 
     if history.std is None:
         yield history
         return
     yield entry(history.name, unit, history.values, history.std)
-    if rate is None or (history.unit == "deg" and history.name != "rigid_rotation"):
+    if compute_rates is None or (history.unit == "deg" and history.name != "rigid_rotation"):
         return
-    found = rate(history.values, history.std)
-    for power, name in enumerate(("velocity", "acceleration") if length else ("velocity",), start=1):
-        for side in ("", "_before", "_after"):
-            values, std = getattr(found, f"{name}{side}"), getattr(found, f"{name}{side}_std")
-            if not side or np.isfinite(values).any():  # else no kink
-                title = f"{history.name}_{name if length else 'rate'}{side}"
+    rate_values = compute_rates(history.values, history.std)
+    for power, name in enumerate(("velocity", "acceleration") if is_length else ("velocity",), start=1):
+        for suffix in ("", "_before", "_after"):
+            values, std = getattr(rate_values, f"{name}{suffix}"), getattr(rate_values, f"{name}{suffix}_std")
+            if not suffix or np.isfinite(values).any():  # else no kink
+                title = f"{history.name}_{name if is_length else 'rate'}{suffix}"
                 yield entry(title, units.per_time(unit, power), values, std)
 
 
-def with_channels(histories: Histories, stated: ChannelSettings) -> Histories:
+def with_channels(histories: Histories, settings: ChannelSettings) -> Histories:
     """Add channels at the times of the frames to what probes measure, and the stress where a cross-section is known.
 
     Parameters
     ----------
     histories
         Of probes, or of none: its frames count.
-    stated
+    settings
         File, clock, and what a stress needs.
 
     Raises
@@ -281,81 +304,97 @@ def with_channels(histories: Histories, stated: ChannelSettings) -> Histories:
     InputError
         As `read_histories`, for the channels.
     """
-    if stated.file is None:
+    if settings.file is None:
         return histories
     times = histories.times
     if times is None:
         raise InputError(
-            f"the channels {stated.file} cannot be brought to the frames, whose times are not known: state "
+            f"the channels {settings.file} cannot be brought to the frames, whose times are not known: state "
             "frame_rate in [scale]"
         )
-    channels, remarks, shifted = Channels.read(stated.file, stated.offset, stated.trigger), list[str](), ""
-    if stated.align is not None:
-        name, wanted = stated.align
-        column = next((one for one in histories.quantities if wanted in (one.name, one.column)), None)
-        if column is None:
-            known = ", ".join(one.name for one in histories.quantities)
-            raise InputError(f'channels.align names the history "{wanted}", which is not one of {known or "none"}')
-        channels, std, coefficient = channels.aligned(name, times, column.values)
-        shifted = f" ({std:.2g} s standard uncertainty), where {name} and {column.name} correlate by {coefficient:.3f}"
-    elif stated.trigger is not None:
-        shifted = f": {stated.trigger} rises at 0"
-    if shifted:
-        remarks.append(f"the times of the channels were shifted by {channels.offset:.6g} s{shifted}")
-    elif not stated.offset:
-        equal = "the clocks of channels and frames are taken as equal"
-        remarks.append(f"{equal}: channels.offset, .trigger or .align relates them")
-    first, last = channels.times[[0, -1]]
-    covered = float(np.nanmax(times) - np.nanmin(times)) / (last - first)
-    if covered < 0.01:  # a factor of 1,000 is far below
-        part = f"the frames cover {covered:.2%} of the time of the channels"
-        remarks.append(f"{part}: is the unit of {stated.file} right?")
-    read = channels.at(times)
-    taken = {"frame", "number", "status", "time_s"} | ({"stress", "stress_MPa"} if stated.area is not None else set())
-    taken.update(*({one.name, one.column, f"{one.column}_std"} for one in histories.quantities))
-    if both := sorted(taken & read.keys()):
-        raise InputError(
-            f"channels of {stated.file} have the names of columns of the history, rename: {', '.join(both)}"
+    channels, remarks, shift_text = Channels.read(settings.file, settings.offset, settings.trigger), list[str](), ""
+    if settings.align is not None:
+        name, history_name = settings.align
+        column = next(
+            (quantity for quantity in histories.quantities if history_name in (quantity.name, quantity.column)), None
         )
-    beside = [History(name=name, unit="", values=values, std=None) for name, values in read.items()]
-    for name, values in read.items():
+        if column is None:
+            names = ", ".join(quantity.name for quantity in histories.quantities)
+            raise InputError(
+                f'channels.align names the history "{history_name}", which is not one of {names or "none"}'
+            )
+        channels, std, coefficient = channels.align(name, times, column.values)
+        shift_text = (
+            f" ({std:.2g} s standard uncertainty), where {name} and {column.name} correlate by {coefficient:.3f}"
+        )
+    elif settings.trigger is not None:
+        shift_text = f": {settings.trigger} rises at 0"
+    if shift_text:
+        remarks.append(f"the times of the channels were shifted by {channels.offset:.6g} s{shift_text}")
+    elif not settings.offset:
+        clock_remark = "the clocks of channels and frames are taken as equal"
+        remarks.append(f"{clock_remark}: channels.offset, .trigger or .align relates them")
+    start, end = channels.times[[0, -1]]
+    covered_fraction = float(np.nanmax(times) - np.nanmin(times)) / (end - start)
+    if covered_fraction < 0.01:  # a factor of 1,000 is far below
+        coverage_remark = f"the frames cover {covered_fraction:.2%} of the time of the channels"
+        remarks.append(f"{coverage_remark}: is the unit of {settings.file} right?")
+    channel_values = channels.interpolate(times)
+    reserved_names = {"frame", "number", "status", "time_s"} | (
+        {"stress", "stress_MPa"} if settings.area is not None else set()
+    )
+    reserved_names.update(
+        *({quantity.name, quantity.column, f"{quantity.column}_std"} for quantity in histories.quantities)
+    )
+    if clashing_names := sorted(reserved_names & channel_values.keys()):
+        raise InputError(
+            f"channels of {settings.file} have the names of columns of the history, rename: {', '.join(clashing_names)}"
+        )
+    channel_histories = [
+        History(name=name, unit="", values=values, std=None) for name, values in channel_values.items()
+    ]
+    for name, values in channel_values.items():
         if missing := int(np.isnan(values).sum()):
             remarks.append(f"the channel {name} has no value in {missing} of {len(histories.frames)} frames")
-    pair = None
-    if stated.area is not None:
-        name, newtons = channels.force(stated.force)
-        beside.append(History(name="stress", unit="MPa", values=read[name] * newtons / stated.area, std=None))
-        strain = next((one.name for one in histories.quantities if one.name.endswith(("_strain", "_e1"))), None)
-        pair = (strain, "stress") if strain else None
+    strain_and_stress = None
+    if settings.area is not None:
+        name, newtons = channels.force(settings.force)
+        channel_histories.append(
+            History(name="stress", unit="MPa", values=channel_values[name] * newtons / settings.area, std=None)
+        )
+        strain = next(
+            (quantity.name for quantity in histories.quantities if quantity.name.endswith(("_strain", "_e1"))), None
+        )
+        strain_and_stress = (strain, "stress") if strain else None
     return replace(
         histories,
-        quantities=(*histories.quantities, *beside),
-        stress_strain=pair,
+        quantities=(*histories.quantities, *channel_histories),
+        stress_strain=strain_and_stress,
         remarks=(*histories.remarks, *remarks),
         channels=channels,
     )
 
 
 def _remarks(
-    physical: Physical, alone: Histories, speed: FloatArray, read: Mapping[str, list[History]]
+    physical: ResultInUnits, base: Histories, speed: FloatArray, by_probe: Mapping[str, list[History]]
 ) -> Iterator[str]:
-    units, frames, exposed = alone.units, alone.frames, (physical.result.provenance.get("exposure_ns") or 0) * 1e-9
+    units, frames, exposure = base.units, base.frames, (physical.result.provenance.get("exposure_ns") or 0) * 1e-9
     if (camera := physical.rectified.camera) is not None:
         yield f"lengths and strains are those on the plane of {camera.name}: {camera.summary()}"
     if units.mm_per_pixel is None:
         yield "no scale is known: lengths are in px (mm_per_pixel in [scale]; `rgbmidic scale` finds it)"
     if not units.timed:
         yield "no time is known: the frame is the unit of time (frame_rate in [scale])"
-    blurred = np.nan_to_num(speed) * exposed > 1  # px: the speckle is smeared over a pixel
+    blurred = np.nan_to_num(speed) * exposure > 1  # px: the speckle is smeared over a pixel
     if units.timed and blurred.any():
         yield (
-            f"motion blur: within the exposure of {exposed:g} s the surface moves by up to "
-            f"{np.nanmax(speed) * exposed:.3g} px, by more than 1 px in {int(blurred.sum())} frames from "
+            f"motion blur: within the exposure of {exposure:g} s the surface moves by up to "
+            f"{np.nanmax(speed) * exposure:.3g} px, by more than 1 px in {int(blurred.sum())} frames from "
             f"frame {frames[blurred][0]} on"
         )
-    if any(history.name.endswith("_equivalent") for part in read.values() for history in part):
+    if any(history.name.endswith("_equivalent") for series in by_probe.values() for history in series):
         yield f"equivalent: {EQUIVALENT}"
-    yield from dict.fromkeys(history.note for part in read.values() for history in part if history.note)
-    for name, part in read.items():
-        if missing := int(np.isnan(part[0].values).sum()):
+    yield from dict.fromkeys(history.note for series in by_probe.values() for history in series if history.note)
+    for name, series in by_probe.items():
+        if missing := int(np.isnan(series[0].values).sum()):
             yield f"{name} is not measured in {missing} of {len(frames)} frames"

@@ -21,34 +21,36 @@ from rgbmidic.fields.nodal import NodalCovariance, RigidMotion, frame_covariance
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, length_of, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Tri3Mesh
-from rgbmidic.results.physical import (
-    EDGE,
-    MOVED,
-    Physical,
+from rgbmidic.renamed import state_new_names
+from rgbmidic.results.quantities import DERIVED, ERROR_QUANTITIES, UNKNOWN_TIME, UV, ResultQuantity, map_quantities
+from rgbmidic.results.result import Portable, Result
+from rgbmidic.results.result_in_units import (
+    DISPLACEMENT_QUANTITIES,
+    EDGE_QUANTITIES,
+    ResultInUnits,
+    common_variance_fraction,
     displacements,
     edge_std,
     frame_times,
-    named,
     reference_frames,
-    shared_part,
+    strain_by_name,
 )
-from rgbmidic.results.quantities import DERIVED, UNKNOWN_TIME, UV, WITH_ERROR, Quantity, map_quantities
-from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import MeshSettings, ProbeSettings, ScaleSettings
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
-WINDOW = 9
+DEFAULT_RATE_WINDOW = 9
 """Frames that a parabola takes in for rates where none are stated. Chosen: the noise of a velocity is then .13 of that
 of a displacement per frame, and a change within 4 frames is still seen."""
-_AROUND = 2
+_WINDOWS_PER_BLOCK = 2
 """Windows of frames that are read at once, and on either side of these: the widest fit takes in 5/3 of a window."""
-_PARTS = 80_000
+_PICTURE_TRIANGLES = 80_000
 """Parts of the elements in a picture, each side in 4 at most: what a picture leaves out that is linear in the elements
 is then a sixteenth."""
-_AT_ONCE = 4096
+_NODES_PER_BATCH = 4096
 """Nodes whose rates are computed at once: 25 MB of results at the default window."""
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapValues:
     """A field in one frame.
@@ -57,7 +59,7 @@ class MapValues:
     ----------
     values, std : ndarray, shape (N,)
         In the unit of the field; NaN where not known.
-    moved : ndarray, shape (N, 2)
+    deformed_nodes : ndarray, shape (N, 2)
         Deformed places of the nodes, px of the image; NaN where not measured.
     status : ndarray, shape (N,), uint8
         `node_status`.
@@ -65,15 +67,16 @@ class MapValues:
 
     values: FloatArray
     std: FloatArray
-    moved: FloatArray
+    deformed_nodes: FloatArray
     status: npt.NDArray[np.uint8]
 
     @property
-    def doubtful(self) -> BoolArray:
+    def is_doubtful(self) -> BoolArray:
         """Mask of the nodes whose value lies within two standard uncertainties of 0, shape (N,)."""
         return np.asarray(np.abs(self.values) < 2 * self.std)
 
 
+@state_new_names
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Maps(Portable):
     """The nodal fields of a result.
@@ -95,16 +98,23 @@ class Maps(Portable):
         the engineering strain; other strains do not depend on it.
     window
         Frames that a rate is taken over, as ``probes.window``.
+
+    Examples
+    --------
+    >>> maps = Maps.from_result(Result.open("my_result"))
+    >>> exx = maps.read("exx", 1)
+    >>> exx.values.shape == exx.std.shape == (len(maps.result.nodes),)
+    True
     """
 
     result: Result
-    physical: Physical
+    physical: ResultInUnits
     since: int | None = None
     rigid_removed: bool = False
-    window: int = WINDOW
+    window: int = DEFAULT_RATE_WINDOW
 
     @classmethod
-    def of(cls, result: Result, scale: ScaleSettings | None = None, **choices: Any) -> Self:
+    def from_result(cls, result: Result, scale: ScaleSettings | None = None, **choices: Any) -> Self:
         """Choose how fields are derived.
 
         Parameters
@@ -114,7 +124,7 @@ class Maps(Portable):
         scale
             It replaces the ``[scale]`` that was kept with the result; None: that one.
         **choices
-            `gauge`, `measure`, `since`, `rigid_removed` and `window`, as of `chosen`.
+            `gauge`, `measure`, `since`, `rigid_removed` and `window`, as of `with_options`.
 
         Returns
         -------
@@ -123,11 +133,11 @@ class Maps(Portable):
         Raises
         ------
         InputError
-            As of `chosen`.
+            As of `with_options`.
         """
-        return cls(result=result, physical=Physical.untimed(result, scale)).chosen(**choices)
+        return cls(result=result, physical=ResultInUnits.without_times(result, scale)).with_options(**choices)
 
-    def chosen(
+    def with_options(
         self,
         *,
         gauge: float | None = None,
@@ -160,10 +170,14 @@ class Maps(Portable):
         frames = len(self.result)
         if since is not None and not 0 <= since < frames:
             raise InputError(f"there is no frame {since} in a result of {frames} frames (0 to {frames - 1})")
-        if since is not None and self.result.finished[since] and np.isnan((first := self.result.frame(since)).u).all():
-            why = first.reason or "no node"
-            raise InputError(f"nothing is known since frame {since}, in which nothing is measured: {why}")
-        window = window or self.result.section(ProbeSettings).window or WINDOW
+        if (
+            since is not None
+            and self.result.finished[since]
+            and np.isnan((base_record := self.result.frame(since)).u).all()
+        ):
+            reason = base_record.reason or "no node"
+            raise InputError(f"nothing is known since frame {since}, in which nothing is measured: {reason}")
+        window = window or self.result.section(ProbeSettings).window or DEFAULT_RATE_WINDOW
         rate_frames(window, FEWEST)
         physical, measure = self.physical, measure or MEASURES[0]
         if (gauge, measure) != (physical.gauge, physical.measure):
@@ -173,12 +187,12 @@ class Maps(Portable):
         return replace(self, physical=physical, since=since, rigid_removed=rigid_removed, window=window)
 
     @cached_property
-    def all(self) -> dict[str, Quantity]:
+    def quantities(self) -> dict[str, ResultQuantity]:
         """Every field by its name, displacements first; each that has an uncertainty is followed by it further down."""
         error = self.result.section(MeshSettings).error
         return map_quantities(self._units, self.result.lights, with_error=bool(error))
 
-    def field(self, name: str) -> Quantity:
+    def field(self, name: str) -> ResultQuantity:
         """Return a field by its name.
 
         Parameters
@@ -188,18 +202,18 @@ class Maps(Portable):
 
         Returns
         -------
-        Quantity
+        ResultQuantity
 
         Raises
         ------
         InputError
             There is none of this name; the message lists all names.
         """
-        if name not in self.all:
-            raise InputError(f'there is no field "{name}"; the fields are {", ".join(self.all)}')
-        return self.all[name]
+        if name not in self.quantities:
+            raise InputError(f'there is no field "{name}"; the fields are {", ".join(self.quantities)}')
+        return self.quantities[name]
 
-    def how(self, name: str) -> str:
+    def processing_note(self, name: str) -> str:
         """Describe how a field is derived, for the text beside it: measure and gauge, reference, rates; may be empty.
 
         Parameters
@@ -212,17 +226,17 @@ class Maps(Portable):
         str
         """
         base = name.removesuffix("_std")
-        field = self.field(base if base in self.all else name)
+        field = self.field(base if base in self.quantities else name)
         since = "" if self.since is None else f"since frame {self.since}"
-        parts = list[str]()
+        phrases = list[str]()
         if field.group == "Displacement":
-            parts = [since, "rigid motion removed" if self.rigid_removed else ""]
+            phrases = [since, "rigid motion removed" if self.rigid_removed else ""]
         elif field.group == "Strain":
-            parts = [self.physical.strain_words(base), since]
-        elif field.group == "Rates" and len(self._there) >= FEWEST:
-            strain = "" if DERIVED[base].unit else self.physical.strain_words(base)
-            parts = [strain, rate_words(self.window, len(self._there))]
-        return ", ".join(filter(None, parts))
+            phrases = [self.physical.strain_description(base), since]
+        elif field.group == "Rates" and len(self._measured_frames) >= FEWEST:
+            strain = "" if DERIVED[base].unit else self.physical.strain_description(base)
+            phrases = [strain, rate_words(self.window, len(self._measured_frames))]
+        return ", ".join(filter(None, phrases))
 
     def read(self, name: str, frame: int) -> MapValues:
         """Read a field in one frame.
@@ -230,7 +244,7 @@ class Maps(Portable):
         Parameters
         ----------
         name
-            Name of the field, one of `all`.
+            Name of the field, one of `quantities`.
         frame
             Index of the frame.
 
@@ -250,49 +264,65 @@ class Maps(Portable):
         if not 0 <= frame < len(self.result):
             raise InputError(f"there is no frame {frame} in a result of {len(self.result)} frames")
         base = name.removesuffix("_std")
-        derived = base in DERIVED or name in WITH_ERROR
-        stored: tuple[str, ...] = () if derived or name in MOVED else EDGE if name in EDGE else (name,)
+        derived = base in DERIVED or name in ERROR_QUANTITIES
+        stored: tuple[str, ...] = (
+            ()
+            if derived or name in DISPLACEMENT_QUANTITIES
+            else EDGE_QUANTITIES
+            if name in EDGE_QUANTITIES
+            else (name,)
+        )
         if kind == "fraction":
             stored = ("light_fraction",)
-        read = next(self.result.table.each(["u", "v", "node_status", *stored], [frame]))
+        record = next(self.result.table.iterate(["u", "v", "node_status", *stored], [frame]))
         nothing = np.full(len(self.result.nodes), np.nan)
-        if name in WITH_ERROR:
-            values, std = self._with_error(WITH_ERROR[name], frame), nothing
+        if name in ERROR_QUANTITIES:
+            values, std = self._with_error(ERROR_QUANTITIES[name], frame), nothing
         elif derived:
             values, std = self._derived(base, frame)
             values, std = (std, nothing) if base != name else (values, std)
         elif kind == "fraction":
             light = self.result.lights.index(name.removeprefix("fraction of "))
-            values, std = np.where(read["node_status"] == 0, read["light_fraction"][:, light], np.nan), nothing
-        elif name in MOVED:
-            values, std = self.physical.length * next(self._displacements([frame]))[MOVED.index(name)], nothing
-        elif name in EDGE:
-            values, std = self.physical.length * edge_std(self.physical.rectified, read)[EDGE.index(name)], nothing
+            values, std = np.where(record["node_status"] == 0, record["light_fraction"][:, light], np.nan), nothing
+        elif name in DISPLACEMENT_QUANTITIES:
+            values, std = (
+                self.physical.length * next(self._displacements([frame]))[DISPLACEMENT_QUANTITIES.index(name)],
+                nothing,
+            )
+        elif name in EDGE_QUANTITIES:
+            edge = edge_std(self.physical.rectified, record)[EDGE_QUANTITIES.index(name)]
+            values, std = self.physical.length * edge, nothing
         else:
-            values, std = np.asarray(read[name], dtype=np.float64), nothing
+            values, std = np.asarray(record[name], dtype=np.float64), nothing
         return MapValues(
             values=np.ascontiguousarray(values, dtype=np.float64),
             std=np.asarray(std, dtype=np.float64),
-            moved=self.result.nodes + np.stack([read["u"], read["v"]], axis=1),
-            status=read["node_status"],
+            deformed_nodes=self.result.nodes + np.stack([record["u"], record["v"]], axis=1),
+            status=record["node_status"],
         )
 
-    def _with_error(self, entry: Quantity, frame: int) -> FloatArray:
-        """Compute a field of `WITH_ERROR` (N,) against the test's reference; NaN in frames without."""
-        names = {f"{one}{end}": None for one in (*UV, *entry.parts) for end in ("", "_std", "_mesh_error")}
-        read = next(self.result.table.each([*names], [frame]))
-        if not read["u_mesh_error"].size:
+    def _with_error(self, entry: ResultQuantity, frame: int) -> FloatArray:
+        """Compute a field of `ERROR_QUANTITIES` (N,) against the test's reference; NaN in frames without."""
+        names = {
+            f"{component}{suffix}": None
+            for component in (*UV, *entry.base_quantities)
+            for suffix in ("", "_std", "_mesh_error")
+        }
+        record = next(self.result.table.iterate([*names], [frame]))
+        if not record["u_mesh_error"].size:
             return np.full(len(self.result.nodes), np.nan)
-        double = {key: np.asarray(values, dtype=np.float64) for key, values in read.items()}
-        pairs = [(double[f"{one}_std"], double[f"{one}_mesh_error"]) for one in entry.parts]
-        if len(pairs) > 1:
-            return np.asarray(np.fmax.reduce([error / std for std, error in pairs]))
-        std, error = pairs[0]
-        if (one := entry.parts[0]) in UV:
-            ends = ("_std", "_mesh_error")
-            moved = ([double[f"{name}{part}"] for part in ("", end) for name in UV] for end in ends)
-            rectified = (self.physical.rectified.displacement(*parts)[2 + UV.index(one)] for parts in moved)
-            std, error = (self.physical.length * part for part in rectified)
+        double = {key: np.asarray(values, dtype=np.float64) for key, values in record.items()}
+        std_and_error = [
+            (double[f"{component}_std"], double[f"{component}_mesh_error"]) for component in entry.base_quantities
+        ]
+        if len(std_and_error) > 1:
+            return np.asarray(np.fmax.reduce([error / std for std, error in std_and_error]))
+        std, error = std_and_error[0]
+        if (component := entry.base_quantities[0]) in UV:
+            suffixes = ("_std", "_mesh_error")
+            inputs = ([double[f"{name}{term}"] for term in ("", suffix) for name in UV] for suffix in suffixes)
+            rectified = (self.physical.rectified.displacement(*arrays)[2 + UV.index(component)] for arrays in inputs)
+            std, error = (self.physical.length * term for term in rectified)
         return error if entry.name.endswith("_error") else np.hypot(error, std)
 
     def _derived(self, name: str, frame: int) -> tuple[FloatArray, FloatArray]:
@@ -301,14 +331,14 @@ class Maps(Portable):
         if entry.group == "Strain":
             return self._strain(frame)[name], self._strain(frame)[f"{name}_std"]
         if entry.order:
-            parts = [self._rates(part, frame, entry.order) for part in entry.parts]
+            components = [self._rates(component, frame, entry.order) for component in entry.base_quantities]
         else:
-            moved = self.displacement(frame)
-            parts = [moved[UV.index(part) : 4 : 2] for part in entry.parts]
-        values, std = parts[0]
-        if len(parts) > 1:
-            vector, error = (np.stack(each, axis=1) for each in zip(*parts, strict=True))
-            values, std = length_of(vector, error[:, :, None] ** 2 * np.eye(len(parts)))
+            displacement = self.displacement(frame)
+            components = [displacement[UV.index(component) : 4 : 2] for component in entry.base_quantities]
+        values, std = components[0]
+        if len(components) > 1:
+            vector, error = (np.stack(terms, axis=1) for terms in zip(*components, strict=True))
+            values, std = length_of(vector, error[:, :, None] ** 2 * np.eye(len(components)))
         return self._units.lengths(values, std) if entry.unit else (values, std)
 
     def displacement(self, frame: int) -> FloatArray:
@@ -325,11 +355,11 @@ class Maps(Portable):
         -------
         ndarray, shape (6, N)
         """
-        moved = self._since(frame)
-        motion = self._rigid(moved)
-        return moved if motion is None else motion.removed(self._covariance.mesh.nodes, moved)
+        displacement = self._relative_displacement(frame)
+        motion = self._rigid(displacement)
+        return displacement if motion is None else motion.removed(self._covariance.mesh.nodes, displacement)
 
-    def drawn(self, field: Quantity, values: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
+    def triangulate(self, field: ResultQuantity, values: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
         """Return nodal values as pictures draw them, linear in triangles, and the triangles.
 
         They are parts of the elements, or the elements of what has no sign: it stays within the values of its nodes.
@@ -347,17 +377,17 @@ class Maps(Portable):
             At the corners of the triangles.
         triangles : ndarray, shape (F, 3), int32
         """
-        if not field.signed:
+        if not field.is_signed:
             return values, self.result.elements
-        places, parts = self._parts
-        return places.read(values), parts
+        points, triangles = self._subdivision
+        return points.read(values), triangles
 
     @cached_property
-    def _parts(self) -> tuple[Places, npt.NDArray[np.int32]]:
+    def _subdivision(self) -> tuple[Places, npt.NDArray[np.int32]]:
         mesh = self.physical.mesh
-        return Places.parts(mesh, int(np.clip((_PARTS / len(mesh.elements)) ** 0.5, 1, 4)))
+        return Places.parts(mesh, int(np.clip((_PICTURE_TRIANGLES / len(mesh.elements)) ** 0.5, 1, 4)))
 
-    def places(self, points: FloatArray, element: IntArray) -> Places:
+    def points_in_elements(self, points: FloatArray, element: IntArray) -> Places:
         """Take points of the image whose elements are known, to read nodal values there.
 
         Parameters
@@ -394,7 +424,7 @@ class Maps(Portable):
         InputError
             The place is outside the mesh, or the gauge is too short.
         """
-        return named(self._strain_of(frame, self._gauge(*self.physical.rectified.place((x, y, length), 1))))
+        return strain_by_name(self._strain_of(frame, self._gauge(*self.physical.rectified.place((x, y, length), 1))))
 
     @cached_property
     def _gauge(self) -> Callable[[float, float, float], StrainGauges]:
@@ -406,25 +436,25 @@ class Maps(Portable):
     def _displacements(self, frames: Iterable[int]) -> Iterator[FloatArray]:
         return displacements(self.result, self.physical.rectified, frames)  # `physical` may be of an earlier state
 
-    def _since(self, frame: int) -> FloatArray:
+    def _relative_displacement(self, frame: int) -> FloatArray:
         """Return u, v and their uncertainties (6, N) since the frame that is the reference here."""
-        moved = next(self._displacements([frame]))
+        displacement = next(self._displacements([frame]))
         if self.since is None:
-            return moved
-        first, factor = self._first, self._common(frame)
-        variance = moved[2:] ** 2 + first[2:] ** 2 - 2 * factor * np.minimum(moved[2:], first[2:]) ** 2
-        return np.concatenate([moved[:2] - first[:2], np.sqrt(np.maximum(variance, 0))])
+            return displacement
+        base, factor = self._base_displacement, self._shared_fraction(frame)
+        variance = displacement[2:] ** 2 + base[2:] ** 2 - 2 * factor * np.minimum(displacement[2:], base[2:]) ** 2
+        return np.concatenate([displacement[:2] - base[:2], np.sqrt(np.maximum(variance, 0))])
 
     @cached_property
-    def _first(self) -> FloatArray:
+    def _base_displacement(self) -> FloatArray:
         return next(self._displacements([self.since or 0]))
 
-    def _common(self, frame: int) -> float:
+    def _shared_fraction(self, frame: int) -> float:
         """Return the fraction of the smaller variance that a frame has in common with the one of `since`."""
         if frame == self.since:
             return 1.0
         references = reference_frames(self.result)[[frame, self.since or 0]]
-        return float(frame_covariance(np.ones(2), shared_part(self.result), references)[0, 1])
+        return float(frame_covariance(np.ones(2), common_variance_fraction(self.result), references)[0, 1])
 
     @cached_property
     def _covariance(self) -> NodalCovariance:
@@ -432,30 +462,38 @@ class Maps(Portable):
         if self.since is None:
             return self.physical.covariance
         mesh = self.physical.mesh
-        places = mesh.nodes + np.nan_to_num(self._first[:2].T)
-        return replace(self.physical.covariance, mesh=Tri3Mesh(nodes=places, elements=mesh.elements))
+        deformed = mesh.nodes + np.nan_to_num(self._base_displacement[:2].T)
+        return replace(self.physical.covariance, mesh=Tri3Mesh(nodes=deformed, elements=mesh.elements))
 
-    def _rigid(self, moved: FloatArray) -> RigidMotion | None:
+    def _rigid(self, displacement: FloatArray) -> RigidMotion | None:
         """Fit the rigid motion that is removed; None where none is, or fewer than two nodes are measured."""
-        fits = self.rigid_removed and np.isfinite(moved).all(axis=0).sum() > 1
-        return RigidMotion.of(self._covariance, *moved) if fits else None
+        fits = self.rigid_removed and np.isfinite(displacement).all(axis=0).sum() > 1
+        return RigidMotion.of(self._covariance, *displacement) if fits else None
 
     @cached_property
     def _strain(self) -> Callable[[int], Mapping[str, FloatArray]]:
         """Strain by name of a frame; of the last two it is kept, for several fields of one frame."""
-        return lru_cache(2)(lambda frame: named(self._strain_of(frame, self.physical.gauges)))
+        return lru_cache(2)(lambda frame: strain_by_name(self._strain_of(frame, self.physical.gauges)))
 
     def _strain_of(self, frame: int, gauges: StrainGauges) -> Strain:
-        moved = next(self._displacements([frame]))
+        displacement = next(self._displacements([frame]))
         if self.since is None:
-            gradient, covariance = gauges.gradient(*moved)
+            gradient, covariance = gauges.gradient(*displacement)
         else:  # both gradients of the same nodes, which have data in both frames
-            both, factor = np.isfinite(moved + self._first).all(axis=0), self._common(frame)
-            now, first = np.where(both, moved, np.nan), np.where(both, self._first, np.nan)
-            smaller = np.sqrt(abs(factor)) * np.minimum(now[2:], first[2:])
-            shared = np.sign(factor) * gauges.gradient(*now[:2], *smaller)[1]
-            gradient, covariance = _composed(gauges.gradient(*now), gauges.gradient(*first), shared)
-        motion = self._rigid(self._since(frame))
+            in_both_frames, factor = (
+                np.isfinite(displacement + self._base_displacement).all(axis=0),
+                self._shared_fraction(frame),
+            )
+            present, base = (
+                np.where(in_both_frames, displacement, np.nan),
+                np.where(in_both_frames, self._base_displacement, np.nan),
+            )
+            smaller = np.sqrt(abs(factor)) * np.minimum(present[2:], base[2:])
+            shared_covariance = np.sign(factor) * gauges.gradient(*present[:2], *smaller)[1]
+            gradient, covariance = _relative_gradient(
+                gauges.gradient(*present), gauges.gradient(*base), shared_covariance
+            )
+        motion = self._rigid(self._relative_displacement(frame))
         if motion is not None:
             c, s = np.cos(motion.rotation), np.sin(motion.rotation)
             back = np.array([[c, s], [-s, c]])
@@ -465,23 +503,23 @@ class Maps(Portable):
 
     def _rates(self, name: str, frame: int, order: int) -> FloatArray:
         """Return the derivative of an order of a field against the test's reference, and its uncertainty, (2, N)."""
-        places = np.flatnonzero(self._there == frame)
-        if not len(places):  # not measured yet
+        positions = np.flatnonzero(self._measured_frames == frame)
+        if not len(positions):  # not measured yet
             return np.full((2, len(self.result.nodes)), np.nan)
-        block, row = divmod(int(places[0]), _AROUND * self.window)
+        block, row = divmod(int(positions[0]), _WINDOWS_PER_BLOCK * self.window)
         return self._block(name, block)[order - 1, :, row]
 
     @cached_property
-    def _there(self) -> IntArray:
+    def _measured_frames(self) -> IntArray:
         return np.flatnonzero(self.result.finished)
 
     @cached_property
     def _units(self) -> Units:
         """Units with that of time, for which one frame is read: `_clock` reads all."""
-        first = next(iter(self.result.each("time_ns", self._there[:1])), UNKNOWN_TIME)
+        first_stamp = next(iter(self.result.iterate("time_ns", self._measured_frames[:1])), UNKNOWN_TIME)
         scale = self.physical.scale or self.result.section(ScaleSettings)
         rate = scale.frame_rate or self.result.provenance.get("frame_rate")
-        return replace(self.physical.units, timed=bool(rate) or first != UNKNOWN_TIME)
+        return replace(self.physical.units, timed=bool(rate) or first_stamp != UNKNOWN_TIME)
 
     @cached_property
     def _clock(self) -> FloatArray:
@@ -490,7 +528,7 @@ class Maps(Portable):
         if times is None and self._units.timed:
             raise InputError("rates need the times of all frames, of which some have none: state frame_rate in [scale]")
         clock = self.result.number if times is None else times
-        return np.asarray(clock[self._there], dtype=np.float64)
+        return np.asarray(clock[self._measured_frames], dtype=np.float64)
 
     @cached_property
     def _block(self) -> Callable[[str, int], FloatArray]:
@@ -499,43 +537,45 @@ class Maps(Portable):
 
     def _rates_of(self, name: str, block: int) -> FloatArray:
         """Compute rates of a field from the frames of a block and those around: the same whichever is asked for."""
-        taken = rate_frames(self.window, len(self._there))
-        size = _AROUND * self.window
-        inner = slice(block * size, min((block + 1) * size, len(self._there)))
-        outer = slice(max(inner.start - size, 0), inner.stop + size)
-        frames, clock = self._there[outer], self._clock[outer]
-        plain = replace(self, since=None, rigid_removed=False)
+        window_frames = rate_frames(self.window, len(self._measured_frames))
+        size = _WINDOWS_PER_BLOCK * self.window
+        block_slice = slice(block * size, min((block + 1) * size, len(self._measured_frames)))
+        padded_slice = slice(max(block_slice.start - size, 0), block_slice.stop + size)
+        frames, clock = self._measured_frames[padded_slice], self._clock[padded_slice]
+        absolute_maps = replace(self, since=None, rigid_removed=False)
         if name in UV:
-            each = (moved[UV.index(name) : 4 : 2] for moved in self._displacements(frames.tolist()))
+            fields = (displacement[UV.index(name) : 4 : 2] for displacement in self._displacements(frames.tolist()))
         else:
-            each = (np.stack(plain._derived(name, frame)) for frame in frames.tolist())
-        series = np.stack([*each], axis=1)
-        span = (taken - 1) * float(np.median(np.diff(self._clock)))
-        common, references = shared_part(self.result), reference_frames(self.result)[frames]
-        mine = slice(inner.start - outer.start, inner.stop - outer.start)
-        found = np.empty((2, 2, inner.stop - inner.start, series.shape[2]))
-        for start in range(0, series.shape[2], _AT_ONCE):
-            part = slice(start, start + _AT_ONCE)
-            made = rates(clock, *series[..., part], window=span, common_fraction=common, references=references)
+            fields = (np.stack(absolute_maps._derived(name, frame)) for frame in frames.tolist())
+        series = np.stack([*fields], axis=1)
+        span = (window_frames - 1) * float(np.median(np.diff(self._clock)))
+        common_fraction, references = common_variance_fraction(self.result), reference_frames(self.result)[frames]
+        rows = slice(block_slice.start - padded_slice.start, block_slice.stop - padded_slice.start)
+        block_rates = np.empty((2, 2, block_slice.stop - block_slice.start, series.shape[2]))
+        for first_node in range(0, series.shape[2], _NODES_PER_BATCH):
+            nodes = slice(first_node, first_node + _NODES_PER_BATCH)
+            node_rates = rates(
+                clock, *series[..., nodes], window=span, common_fraction=common_fraction, references=references
+            )
             for order, quantity in enumerate(("velocity", "acceleration")):
-                found[order, 0, :, part] = getattr(made, quantity)[mine]
-                found[order, 1, :, part] = getattr(made, f"{quantity}_std")[mine]
-        return found
+                block_rates[order, 0, :, nodes] = getattr(node_rates, quantity)[rows]
+                block_rates[order, 1, :, nodes] = getattr(node_rates, f"{quantity}_std")[rows]
+        return block_rates
 
 
-def _composed(
-    now: tuple[FloatArray, FloatArray], first: tuple[FloatArray, FloatArray], shared: FloatArray
+def _relative_gradient(
+    present: tuple[FloatArray, FloatArray], base: tuple[FloatArray, FloatArray], shared: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Compute the displacement gradient from one state to another, ``F_now F_first⁻¹ - I``, and its covariance.
 
     With ``A = I ⊗ F_first⁻ᵀ`` and ``B = (F_now F_first⁻¹) ⊗ F_first⁻ᵀ`` its change is ``A d(now) - B d(first)``, both
     row by row; `shared` (G, 4, 4) is the covariance between both gradients.
     """
-    inverse = np.linalg.inv(np.eye(2) + first[0])
-    whole = (np.eye(2) + now[0]) @ inverse
+    inverse = np.linalg.inv(np.eye(2) + base[0])
+    relative = (np.eye(2) + present[0]) @ inverse
     a = np.einsum("ij,glk->gikjl", np.eye(2), inverse).reshape(-1, 4, 4)
-    b = np.einsum("gij,glk->gikjl", whole, inverse).reshape(-1, 4, 4)
-    turned = [np.swapaxes(part, 1, 2) for part in (a, b)]
-    cross = a @ shared @ turned[1]
-    covariance = a @ now[1] @ turned[0] + b @ first[1] @ turned[1] - cross - np.swapaxes(cross, 1, 2)
-    return whole - np.eye(2), covariance
+    b = np.einsum("gij,glk->gikjl", relative, inverse).reshape(-1, 4, 4)
+    transposed = [np.swapaxes(matrix, 1, 2) for matrix in (a, b)]
+    cross = a @ shared @ transposed[1]
+    covariance = a @ present[1] @ transposed[0] + b @ base[1] @ transposed[1] - cross - np.swapaxes(cross, 1, 2)
+    return relative - np.eye(2), covariance

@@ -13,32 +13,35 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields import ProfileLine
 from rgbmidic.fields.profiles import Arrivals, Front, arrival_times, fit_front, rate_correlation
 from rgbmidic.fields.units import column
+from rgbmidic.renamed import state_new_names
 from rgbmidic.results.files import check_file, write_complete, write_table
 from rgbmidic.results.maps import Maps
-from rgbmidic.results.physical import frame_times, shared_part
 from rgbmidic.results.quantities import UV
+from rgbmidic.results.result_in_units import common_variance_fraction, frame_times
 from rgbmidic.typing import AnyArray, FloatArray
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Wave:
     """A front or peak along a profile, in the profile's units.
 
     Attributes
     ----------
-    what, level
+    feature, level
         As of `rgbmidic.fields.profiles.arrival_times`.
     arrivals, front
         When it is at each position, and the straight line through that. The uncertainty of the speed includes the
         scale's.
     """
 
-    what: str
+    feature: str
     level: float | str
     arrivals: Arrivals
     front: Front
 
 
+@state_new_names
 class Profile:
     """A field along a line in some frames; its values are NaN until `fill` reads them.
 
@@ -80,23 +83,28 @@ class Profile:
         The field has no uncertainty, no frame is measured yet, or half of the line is outside the mesh.
     """
 
-    def __init__(self, maps: Maps, field: str, place: Sequence[float], frames: Sequence[int] | AnyArray) -> None:
-        self.field, self.how, result, physical = maps.field(field), maps.how(field), maps.result, maps.physical
-        if f"{field}_std" not in maps.all:
+    def __init__(self, maps: Maps, field: str, endpoints: Sequence[float], frames: Sequence[int] | AnyArray) -> None:
+        self.field, self.processing_note, result, physical = (
+            maps.field(field),
+            maps.processing_note(field),
+            maps.result,
+            maps.physical,
+        )
+        if f"{field}_std" not in maps.quantities:
             raise InputError(
                 f'a profile is of a field with an uncertainty, not of "{field}"; these are '
-                + ", ".join(name for name in maps.all if f"{name}_std" in maps.all)
+                + ", ".join(name for name in maps.quantities if f"{name}_std" in maps.quantities)
             )
         self.frames = np.asarray(frames, dtype=np.int64)
         if not len(self.frames):
             raise InputError(f"no frame of {result.path} is measured yet")
-        self.line = ProfileLine(physical.covariance, physical.gauges, *physical.rectified.place(place, 2))
+        self.line = ProfileLine(physical.covariance, physical.gauges, *physical.rectified.place(endpoints, 2))
         times, self.numbers = frame_times(result, physical.scale), result.number[self.frames]
         self.times = None if times is None else times[self.frames]
         self.units = replace(physical.units, timed=times is not None)
         self.values, self.std = np.full((2, len(self.frames), len(self.line.points)), np.nan)
         self.bias_fractions = np.zeros(len(self.frames))
-        self.common_fraction, self.rate_window = shared_part(result), 0.0
+        self.common_fraction, self.rate_window = common_variance_fraction(result), 0.0
         if self.field.group == "Rates" and len(self.frames) > 1:
             self.rate_window = (maps.window - 1) * float(np.median(np.diff(self.clock)))
 
@@ -112,13 +120,15 @@ class Profile:
         """
         for row in rows:
             name, frame, bias = self.field.name, int(self.frames[row]), np.zeros(1)
-            read = maps.read(name, frame)
+            map_values = maps.read(name, frame)
             if name in UV:
                 bias = (self.units.mm_per_pixel or 1.0) * maps.displacement(frame)[4 + UV.index(name)]
-                variances = np.square([bias, read.std])[:, self.line.nodes]
-                shared, whole = np.nansum(variances, axis=1)
-                self.bias_fractions[row] = shared / whole if whole else 0.0
-            self.values[row], self.std[row] = self.line.read(read.values, read.std, self.kind, bias)
+                variances = np.square([bias, map_values.std])[:, self.line.nodes]
+                bias_variance, total_variance = np.nansum(variances, axis=1)
+                self.bias_fractions[row] = bias_variance / total_variance if total_variance else 0.0
+            self.values[row], self.std[row] = self.line.read(
+                map_values.values, map_values.std, self.covariance_key, bias
+            )
 
     @property
     def positions(self) -> FloatArray:
@@ -131,18 +141,18 @@ class Profile:
         return np.asarray(self.numbers if self.times is None else self.times, dtype=np.float64)
 
     @property
-    def kind(self) -> str:
+    def covariance_key(self) -> str:
         """Key of `ProfileLine.covariances`: how the errors of the field hang together."""
         if self.field.name[:3] in ("exx", "eyy"):
             return self.field.name[:3]
         return "strain" if self.field.unit in ("", "deg") or "_rate" in self.field.name else ""
 
-    def wave(self, what: str = "front", level: float | str = "50%") -> Wave:
+    def wave(self, feature: str = "front", level: float | str = "50%") -> Wave:
         """Fit the speed of a front or peak.
 
         Parameters
         ----------
-        what, level
+        feature, level
             As of `rgbmidic.fields.profiles.arrival_times`.
 
         Returns
@@ -152,23 +162,23 @@ class Profile:
         Raises
         ------
         InputError
-            Nothing travels along the line, or `what` or `level` is none of those allowed.
+            Nothing travels along the line, or `feature` or `level` is none of those allowed.
         """
         clock = self.clock
-        between = rate_correlation(clock, self.rate_window) if self.rate_window else None
-        more: dict[str, Any] = {
+        frame_correlation = rate_correlation(clock, self.rate_window) if self.rate_window else None
+        options: dict[str, Any] = {
             "common_fraction": 0.0 if self.rate_window else self.common_fraction,
-            "between_frames": between,
+            "between_frames": frame_correlation,
         }
-        arrivals = arrival_times(clock, self.values, self.std, what=what, level=level, **more)
-        correlation = self.line.correlation(self.kind, float(self.bias_fractions.mean()))
-        front = fit_front(self.positions, arrivals, self.std, correlation, usable=self.line.even, **more)
+        arrivals = arrival_times(clock, self.values, self.std, what=feature, level=level, **options)
+        correlation = self.line.correlation(self.covariance_key, float(self.bias_fractions.mean()))
+        front = fit_front(self.positions, arrivals, self.std, correlation, usable=self.line.even, **options)
         scale = self.units.mm_per_pixel_std / (self.units.mm_per_pixel or 1.0)
         front = replace(front, speed_std=float(np.hypot(front.speed_std, scale * front.speed)))
-        return Wave(what=what, level=level, arrivals=arrivals, front=front)
+        return Wave(feature=feature, level=level, arrivals=arrivals, front=front)
 
 
-def read_profile(maps: Maps, field: str, place: Sequence[float], frames: Sequence[int] | None = None) -> Profile:
+def read_profile(maps: Maps, field: str, endpoints: Sequence[float], frames: Sequence[int] | None = None) -> Profile:
     """Read a field along a line in every frame.
 
     Parameters
@@ -177,7 +187,7 @@ def read_profile(maps: Maps, field: str, place: Sequence[float], frames: Sequenc
         The result and how its fields are derived.
     field
         Name of the field.
-    place
+    endpoints
         Ends x0, y0, x1, y1 of the line in px of the image.
     frames
         Indices of the frames; None: all that are measured.
@@ -190,8 +200,17 @@ def read_profile(maps: Maps, field: str, place: Sequence[float], frames: Sequenc
     ------
     InputError
         There is no such field or frame, it has no uncertainty, or half of the line is outside the mesh.
+
+    Examples
+    --------
+    >>> from rgbmidic.results import Result
+    >>> maps = Maps.from_result(Result.open("my_result"))
+    >>> (x0, y0), (x1, y1) = maps.result.nodes.min(axis=0), maps.result.nodes.max(axis=0)
+    >>> profile = read_profile(maps, "u", (x0, (y0 + y1) / 2, x1, (y0 + y1) / 2))
+    >>> profile.values.shape == (len(profile.frames), len(profile.positions))
+    True
     """
-    profile = Profile(maps, field, place, np.flatnonzero(maps.result.finished) if frames is None else frames)
+    profile = Profile(maps, field, endpoints, np.flatnonzero(maps.result.finished) if frames is None else frames)
     profile.fill(maps, range(len(profile.frames)))
     if not np.isfinite(profile.values).any():
         raise InputError(f"{field} is measured in no frame along the line; place it elsewhere")
@@ -218,33 +237,35 @@ def write_profile(profile: Profile, out: Path | str, wave: Wave | None = None, *
         A file exists, its folder does not, or it cannot be written.
     """
     out = Path(out)
-    beside = arrivals_file(out)
-    for file in (out, *([beside] if wave else [])):
+    arrivals_path = arrivals_file(out)
+    for file in (out, *([arrivals_path] if wave else [])):
         check_file(file, overwrite=overwrite)
     unit, value = profile.units.length, column(profile.field.name, profile.field.unit)
-    head = [column(part, unit) for part in ("position", "x", "y")]
-    at = np.column_stack([profile.positions, profile.line.points * (profile.units.mm_per_pixel or 1.0)])
-    timed = [] if profile.times is None else ["time_s"]
+    head = [column(name, unit) for name in ("position", "x", "y")]
+    positions = np.column_stack([profile.positions, profile.line.points * (profile.units.mm_per_pixel or 1.0)])
+    time_columns = [] if profile.times is None else ["time_s"]
 
     def rows() -> Iterator[list[object]]:
         for row, (frame, number, clock) in enumerate(zip(profile.frames, profile.numbers, profile.clock, strict=True)):
-            start = [frame, number, *([f"{clock:.12g}"] if timed else [])]
-            for numbers in np.column_stack([at, profile.values[row], profile.std[row]]).tolist():
-                yield [*start, *numbers]
+            cells = [frame, number, *([f"{clock:.12g}"] if time_columns else [])]
+            for numbers in np.column_stack([positions, profile.values[row], profile.std[row]]).tolist():
+                yield [*cells, *numbers]
 
-    names = ["frame", "number", *timed, *head, value, f"{value}_std"]
+    names = ["frame", "number", *time_columns, *head, value, f"{value}_std"]
     write_complete(out, lambda file: write_table(file, names, rows()))
     if wave is None:
         return
-    clock = "s" if timed else "frame"
+    clock = "s" if time_columns else "frame"
     columns = {
-        **dict(zip(head, at.T, strict=True)),
+        **dict(zip(head, positions.T, strict=True)),
         f"arrival_{clock}": wave.arrivals.times,
         f"arrival_{clock}_std": wave.arrivals.std,
         f"residual_{clock}": wave.front.residuals,
         "used": wave.front.used.astype(float),
     }
-    write_complete(beside, lambda file: write_table(file, columns, np.column_stack([*columns.values()]).tolist()))
+    write_complete(
+        arrivals_path, lambda file: write_table(file, columns, np.column_stack([*columns.values()]).tolist())
+    )
 
 
 def arrivals_file(out: Path) -> Path:

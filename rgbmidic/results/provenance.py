@@ -32,19 +32,19 @@ SCHEMA_VERSION = 13
 """Goes up with every change of the quantities or files: a result of another version is refused, not guessed at."""
 
 PROVENANCE = "provenance.json"
-PUT_BACK = "put back the file that was there, or delete it and go on with --resume"
+RESTORE_REMEDY = "put back the file that was there, or delete it and go on with --resume"
 """What to do about a file of another run."""
 _SEAL = "sha256"
 _PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "rawpy", "tifffile", "h5py")
-_ALWAYS = ("rgbmidic", *_PACKAGES[:4])
+_NUMERICAL_PACKAGES = ("rgbmidic", *_PACKAGES[:4])
 """Packages whose version decides on the bits of any result; the others read formats of frames."""
-READING = ("scale", "probes", "setup", "channels")
+READING_SECTIONS = ("scale", "probes", "setup", "channels")
 """Sections of the settings that state how a result is read, and not what is measured."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Origin:
-    """What all frames of a result share.
+    """Mesh, names, settings and inputs that all frames of a result share.
 
     Attributes
     ----------
@@ -85,8 +85,8 @@ class Origin:
     def mesh(self) -> dict[str, AnyArray]:
         """`nodes` and `elements`, and what is known of finite elements, in the types of the table."""
         arrays: dict[str, npt.ArrayLike] = {"nodes": self.nodes, "elements": self.elements}
-        if (stated := self.finite_elements) is not None:
-            numbers = stated.node_numbers, stated.element_numbers, stated.points
+        if (fe_mesh := self.finite_elements) is not None:
+            numbers = fe_mesh.node_numbers, fe_mesh.element_numbers, fe_mesh.points
             arrays |= zip(FINITE_ELEMENTS, numbers, strict=True)
         return {name: SHARED[name].convert(array, {}) for name, array in arrays.items()}
 
@@ -97,7 +97,7 @@ class Origin:
         -------
         dict
         """
-        document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION, "created": now()}
+        document: dict[str, Any] = {"schema": SCHEMA_NAME, "schema_version": SCHEMA_VERSION, "created": current_time()}
         versions = {"rgbmidic": __version__, "python": platform.python_version()}
         for name in _PACKAGES:
             with suppress(importlib.metadata.PackageNotFoundError):
@@ -132,30 +132,36 @@ def digest(content: Mapping[str, AnyArray] | list[str]) -> str:
     return sums.hexdigest()
 
 
-def check_same(path: Path, was: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuse to go on with a result whose provenance `was` when frames to come would have the provenance `now`.
+def check_same(path: Path, stored: Mapping[str, Any], current: Mapping[str, Any]) -> None:
+    """Refuse to go on with a result whose provenance `stored` when frames to come would have the provenance `current`.
 
     Raises
     ------
     AnotherTestError
         Settings, calibration, inputs, frames, mesh, lights, references, or a version differ; the message says which.
     """
-    before, after = dict(_compared(was)), dict(_compared(now))
-    pairs = {name: (before.get(name), after.get(name)) for name in {**before, **after}}
+    stored_entries, current_entries = dict(_compared_entries(stored)), dict(_compared_entries(current))
+    entry_pairs = {
+        name: (stored_entries.get(name), current_entries.get(name)) for name in {**stored_entries, **current_entries}
+    }
     # 25 and 25.0 are one number; 1 is a frame, true is not
-    names = [name for name, (one, two) in pairs.items() if one != two or isinstance(one, bool) != isinstance(two, bool)]
+    names = [
+        name
+        for name, (stored_value, current_value) in entry_pairs.items()
+        if stored_value != current_value or isinstance(stored_value, bool) != isinstance(current_value, bool)
+    ]
     if names:
-        stated = ["{} was {}, now {}".format(name, *map(_short, pairs[name])) for name in names[:3]]
-        differences, more = "; ".join(stated), f"; and {len(names) - 3} more" if len(names) > 3 else ""
+        phrases = ["{} was {}, now {}".format(name, *map(_short, entry_pairs[name])) for name in names[:3]]
+        differences, remainder = "; ".join(phrases), f"; and {len(names) - 3} more" if len(names) > 3 else ""
         raise AnotherTestError(
-            f"{path} is of another test and is not gone on with: {differences}{more}; give another folder"
+            f"{path} is of another test and is not gone on with: {differences}{remainder}; give another folder"
         )
 
 
-def _compared(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+def _compared_entries(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield what decides on the bits of a result, each under a name for messages."""
     for section, keys in document.get("settings", {}).items():
-        if section not in READING:
+        if section not in READING_SECTIONS:
             yield from ((f"{section}.{key}", value) for key, value in keys.items())
     yield "the calibration", document.get("calibration", {}).get("sha256")
     yield from ((f"the input {name}", text) for name, text in document["inputs"].items())
@@ -164,7 +170,7 @@ def _compared(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     yield "the number of frames", document["frames"]["count"]
     yield "the list of frames", document["frames"]["sha256"]
     yield from ((name, document[name]) for name in ("lights", "references"))
-    for name in (*_ALWAYS, *document["readers"]):
+    for name in (*_NUMERICAL_PACKAGES, *document["readers"]):
         yield f"the version of {name}", document["versions"].get(name)
 
 
@@ -175,10 +181,10 @@ def _short(value: Any) -> str:
 
 def fingerprint(document: Mapping[str, Any]) -> bytes:
     """Return the digest (16 bytes) of what `check_same` compares: every record of a run has it in its header."""
-    return hashlib.sha256(_canonical(dict(_compared(document)))).digest()[:16]
+    return hashlib.sha256(_canonical(dict(_compared_entries(document)))).digest()[:16]
 
 
-def sealed(document: Mapping[str, Any]) -> dict[str, Any]:
+def with_checksum(document: Mapping[str, Any]) -> dict[str, Any]:
     """Add the checksum of the content to a provenance, as it is written."""
     return {**document, _SEAL: hashlib.sha256(_canonical(document)).hexdigest()}
 
@@ -229,7 +235,7 @@ def read_provenance(path: Path) -> dict[str, Any]:
             f"schema version {SCHEMA_VERSION}: read it with the version that wrote it, or measure the test again"
         )
     seal = document.pop(_SEAL, None)
-    if sealed(document)[_SEAL] != seal:
+    if with_checksum(document)[_SEAL] != seal:
         raise ResultError(
             f"{path / PROVENANCE} was changed after it was written: put it back as it was. Another [scale], [setup] or "
             "other [probes] or [channels] are stated in TEST.toml: `rgbmidic run TEST.toml --out DIR --resume` keeps "
@@ -238,6 +244,6 @@ def read_provenance(path: Path) -> dict[str, Any]:
     return document
 
 
-def now() -> str:
+def current_time() -> str:
     """Return the present date and time."""
     return datetime.now(UTC).isoformat(timespec="seconds")

@@ -15,14 +15,16 @@ import numpy as np
 from rgbmidic.errors import InputError
 from rgbmidic.fields.strain import EQUIVALENT
 from rgbmidic.fields.units import Units
-from rgbmidic.text import rounded, uncertain
+from rgbmidic.renamed import state_new_names
+from rgbmidic.text import format_value, format_with_std
 from rgbmidic.timing import STAGES
 
 Kind = Literal["displacement", "strain", "positive", "fraction", "angle", "codes"]
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class ResultQuantity:
     """An entry of the table: what a name stands for, of every frame or of all together, kept or derived.
 
     Attributes
@@ -34,11 +36,11 @@ class Quantity:
         Axes in one frame: ``"node"`` and ``"light"`` have the result's sizes, a number is a size itself, and any other
         word is open: its size may differ from frame to frame. Without axes it is a plain number or text.
     unit
-        Empty where there is none; ``"px"`` becomes the reader's unit of lengths (`in_units`).
+        Empty where there is none; ``"px"`` becomes the reader's unit of lengths (`with_units`).
     source
         Attribute of the object that it comes from, a `Solution` or a `Strain`, a column of it behind a dot; empty where
         the main job provides it. That of its standard uncertainty has ``_std`` behind the first word.
-    meaning
+    description
         Its description in docs/reference/conventions.md.
     dtype
         Type of the array, in memory and on disk: what is known to no more than some digits has single precision.
@@ -48,44 +50,54 @@ class Quantity:
         What each integer means, for a status.
     symbol
         How formulas and pictures write it; empty for what maps do not show.
-    parts, order
+    base_quantities, order
         Quantities from which it follows: their length where there are two, their derivative by time of an order, a
         strain or a discretisation error.
     group
         Heading under which maps list it.
     kind
         Kind of the values, which sets colours and format.
+
+    Examples
+    --------
+    >>> QUANTITIES["u_std"].unit, QUANTITIES["status"].codes
+    ('px', ('converged', 'not converged', 'failed'))
     """
 
     name: str
     axes: tuple[str | int, ...]
     unit: str
     source: str
-    meaning: str
+    description: str
     _: KW_ONLY
     dtype: type[np.generic] = np.float32
     blank: float | int | str = float("nan")
     codes: tuple[str, ...] = ()
     symbol: str = ""
-    parts: tuple[str, ...] = ()
+    base_quantities: tuple[str, ...] = ()
     order: int = 0
     group: str = "Quality"
     kind: Kind = "strain"
 
     @property
-    def uncertainty(self) -> Quantity:
+    def file_name(self) -> str:
+        """Name of its array in records and npz files: the small strain of the nodes has no prefix there."""
+        return self.name.removeprefix("nodal_")
+
+    @property
+    def uncertainty(self) -> ResultQuantity:
         """Its standard uncertainty."""
         return replace(
             self,
             name=f"{self.name}_std",
             source=re.sub(r"^[a-z]+", r"\g<0>_std", self.source),
-            meaning=f"standard uncertainty of {self.name}",
+            description=f"standard uncertainty of {self.name}",
             symbol=self.symbol and f"σ({self.symbol})",
             group="Uncertainty",
             kind="positive",
         )
 
-    def in_units(self, units: Units) -> Quantity:
+    def with_units(self, units: Units) -> ResultQuantity:
         """Return it with the reader's units of length and time.
 
         Parameters
@@ -95,7 +107,7 @@ class Quantity:
 
         Returns
         -------
-        Quantity
+        ResultQuantity
         """
         unit = units.length if self.unit == "px" else self.unit
         return replace(self, unit=units.per_time(unit, self.order) if self.order else unit)
@@ -106,27 +118,27 @@ class Quantity:
         return f"{self.symbol} ({self.unit})" if self.unit else self.symbol
 
     @property
-    def signed(self) -> bool:
-        """Whether colours symmetric about 0 make sense."""
+    def is_signed(self) -> bool:
+        """True if colours symmetric about 0 make sense."""
         return self.kind in ("displacement", "strain")
 
     @property
-    def logarithmic(self) -> bool:
-        """Whether colours spread by ratio: uncertainties, and what is compared with 1."""
+    def is_logarithmic(self) -> bool:
+        """True if colours spread by ratio: for uncertainties, and for what is compared with 1."""
         return self.kind == "positive" and self.group in ("Quality", "Uncertainty")
 
     @property
     def stepped(self) -> bool:
-        """Whether values between those of two nodes mean nothing."""
+        """True if values between those of two nodes mean nothing."""
         return self.kind in ("angle", "codes")
 
     @property
-    def ends(self) -> tuple[float, float] | None:
+    def fixed_range(self) -> tuple[float, float] | None:
         """Values of the first and last colour, where the kind of quantity sets them."""
         fixed = {"codes": (-0.5, len(self.codes) - 0.5), "fraction": (0.0, 1.0), "angle": (-90.0, 90.0)}
         return fixed.get(self.kind)
 
-    def text(self, value: float, std: float = float("nan")) -> str:
+    def format(self, value: float, std: float = float("nan")) -> str:
         """Return a value with its standard uncertainty and unit as text.
 
         Parameters
@@ -145,8 +157,8 @@ class Quantity:
         if self.codes:
             return self.codes[int(value)]
         if self.group == "Uncertainty":
-            return f"{rounded(value, value)} {self.unit}".rstrip()
-        return uncertain(value, std, self.unit)
+            return f"{format_value(value, value)} {self.unit}".rstrip()
+        return format_with_std(value, std, self.unit)
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int | None, ...]:
         """Return the shape in one frame for these sizes of ``"node"`` and ``"light"``; None for an open axis.
@@ -163,23 +175,23 @@ class Quantity:
         return tuple(axis if isinstance(axis, int) else sizes.get(axis) for axis in self.axes)
 
     @property
-    def stackable(self) -> bool:
-        """Whether all frames make one array: no axis is open, and it is no text."""
+    def is_stackable(self) -> bool:
+        """True if all frames make one array: no axis is open, and it is no text."""
         return None not in self.shape({"node": 0, "light": 0}) and self.dtype is not np.str_
 
     @property
-    def estimated(self) -> bool:
-        """Whether it is of the nodes, but only in frames of which it is asked for."""
+    def is_estimated(self) -> bool:
+        """True for a quantity of the nodes that only frames have of which it was requested."""
         return self.axes == _ESTIMATED
 
     @property
     def attributes(self) -> dict[str, Any]:
         """Description by the CF conventions: units ("1" where there is none), long_name, and what a status means."""
-        about: dict[str, Any] = {"units": self.unit or "1", "long_name": self.meaning}
+        attributes: dict[str, Any] = {"units": self.unit or "1", "long_name": self.description}
         if self.codes:
-            about["flag_values"] = np.arange(len(self.codes), dtype=self.dtype)
-            about["flag_meanings"] = " ".join(code.replace(" ", "_") for code in self.codes)
-        return about
+            attributes["flag_values"] = np.arange(len(self.codes), dtype=self.dtype)
+            attributes["flag_meanings"] = " ".join(code.replace(" ", "_") for code in self.codes)
+        return attributes
 
     def convert(self, value: Any, sizes: Mapping[str, int]) -> Any:
         """Return `value` in the type of the table.
@@ -201,7 +213,9 @@ class Quantity:
             It has another shape.
         """
         array, shape = np.asarray(value, dtype=self.dtype), self.shape(sizes)
-        if array.ndim != len(shape) or any(a not in (None, b) for a, b in zip(shape, array.shape, strict=True)):
+        if array.ndim != len(shape) or any(
+            expected not in (None, length) for expected, length in zip(shape, array.shape, strict=True)
+        ):
             raise InputError(f"{self.name} of a result has the shape {shape} (None: any), not {array.shape}")
         return array if self.axes else array.item()
 
@@ -219,7 +233,7 @@ class Quantity:
         """
         return np.full([size or 0 for size in self.shape(sizes)], self.blank, dtype=self.dtype)
 
-    def of(self, source: object) -> Any:
+    def read_from(self, source: object) -> Any:
         """Take the quantity from an object with the attribute that `source` names.
 
         Parameters
@@ -236,9 +250,9 @@ class Quantity:
         return value[:, int(column)] if column else value
 
 
-def with_uncertainty(*quantities: Quantity) -> tuple[Quantity, ...]:
+def with_uncertainty(*quantities: ResultQuantity) -> tuple[ResultQuantity, ...]:
     """Return quantities, then the standard uncertainty of each."""
-    return *quantities, *(one.uncertainty for one in quantities)
+    return *quantities, *(quantity.uncertainty for quantity in quantities)
 
 
 NO_CHECKSUM = -1
@@ -250,89 +264,93 @@ _ESTIMATED = ("estimated node",)
 _NODE, _LIGHT, _PICTURE = ("node",), ("light",), ("light", "row", "column")
 _TEXT: dict[str, Any] = {"dtype": np.str_, "blank": ""}
 _BYTE: dict[str, Any] = {"dtype": np.uint8, "blank": 0}
-_EXACT: dict[str, Any] = {"dtype": np.float64}
+_DOUBLE: dict[str, Any] = {"dtype": np.float64}
 _AT_NODE = "relative to the reference, at the node"
 _NOT_FIT = "(not the best linear fit's nodal value)"
-_AROUND = "slope of the quadratic through the neighbouring nodes; NaN also next to a node that is not measured"
+_NODAL_SLOPE = "slope of the quadratic through the neighbouring nodes; NaN also next to a node that is not measured"
 _BIAS = "part of {}_std left by the bias of the lights, alike over some 24 px; 0 where there is none"
 _EDGE = "part of {}_std that the recovery misses near edges of the region; 0 elsewhere and with `mesh.error`"
-_LEFT_OUT = "discretisation error of {}, caused by mesh and recovery, one sigma; empty unless `mesh.error` requests it"
-_ENDS = ("converged", "not converged", "failed")
-_NODE_ENDS = ("measured", "not seen", "decorrelated", "filled")
+_DISCRETISATION = (
+    "discretisation error of {}, caused by mesh and recovery, one sigma; empty unless `mesh.error` requests it"
+)
+_FRAME_OUTCOMES = ("converged", "not converged", "failed")
+_NODE_OUTCOMES = ("measured", "not seen", "decorrelated", "filled")
 
 _TABLE = (
-    Quantity("number", (), "", "", "number of the frame; missing frames leave gaps", dtype=np.int64, blank=-1),
-    Quantity("time_ns", (), "ns", "",
+    ResultQuantity("number", (), "", "", "number of the frame; missing frames leave gaps", dtype=np.int64, blank=-1),
+    ResultQuantity("time_ns", (), "ns", "",
         "time of the frame after the trigger; the smallest 64-bit integer if it is not known",
         dtype=np.int64, blank=UNKNOWN_TIME),
-    Quantity("status", (), "", "status", "status of the frame, see below", dtype=np.int64, blank=2, codes=_ENDS),
-    Quantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
-    Quantity("warnings", ("warning",), "", "", "what is doubtful about it, a text each", **_TEXT),
-    Quantity("unread", (), "", "",
+    ResultQuantity("status", (), "", "status",
+        "status of the frame, see below", dtype=np.int64, blank=2, codes=_FRAME_OUTCOMES),
+    ResultQuantity("reason", (), "", "reason", "why it failed or did not converge, else empty", **_TEXT),
+    ResultQuantity("warnings", ("warning",), "", "", "what is doubtful about it, a text each", **_TEXT),
+    ResultQuantity("unread", (), "", "",
         "1 if the frame failed because it could not be read (`--resume` tries again), else 0", dtype=np.int64, blank=0),
-    Quantity("tries", (), "", "",
+    ResultQuantity("tries", (), "", "",
         "2 for a key frame that was also measured from the frame just before it, else 1", dtype=np.int64, blank=1),
-    Quantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
-    Quantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
-    Quantity("inputs", ("file", 2), "", "", "path and SHA-256 of each file that the frame was read from", **_TEXT),
-    Quantity("machine", (), "", "",
+    ResultQuantity("iterations", (), "", "iterations", "Gauss-Newton iterations", dtype=np.int64, blank=0),
+    ResultQuantity("history", ("iteration",), "px", "history", "largest motion of a measured node in each iteration"),
+    ResultQuantity("inputs", ("file", 2), "", "",
+        "path and SHA-256 of each file that the frame was read from", **_TEXT),
+    ResultQuantity("machine", (), "", "",
         "processor and BLAS library that it was measured with, on which the last bits depend; empty if it failed",
         **_TEXT),
-    Quantity("checksum", (), "", "",
+    ResultQuantity("checksum", (), "", "",
         "CRC-32 of the frame's samples where the reference was read; -1 if it failed. Noise makes all differ",
         dtype=np.int64, blank=NO_CHECKSUM),
-    Quantity("node_status", _NODE, "", "node_status",
-        "see below", dtype=np.uint8, blank=1, codes=_NODE_ENDS, kind="codes"),
-    Quantity("u", _NODE, "px", "displacement.0", f"displacement in x {_AT_NODE} {_NOT_FIT}", **_EXACT),
-    Quantity("v", _NODE, "px", "displacement.1", f"displacement in y {_AT_NODE}", **_EXACT),
-    Quantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
-    Quantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
-    Quantity("u_bias_std", _NODE, "px", "bias_std.0", _BIAS.format("u"), kind="positive"),
-    Quantity("v_bias_std", _NODE, "px", "bias_std.1", _BIAS.format("v"), kind="positive"),
-    Quantity("u_edge_std", _NODE, "px", "edge_std.0", _EDGE.format("u"), kind="positive"),
-    Quantity("v_edge_std", _NODE, "px", "edge_std.1", _EDGE.format("v"), kind="positive"),
+    ResultQuantity("node_status", _NODE, "", "node_status",
+        "see below", dtype=np.uint8, blank=1, codes=_NODE_OUTCOMES, kind="codes"),
+    ResultQuantity("u", _NODE, "px", "displacement.0", f"displacement in x {_AT_NODE} {_NOT_FIT}", **_DOUBLE),
+    ResultQuantity("v", _NODE, "px", "displacement.1", f"displacement in y {_AT_NODE}", **_DOUBLE),
+    ResultQuantity("u_std", _NODE, "px", "displacement_std.0", "standard uncertainty of u (one sigma)"),
+    ResultQuantity("v_std", _NODE, "px", "displacement_std.1", "standard uncertainty of v (one sigma)"),
+    ResultQuantity("u_bias_std", _NODE, "px", "bias_std.0", _BIAS.format("u"), kind="positive"),
+    ResultQuantity("v_bias_std", _NODE, "px", "bias_std.1", _BIAS.format("v"), kind="positive"),
+    ResultQuantity("u_edge_std", _NODE, "px", "edge_std.0", _EDGE.format("u"), kind="positive"),
+    ResultQuantity("v_edge_std", _NODE, "px", "edge_std.1", _EDGE.format("v"), kind="positive"),
     *with_uncertainty(
-        Quantity("exx", _NODE, "", "strain.0", f"small strain in x: {_AROUND}"),
-        Quantity("eyy", _NODE, "", "strain.1", f"small strain in y: {_AROUND}"),
-        Quantity("exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_AROUND}"),
+        ResultQuantity("nodal_exx", _NODE, "", "strain.0", f"small strain in x: {_NODAL_SLOPE}"),
+        ResultQuantity("nodal_eyy", _NODE, "", "strain.1", f"small strain in y: {_NODAL_SLOPE}"),
+        ResultQuantity("nodal_exy", _NODE, "", "strain.2", f"small strain, tensor shear: {_NODAL_SLOPE}"),
     ),
-    Quantity("u_mesh_error", _ESTIMATED, "px", "displacement_error.0", _LEFT_OUT.format("u")),
-    Quantity("v_mesh_error", _ESTIMATED, "px", "displacement_error.1", _LEFT_OUT.format("v")),
-    Quantity("exx_mesh_error", _ESTIMATED, "", "strain_error.0", _LEFT_OUT.format("exx")),
-    Quantity("eyy_mesh_error", _ESTIMATED, "", "strain_error.1", _LEFT_OUT.format("eyy")),
-    Quantity("exy_mesh_error", _ESTIMATED, "", "strain_error.2", _LEFT_OUT.format("exy")),
-    Quantity("match", (), "", "",
+    ResultQuantity("u_mesh_error", _ESTIMATED, "px", "displacement_error.0", _DISCRETISATION.format("u")),
+    ResultQuantity("v_mesh_error", _ESTIMATED, "px", "displacement_error.1", _DISCRETISATION.format("v")),
+    ResultQuantity("nodal_exx_mesh_error", _ESTIMATED, "", "strain_error.0", _DISCRETISATION.format("nodal_exx")),
+    ResultQuantity("nodal_eyy_mesh_error", _ESTIMATED, "", "strain_error.1", _DISCRETISATION.format("nodal_eyy")),
+    ResultQuantity("nodal_exy_mesh_error", _ESTIMATED, "", "strain_error.2", _DISCRETISATION.format("nodal_exy")),
+    ResultQuantity("match", (), "", "",
         "median correlation coefficient of the elements with their reference, for the light that matches best; NaN "
         "without `frames.update_reference`"),
-    Quantity("best_match", (), "", "",
+    ResultQuantity("best_match", (), "", "",
         "largest `match` of the frames compared with the same reference, up to this one", blank=0),
-    Quantity("reference_updates", ("reference_update",), "", "",
+    ResultQuantity("reference_updates", ("reference_update",), "", "",
         "indices in the result of the frames that became the reference, up to this one: this frame was compared with "
         "the last one before it, or with the test's reference", dtype=np.int64, blank=0),
-    Quantity("misfit", _NODE, "", "misfit",
+    ResultQuantity("misfit", _NODE, "", "misfit",
         "weighted rms residual around a node over its median: 1 is typical, 3 is suspicious", kind="positive"),
-    Quantity("light_fraction", ("node", "light"), "", "light_fraction",
+    ResultQuantity("light_fraction", ("node", "light"), "", "light_fraction",
         "fraction of each light in the information that determines a node", blank=0),
-    Quantity("residual", _LIGHT, "", "residual",
+    ResultQuantity("residual", _LIGHT, "", "residual",
         "weighted rms of `f - g(x + u)`, in the unit of the correlated images: none if these are divided by their "
         "local mean (the default), else DN"),
-    Quantity("weight_fraction", _LIGHT, "", "weight_fraction",
+    ResultQuantity("weight_fraction", _LIGHT, "", "weight_fraction",
         "mean fraction of each light in the weights; their sum is the part of the region that any light sees"),
-    Quantity("brightness", ("light", 2), "", "",
+    ResultQuantity("brightness", ("light", 2), "", "",
         "gain and offset (DN) of each light relative to the reference, from contrast and mean of the speckle, medians "
         "over the elements; reported, not used"),
-    Quantity("rigid", ("light", "function"), "", "rigid",
+    ResultQuantity("rigid", ("light", "function"), "", "rigid",
         "coefficients of each light's rigid functions: shift in x and y (px), rotation (rad); 0 for the first, NaN for "
         "a light that sees nothing"),
-    Quantity("seconds", (len(STAGES),), "s", "",
+    ResultQuantity("seconds", (len(STAGES),), "s", "",
         f"time of each of the stages {', '.join(STAGES)}; NaN without `--timings`"),
-    Quantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
-    Quantity("reflection_thumbnail", _PICTURE, "", "",
+    ResultQuantity("weights_thumbnail", _PICTURE, "", "", "reduced picture of each light's weight, 255 for 1", **_BYTE),
+    ResultQuantity("reflection_thumbnail", _PICTURE, "", "",
         "reduced picture of each light's reflection index, 255 for 1; empty if the separation does not give it",
         **_BYTE),
 )  # fmt: skip
 
-QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _TABLE}
+QUANTITIES: dict[str, ResultQuantity] = {quantity.name: quantity for quantity in _TABLE}
 """Every quantity by its name, in the order of the documents."""
 FAILED = QUANTITIES["status"].codes.index("failed")
 """`status` of a frame that could not be measured."""
@@ -341,14 +359,14 @@ _CORNERS = "node indices; `(p1 - p0) x (p2 - p0) > 0` in (x, y)"
 _REFERENCE = "reference image of each light, stretched to 8 bit, for pictures"
 _LABEL = "number of the node in the file of `mesh.file`"
 _CELL = "number of the element in the file of `mesh.file` that the triangle is from"
-_OWN_AXES = "node positions (x, y) in the axes of the file of `mesh.file`"
-SHARED: dict[str, Quantity] = {
-    "nodes": Quantity("nodes", ("node", 2), "px", "", "node positions (x, y) on the reference image", **_EXACT),
-    "elements": Quantity("elements", ("element", 3), "", "", _CORNERS, dtype=np.int32, blank=0),
-    "node_number": Quantity("node_number", ("node",), "", "", _LABEL, dtype=np.int64, blank=-1),
-    "element_number": Quantity("element_number", ("element",), "", "", _CELL, dtype=np.int64, blank=-1),
-    "node_mm": Quantity("node_mm", ("node", 2), "mm", "", _OWN_AXES, **_EXACT),
-    "reference": Quantity("reference", ("light", "image row", "image column"), "", "", _REFERENCE, **_BYTE),
+_FILE_AXES = "node positions (x, y) in the axes of the file of `mesh.file`"
+SHARED: dict[str, ResultQuantity] = {
+    "nodes": ResultQuantity("nodes", ("node", 2), "px", "", "node positions (x, y) on the reference image", **_DOUBLE),
+    "elements": ResultQuantity("elements", ("element", 3), "", "", _CORNERS, dtype=np.int32, blank=0),
+    "node_number": ResultQuantity("node_number", ("node",), "", "", _LABEL, dtype=np.int64, blank=-1),
+    "element_number": ResultQuantity("element_number", ("element",), "", "", _CELL, dtype=np.int64, blank=-1),
+    "node_mm": ResultQuantity("node_mm", ("node", 2), "mm", "", _FILE_AXES, **_DOUBLE),
+    "reference": ResultQuantity("reference", ("light", "image row", "image column"), "", "", _REFERENCE, **_BYTE),
 }
 """Quantities that all frames have in common."""
 
@@ -357,12 +375,12 @@ FINITE_ELEMENTS = ("node_number", "element_number", "node_mm")
 
 UV = ("u", "v")
 DERIVED = {
-    name: Quantity(
-        name, _NODE, unit, "", meaning, symbol=symbol, parts=parts, order=order,
+    name: ResultQuantity(
+        name, _NODE, unit, "", description, symbol=symbol, base_quantities=base, order=order,
         group="Rates" if order else "Displacement",
-        kind="strain" if not unit else "positive" if parts == UV else "displacement",
+        kind="strain" if not unit else "positive" if base == UV else "displacement",
     )
-    for name, unit, symbol, meaning, parts, order in (
+    for name, unit, symbol, description, base, order in (
         ("u", "px", "u", "displacement in x", ("u",), 0),
         ("v", "px", "v", "displacement in y", ("v",), 0),
         ("magnitude", "px", "|u|", "length of the displacement", UV, 0),
@@ -384,46 +402,57 @@ _ANGLE: dict[str, Any] = {"group": "Strain", "kind": "angle"}
 _TOWARDS, _LARGEST = "direction of e1, from x towards y", "largest engineering shear in the plane, e1 - e2"
 STRAIN = (
     *with_uncertainty(
-        Quantity("exx", _NODE, "", "components.0", "strain in x", symbol="εxx", group="Strain"),
-        Quantity("eyy", _NODE, "", "components.1", "strain in y", symbol="εyy", group="Strain"),
-        Quantity("exy", _NODE, "", "components.2", "strain, tensor shear", symbol="εxy", group="Strain"),
+        ResultQuantity("exx", _NODE, "", "components.0", "strain in x", symbol="εxx", group="Strain"),
+        ResultQuantity("eyy", _NODE, "", "components.1", "strain in y", symbol="εyy", group="Strain"),
+        ResultQuantity("exy", _NODE, "", "components.2", "strain, tensor shear", symbol="εxy", group="Strain"),
     ),
     *with_uncertainty(
-        Quantity("e1", _NODE, "", "principal.0", "larger principal strain in the plane", symbol="ε₁", group="Strain"),
-        Quantity("e2", _NODE, "", "principal.1", "smaller principal strain in the plane", symbol="ε₂", group="Strain"),
+        ResultQuantity(
+            "e1", _NODE, "", "principal.0", "larger principal strain in the plane", symbol="ε₁", group="Strain"
+        ),
+        ResultQuantity(
+            "e2", _NODE, "", "principal.1", "smaller principal strain in the plane", symbol="ε₂", group="Strain"
+        ),
     ),
-    *with_uncertainty(Quantity("direction", _NODE, "deg", "direction_deg", _TOWARDS, symbol="θ₁", **_ANGLE)),
-    *with_uncertainty(Quantity("shear", _NODE, "", "shear", _LARGEST, symbol="γmax", **_POSITIVE)),
-    *with_uncertainty(Quantity("equivalent", _NODE, "", "equivalent", EQUIVALENT, symbol="εeq (Hencky)", **_POSITIVE)),
+    *with_uncertainty(ResultQuantity("direction", _NODE, "deg", "direction_deg", _TOWARDS, symbol="θ₁", **_ANGLE)),
+    *with_uncertainty(ResultQuantity("shear", _NODE, "", "shear", _LARGEST, symbol="γmax", **_POSITIVE)),
+    *with_uncertainty(
+        ResultQuantity("equivalent", _NODE, "", "equivalent", EQUIVALENT, symbol="εeq (Hencky)", **_POSITIVE)
+    ),
 )
 """Strain of a frame over a gauge, in the order of exports."""
 DERIVED |= {entry.name: entry for entry in STRAIN if entry.group == "Strain"}
 ELEMENT_STRAIN = tuple(
-    replace(entry, name=f"{entry.name}_element", axes=("element",), meaning=f"{entry.meaning}, constant in an element")
+    replace(
+        entry,
+        name=f"{entry.name}_element",
+        axes=("element",),
+        description=f"{entry.description}, constant in an element",
+    )
     for entry in STRAIN[:3]
 )
-COMPONENTS = ("u", "v", "exx", "eyy", "exy")
-WITH_ERROR = {
-    f"{name}_{end}": Quantity(
-        f"{name}_{end}", _NODE, "px" if name in UV else "", "",
-        meaning.format(name if name in UV else f"the small strain {name} of the nodes"),
-        symbol=f"{name}_{end}", parts=(name,), group="Uncertainty", kind="positive",
+COMPONENTS = ("u", "v", "nodal_exx", "nodal_eyy", "nodal_exy")
+ERROR_QUANTITIES = {
+    f"{name}_{suffix}": ResultQuantity(
+        f"{name}_{suffix}", _NODE, "px" if name in UV else "", "",
+        description.format(name if name in UV else f"the small strain {name}"),
+        symbol=f"{name}_{suffix}", base_quantities=(name,), group="Uncertainty", kind="positive",
     )
-    for end, meaning in (
+    for suffix, description in (
         ("mesh_error", "discretisation error of {}: what mesh and recovery leave out"),
         ("total", "noise and discretisation error of {} together"),
     )
     for name in COMPONENTS
 }  # fmt: skip
-_FINER_MESH = "largest discretisation error over the noise of u, v, exx, eyy, exy: above 1 a finer mesh is needed"
-WITH_ERROR["finer_mesh"] = Quantity(
-    "finer_mesh", _NODE, "", "", _FINER_MESH, symbol="finer_mesh", parts=COMPONENTS, kind="positive"
+_FINER_MESH = "largest discretisation error over the noise of u, v and the small strain: above 1 a finer mesh is needed"
+ERROR_QUANTITIES["finer_mesh"] = ResultQuantity(
+    "finer_mesh", _NODE, "", "", _FINER_MESH, symbol="finer_mesh", base_quantities=COMPONENTS, kind="positive"
 )
 """Quantities of results whose ``mesh.error`` asks for the discretisation error."""
 _GROUPS = ("Displacement", "Strain", "Rates", "Quality", "Uncertainty")
 
 
-def map_quantities(units: Units, lights: tuple[str, ...], *, with_error: bool) -> dict[str, Quantity]:
+def map_quantities(units: Units, lights: tuple[str, ...], *, with_error: bool) -> dict[str, ResultQuantity]:
     """Return what maps show by its name, group by group; each that has an uncertainty is followed by it further down.
 
     Parameters
@@ -439,14 +468,23 @@ def map_quantities(units: Units, lights: tuple[str, ...], *, with_error: bool) -
     -------
     dict of str to Quantity
     """
-    spread = [entry.uncertainty for entry in DERIVED.values()]
-    taken = {entry.name for entry in (*DERIVED.values(), *spread)}
-    kept = [
-        replace(entry, symbol=name, meaning=", ".join(entry.codes) or entry.meaning)
+    uncertainties = [entry.uncertainty for entry in DERIVED.values()]
+    derived_names = {entry.name for entry in (*DERIVED.values(), *uncertainties)}
+    stored = [
+        replace(entry, symbol=name, description=", ".join(entry.codes) or entry.description)
         for name, entry in QUANTITIES.items()
-        if entry.axes == _NODE and name not in taken
+        if entry.axes == _NODE and entry.file_name not in derived_names
     ]
-    meaning, names = QUANTITIES["light_fraction"].meaning, [f"fraction of {light}" for light in lights]
-    fractions = [Quantity(name, _NODE, "", "", meaning, symbol=name, kind="fraction") for name in names]
-    every = [*DERIVED.values(), *kept, *(WITH_ERROR.values() if with_error else ()), *fractions, *spread]
-    return {entry.name: entry.in_units(units) for entry in sorted(every, key=lambda one: _GROUPS.index(one.group))}
+    description, names = QUANTITIES["light_fraction"].description, [f"fraction of {light}" for light in lights]
+    fractions = [ResultQuantity(name, _NODE, "", "", description, symbol=name, kind="fraction") for name in names]
+    quantities = [
+        *DERIVED.values(),
+        *stored,
+        *(ERROR_QUANTITIES.values() if with_error else ()),
+        *fractions,
+        *uncertainties,
+    ]
+    return {
+        entry.name: entry.with_units(units)
+        for entry in sorted(quantities, key=lambda entry: _GROUPS.index(entry.group))
+    }

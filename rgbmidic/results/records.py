@@ -22,12 +22,13 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Protocol, TypeVar
 
 import numpy as np
 
-from rgbmidic.errors import AnotherTestError, InputError, ResultError, disk_faults
+from rgbmidic.errors import AnotherTestError, InputError, ResultError, convert_disk_errors
+from rgbmidic.renamed import state_new_names
 from rgbmidic.results.files import npy_array, npy_bytes, write_complete
-from rgbmidic.results.provenance import PROVENANCE, PUT_BACK
+from rgbmidic.results.provenance import PROVENANCE, RESTORE_REMEDY
 from rgbmidic.results.quantities import QUANTITIES
 from rgbmidic.settings import require_regular_file
-from rgbmidic.text import Described
+from rgbmidic.text import HtmlRepr
 from rgbmidic.typing import BoolArray, IntArray
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ FRAMES = "solution"
 _NAME = re.compile(r"([0-9]{6}|[1-9][0-9]{6,})\.npz")
 _LOCAL = struct.Struct("<4s5H3I2H")
 """What precedes the name and content of an array; this and the following: PKWARE's APPNOTE.TXT 6.3, 4.3.7 to 4.3.16."""
-_CHECK, _END, _COMMENT = struct.Struct("<I"), struct.calcsize("<4s4H2IH"), struct.calcsize("<16sQI")
+_CHECK, _END_BYTES, _COMMENT = struct.Struct("<I"), struct.calcsize("<4s4H2IH"), struct.calcsize("<16sQI")
 _VERSION, _DATE = 20, 0x21
 """Version 2.0 of the format has all that is used; the first of January 1980 is its first date."""
 _STORED, _DEFLATED = 0, 8
@@ -53,10 +54,10 @@ def _layout(names: tuple[str, ...]) -> tuple[dict[str, bytes], struct.Struct, st
     Returns the name of each array in the archive, by its quantity; the directory, its end, and the comment without its
     checksum; and what is read of them: method, CRC-32, bytes and place of every array, run and frame.
     """
-    files = {name: f"{name}.npy".encode() for name in names}
-    tail = "".join(f"4s6H3I5H2I{len(file)}s" for file in files.values())
-    found = "".join(f"10xH4x2I18xI{len(file)}x" for file in files.values())
-    return files, struct.Struct(f"<{tail}4s4H2IH16sQ"), struct.Struct(f"<{found}{_END}x16sQ")
+    files = {name: f"{QUANTITIES[name].file_name}.npy".encode() for name in names}
+    directory_format = "".join(f"4s6H3I5H2I{len(file)}s" for file in files.values())
+    fields_format = "".join(f"10xH4x2I18xI{len(file)}x" for file in files.values())
+    return files, struct.Struct(f"<{directory_format}4s4H2IH16sQ"), struct.Struct(f"<{fields_format}{_END_BYTES}x16sQ")
 
 
 T_co = TypeVar("T_co", covariant=True)
@@ -78,7 +79,7 @@ class _Attribute:
         return holder._quantity(self._name)
 
 
-class Quantities:
+class QuantityAttributes:
     """Quantities with one shape in all frames as attributes: of all frames in a result, of one in a record."""
 
     __slots__ = ()
@@ -98,17 +99,17 @@ class Quantities:
     v_bias_std = _Attribute()
     u_edge_std = _Attribute()
     v_edge_std = _Attribute()
-    exx = _Attribute()
-    eyy = _Attribute()
-    exy = _Attribute()
-    exx_std = _Attribute()
-    eyy_std = _Attribute()
-    exy_std = _Attribute()
+    nodal_exx = _Attribute()
+    nodal_eyy = _Attribute()
+    nodal_exy = _Attribute()
+    nodal_exx_std = _Attribute()
+    nodal_eyy_std = _Attribute()
+    nodal_exy_std = _Attribute()
     u_mesh_error = _Attribute()
     v_mesh_error = _Attribute()
-    exx_mesh_error = _Attribute()
-    eyy_mesh_error = _Attribute()
-    exy_mesh_error = _Attribute()
+    nodal_exx_mesh_error = _Attribute()
+    nodal_eyy_mesh_error = _Attribute()
+    nodal_exy_mesh_error = _Attribute()
     match = _Attribute()
     best_match = _Attribute()
     misfit = _Attribute()
@@ -119,8 +120,9 @@ class Quantities:
     seconds = _Attribute()
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameRecord(Quantities, Described):
+class FrameRecord(QuantityAttributes, HtmlRepr):
     """The result of one frame; every quantity of `rgbmidic.results.QUANTITIES` is an attribute, such as ``record.u``.
 
     Attributes
@@ -134,6 +136,11 @@ class FrameRecord(Quantities, Described):
     ------
     InputError
         A quantity is missing, unknown or has another shape.
+
+    Examples
+    --------
+    >>> FrameRecord.failed("too dark", nodes=2, lights=1).u
+    array([nan, nan])
     """
 
     values: Mapping[str, Any]
@@ -150,13 +157,15 @@ class FrameRecord(Quantities, Described):
 
     def __post_init__(self) -> None:
         """Check names and shapes, and take over the types of the table."""
-        if odd := self.values.keys() ^ QUANTITIES.keys():
-            raise InputError(f"a frame record holds {', '.join(QUANTITIES)}; missing or unknown: {', '.join(odd)}")
+        if mismatched_names := self.values.keys() ^ QUANTITIES.keys():
+            raise InputError(
+                f"a frame record holds {', '.join(QUANTITIES)}; missing or unknown: {', '.join(mismatched_names)}"
+            )
         values = {name: entry.convert(self.values[name], self.sizes) for name, entry in QUANTITIES.items()}
         object.__setattr__(self, "values", values)
 
     @classmethod
-    def of(cls, *, nodes: int, lights: int, **values: Any) -> FrameRecord:
+    def from_values(cls, *, nodes: int, lights: int, **values: Any) -> FrameRecord:
         """Make a record of some quantities; the others have the value of a frame that could not be measured.
 
         Parameters
@@ -172,34 +181,36 @@ class FrameRecord(Quantities, Described):
         """
         sizes = {"node": nodes, "light": lights}
         blank = {name: entry.unmeasured(sizes) for name, entry in QUANTITIES.items()}
-        given = {name: value for name, value in values.items() if value is not None}
-        if isinstance(files := given.get("inputs"), Mapping):
-            given["inputs"] = np.array(list(files.items()), dtype=np.str_).reshape(-1, 2)
-        return cls(values=blank | given, sizes=sizes)
+        quantities = {name: value for name, value in values.items() if value is not None}
+        if isinstance(files := quantities.get("inputs"), Mapping):
+            quantities["inputs"] = np.array(list(files.items()), dtype=np.str_).reshape(-1, 2)
+        return cls(values=blank | quantities, sizes=sizes)
 
     @classmethod
-    def from_solution(cls, solution: Solution, **given: Any) -> FrameRecord:
+    def from_solution(cls, solution: Solution, **quantities: Any) -> FrameRecord:
         """Make the record of a solved frame.
 
         Parameters
         ----------
         solution
             Provides the quantities that have a `Quantity.source`.
-        **given
-            The others, such as `number`, `time_ns`, `inputs`, `brightness` and `weights_thumbnail`, as of `of`.
+        **quantities
+            The others, such as `number`, `time_ns`, `inputs` and `weights_thumbnail`, as in `from_values`.
 
         Returns
         -------
         FrameRecord
         """
         nodes, lights = np.shape(solution.light_fraction)
-        known = [entry for entry in QUANTITIES.values() if entry.source]
+        entries = [entry for entry in QUANTITIES.values() if entry.source]
         if not np.isfinite(solution.displacement_error).any():
-            known = [entry for entry in known if not entry.estimated]
-        return cls.of(nodes=nodes, lights=lights, **{entry.name: entry.of(solution) for entry in known}, **given)
+            entries = [entry for entry in entries if not entry.is_estimated]
+        return cls.from_values(
+            nodes=nodes, lights=lights, **{entry.name: entry.read_from(solution) for entry in entries}, **quantities
+        )
 
     @classmethod
-    def failed(cls, reason: str, *, nodes: int, lights: int, **given: Any) -> FrameRecord:
+    def failed(cls, reason: str, *, nodes: int, lights: int, **quantities: Any) -> FrameRecord:
         """Make the record of a frame that could not be measured at all: NaN everywhere, and the reason.
 
         Parameters
@@ -208,21 +219,21 @@ class FrameRecord(Quantities, Described):
             Why nothing could be measured.
         nodes, lights
             Their numbers N and k.
-        **given
-            Other quantities, as of `of`.
+        **quantities
+            Other quantities, as in `from_values`.
 
         Returns
         -------
         FrameRecord
         """
-        return cls.of(nodes=nodes, lights=lights, reason=reason, **given)
+        return cls.from_values(nodes=nodes, lights=lights, reason=reason, **quantities)
 
     def __repr__(self) -> str:
         """Return number, status and size of the frame, and the names of its quantities."""
-        end = QUANTITIES["status"].codes[self.values["status"]]
-        told = f": {self.values['reason']}" if self.values["reason"] else ""
-        about = f"<rgbmidic frame {self.values['number']}, {end}{told}; {self.sizes['node']} nodes>"
-        return f"{about}\nquantities: {', '.join(QUANTITIES)}"
+        outcome = QUANTITIES["status"].codes[self.values["status"]]
+        reason = f": {self.values['reason']}" if self.values["reason"] else ""
+        summary = f"<rgbmidic frame {self.values['number']}, {outcome}{reason}; {self.sizes['node']} nodes>"
+        return f"{summary}\nquantities: {', '.join(QUANTITIES)}"
 
     def _quantity(self, name: str, /) -> Any:
         return self.values[name]
@@ -262,19 +273,19 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes, chec
     ResultError
         The disk is full or refuses, or the check fails; nothing is left of the frame.
     """
-    (files, directory, _), parts, entries, end = _layout(tuple(QUANTITIES)), list[bytes](), list[Any](), 0
+    (files, directory, _), chunks, entries, offset = _layout(tuple(QUANTITIES)), list[bytes](), list[Any](), 0
     for name, file in files.items():
         content = npy_bytes(record.values[name])
-        picture = QUANTITIES[name].dtype is np.uint8 and not QUANTITIES[name].stackable
-        stored = zlib.compress(content, zlib.Z_BEST_SPEED, wbits=-zlib.MAX_WBITS) if picture else content
-        method, sizes = _DEFLATED if picture else _STORED, (len(stored), len(content), len(file), 0)
-        about = (_VERSION, 0, method, 0, _DATE, zlib.crc32(content), *sizes)
-        parts += _LOCAL.pack(b"PK\x03\x04", *about), file, stored
-        entries += b"PK\x01\x02", _VERSION, *about, 0, 0, 0, 0, end, file
-        end += _LOCAL.size + len(file) + len(stored)
-    count, length = len(files), directory.size + _CHECK.size - _COMMENT - _END
-    tail = directory.pack(*entries, b"PK\x05\x06", 0, 0, count, count, length, end, _COMMENT, run, frame)
-    content = b"".join([*parts, tail, _CHECK.pack(zlib.crc32(tail))])
+        picture = QUANTITIES[name].dtype is np.uint8 and not QUANTITIES[name].is_stackable
+        payload = zlib.compress(content, zlib.Z_BEST_SPEED, wbits=-zlib.MAX_WBITS) if picture else content
+        method, sizes = _DEFLATED if picture else _STORED, (len(payload), len(content), len(file), 0)
+        header = (_VERSION, 0, method, 0, _DATE, zlib.crc32(content), *sizes)
+        chunks += _LOCAL.pack(b"PK\x03\x04", *header), file, payload
+        entries += b"PK\x01\x02", _VERSION, *header, 0, 0, 0, 0, offset, file
+        offset += _LOCAL.size + len(file) + len(payload)
+    count, length = len(files), directory.size + _CHECK.size - _COMMENT - _END_BYTES
+    tail = directory.pack(*entries, b"PK\x05\x06", 0, 0, count, count, length, offset, _COMMENT, run, frame)
+    content = b"".join([*chunks, tail, _CHECK.pack(zlib.crc32(tail))])
 
     def write(file: BinaryIO) -> None:
         check()
@@ -285,23 +296,23 @@ def write_record(folder: Path, frame: int, record: FrameRecord, run: bytes, chec
 
 def _read_record(path: Path, frame: int, names: Iterable[str], run: bytes) -> dict[str, Any]:
     """Read some quantities of a frame and verify their checksums; what is of this run has its shapes."""
-    files, directory, read = _layout(tuple(QUANTITIES))
+    files, directory, fields_struct = _layout(tuple(QUANTITIES))
     with require_regular_file(path).open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - directory.size - _CHECK.size, 0))
         tail = file.read()
         if len(tail) < directory.size or _CHECK.pack(zlib.crc32(tail[: directory.size])) != tail[directory.size :]:
             raise ResultError("its directory is damaged or cut off")
-        *places, owner, number = read.unpack(tail[: directory.size])
+        *fields, owner, number = fields_struct.unpack(tail[: directory.size])
         if owner != run:
-            raise AnotherTestError(f"{path} is of another run than {path.parents[1] / PROVENANCE}: {PUT_BACK}")
+            raise AnotherTestError(f"{path} is of another run than {path.parents[1] / PROVENANCE}: {RESTORE_REMEDY}")
         if number != frame:
             raise ResultError(f"it holds frame {number}")
-        each = iter(places)
-        found, values = dict(zip(files, zip(each, each, each, each, strict=True), strict=True)), {}
+        iterator = iter(fields)
+        entries, values = dict(zip(files, zip(iterator, iterator, iterator, iterator, strict=True), strict=True)), {}
         for name in names:
-            method, check, length, start = found[name]
-            file.seek(start + _LOCAL.size + len(files[name]))
+            method, check, length, offset = entries[name]
+            file.seek(offset + _LOCAL.size + len(files[name]))
             content = file.read(min(length, size))
             content = zlib.decompress(content, wbits=-zlib.MAX_WBITS) if method == _DEFLATED else content
             if zlib.crc32(content) != check:
@@ -323,7 +334,7 @@ class FrameTable:
         Number of nodes (``"node"``) and of lights (``"light"``) of every frame.
     run : bytes, length 16
         Digest of the run.
-    written : ndarray, shape (T,), int64
+    write_times : ndarray, shape (T,), int64
         When each frame was written, ns; -1 where it is not measured yet.
     damaged : ndarray, shape (T,), bool
         Frames that are known to be lost to damage; they are not `finished`.
@@ -332,7 +343,7 @@ class FrameTable:
     folder: Path
     sizes: Mapping[str, int]
     run: bytes
-    written: IntArray
+    write_times: IntArray
     damaged: BoolArray
 
     @classmethod
@@ -346,18 +357,18 @@ class FrameTable:
         ResultError
             The folder cannot be read.
         """
-        folder, written = path / FRAMES, np.full(count, -1, dtype=np.int64)
-        with disk_faults(ResultError, f"{folder} cannot be read"):
+        folder, write_times = path / FRAMES, np.full(count, -1, dtype=np.int64)
+        with convert_disk_errors(ResultError, f"{folder} cannot be read"):
             for frame, file in record_files(folder).items():
                 with suppress(FileNotFoundError, IndexError):  # discarded just now, or of no frame
-                    written[frame] = file.stat().st_mtime_ns
-        lost = np.zeros(count, dtype=bool)
-        return cls(folder=folder, sizes=dict(sizes), run=run, written=written, damaged=lost)
+                    write_times[frame] = file.stat().st_mtime_ns
+        damaged = np.zeros(count, dtype=bool)
+        return cls(folder=folder, sizes=dict(sizes), run=run, write_times=write_times, damaged=damaged)
 
     @property
     def finished(self) -> BoolArray:
         """Which frames there are, shape (T,)."""
-        return np.asarray((self.written >= 0) & ~self.damaged)
+        return np.asarray((self.write_times >= 0) & ~self.damaged)
 
     def without_damaged(self, *, ended: bool) -> FrameTable:
         """Read every record once and return the table without the damaged ones.
@@ -375,14 +386,14 @@ class FrameTable:
         damaged = ~self.finished & ended
         for frame in np.flatnonzero(self.finished).tolist():
             try:
-                next(self.each(None, [frame]))
+                next(self.iterate(None, [frame]))
             except AnotherTestError:
                 raise
             except ResultError:
                 damaged[frame] = True
         return replace(self, damaged=damaged)
 
-    def each(self, names: Sequence[str] | None, frames: Iterable[int]) -> Iterator[dict[str, Any]]:
+    def iterate(self, names: Sequence[str] | None, frames: Iterable[int]) -> Iterator[dict[str, Any]]:
         """Read some quantities of one frame after the other.
 
         Parameters
@@ -402,16 +413,16 @@ class FrameTable:
         ResultError
             A record is damaged, or of another run; the message names file and frame.
         """
-        chosen, finished = tuple(QUANTITIES if names is None else names), self.finished
+        selection, finished = tuple(QUANTITIES if names is None else names), self.finished
         blank = cache(partial(FrameRecord.failed, nodes=self.sizes["node"], lights=self.sizes["light"]))
         for frame in frames:
             if not finished[frame]:
                 values = blank(_DAMAGED if self.damaged[frame] else _NOT_YET).values
-                yield {name: values[name] for name in chosen}
+                yield {name: values[name] for name in selection}
                 continue
             file = record_file(self.folder, frame)
             try:
-                yield _read_record(file, frame, chosen, self.run)
+                yield _read_record(file, frame, selection, self.run)
             except OSError as error:
                 raise ResultError(f"{file} cannot be read: {error.strerror or error}") from None
             except (AnotherTestError, KeyError):  # KeyError: there is no quantity of this name

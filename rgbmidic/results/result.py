@@ -12,15 +12,24 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from rgbmidic.errors import InputError, ResultError, optional
+from rgbmidic.errors import InputError, ResultError, import_optional
+from rgbmidic.renamed import state_new_names
 from rgbmidic.results.files import read_arrays, read_json, write_json
-from rgbmidic.results.provenance import PROVENANCE, PUT_BACK, digest, fingerprint, now, read_provenance, sealed
+from rgbmidic.results.provenance import (
+    PROVENANCE,
+    RESTORE_REMEDY,
+    current_time,
+    digest,
+    fingerprint,
+    read_provenance,
+    with_checksum,
+)
 from rgbmidic.results.quantities import FINITE_ELEMENTS, QUANTITIES, SHARED
-from rgbmidic.results.records import FrameRecord, FrameTable, Quantities
-from rgbmidic.results.warnings import of_frames
+from rgbmidic.results.records import FrameRecord, FrameTable, QuantityAttributes
+from rgbmidic.results.warnings import join_frame_warnings
 from rgbmidic.settings import read_section
 from rgbmidic.settings.schema import section_types
-from rgbmidic.text import Described
+from rgbmidic.text import HtmlRepr
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -46,8 +55,9 @@ class Portable:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
+@state_new_names
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Result(Portable, Quantities, Described):
+class Result(Portable, QuantityAttributes, HtmlRepr):
     """The result of a test, for post-processing.
 
     `Result.open` opens a result folder, also during a run, and reads only the mesh and which frames there are. The
@@ -57,7 +67,7 @@ class Result(Portable, Quantities, Described):
     - ``result.u``, ``result.misfit`` and so on: one quantity of all T frames as an array with the frames as first
       axis, such as (T, N) for N nodes. It is read at its first use and then kept in memory. Only quantities whose
       shape is the same in all frames are attributes.
-    - `each`: any quantity frame by frame, for results larger than the memory.
+    - `iterate`: any quantity frame by frame, for results larger than the memory.
     - `frame`: all quantities of one frame, a `FrameRecord`.
     - `to_xarray`: all quantities with named dimensions, coordinates and units, read frame by frame when used.
 
@@ -131,14 +141,14 @@ class Result(Portable, Quantities, Described):
         shared, lights = read_shared(path, provenance), tuple(provenance["lights"])
         sizes = {"node": len(shared["nodes"]), "light": len(lights)}
         table = FrameTable.load(path, sizes, len(shared["names"]), fingerprint(provenance))
-        made = cls(path=path, table=table, lights=lights, provenance=provenance, **shared)
+        result = cls(path=path, table=table, lights=lights, provenance=provenance, **shared)
         if not partial:
-            made._check_complete()
+            result._check_complete()
         elif check:
-            made = made.without_damaged()
-            if lost := np.flatnonzero(made.table.damaged).tolist():
-                logger.warning("%s is damaged: frames lost: %s", path, listed(lost, made.names))
-        return made
+            result = result.without_damaged()
+            if damaged_frames := np.flatnonzero(result.table.damaged).tolist():
+                logger.warning("%s is damaged: frames lost: %s", path, list_frames(damaged_frames, result.names))
+        return result
 
     def refresh(self) -> Self:
         """Open the result again, with the frames that were added since.
@@ -157,8 +167,8 @@ class Result(Portable, Quantities, Described):
         if {**provenance, **ended} != {**self.provenance, **ended}:
             raise ResultError(f"{self.path} now holds another result; open it again")
         table = FrameTable.load(self.path, self.table.sizes, len(self), fingerprint(provenance))
-        now = replace(self, table=table, provenance=provenance)
-        return now.without_damaged() if self.table.damaged.any() else now
+        refreshed = replace(self, table=table, provenance=provenance)
+        return refreshed.without_damaged() if self.table.damaged.any() else refreshed
 
     def without_damaged(self) -> Self:
         """Read every record once and return the result without the damaged ones; once ended it misses none.
@@ -174,7 +184,7 @@ class Result(Portable, Quantities, Described):
         missing, path, count = np.flatnonzero(~self.finished).tolist(), self.path, len(self)
         if not missing:
             return
-        frames = listed(missing, self.names)
+        frames = list_frames(missing, self.names)
         if "finished" in self.provenance or self.table.damaged.any():
             raise ResultError(
                 f"{path} is damaged: of {count} frames are lost {frames}; `rgbmidic run TEST.toml --out {path} "
@@ -185,14 +195,14 @@ class Result(Portable, Quantities, Described):
         )
 
     def __repr__(self) -> str:
-        """Return what the result is of, in a few lines; values are not read."""
+        """Summarise the result in a few lines; values are not read."""
         done, lights = int(self.finished.sum()), ", ".join(self.lights)
         lines = [
             f"<rgbmidic.Result {self.path}>",
             f"frames: {len(self)}, {done} measured" if done < len(self) else f"frames: {len(self)}",
             f"mesh:   {len(self.nodes)} nodes, {len(self.elements)} elements",
             f"lights: {lights}",
-            "read:   result.u (T, N), .u_std, .strain, .misfit, ...; .frame(i), .each(name), .to_xarray()",
+            "read:   result.u (T, N), .u_std, .nodal_strain, .misfit, ...; .frame(i), .each(name), .to_xarray()",
         ]
         return "\n".join(lines)
 
@@ -210,17 +220,17 @@ class Result(Portable, Quantities, Described):
         """Indices of the frames that are no reference."""
         return tuple(sorted({*range(len(self))} - {*self.provenance["references"]}))
 
-    def section(self, kind: type[S]) -> S:
+    def section(self, section_type: type[S]) -> S:
         """Return a section of the settings that the result was measured with; its defaults where none were kept.
 
         Parameters
         ----------
-        kind
+        section_type
             Class of the section, such as `rgbmidic.settings.ScaleSettings`.
 
         Returns
         -------
-        object of `kind`
+        object of `section_type`
 
         Raises
         ------
@@ -229,11 +239,13 @@ class Result(Portable, Quantities, Described):
         ConfigurationError
             None was kept, and one of its keys has no default.
         """
-        names = {known: name for name, known in section_types().items()}
-        if kind not in names:
-            raise InputError(f"{kind!r} is no section of a TEST.toml; these are {', '.join(k.__name__ for k in names)}")
-        name = names[kind]
-        return read_section(kind, name, self.provenance.get("settings", {}).get(name, {}))
+        names = {section_class: name for name, section_class in section_types().items()}
+        if section_type not in names:
+            raise InputError(
+                f"{section_type!r} is no section of a TEST.toml; these are {', '.join(cls.__name__ for cls in names)}"
+            )
+        name = names[section_type]
+        return read_section(section_type, name, self.provenance.get("settings", {}).get(name, {}))
 
     def setting(self, section: str, key: str, default: Any = None) -> Any:
         """Return a setting of the run, as TEST.toml names it; `default` where it was not kept.
@@ -272,10 +284,10 @@ class Result(Portable, Quantities, Described):
         """
         if not isinstance(index, int | np.integer) or not -len(self) <= index < len(self):
             raise InputError(f"there is no frame {index!r} in a result of {len(self)} frames (0 to {len(self) - 1})")
-        values = next(self.table.each(None, [int(index) % len(self)]))
+        values = next(self.table.iterate(None, [int(index) % len(self)]))
         return FrameRecord(values=values, sizes=self.table.sizes)
 
-    def each(self, name: str, frames: Iterable[int] | None = None) -> Iterator[Any]:
+    def iterate(self, name: str, frames: Iterable[int] | None = None) -> Iterator[Any]:
         """Read one quantity, frame after frame (None: all); yields arrays, or plain numbers or texts.
 
         Parameters
@@ -289,8 +301,8 @@ class Result(Portable, Quantities, Described):
         ------
         Any
         """
-        chosen = range(len(self)) if frames is None else frames
-        return (values[name] for values in self.table.each([name], chosen))
+        indices = range(len(self)) if frames is None else frames
+        return (values[name] for values in self.table.iterate([name], indices))
 
     def stack(self, name: str) -> AnyArray:
         """Read one quantity of all frames into one array, the frames as first axis.
@@ -305,10 +317,10 @@ class Result(Portable, Quantities, Described):
         ndarray, shape (T, ...)
         """
         entry = QUANTITIES[name]
-        shape = (len(self.nodes),) if entry.estimated else entry.unmeasured(self.table.sizes).shape
+        shape = (len(self.nodes),) if entry.is_estimated else entry.unmeasured(self.table.sizes).shape
         stacked = np.full((len(self), *shape), entry.blank, dtype=entry.dtype)
-        for index, value in enumerate(self.each(name)):
-            if np.size(value) or not entry.estimated:
+        for index, value in enumerate(self.iterate(name)):
+            if np.size(value) or not entry.is_estimated:
                 stacked[index] = value
         return stacked
 
@@ -343,7 +355,7 @@ class Result(Portable, Quantities, Described):
         ResultError
             A frame is damaged; raised when a value of it is read.
         """
-        dataset: xr.Dataset = optional("rgbmidic.results.dataset", "xarray").to_dataset(self, scale)
+        dataset: xr.Dataset = import_optional("rgbmidic.results.dataset", "xarray").to_dataset(self, scale)
         return dataset
 
     def _quantity(self, name: str, /) -> AnyArray:
@@ -351,39 +363,39 @@ class Result(Portable, Quantities, Described):
         return stacked
 
     @property
-    def strain(self) -> FloatArray:
-        """Small strain (exx, eyy, exy), shape (T, N, 3)."""
-        return np.stack([self.exx, self.eyy, self.exy], axis=-1)
+    def nodal_strain(self) -> FloatArray:
+        """Small strain (exx, eyy, exy) of the nodes, shape (T, N, 3): no gauge, and no finite strain."""
+        return np.stack([self.nodal_exx, self.nodal_eyy, self.nodal_exy], axis=-1)
 
     @property
-    def strain_std(self) -> FloatArray:
-        """Standard uncertainty of `strain`, shape (T, N, 3)."""
-        return np.stack([self.exx_std, self.eyy_std, self.exy_std], axis=-1)
+    def nodal_strain_std(self) -> FloatArray:
+        """Standard uncertainty of `nodal_strain`, shape (T, N, 3)."""
+        return np.stack([self.nodal_exx_std, self.nodal_eyy_std, self.nodal_exy_std], axis=-1)
 
     @property
     def reasons(self) -> tuple[str, ...]:
         """Why each frame failed or did not converge, length T; empty texts otherwise."""
-        return tuple(self.each("reason"))
+        return tuple(self.iterate("reason"))
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the run warned of: of the test as a whole, then of frames, with their numbers."""
+        """Warnings of the run: of the test as a whole, then of frames, with their numbers."""
         of_test = [*self.provenance.get("warnings", ()), *self.provenance.get("final_warnings", ())]
-        texts = zip(range(len(self)), self.each("warnings"), strict=True)
-        return (*of_test, *of_frames(((frame, each.tolist()) for frame, each in texts), self.names))
+        texts = zip(range(len(self)), self.iterate("warnings"), strict=True)
+        return (*of_test, *join_frame_warnings(((frame, messages.tolist()) for frame, messages in texts), self.names))
 
     @property
     def inputs(self) -> dict[str, str]:
         """Path and SHA-256 of every file that the frames were read from."""
-        return {path: digest for pairs in self.each("inputs") for path, digest in pairs.tolist()}
+        return {path: digest for file_rows in self.iterate("inputs") for path, digest in file_rows.tolist()}
 
     @cached_property
     def mean_light_fraction(self) -> FloatArray:
         """Mean of `light_fraction` over the measured nodes, shape (T, k); NaN where none is measured."""
         fractions = np.full((len(self), len(self.lights)), np.nan)
-        for row, values in enumerate(self.table.each(["light_fraction", "node_status"], range(len(self)))):
-            if (measured := values["node_status"] == 0).any():
-                fractions[row] = values["light_fraction"][measured].mean(axis=0, dtype=np.float64)
+        for row, values in enumerate(self.table.iterate(["light_fraction", "node_status"], range(len(self)))):
+            if (is_measured := values["node_status"] == 0).any():
+                fractions[row] = values["light_fraction"][is_measured].mean(axis=0, dtype=np.float64)
         return fractions
 
     @cached_property
@@ -427,14 +439,14 @@ def finish_result(path: Path | str, warnings: Sequence[str] = ()) -> None:
     result = Result.open(path, partial=True, check=False)
     result.without_damaged()._check_complete()
     if "finished" not in result.provenance:
-        ended = {"final_warnings": list(warnings), "finished": now()}
-        write_json(result.path / PROVENANCE, sealed({**result.provenance, **ended}))
+        ended = {"final_warnings": list(warnings), "finished": current_time()}
+        write_json(result.path / PROVENANCE, with_checksum({**result.provenance, **ended}))
 
 
-def listed(frames: Sequence[int], names: Sequence[str], most: int = 5) -> str:
-    """List the first of some frames with their names, `most` on a line of a terminal, and how many more there are."""
-    more = f" and {len(frames) - most} more" if len(frames) > most else ""
-    return ", ".join(f"{frame} ({names[frame]})" for frame in frames[:most]) + more
+def list_frames(frames: Sequence[int], names: Sequence[str], max_count: int = 5) -> str:
+    """List the first of some frames with their names, at most `max_count`, and how many more there are."""
+    remainder = f" and {len(frames) - max_count} more" if len(frames) > max_count else ""
+    return ", ".join(f"{frame} ({names[frame]})" for frame in frames[:max_count]) + remainder
 
 
 def read_shared(path: Path, provenance: Mapping[str, Any]) -> dict[str, Any]:
@@ -452,8 +464,8 @@ def read_shared(path: Path, provenance: Mapping[str, Any]) -> dict[str, Any]:
     texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
     if not texts or {"count": len(names), "sha256": digest(names)} != provenance["frames"]:
         raise ResultError(f"{path / NAMES} is damaged: it does not hold the names of the frames")
-    stated = FINITE_ELEMENTS if "finite_elements" in provenance else ()
-    mesh = _read(path / MESH, ["nodes", "elements", *stated], {})
+    mesh_file_names = FINITE_ELEMENTS if "finite_elements" in provenance else ()
+    mesh = _read_converted(path / MESH, ["nodes", "elements", *mesh_file_names], {})
     if digest(mesh) != provenance["mesh"]:
         raise ResultError(f"{path / MESH} is damaged or of another result")
     return {"names": tuple(names), **mesh}
@@ -471,12 +483,12 @@ def read_reference(path: Path, sizes: Mapping[str, int], run: bytes) -> npt.NDAr
     if not file.is_file():
         return None
     if read_arrays(file, ["run"])["run"].tobytes() != run:
-        raise ResultError(f"{file} is of another run than {path / PROVENANCE}: {PUT_BACK}")
-    pictures: npt.NDArray[np.uint8] = _read(file, ["reference"], sizes)["reference"]
+        raise ResultError(f"{file} is of another run than {path / PROVENANCE}: {RESTORE_REMEDY}")
+    pictures: npt.NDArray[np.uint8] = _read_converted(file, ["reference"], sizes)["reference"]
     return pictures
 
 
-def _read(path: Path, names: Iterable[str], sizes: Mapping[str, int]) -> dict[str, AnyArray]:
+def _read_converted(path: Path, names: Iterable[str], sizes: Mapping[str, int]) -> dict[str, AnyArray]:
     arrays = read_arrays(path, names)
     try:
         return {name: SHARED[name].convert(array, sizes) for name, array in arrays.items()}

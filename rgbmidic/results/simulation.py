@@ -1,6 +1,6 @@
 """A finite-element result that a measurement is compared with, read from files, and levelled.
 
-Levelling is what a measurement on a mesh makes of a simulated displacement: the same fit and recovery, applied to it.
+Levelling applies the fit and the recovery of a measurement's mesh to a simulated displacement.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from rgbmidic.errors import InputError
 from rgbmidic.fields.interpolation import Places
 from rgbmidic.frames.names import NamedFiles
 from rgbmidic.mesh import FiniteElementMesh, Placement, Tri3Mesh, read_mesh
-from rgbmidic.results.physical import placement_of, rectification_of
+from rgbmidic.renamed import refuse_old_names, state_new_names
 from rgbmidic.results.result import Result
+from rgbmidic.results.result_in_units import placement_of, rectification_of
 from rgbmidic.settings import LENGTH_UNITS, ScaleSettings, require_regular_file
 from rgbmidic.typing import BoolArray, FloatArray, IntArray
 
@@ -41,6 +42,7 @@ _COMPONENTS = tuple(
 _TIMES = {"time": 1.0, "time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6}
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Simulation:
     """Displacement that a simulation has at its nodes, over time.
@@ -109,12 +111,14 @@ class Simulation:
                 raise InputError(f"{path} has numbers of nodes only: state the mesh that they belong to (--mesh FILE)")
             values, times = _read_table(path, mesh, unit)
         else:
-            clock, files = zip(*_listed(path, interval), strict=True)
-            mesh, *others = meshes = [read_mesh(file, unit=unit) for file in files]
-            for other in others:
-                if not np.array_equal(mesh.node_numbers, other.node_numbers):
-                    raise InputError(f"{other.name} has other nodes than {mesh.name}: the states must have one mesh")
-            values = np.stack([_displacement(one, field) for one in meshes])
+            clock, files = zip(*_list_states(path, interval), strict=True)
+            mesh, *other_meshes = meshes = [read_mesh(file, unit=unit) for file in files]
+            for other_mesh in other_meshes:
+                if not np.array_equal(mesh.node_numbers, other_mesh.node_numbers):
+                    raise InputError(
+                        f"{other_mesh.name} has other nodes than {mesh.name}: the states must have one mesh"
+                    )
+            values = np.stack([_displacement(state_mesh, field) for state_mesh in meshes])
             times = None if None in clock else np.array(clock, dtype=np.float64)
         if times is not None and not (np.diff(times) > 0).all():
             raise InputError(f"the times of the simulation {path} must rise, not {times[:5].tolist()} ...")
@@ -124,30 +128,30 @@ class Simulation:
             )
         return cls(mesh=mesh, displacement=values, times=None if times is None else times + offset, name=str(path))
 
-    def at(self, time: float) -> FloatArray:
+    def interpolate(self, time: float) -> FloatArray:
         """Interpolate the displacement (M, 2) linearly between the states before and after a time within theirs."""
         if self.times is None or len(self.times) == 1:
             return np.asarray(self.displacement[0])
-        after = int(np.clip(np.searchsorted(self.times, time), 1, len(self.times) - 1))
-        part = (time - self.times[after - 1]) / (self.times[after] - self.times[after - 1])
-        return np.asarray((1 - part) * self.displacement[after - 1] + part * self.displacement[after])
+        upper = int(np.clip(np.searchsorted(self.times, time), 1, len(self.times) - 1))
+        fraction = (time - self.times[upper - 1]) / (self.times[upper] - self.times[upper - 1])
+        return np.asarray((1 - fraction) * self.displacement[upper - 1] + fraction * self.displacement[upper])
 
 
-def _listed(path: Path, interval: float | None) -> list[tuple[float | None, Path]]:
+def _list_states(path: Path, interval: float | None) -> list[tuple[float | None, Path]]:
     """Return time and file of every state; None for the time of a single file."""
     if path.is_dir():
         indices = sorted(path.glob("*.pvd"))
         if len(indices) > 1:
             raise InputError(f"{path} holds {len(indices)} .pvd files: name one of them")
         if not indices:
-            return _numbered(path, interval)
+            return _list_numbered_states(path, interval)
         path = indices[0]
     if path.suffix.lower() != ".pvd":
         return [(None, path)]
     try:
-        sets = list(ElementTree.fromstring(require_regular_file(path).read_bytes()).iter("DataSet"))
+        datasets = list(ElementTree.fromstring(require_regular_file(path).read_bytes()).iter("DataSet"))
         states: list[tuple[float | None, Path]] = [
-            (float(one.attrib["timestep"]), path.parent / one.attrib["file"]) for one in sets
+            (float(element.attrib["timestep"]), path.parent / element.attrib["file"]) for element in datasets
         ]
     except (OSError, ElementTree.ParseError, KeyError, ValueError) as error:
         raise InputError(f"{path} is not a readable .pvd file: {error}") from None
@@ -156,7 +160,7 @@ def _listed(path: Path, interval: float | None) -> list[tuple[float | None, Path
     return states
 
 
-def _numbered(path: Path, interval: float | None) -> list[tuple[float | None, Path]]:
+def _list_numbered_states(path: Path, interval: float | None) -> list[tuple[float | None, Path]]:
     """Return the files of a folder by the last number in their names, times the `interval`."""
     files = NamedFiles.from_files([file for file in path.iterdir() if file.suffix.lower() in (".vtu", ".vtk")])
     if not files.paths or not all(files.numbers):
@@ -171,14 +175,14 @@ def _numbered(path: Path, interval: float | None) -> list[tuple[float | None, Pa
 
 
 def _displacement(mesh: FiniteElementMesh, field: str | None) -> FloatArray:
-    """Displacement (M, 2) in mm of a mesh's nodal data."""
+    """Return the displacement (M, 2) in mm of a mesh's nodal data."""
     names = {name.lower(): name for name in mesh.fields}
-    name = field if field is not None else next((names[one] for one in _FIELDS if one in names), None)
+    name = field if field is not None else next((names[entry] for entry in _FIELDS if entry in names), None)
     values = None if name is None else mesh.fields.get(name)
     if values is None or values.ndim != 2 or values.shape[1] <= max(mesh.axes):
-        there = ", ".join(f"{name} {one.shape[1:]}" for name, one in mesh.fields.items()) or "none"
-        wanted = f'"{field}"' if field is not None else f"one of {', '.join(_FIELDS)}"
-        raise InputError(f"{mesh.name} has no nodal vector {wanted} (--field); its nodal data: {there}")
+        available = ", ".join(f"{name} {entry.shape[1:]}" for name, entry in mesh.fields.items()) or "none"
+        requested = f'"{field}"' if field is not None else f"one of {', '.join(_FIELDS)}"
+        raise InputError(f"{mesh.name} has no nodal vector {requested} (--field); its nodal data: {available}")
     return np.asarray(values[:, mesh.axes], dtype=np.float64) * mesh.unit_mm
 
 
@@ -191,45 +195,47 @@ def _read_table(path: Path, mesh: FiniteElementMesh, unit: str) -> tuple[FloatAr
     names = [name.strip() for name in next(csv.reader(lines[:1]), [])]
     components = [[match for name in names if (match := pattern.fullmatch(name))] for pattern in _COMPONENTS]
     clocks = [name for name in names if name.lower() in _TIMES]
-    if names.count("node") != 1 or [len(found) for found in components] != [1, 1] or len(clocks) > 1:
+    if names.count("node") != 1 or [len(matches) for matches in components] != [1, 1] or len(clocks) > 1:
         raise InputError(
             f'{path} needs a header line with one column each "node", "u_mm" and "v_mm" (and "time_s"), not {names}'
         )
-    wanted = [names.index(name) for name in ("node", *(match.string for (match,) in components), *clocks)]
+    columns = [names.index(name) for name in ("node", *(match.string for (match,) in components), *clocks)]
     rows = []
     for number, row in enumerate(csv.reader(lines[1:]), 2):
         try:
-            rows.append([float(row[place]) for place in wanted])
+            rows.append([float(row[column]) for column in columns])
         except (ValueError, IndexError):
             raise InputError(f"row {number} of {path} is not numbers: {row}") from None
-    table = np.array(rows, dtype=np.float64).reshape(-1, len(wanted))
+    table = np.array(rows, dtype=np.float64).reshape(-1, len(columns))
     if mesh.numbering.startswith("counted"):
         logger.warning("%s: the nodes of %s are %s: those of the table must be, too", path, mesh.name, mesh.numbering)
-    places = places_among(mesh.node_numbers, table[:, 0])
-    known = places >= 0
-    if not known.any():
+    indices = label_indices(mesh.node_numbers, table[:, 0])
+    valid = indices >= 0
+    if not valid.any():
         raise InputError(f"{path} has no row for a node of {mesh.name}")
-    if not known.all():
-        logger.warning("%s: %d rows name nodes that %s does not have", path, int((~known).sum()), mesh.name)
-        table, places = table[known], places[known]
+    if not valid.all():
+        logger.warning("%s: %d rows name nodes that %s does not have", path, int((~valid).sum()), mesh.name)
+        table, indices = table[valid], indices[valid]
     times = table[:, 3] * _TIMES[clocks[0].lower()] if clocks else np.zeros(len(table))
     steps, state = np.unique(times, return_inverse=True)
-    cells, count = np.unique(state * len(mesh.points) + places, return_counts=True)
+    cells, count = np.unique(state * len(mesh.points) + indices, return_counts=True)
     if (count > 1).any():
         node = mesh.node_numbers[cells[count.argmax()] % len(mesh.points)]
         raise InputError(f"{path} has two rows or more for node {node} at one time: several states need a time_s")
     values = np.full((len(steps), len(mesh.points), 2), np.nan)
-    values[state, places] = table[:, 1:3] * [LENGTH_UNITS[(match[1] or unit).lower()] for (match,) in components]
+    values[state, indices] = table[:, 1:3] * [LENGTH_UNITS[(match[1] or unit).lower()] for (match,) in components]
     return values, steps if clocks else None
 
 
-def places_among(numbers: IntArray, wanted: npt.NDArray[Any]) -> IntArray:
-    """Place of each wanted label among some numbers; -1 where it is none of them."""
-    index = {number: place for place, number in enumerate(numbers.tolist())}
-    return np.array([index.get(number, -1) for number in wanted.tolist()], dtype=np.int64)
+def label_indices(numbers: IntArray, labels: npt.NDArray[Any]) -> IntArray:
+    """Return the index of each label among some numbers; -1 where it is none of them."""
+    positions = {number: position for position, number in enumerate(numbers.tolist())}
+    return np.array([positions.get(number, -1) for number in labels.tolist()], dtype=np.int64)
 
 
-def place(result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence[Sequence[float]] = ()) -> Placement:
+def find_placement(
+    result: Result, *, scale: ScaleSettings | None = None, point_pairs: Sequence[Sequence[float]] = ()
+) -> Placement:
     """Place a simulation's mesh on the image of a result.
 
     Parameters
@@ -238,7 +244,7 @@ def place(result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence
         The result.
     scale
         It replaces the ``[scale]`` that was kept with the result; None: that one.
-    pairs
+    point_pairs
         Points (x_mm, y_mm, x_px, y_px), two or more; none: ``mesh.points`` of the result.
 
     Raises
@@ -246,24 +252,30 @@ def place(result: Result, *, scale: ScaleSettings | None = None, pairs: Sequence
     InputError
         No points are known, or they place no mesh.
     """
-    known, where = list(pairs), "--points"
-    if not known and (placed := placement_of(result)) is not None:
-        known, where = placed.pairs.tolist(), "mesh.points"
-    if not known:
+    points, source = point_pairs, "--points"
+    if not points and (stored_placement := placement_of(result)) is not None:
+        points, source = stored_placement.pairs.tolist(), "mesh.points"
+    if not points:
         raise InputError(
             f"where the simulation's mesh lies on the image of {result.path} is not known: state two points or more, "
             "--points X_MM,Y_MM:X_PX,Y_PX each"
         )
-    found = Placement.fit(known, rectification_of(result, scale, "mm").camera, label=where)
-    stated = (scale or result.section(ScaleSettings)).mm_per_pixel  # half a pixel at each end of 100 px is .7 % of it
-    if found.mm_per_pixel is not None and stated is not None and abs(found.mm_per_pixel / stated - 1) > 0.01:
+    placement = Placement.fit(points, rectification_of(result, scale, "mm").camera, label=source)
+    mm_per_pixel = (
+        scale or result.section(ScaleSettings)
+    ).mm_per_pixel  # half a pixel at each end of 100 px is .7 % of it
+    if (
+        placement.mm_per_pixel is not None
+        and mm_per_pixel is not None
+        and abs(placement.mm_per_pixel / mm_per_pixel - 1) > 0.01
+    ):
         text = "%s state %.6g mm per px, scale.mm_per_pixel %.6g: the former is taken"
-        logger.warning(text, where, found.mm_per_pixel, stated)
-    return found
+        logger.warning(text, source, placement.mm_per_pixel, mm_per_pixel)
+    return placement
 
 
 class Levelling:
-    """What a measurement on a mesh makes of a simulated displacement field.
+    """Fit and recovery of a measurement's mesh, applied to a simulated displacement field.
 
     The solve is a least-squares fit of linear elements, in which the texture counts alike everywhere on average, and
     the nodal values are recovered from it by quadratics. Both are applied here.
@@ -284,38 +296,49 @@ class Levelling:
     def __init__(self, mesh: Tri3Mesh, simulated: Tri3Mesh) -> None:
         # the simulation is averaged over elements of half its own, 3 to 12 along a side: the error falls as the square
         # of their number, and is 1 % of what levelling changes at 3 (derived)
-        inner = _middles(int(np.clip(math.ceil(2 * mesh.size / simulated.size), 3, 12)))
-        points = np.einsum("qc,ecd->eqd", inner, mesh.nodes[mesh.elements])
-        places = Places.of(simulated, points.reshape(-1, 2))
+        sub_points = _subcentroids(int(np.clip(math.ceil(2 * mesh.size / simulated.size), 3, 12)))
+        points = np.einsum("qc,ecd->eqd", sub_points, mesh.nodes[mesh.elements])
+        points_in_simulation = Places.of(simulated, points.reshape(-1, 2))
         # it is continued linearly by half an element: the outline of a region drawn by hand differs by some px (chosen)
-        depth: FloatArray = np.asarray(places.barycentric.min(axis=1)).reshape(points.shape[:2])
-        used: BoolArray = np.asarray((depth > -0.5).all(axis=1))
-        if not used.any():
+        depth: FloatArray = np.asarray(points_in_simulation.barycentric.min(axis=1)).reshape(points.shape[:2])
+        is_covered: BoolArray = np.asarray((depth > -0.5).all(axis=1))
+        if not is_covered.any():
             raise InputError("the simulation's mesh covers no element of the measurement's: check where it is placed")
         row = np.arange(depth.size)
         # the simulation is linear in its elements
-        entries = places.barycentric.ravel(), (np.repeat(row, 3), simulated.elements[places.element].ravel())
-        read = sp.csr_matrix(entries, shape=(len(row), len(simulated.nodes)))
-        columns, values = np.repeat(mesh.elements, len(inner), axis=0), np.tile(inner, (len(mesh.elements), 1))
+        entries = (
+            points_in_simulation.barycentric.ravel(),
+            (np.repeat(row, 3), simulated.elements[points_in_simulation.element].ravel()),
+        )
+        sampling = sp.csr_matrix(entries, shape=(len(row), len(simulated.nodes)))
+        columns, values = (
+            np.repeat(mesh.elements, len(sub_points), axis=0),
+            np.tile(sub_points, (len(mesh.elements), 1)),
+        )
         shape = sp.csr_matrix((values.ravel(), (np.repeat(row, 3), columns.ravel())), shape=(len(row), len(mesh.nodes)))
-        weighted = sp.csr_matrix(sp.diags(np.repeat(used * mesh.areas / len(inner), len(inner))) @ shape).T
-        self._covered: BoolArray = np.asarray(mesh.to_nodes(np.asarray(used, dtype=np.float64)) > 0)
+        weighted = sp.csr_matrix(
+            sp.diags(np.repeat(is_covered * mesh.areas / len(sub_points), len(sub_points))) @ shape
+        ).T
+        self._covered: BoolArray = np.asarray(mesh.to_nodes(np.asarray(is_covered, dtype=np.float64)) > 0)
         self._factors = splu(sp.csc_matrix(weighted @ shape + sp.diags(1.0 * ~self._covered)))
-        self._moments = sp.csr_matrix(weighted @ read)
-        self._recovery = Recovery.over(mesh, used, self._covered.astype(np.float64))
+        self._moments = sp.csr_matrix(weighted @ sampling)
+        self._recovery = Recovery.over(mesh, is_covered, self._covered.astype(np.float64))
 
     def __call__(self, displacement: FloatArray) -> FloatArray:
-        """Displacement (2, N) at the measurement's nodes of a simulated one (M, 2); NaN where that does not reach."""
+        """Return the displacement (2, N) at the measurement's nodes of a simulated one (M, 2); NaN outside its mesh."""
         moments = self._moments @ np.nan_to_num(displacement)
         unknown: FloatArray = np.asarray(np.isnan(displacement).any(axis=1), dtype=np.float64)
-        lost = np.asarray(abs(self._moments) @ unknown) > 0
+        touches_unknown = np.asarray(abs(self._moments) @ unknown) > 0
         recovered = (self._recovery.value @ self._factors.solve(moments)).T
-        return np.where(self._covered & ~lost, recovered, np.nan)
+        return np.where(self._covered & ~touches_unknown, recovered, np.nan)
 
 
-def _middles(parts: int) -> FloatArray:
-    """Barycentric coordinates (parts^2, 3) of the middles of equal parts of a triangle."""
-    up = [(i + 1 / 3, j + 1 / 3) for i in range(parts) for j in range(parts - i)]
-    down = [(i + 2 / 3, j + 2 / 3) for i in range(parts - 1) for j in range(parts - 1 - i)]
-    first, second = np.array(up + down).T / parts
-    return np.stack([first, second, 1 - first - second], axis=1)
+def _subcentroids(divisions: int) -> FloatArray:
+    """Return barycentric coordinates (divisions^2, 3) of the centroids of equal triangles in a triangle."""
+    up = [(i + 1 / 3, j + 1 / 3) for i in range(divisions) for j in range(divisions - i)]
+    down = [(i + 2 / 3, j + 2 / 3) for i in range(divisions - 1) for j in range(divisions - 1 - i)]
+    first_coordinate, second_coordinate = np.array(up + down).T / divisions
+    return np.stack([first_coordinate, second_coordinate, 1 - first_coordinate - second_coordinate], axis=1)
+
+
+__getattr__ = refuse_old_names(__name__)

@@ -17,9 +17,17 @@ from typing import Self
 import numpy as np
 
 from rgbmidic.errors import InputError, ResultError
-from rgbmidic.results.claim import ALL_FRAMES, Claim
-from rgbmidic.results.files import remove_parts, write_arrays, write_json, writing
-from rgbmidic.results.provenance import PROVENANCE, Origin, check_same, fingerprint, is_result, read_provenance, sealed
+from rgbmidic.results.files import remove_partial_files, write_arrays, write_errors, write_json
+from rgbmidic.results.lock import ALL_FRAMES, FrameLock
+from rgbmidic.results.provenance import (
+    PROVENANCE,
+    Origin,
+    check_same,
+    fingerprint,
+    is_result,
+    read_provenance,
+    with_checksum,
+)
 from rgbmidic.results.records import FRAMES, FrameRecord, FrameTable, record_file, record_files, write_record
 from rgbmidic.results.result import MESH, NAMES, REFERENCE, finish_result, read_reference, read_shared
 from rgbmidic.typing import BoolArray
@@ -42,12 +50,21 @@ class ResultStore:
         Number of frames of the test.
     sizes
         Number of nodes (``"node"``) and of lights (``"light"``) of every frame.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> origin = Origin(nodes=[[0, 0], [9, 0], [0, 9]], elements=[[0, 1, 2]], names=["a.png"], lights=["red"])
+    >>> with ResultStore.create(f"{mkdtemp()}/result", origin) as store:
+    ...     store.write_frame(0, FrameRecord.failed("too dark", nodes=3, lights=1))
+    >>> store.finished()
+    array([ True])
     """
 
     path: Path
     frame_count: int
     sizes: Mapping[str, int]
-    _claim: Claim
+    _lock: FrameLock
     _run: bytes
 
     @classmethod
@@ -73,7 +90,7 @@ class ResultStore:
             The folder is in use by another run, holds a result (and `overwrite` is False) or foreign files under a
             result's names, or cannot be written.
         """
-        return cls._claimed(Path(path), origin, ALL_FRAMES, overwrite=overwrite)
+        return cls._open_locked(Path(path), origin, ALL_FRAMES, overwrite=overwrite)
 
     @classmethod
     def resume(cls, path: Path | str, origin: Origin, *, frames: range | None = None) -> Self:
@@ -101,7 +118,7 @@ class ResultStore:
             being written by another run.
         """
         read_provenance(Path(path))
-        return cls._claimed(Path(path), origin, frames, restate=True)
+        return cls._open_locked(Path(path), origin, frames, restate=True)
 
     @classmethod
     def join(cls, path: Path | str, origin: Origin, *, frames: range | None = None) -> Self:
@@ -122,25 +139,25 @@ class ResultStore:
         -------
         ResultStore
         """
-        return cls._claimed(Path(path), origin, frames)
+        return cls._open_locked(Path(path), origin, frames)
 
     @classmethod
-    def _claimed(
+    def _open_locked(
         cls, path: Path, origin: Origin, frames: range | None, *, overwrite: bool | None = None, restate: bool = False
     ) -> Self:
         """Claim the frames and start the folder; `overwrite` None: whatever is there stays."""
         count, sizes = len(origin.names), {"node": len(origin.mesh["nodes"]), "light": len(origin.lights)}
-        with writing(path):
+        with write_errors(path):
             path.mkdir(parents=True, exist_ok=True)
-        claim = Claim.take(path, range(count) if frames is None else frames)
+        lock = FrameLock.acquire(path, range(count) if frames is None else frames)
         try:
             if overwrite is not None:
-                _make_room(path, overwrite=overwrite)
-            run = _start(path, origin, restate=restate)
+                _empty_folder(path, overwrite=overwrite)
+            run = _write_shared_files(path, origin, restate=restate)
         except BaseException:
-            claim.release()
+            lock.release()
             raise
-        return cls(path=path, frame_count=count, sizes=sizes, _claim=claim, _run=run)
+        return cls(path=path, frame_count=count, sizes=sizes, _lock=lock, _run=run)
 
     def __enter__(self) -> Self:
         """Return the store."""
@@ -152,7 +169,7 @@ class ResultStore:
 
     def release(self) -> None:
         """Remove the claim, so that other runs can write these frames."""
-        self._claim.release()
+        self._lock.release()
 
     def write_frame(self, index: int, record: FrameRecord) -> None:
         """Keep the result of frame `index`; in any order, and again, where the last one counts.
@@ -177,7 +194,7 @@ class ResultStore:
             raise InputError(f"there is no frame {index} in a result of {self.frame_count} frames")
         if record.sizes != self.sizes:
             raise InputError(f"frame {index} has the sizes {record.sizes}, the result {self.sizes}")
-        write_record(self.path / FRAMES, index, record, self._run, self._claim.check)
+        write_record(self.path / FRAMES, index, record, self._run, self._lock.check)
 
     def discard(self, frames: Collection[int]) -> None:
         """Discard frames that are to be measured again.
@@ -195,7 +212,7 @@ class ResultStore:
         if frames:
             self.reopen()  # which checks the claim
         for frame in frames:
-            with writing(file := record_file(self.path / FRAMES, frame)):
+            with write_errors(file := record_file(self.path / FRAMES, frame)):
                 file.unlink(missing_ok=True)
 
     def finished(self) -> BoolArray:
@@ -218,11 +235,11 @@ class ResultStore:
 
     def reopen(self) -> None:
         """Take the date of its end out of the provenance, before frames are written."""
-        self._claim.check()
+        self._lock.check()
         provenance = read_provenance(self.path)
         if provenance.pop("finished", None) is not None:
             provenance.pop("final_warnings", None)
-            write_json(self.path / PROVENANCE, sealed(provenance))
+            write_json(self.path / PROVENANCE, with_checksum(provenance))
 
     def finish(self, warnings: Sequence[str] = ()) -> None:
         """Release the store and call `finish_result`, when every frame is written.
@@ -232,12 +249,12 @@ class ResultStore:
         warnings
             What only all frames together show, to be kept.
         """
-        self._claim.check()
+        self._lock.check()
         self.release()
         finish_result(self.path, warnings)
 
 
-def _make_room(path: Path, *, overwrite: bool) -> None:
+def _empty_folder(path: Path, *, overwrite: bool) -> None:
     """Empty the folder of an old result, its provenance last; nothing else in it is touched."""
     if not is_result(path):
         return
@@ -246,14 +263,14 @@ def _make_room(path: Path, *, overwrite: bool) -> None:
             f"{path} already holds a result; choose another folder, overwrite it (overwrite=True, --overwrite), or go "
             "on with it (--resume)"
         )
-    with writing(path):
-        old = (path / FRAMES).glob("[0-9]*.frames")  # of schema versions to 10
+    with write_errors(path):
+        old_files = (path / FRAMES).glob("[0-9]*.frames")  # of schema versions to 10
         frames = (Path(entry) for entry in record_files(path / FRAMES).values())
-        for file in (*old, *frames, *(path / name for name in (REFERENCE, MESH, NAMES, PROVENANCE))):
+        for file in (*old_files, *frames, *(path / name for name in (REFERENCE, MESH, NAMES, PROVENANCE))):
             file.unlink(missing_ok=True)
 
 
-def _start(path: Path, origin: Origin, *, restate: bool) -> bytes:
+def _write_shared_files(path: Path, origin: Origin, *, restate: bool) -> bytes:
     """Write what all frames share where it is missing or damaged; refuse a folder of another origin.
 
     With `restate` the provenance takes over the settings and the camera of `origin`, which state how a result is read.
@@ -261,39 +278,39 @@ def _start(path: Path, origin: Origin, *, restate: bool) -> bytes:
     """
     foreign = [file for name in (MESH, REFERENCE, NAMES) if (file := path / name).exists()]
     foreign += map(Path, record_files(path / FRAMES).values())
-    stated = origin.provenance()
+    provenance = origin.provenance()
     if not (path / PROVENANCE).exists():  # looked at after the others: it is the first to appear
         if foreign:
             raise ResultError(f"{path} holds a {foreign[0].name} that is not of a result; give another folder")
-        write_json(path / PROVENANCE, sealed(stated), new=True)
-    kept = read_provenance(path)
-    check_same(path, kept, stated)
-    read_by = {name: stated.get(name) for name in ("settings", "camera")}
-    if restate and read_by != {name: kept.get(name) for name in read_by}:
-        write_json(path / PROVENANCE, sealed({**kept, **read_by}))
-    if kept["machine"] != stated["machine"]:
+        write_json(path / PROVENANCE, with_checksum(provenance), exclusive=True)
+    stored = read_provenance(path)
+    check_same(path, stored, provenance)
+    reading_settings = {name: provenance.get(name) for name in ("settings", "camera")}
+    if restate and reading_settings != {name: stored.get(name) for name in reading_settings}:
+        write_json(path / PROVENANCE, with_checksum({**stored, **reading_settings}))
+    if stored["machine"] != provenance["machine"]:
         text = "%s was begun with %s, and goes on with %s: the last bits of its frames may differ"
-        logger.warning(text, path, kept["machine"], stated["machine"])
-    with writing(path):
+        logger.warning(text, path, stored["machine"], provenance["machine"])
+    with write_errors(path):
         (path / FRAMES).mkdir(exist_ok=True)
-        remove_parts(path, "*")
-        remove_parts(path / FRAMES, "*")
-    run, sizes = fingerprint(kept), {"light": len(origin.lights)}
-    if not _readable(lambda: read_shared(path, kept)):
+        remove_partial_files(path, "*")
+        remove_partial_files(path / FRAMES, "*")
+    run, sizes = fingerprint(stored), {"light": len(origin.lights)}
+    if not _is_readable(lambda: read_shared(path, stored)):
         write_json(path / NAMES, list(origin.names))
         write_arrays(path / MESH, origin.mesh)
-    if origin.reference is not None and not _readable(lambda: read_reference(path, sizes, run)):
+    if origin.reference is not None and not _is_readable(lambda: read_reference(path, sizes, run)):
         images = np.asarray(origin.reference, dtype=np.float32)  # stretched to 8 bit between percentiles 1 and 99
-        known = np.isfinite(images).any(axis=(1, 2), keepdims=True)
-        low, high = np.nanpercentile(np.where(known, images, 0), [1, 99], axis=(1, 2), keepdims=True)
-        scaled = 255 * (images - low) / np.maximum(high - low, 1e-6)
-        pictures = np.clip(np.nan_to_num(scaled), 0, 255).astype(np.uint8)
+        has_pixels = np.isfinite(images).any(axis=(1, 2), keepdims=True)
+        low, high = np.nanpercentile(np.where(has_pixels, images, 0), [1, 99], axis=(1, 2), keepdims=True)
+        stretched = 255 * (images - low) / np.maximum(high - low, 1e-6)
+        pictures = np.clip(np.nan_to_num(stretched), 0, 255).astype(np.uint8)
         write_arrays(path / REFERENCE, {"reference": pictures, "run": np.frombuffer(run, dtype=np.uint8)})
     return run
 
 
-def _readable(read: Callable[[], object]) -> bool:
+def _is_readable(read_file: Callable[[], object]) -> bool:
     try:
-        return read() is not None
+        return read_file() is not None
     except ResultError:
         return False

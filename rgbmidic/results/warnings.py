@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 
-def of_frames(texts: Iterable[tuple[int, Sequence[str]]], names: Sequence[str]) -> list[str]:
+def join_frame_warnings(texts: Iterable[tuple[int, Sequence[str]]], names: Sequence[str]) -> list[str]:
     """Join the warnings of frames that have the same text.
 
     Parameters
@@ -25,7 +25,7 @@ def of_frames(texts: Iterable[tuple[int, Sequence[str]]], names: Sequence[str]) 
 
     Examples
     --------
-    >>> of_frames([(0, []), (1, ["dark"]), (2, ["dark", "late"]), (4, ["dark"])], ["a.png"] * 5)
+    >>> join_frame_warnings([(0, []), (1, ["dark"]), (2, ["dark", "late"]), (4, ["dark"])], ["a.png"] * 5)
     ['frames 1 to 2, 4 (a.png, ...): dark', 'frame 2 (a.png): late']
     """
     frames: dict[str, list[int]] = {}
@@ -34,22 +34,25 @@ def of_frames(texts: Iterable[tuple[int, Sequence[str]]], names: Sequence[str]) 
             frames.setdefault(text, []).append(frame)
     lines = []
     for text, numbers in frames.items():
-        where = f"frame{'s' if len(numbers) > 1 else ''} {_ranges(numbers)}"
+        frames_text = f"frame{'s' if len(numbers) > 1 else ''} {_ranges(numbers)}"
         name = f" ({names[numbers[0]]}{', ...' if len(numbers) > 1 else ''})"
-        lines.append(f"{where}{name if names[numbers[0]] != where else ''}: {text}")
+        lines.append(f"{frames_text}{name if names[numbers[0]] != frames_text else ''}: {text}")
     return lines
 
 
-def _ranges(numbers: Sequence[int], most: int = 12) -> str:
-    """Write rising numbers as ranges, `most` of them."""
-    ends: list[list[int]] = []
+def _ranges(numbers: Sequence[int], max_count: int = 12) -> str:
+    """Write rising numbers as ranges, `max_count` of them."""
+    ranges: list[list[int]] = []
     for number in numbers:
-        if ends and number == ends[-1][1] + 1:
-            ends[-1][1] = number
+        if ranges and number == ranges[-1][1] + 1:
+            ranges[-1][1] = number
         else:
-            ends.append([number, number])
-    more = f" and {len(ends) - most} more ranges" if len(ends) > most else ""
-    return ", ".join(f"{a} to {b}" if b > a else f"{a}" for a, b in ends[:most]) + more
+            ranges.append([number, number])
+    remainder = f" and {len(ranges) - max_count} more ranges" if len(ranges) > max_count else ""
+    return (
+        ", ".join(f"{first} to {last}" if last > first else f"{first}" for first, last in ranges[:max_count])
+        + remainder
+    )
 
 
 class _Collector(logging.Handler):
@@ -66,7 +69,7 @@ class _Collector(logging.Handler):
 
 
 @contextmanager
-def collected() -> Iterator[list[tuple[int, str]]]:
+def collect_messages() -> Iterator[list[tuple[int, str]]]:
     """Collect level and text of what this thread logs through rgbmidic's loggers."""
     logger, handler = logging.getLogger("rgbmidic"), _Collector()
     logger.addHandler(handler)

@@ -1,5 +1,6 @@
 """Settings of a test, as TEST.toml states them: their schema, the conversion of its values, reading it."""
 
+from rgbmidic.renamed import refuse_old_names
 from rgbmidic.settings.conversion import (
     bounded,
     check_names,
@@ -71,3 +72,5 @@ __all__ = [
     "to_plain",
     "unique_keys",
 ]
+
+__getattr__ = refuse_old_names(__name__)

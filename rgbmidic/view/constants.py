@@ -40,7 +40,7 @@ class ViewerConstants:
         Elements whose edges are drawn at most: more are a grey surface on a screen of two million pixels.
     reason_letters
         Letters of a frame's reason that are shown at once: two lines of the column.
-    listed
+    max_listed_tests
         Results and tests that a folder's page lists at most, the newest: some 5 ms each.
     range_frames
         Frames, evenly spread, whose values set the colour range of a whole test: they are read within a second.
@@ -83,7 +83,7 @@ class ViewerConstants:
     circle_corners: int = 48
     mesh_edges: int = 20_000
     reason_letters: int = 90
-    listed: int = 200
+    max_listed_tests: int = 200
     range_frames: int = 24
     raw_frames: int = 8
     frames_at_once: int = 100

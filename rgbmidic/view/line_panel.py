@@ -19,18 +19,18 @@ from rgbmidic.report import profile_figure
 from rgbmidic.report.style import time_axis
 from rgbmidic.results import Maps, MapValues
 from rgbmidic.results.profiles import Profile
-from rgbmidic.view.address import probe_marks, probe_place
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.curves import NOW, band
-from rgbmidic.view.models import READ_OUT, Background, labelled, warning
+from rgbmidic.view.curves import FRAME_MARK_STYLE, uncertainty_band
+from rgbmidic.view.fields import FieldsInView
 from rgbmidic.view.picture import IMAGE, columns, plain_plot
-from rgbmidic.view.shown import ShownFields
+from rgbmidic.view.url_state import probe_marks, probe_position
+from rgbmidic.view.widgets import LIVE_REGION, Background, aria_group, warning
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class _Reading:
+class _LineReading:
     """A field along a line in all frames of a result, as far as it is read.
 
     Parameters
@@ -52,28 +52,32 @@ class _Reading:
         Time of all frames, and what it is.
     """
 
-    def __init__(self, maps: Maps, field: str, place: Sequence[float], before: _Reading | None) -> None:
-        self.maps, self.profile = maps, Profile(maps, field, place, range(len(maps.result)))
-        self.written, self.read = maps.result.table.written, np.zeros(len(maps.result), dtype=np.bool_)
-        if before and not self.profile.rate_window and (self.written == before.written)[before.read].all():
-            self.profile.values[:], self.profile.std[:] = before.profile.values, before.profile.std
-            self.read = before.read.copy()
+    def __init__(self, maps: Maps, field: str, endpoints: Sequence[float], previous: _LineReading | None) -> None:
+        self.maps, self.profile = maps, Profile(maps, field, endpoints, range(len(maps.result)))
+        self.write_times, self.is_read = maps.result.table.write_times, np.zeros(len(maps.result), dtype=np.bool_)
+        if (
+            previous
+            and not self.profile.rate_window
+            and (self.write_times == previous.write_times)[previous.is_read].all()
+        ):
+            self.profile.values[:], self.profile.std[:] = previous.profile.values, previous.profile.std
+            self.is_read = previous.is_read.copy()
         self.clock, self.label = time_axis(self.profile.times, self.profile.frames)
-        self.further()
+        self.read_more()
 
     @property
     def missing(self) -> npt.NDArray[np.int64]:
         """Indices of the frames that are measured and not read."""
-        return np.flatnonzero(self.maps.result.finished & ~self.read)
+        return np.flatnonzero(self.maps.result.finished & ~self.is_read)
 
-    def further(self) -> _Reading:
+    def read_more(self) -> _LineReading:
         """Read for a while; a damaged frame stays blank."""
-        end = time.monotonic() + VIEWER.slice_s
+        deadline = time.monotonic() + VIEWER.slice_s
         for frame in self.missing.tolist():
             with suppress(ResultError):
                 self.profile.fill(self.maps, [frame])
-            self.read[frame] = True
-            if time.monotonic() > end:
+            self.is_read[frame] = True
+            if time.monotonic() > deadline:
                 break
         return self
 
@@ -105,17 +109,19 @@ class LinePanel:
     """
 
     def __init__(
-        self, document: Document, shown: ShownFields, colours: bk.LinearColorMapper, look: Mapping[str, Any]
+        self, document: Document, fields: FieldsInView, colours: bk.LinearColorMapper, look: Mapping[str, Any]
     ) -> None:
-        self._reading: _Reading | None = None
-        self._asked: tuple[Any, ...] = ()
+        self._reading: _LineReading | None = None
+        self._request: tuple[Any, ...] = ()
         self._values: MapValues | None = None
         self._look: object = None
-        self._shown, self._map_colours, self._reader = shown, colours, Background(document)
+        self._fields, self._map_colours, self._reader = fields, colours, Background(document)
         self.names: list[str] = []
-        says = labelled("curves over time, or the field along a line")
-        self.choice = bk.RadioButtonGroup(labels=[], name="beside_map", visible=False, html_attributes=says, **look)
-        self.told = bk.Div(name="told_of_line", html_attributes=READ_OUT, **look)
+        description = aria_group("curves over time, or the field along a line")
+        self.choice = bk.RadioButtonGroup(
+            labels=[], name="beside_map", visible=False, html_attributes=description, **look
+        )
+        self.status = bk.Div(name="line_status", html_attributes=LIVE_REGION, **look)
         self._image = bk.ColumnDataSource(columns(IMAGE), name="wave")
         self._line = bk.ColumnDataSource(columns("x y"), name="profile")
         self._bands = bk.ColumnDataSource(columns("xs ys"), name="profile bands")
@@ -127,55 +133,57 @@ class LinePanel:
         self._colours = bk.LinearColorMapper(palette=colours.palette, nan_color=nothing, name="wave_colours")
         self.wave.image(*IMAGE.split(), source=self._image, color_mapper=self._colours)
         self.wave.add_layout(bk.ColorBar(color_mapper=self._colours, width=10), "right")
-        self.now = bk.Span(name="wave_now", **NOW)
-        self.wave.add_layout(self.now)
-        self.profile, colour = plain_plot(title="Profile", name="profile_plot"), NOW["line_color"]
+        self.frame_mark = bk.Span(name="wave_frame_mark", **FRAME_MARK_STYLE)
+        self.wave.add_layout(self.frame_mark)
+        self.profile, colour = plain_plot(title="Profile", name="profile_plot"), FRAME_MARK_STYLE["line_color"]
         self.profile.patches("xs", "ys", source=self._bands, fill_color=colour, fill_alpha=0.25, line_alpha=0)
-        drawn = self.profile.line("x", "y", source=self._line, line_color=colour, line_width=1.5)
-        self.profile.y_range.renderers = [drawn]
-        self.parts = (self.told, self.wave, self.profile)
+        profile_line = self.profile.line("x", "y", source=self._line, line_color=colour, line_width=1.5)
+        self.profile.y_range.renderers = [profile_line]
+        self.models = (self.status, self.wave, self.profile)
 
     def update(self, values: MapValues) -> bool:
         """Show the field, of which the map has `values`, along the line in view; return whether there is one."""
-        shown, view = self._shown, self._shown.view
+        fields, view = self._fields, self._fields.view
         probes = probe_marks(view.marks).items()
-        lines = {name: probe_place(marks, 0) for name, marks in probes if marks[0].kind == "line"}
-        self.names, there = ["", *lines], view.line in lines
+        lines = {name: probe_position(marks, 0) for name, marks in probes if marks[0].kind == "line"}
+        self.names, has_line = ["", *lines], view.line in lines
         self.choice.labels = ["over time", *(f"along {name.replace('_', ' ')}" for name in lines)]
-        self.choice.update(visible=bool(lines), active=self.names.index(view.line) if there else 0)
-        for part in self.parts:
-            part.visible = there
-        if not there:
-            self._reader.drop()
-            self._asked, self._reading, self.told.text = (), None, ""
+        self.choice.update(visible=bool(lines), active=self.names.index(view.line) if has_line else 0)
+        for model in self.models:
+            model.visible = has_line
+        if not has_line:
+            self._reader.cancel()
+            self._request, self._reading, self.status.text = (), None, ""
             return False
-        asked = (view.field, lines[view.line], shown.chosen, shown.result)
+        request = (view.field, lines[view.line], fields.derivation, fields.result)
         look = (view.range, view.low, view.high, view.symmetric, view.palette, view.levels)
-        if asked != self._asked:
-            before = self._reading if asked[:-1] == self._asked[:-1] else None
-            self._asked, self._reading = asked, before
-            self.told.text = "reading the frames …"
-            self._reader.ask(partial(_Reading, shown.maps, view.field, lines[view.line], before), self._take)
+        if request != self._request:
+            previous = self._reading if request[:-1] == self._request[:-1] else None
+            self._request, self._reading = request, previous
+            self.status.text = "reading the frames …"
+            self._reader.submit(
+                partial(_LineReading, fields.maps, view.field, lines[view.line], previous), self._receive
+            )
             self._look = None
         if look != self._look:
             self._look = look
             self._draw()
-        self.show(values)
+        self.show_profile(values)
         return True
 
-    def _take(self, read: Callable[[], _Reading]) -> None:
+    def _receive(self, read_result: Callable[[], _LineReading]) -> None:
         """Draw what was read, and read on."""
         try:
-            reading = self._reading = read()
+            reading = self._reading = read_result()
         except Exception as error:  # a line outside the mesh, a field without uncertainty: reported where it would be
-            self._reading, self.told.text = None, warning(str(error))
+            self._reading, self.status.text = None, warning(str(error))
         else:
             missing = len(reading.missing)
-            self.told.text = f"{int(reading.read.sum())} frames read, {missing} to go" if missing else ""
+            self.status.text = f"{int(reading.is_read.sum())} frames read, {missing} to go" if missing else ""
             if missing:
-                self._reader.ask(reading.further, self._take)
+                self._reader.submit(reading.read_more, self._receive)
         self._draw()
-        self.show(self._values)
+        self.show_profile(self._values)
 
     def _draw(self) -> None:
         """Draw position against time: a column for each frame, or less where they are many."""
@@ -183,18 +191,18 @@ class LinePanel:
             self._image.data = columns(IMAGE)
             return
         profile, clock = self._reading.profile, self._reading.clock
-        there = np.flatnonzero(self._reading.maps.result.finished & np.isfinite(clock))
-        steps = np.diff(clock[there])
+        measured_frames = np.flatnonzero(self._reading.maps.result.finished & np.isfinite(clock))
+        steps = np.diff(clock[measured_frames])
         steps = steps[steps > 0]
         step = float(steps.min()) if len(steps) else 1.0
         count = min(round(float(steps.sum()) / step) + 1, VIEWER.screen_columns)
-        grid = np.linspace(clock[there[0]], clock[there[-1]], count)
-        nearest = there[np.searchsorted((clock[there][1:] + clock[there][:-1]) / 2, grid)]
-        half, apart = float(grid[-1] - grid[0]) / max(count - 1, 1) / 2 or 0.5, float(profile.positions[1])
+        grid = np.linspace(clock[measured_frames[0]], clock[measured_frames[-1]], count)
+        nearest = measured_frames[np.searchsorted((clock[measured_frames][1:] + clock[measured_frames][:-1]) / 2, grid)]
+        half_column, spacing = float(grid[-1] - grid[0]) / max(count - 1, 1) / 2 or 0.5, float(profile.positions[1])
         image = profile.values[nearest].T.astype(np.float32)
-        left, wide = float(grid[0]) - half, float(grid[-1] - grid[0]) + 2 * half
-        self._image.data = columns(IMAGE, [(image, left, -apart / 2, wide, apart * len(profile.positions))])
-        low, high = self._shown.ends(profile.field.name, along=profile)
+        x_start, width = float(grid[0]) - half_column, float(grid[-1] - grid[0]) + 2 * half_column
+        self._image.data = columns(IMAGE, [(image, x_start, -spacing / 2, width, spacing * len(profile.positions))])
+        low, high = self._fields.colour_range(profile.field.name, profile=profile)
         self._colours.update(low=low, high=high)
         if self._colours.palette != self._map_colours.palette:
             self._colours.palette = self._map_colours.palette
@@ -203,32 +211,35 @@ class LinePanel:
         self.profile.xaxis.axis_label, self.profile.yaxis.axis_label = position, profile.field.label
         self.wave.title.text = f"{profile.field.label} along the line"
 
-    def show(self, values: MapValues | None) -> None:
+    def show_profile(self, values: MapValues | None) -> None:
         """Show the profile of the frame in view, of which the map has the values; None: it shows nothing."""
-        self._values, frame, self.told.visible = values, self._shown.view.frame, bool(self.told.text)
+        self._values, frame, self.status.visible = values, self._fields.view.frame, bool(self.status.text)
         if self._reading is None or values is None:
-            self._line.data, self._bands.data, self.now.location = columns("x y"), columns("xs ys"), None
+            self._line.data, self._bands.data, self.frame_mark.location = columns("x y"), columns("xs ys"), None
             return
         profile = self._reading.profile
-        along, std = profile.line.read(values.values, values.std, profile.kind)
-        self._line.data = {"x": profile.positions, "y": along}
-        curve = History(name=profile.field.name, unit=profile.field.unit, values=along, std=std)
-        self._bands.data = dict(zip(("xs", "ys"), band(profile.positions, curve), strict=True))
-        at = self._reading.clock[frame]
-        self.now.location, self.profile.title.text = float(at) if np.isfinite(at) else None, f"Profile in frame {frame}"
+        profile_values, std = profile.line.read(values.values, values.std, profile.covariance_key)
+        self._line.data = {"x": profile.positions, "y": profile_values}
+        curve = History(name=profile.field.name, unit=profile.field.unit, values=profile_values, std=std)
+        self._bands.data = dict(zip(("xs", "ys"), uncertainty_band(profile.positions, curve), strict=True))
+        time = self._reading.clock[frame]
+        self.frame_mark.location, self.profile.title.text = (
+            float(time) if np.isfinite(time) else None,
+            f"Profile in frame {frame}",
+        )
 
     def figure(self) -> Figure | None:
         """Draw the frames that are read, and the profile of the one in view, for print; None where there are none."""
-        reading, frame = self._reading, self._shown.view.frame
-        there = [] if reading is None else np.flatnonzero(reading.read & reading.maps.result.finished).tolist()
-        if reading is None or not there:
+        reading, frame = self._reading, self._fields.view.frame
+        frames = [] if reading is None else np.flatnonzero(reading.is_read & reading.maps.result.finished).tolist()
+        if reading is None or not frames:
             return None
-        profile = Profile(reading.maps, reading.profile.field.name, self._asked[1], there)
-        profile.values[:], profile.std[:] = reading.profile.values[there], reading.profile.std[there]
-        return profile_figure(profile, shown=[there.index(frame)] if frame in there else ())
+        profile = Profile(reading.maps, reading.profile.field.name, self._request[1], frames)
+        profile.values[:], profile.std[:] = reading.profile.values[frames], reading.profile.std[frames]
+        return profile_figure(profile, curve_rows=[frames.index(frame)] if frame in frames else ())
 
-    def frame(self, x: float) -> int:
+    def frame_at(self, x: float) -> int:
         """Return the index of the frame at a place of the time axis."""
         if self._reading is None or not np.isfinite(self._reading.clock).any():
-            return self._shown.view.frame
+            return self._fields.view.frame
         return int(np.nanargmin(np.abs(self._reading.clock - x)))

@@ -19,17 +19,17 @@ from bokeh.events import MouseMove
 from rgbmidic.report.style import BAR, OKABE_ITO, add_colour_bar, draw_figure, finish_picture, literal
 from rgbmidic.results import frame_times
 from rgbmidic.typing import FloatArray
-from rgbmidic.view.address import MARKS, SCALE, Mark, probe_marks, probe_place
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.picture import AROUND, Canvas, Picture, Window, columns, element_at, paint, palette
-from rgbmidic.view.shown import ShownFields
+from rgbmidic.view.fields import FieldsInView
+from rgbmidic.view.picture import OUTSIDE_GREY, Canvas, ImageWindow, Picture, columns, element_at, paint, palette
+from rgbmidic.view.url_state import MARKS, SCALE, Mark, probe_marks, probe_position
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-_ENDS, _LABEL = "x0 y0 x1 y1", "x y text colour side along down"
+_SEGMENT, _LABEL = "x0 y0 x1 y1", "x y text colour side along down"
 LETTERS = {
     "text_color": "#ffffff",
     "text_align": "side",
@@ -41,7 +41,7 @@ LETTERS = {
     "padding": 2,
 }
 """Look of a text over the image, where `beside` places it."""
-_AWAY, _LETTER, _LINE = 8, 7, 20
+_TEXT_OFFSET, _LETTER, _LINE = 8, 7, 20
 """Pixels of the screen: from a place to its text; width of a letter and height of a line of 12 px."""
 
 
@@ -64,15 +64,15 @@ class LineLayer:
     """
 
     def __init__(self, canvas: Canvas, name: str, width: float = 1.4) -> None:
-        self.lines, self._drawn = np.zeros((0, 4)), bk.ColumnDataSource(columns(_ENDS), name=name)
-        for colour, wide in (("#15181c", width + 1.6), ("#ffffff", width)):
-            canvas.plot.segment(*_ENDS.split(), source=self._drawn, line_color=colour, line_width=wide)
+        self.lines, self._source = np.zeros((0, 4)), bk.ColumnDataSource(columns(_SEGMENT), name=name)
+        for colour, stroke in (("#15181c", width + 1.6), ("#ffffff", width)):
+            canvas.plot.segment(*_SEGMENT.split(), source=self._source, line_color=colour, line_width=stroke)
 
     def show(self, lines: FloatArray | None = None) -> None:
         """Show lines (M, 4) from x0, y0 to x1, y1; None: none."""
         if lines is not None or len(self.lines):
             self.lines = np.zeros((0, 4)) if lines is None else lines
-            self._drawn.data = dict(zip(_ENDS.split(), self.lines.T, strict=True))
+            self._source.data = dict(zip(_SEGMENT.split(), self.lines.T, strict=True))
 
 
 class LabelLayer:
@@ -92,78 +92,100 @@ class LabelLayer:
         canvas.plot.text("x", "y", "text", source=self._points, **LETTERS)
 
     def show(
-        self, points: Sequence[tuple[float, float, str, str]] = (), others: Sequence[tuple[float, float, str]] = ()
+        self, points: Sequence[tuple[float, float, str, str]] = (), other_texts: Sequence[tuple[float, float, str]] = ()
     ) -> None:
-        """Show points with their texts and colours, the texts clear of `others` that `beside` has placed."""
+        """Show points with their texts and colours, the texts clear of `other_texts` that `place_texts` has placed."""
         if points or len(self._points.data["x"]):
-            placed = beside([*others, *(one[:3] for one in points)], self._canvas.window)[len(others) :]
-            self._points.data = columns(_LABEL, [(*one, *place) for one, place in zip(points, placed, strict=True)])
+            placements = place_texts([*other_texts, *(point[:3] for point in points)], self._canvas.window)[
+                len(other_texts) :
+            ]
+            self._points.data = columns(
+                _LABEL, [(*point, *placement) for point, placement in zip(points, placements, strict=True)]
+            )
 
 
-def beside(texts: Sequence[tuple[float, float, str]], window: Window) -> list[tuple[str, int, int]]:
+def place_texts(texts: Sequence[tuple[float, float, str]], window: ImageWindow) -> list[tuple[str, int, int]]:
     """Return alignment and offsets of texts at (x, y) that end within a window and do not lie on each other."""
-    step = (window.right - window.left) / window.width  # px of the image to one of the screen
-    placed, taken = [], list[tuple[float, float, float]]()
+    step = (window.x_max - window.x_min) / window.width  # px of the image to one of the screen
+    placements, boxes = [], list[tuple[float, float, float]]()
     for x, y, text in texts:
-        left, wide, top = (x - window.left) / step + _AWAY, _LETTER * len(text), (y - window.top) / step
-        turned = left + wide > window.width
-        left, low = left - (wide + 2 * _AWAY if turned else 0), top
-        while any(abs(low - other) < _LINE and left < end and begin < left + wide for begin, end, other in taken):
-            low += _LINE
-        taken.append((left, left + wide, low))
-        placed.append(("right" if turned else "left", -_AWAY if turned else _AWAY, round(low - top)))
-    return placed
+        x_start, length, y_text = (
+            (x - window.x_min) / step + _TEXT_OFFSET,
+            _LETTER * len(text),
+            (y - window.y_min) / step,
+        )
+        is_flipped = x_start + length > window.width
+        x_start, y_free = x_start - (length + 2 * _TEXT_OFFSET if is_flipped else 0), y_text
+        while any(
+            abs(y_free - box_y) < _LINE and x_start < box_end and box_start < x_start + length
+            for box_start, box_end, box_y in boxes
+        ):
+            y_free += _LINE
+        boxes.append((x_start, x_start + length, y_free))
+        placements.append(
+            ("right" if is_flipped else "left", -_TEXT_OFFSET if is_flipped else _TEXT_OFFSET, round(y_free - y_text))
+        )
+    return placements
 
 
-def _thinned(window: Window, nodes: FloatArray, known: Any) -> tuple[npt.NDArray[np.int64], float]:
+def _thin_out(window: ImageWindow, nodes: FloatArray, has_value: Any) -> tuple[npt.NDArray[np.int64], float]:
     """Thin out the nodes (N, 2) that are known, evenly over the view; return their indices, and their distance."""
-    cell = max(window.right - window.left, window.bottom - window.top) / VIEWER.lines_across
-    kept = np.flatnonzero(known & np.isfinite(nodes).all(axis=1))
-    places = np.floor(nodes[kept] / cell).astype(int)
-    return kept[np.unique(places, axis=0, return_index=True)[1]], cell
+    cell = max(window.x_max - window.x_min, window.y_max - window.y_min) / VIEWER.lines_across
+    indices = np.flatnonzero(has_value & np.isfinite(nodes).all(axis=1))
+    cells = np.floor(nodes[indices] / cell).astype(int)
+    return indices[np.unique(cells, axis=0, return_index=True)[1]], cell
 
 
-def direction_lines(window: Window, nodes: FloatArray, degrees: FloatArray) -> FloatArray:
-    """Lines (M, 4) along directions (N,), in degrees from x towards y, at nodes (N, 2), evenly thinned out."""
-    thinned, cell = _thinned(window, nodes, np.isfinite(degrees))
-    angle = np.radians(degrees[thinned])
-    half = 0.4 * cell * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return np.concatenate([nodes[thinned] - half, nodes[thinned] + half], axis=1)
+def direction_lines(window: ImageWindow, nodes: FloatArray, degrees: FloatArray) -> FloatArray:
+    """Return lines (M, 4) along directions (N,), in degrees from x towards y, at nodes (N, 2), evenly thinned out."""
+    indices, cell = _thin_out(window, nodes, np.isfinite(degrees))
+    angle = np.radians(degrees[indices])
+    half_line = 0.4 * cell * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate([nodes[indices] - half_line, nodes[indices] + half_line], axis=1)
 
 
-def arrow_lines(window: Window, nodes: FloatArray, moved: FloatArray, longer: float) -> tuple[FloatArray, float]:
-    """Lines (M, 4) of arrows along displacements (N, 2) at nodes (N, 2), thinned out, and how much longer they are.
+def arrow_lines(
+    window: ImageWindow, nodes: FloatArray, displacement: FloatArray, factor: float
+) -> tuple[FloatArray, float]:
+    """Return lines (M, 4) of arrows along displacements (N, 2) at nodes (N, 2), thinned out, and their magnification.
 
-    With `longer` 0 the longest reaches to the next arrow.
+    With `factor` 0 the longest reaches to the next arrow.
     """
-    thinned, cell = _thinned(window, nodes, np.isfinite(moved).all(axis=1))
-    start, along = nodes[thinned], moved[thinned]
-    reach = np.hypot(*along.T).max(initial=0)
-    longer = longer or (0.9 * cell / reach if reach > 0 else 1.0)
-    end = start + longer * along
-    parts = [np.concatenate([start, end], axis=1)]
+    indices, cell = _thin_out(window, nodes, np.isfinite(displacement).all(axis=1))
+    start, vector = nodes[indices], displacement[indices]
+    reach = np.hypot(*vector.T).max(initial=0)
+    factor = factor or (0.9 * cell / reach if reach > 0 else 1.0)
+    tip = start + factor * vector
+    segments = [np.concatenate([start, tip], axis=1)]
     for turn in (2.6, -2.6):  # rad from the arrow to the sides of its point
-        c, s = 0.3 * np.cos(turn), 0.3 * np.sin(turn)
-        parts.append(np.concatenate([end, end + longer * along @ np.array([[c, s], [-s, c]])], axis=1))
-    return np.concatenate(parts), float(longer)
+        cosine, sine = 0.3 * np.cos(turn), 0.3 * np.sin(turn)
+        segments.append(
+            np.concatenate([tip, tip + factor * vector @ np.array([[cosine, sine], [-sine, cosine]])], axis=1)
+        )
+    return np.concatenate(segments), float(factor)
 
 
 def contour_lines(
     nodes: FloatArray, elements: npt.NDArray[np.int32], values: FloatArray, levels: Sequence[float]
 ) -> FloatArray:
-    """Lines (M, 4) on which a field, linear in each element, has one of the levels; none beside nodes without data."""
-    whole = elements[np.isfinite(values[elements] + nodes[elements].sum(axis=2)).all(axis=1)]
+    """Return lines (M, 4) on which a field, linear in each element, has one of the levels; none beside blank nodes."""
+    complete = elements[np.isfinite(values[elements] + nodes[elements].sum(axis=2)).all(axis=1)]
     lines = []
     for level in levels:
-        above = values[whole] > level
-        crossed = above.any(axis=1) & ~above.all(axis=1)
-        cut, side = whole[crossed], above[crossed]
+        is_above = values[complete] > level
+        is_crossed = is_above.any(axis=1) & ~is_above.all(axis=1)
+        corners, corner_above = complete[is_crossed], is_above[is_crossed]
         # the corner that is alone on its side: from it, the line cuts both edges
-        alone = np.where(side.sum(axis=1) == 1, side.argmax(axis=1), side.argmin(axis=1))
-        a, *others = np.take_along_axis(cut, (alone[:, None] + np.arange(3)) % 3, axis=1).T
-        parts = [((level - values[a]) / (values[b] - values[a]))[:, None] for b in others]
-        ends = [nodes[a] + part * (nodes[b] - nodes[a]) for part, b in zip(parts, others, strict=True)]
-        lines.append(np.concatenate(ends, axis=1))
+        single_corner = np.where(
+            corner_above.sum(axis=1) == 1, corner_above.argmax(axis=1), corner_above.argmin(axis=1)
+        )
+        apex, *far_corners = np.take_along_axis(corners, (single_corner[:, None] + np.arange(3)) % 3, axis=1).T
+        fractions = [((level - values[apex]) / (values[corner] - values[apex]))[:, None] for corner in far_corners]
+        points = [
+            nodes[apex] + fraction * (nodes[corner] - nodes[apex])
+            for fraction, corner in zip(fractions, far_corners, strict=True)
+        ]
+        lines.append(np.concatenate(points, axis=1))
     return np.concatenate(lines) if lines else np.zeros((0, 4))
 
 
@@ -173,13 +195,13 @@ _PROBE = "xs ys colour x y text side along down"
 _TURN = np.linspace(0, 2 * np.pi, 49)
 
 
-def _outline(ends: Sequence[Mark], gauge: float) -> tuple[list[float], list[float]]:
+def _outline(marks: Sequence[Mark], gauge: float) -> tuple[list[float], list[float]]:
     """Return the x and y of the lines that show a probe."""
-    xs, ys = [mark.x for mark in ends], [mark.y for mark in ends]
-    if ends[0].kind == "region":
+    xs, ys = [mark.x for mark in marks], [mark.y for mark in marks]
+    if marks[0].kind == "region":
         return [xs[0], xs[1], xs[1], xs[0], xs[0]], [ys[0], ys[0], ys[1], ys[1], ys[0]]
-    if ends[0].kind in ("circle", "strain_gauge"):
-        radius = gauge / 2 if len(ends) == 1 else float(np.hypot(xs[1] - xs[0], ys[1] - ys[0]))
+    if marks[0].kind in ("circle", "strain_gauge"):
+        radius = gauge / 2 if len(marks) == 1 else float(np.hypot(xs[1] - xs[0], ys[1] - ys[0]))
         return (xs[0] + radius * np.cos(_TURN)).tolist(), (ys[0] + radius * np.sin(_TURN)).tolist()
     return xs, ys
 
@@ -203,55 +225,60 @@ class MarkLayer:
     """
 
     def __init__(self, canvas: Canvas, elements: npt.NDArray[np.int32]) -> None:
-        self.colours, self.drawn = dict[str, str](), list[tuple[Any, ...]]()
-        self._canvas, self._elements, self._shown = canvas, elements, dict[object, tuple[Mark, Mark]]()
+        self.colours, self.shapes = dict[str, str](), list[tuple[Any, ...]]()
+        self._canvas, self._elements, self._placed_marks = canvas, elements, dict[object, tuple[Mark, Mark]]()
         self._placed: object = None
-        self._joined = bk.ColumnDataSource(columns(_PROBE), name="probes")
-        canvas.plot.multi_line("xs", "ys", source=self._joined, line_color="colour", line_width=3)
-        canvas.plot.text("x", "y", "text", source=self._joined, border_line_color="colour", **LETTERS)
+        self._source = bk.ColumnDataSource(columns(_PROBE), name="probes")
+        canvas.plot.multi_line("xs", "ys", source=self._source, line_color="colour", line_width=3)
+        canvas.plot.text("x", "y", "text", source=self._source, border_line_color="colour", **LETTERS)
 
-    def place(
+    def draw_marks(
         self, marks: Sequence[Mark], reference: FloatArray, nodes: FloatArray, values: Mapping[str, str], gauge: float
     ) -> None:
         """Draw marks, which lie on the `reference` (N, 2) of the nodes, where the nodes (N, 2) carry them.
 
         Each probe shows its value of `values`; strain gauges are circles of the length `gauge` (px).
         """
-        at = [self._carried(mark, reference, nodes) for mark in marks]
-        self._shown = {mark.key: (mark, own) for mark, own in zip(at, marks, strict=True)}
-        self._canvas.place(at)
-        placed = (at, dict(values), gauge, self._canvas.window)
+        moved_marks = [self._carry(mark, reference, nodes) for mark in marks]
+        self._placed_marks = {mark.key: (mark, original) for mark, original in zip(moved_marks, marks, strict=True)}
+        self._canvas.place_marks(moved_marks)
+        placed = (moved_marks, dict(values), gauge, self._canvas.window)
         if placed == self._placed:
             return
         self._placed = placed
-        ends = [mark for mark in at if mark.kind == SCALE]
-        probes = {**probe_marks(at), **({SCALE: ends} if len(ends) > 1 else {})}
-        self.colours = {name: _COLOURS[place % len(_COLOURS)] for place, name in enumerate(probes)}
-        lines = [_outline(ends, gauge) for ends in probes.values()]
+        group = [mark for mark in moved_marks if mark.kind == SCALE]
+        probes = {**probe_marks(moved_marks), **({SCALE: group} if len(group) > 1 else {})}
+        self.colours = {name: _COLOURS[index % len(_COLOURS)] for index, name in enumerate(probes)}
+        lines = [_outline(group, gauge) for group in probes.values()]
         texts = [
-            (ends[0].x, ends[0].y, f"{name.replace('_', ' ')}{values.get(name, '')}") for name, ends in probes.items()
+            (group[0].x, group[0].y, f"{name.replace('_', ' ')}{values.get(name, '')}")
+            for name, group in probes.items()
         ]
-        sides = beside(texts, self._canvas.window)
-        self.drawn = [(*line, self.colours[name], *text) for line, name, text in zip(lines, probes, texts, strict=True)]
-        self._joined.data = columns(_PROBE, [(*one, *side) for one, side in zip(self.drawn, sides, strict=True)])
+        placements = place_texts(texts, self._canvas.window)
+        self.shapes = [
+            (*line, self.colours[name], *text) for line, name, text in zip(lines, probes, texts, strict=True)
+        ]
+        self._source.data = columns(
+            _PROBE, [(*shape, *placement) for shape, placement in zip(self.shapes, placements, strict=True)]
+        )
 
-    def taken(self, nodes: FloatArray, reference: FloatArray) -> tuple[Mark, ...] | None:
+    def read_marks(self, nodes: FloatArray, reference: FloatArray) -> tuple[Mark, ...] | None:
         """Return the marks, set over nodes (N, 2), on the `reference` (N, 2); None where none has changed."""
-        now = self._canvas.set
-        if now == [mark for mark, _ in self._shown.values()]:
+        marks_on_plot = self._canvas.current_marks
+        if marks_on_plot == [mark for mark, _ in self._placed_marks.values()]:
             return None
         marks = []
-        for mark in now:
-            shown, own = self._shown.get(mark.key, (None, mark))
-            marks.append(own if mark == shown else self._carried(mark, nodes, reference))
+        for mark in marks_on_plot:
+            displayed, original = self._placed_marks.get(mark.key, (None, mark))
+            marks.append(original if mark == displayed else self._carry(mark, nodes, reference))
         return tuple(marks)
 
-    def _carried(self, mark: Mark, before: FloatArray, after: FloatArray) -> Mark:
-        """Carry a mark from the nodes `before` to those `after`; outside the mesh or without data it stays."""
-        found = None if before is after else element_at(before, self._elements, mark.x, mark.y)
-        if found is None:
+    def _carry(self, mark: Mark, nodes_before: FloatArray, nodes_after: FloatArray) -> Mark:
+        """Carry a mark from `nodes_before` to `nodes_after`; outside the mesh or without data it stays."""
+        element = None if nodes_before is nodes_after else element_at(nodes_before, self._elements, mark.x, mark.y)
+        if element is None:
             return mark
-        x, y = found[1] @ after[found[0]]
+        x, y = element[1] @ nodes_after[element[0]]
         return replace(mark, x=float(x), y=float(y)) if np.isfinite(x + y) else mark
 
 
@@ -271,7 +298,7 @@ class MapPanel:
 
     Attributes
     ----------
-    canvas, beside
+    canvas, place_texts
         Canvas of the first field, on which marks are set, and those of the others.
     marks
         Marks of probes.
@@ -282,27 +309,30 @@ class MapPanel:
     def __init__(
         self,
         document: Document,
-        shown: ShownFields,
+        fields: FieldsInView,
         redraw: Callable[[], None],
         hover: Callable[[Any], None],
         dark: bool,
     ) -> None:
-        self._document, self._shown, self._dark = document, shown, dark
+        self._document, self._fields, self._dark = document, fields, dark
         self._redraw, self._hover = redraw, hover
-        result = shown.result
-        self.canvas = canvas = Canvas(document, MARKS, shown.view.window or Canvas.around(result.nodes), redraw)
+        result = fields.result
+        self.canvas = canvas = Canvas(document, MARKS, fields.view.window or Canvas.edges_around(result.nodes), redraw)
         canvas.plot.on_event(MouseMove, hover)
-        self.beside, self._count = list[Canvas](), 1
+        self.side_canvases, self._count = list[Canvas](), 1
         self._directions, self._contours = LineLayer(canvas, "direction lines"), LineLayer(canvas, "contour lines", 0.8)
         self._arrows, self._blank = LineLayer(canvas, "arrows"), LabelLayer(canvas, "blank nodes", size=5)
-        self.marks, self._ends = MarkLayer(canvas, result.elements), LabelLayer(canvas, "extreme nodes", size=9)
+        self.marks, self._extreme_labels = (
+            MarkLayer(canvas, result.elements),
+            LabelLayer(canvas, "extreme nodes", size=9),
+        )
         self.column = bk.Column(children=[canvas.plot], sizing_mode="stretch_both")
 
     def clear(self) -> None:
         """Show nothing."""
-        for canvas in (self.canvas, *self.beside):
+        for canvas in (self.canvas, *self.side_canvases):
             canvas.clear()
-        for layer in (self._directions, self._contours, self._arrows, self._ends, self._blank):
+        for layer in (self._directions, self._contours, self._arrows, self._extreme_labels, self._blank):
             layer.show()
 
     def figure(self) -> Figure:
@@ -310,112 +340,123 @@ class MapPanel:
         from matplotlib.collections import LineCollection
         from matplotlib.colors import ListedColormap, Normalize
 
-        shown, view, window = self._shown, self._shown.view, self.canvas.window
-        (picture, _), (unit, factor), names = shown.picture, shown.maps.physical.axes, shown.names
+        fields, view, window = self._fields, self._fields.view, self.canvas.window
+        (picture, _), (unit, factor), names = fields.picture, fields.maps.physical.axes, fields.names
         height = round(VIEWER.print_columns * window.height / window.width)
         large = replace(window, width=VIEWER.print_columns, height=height)
         layers = [layer.lines for layer in (self._directions, self._contours, self._arrows)]
 
         def draw(axes: list[Axes]) -> None:
             for axis, name in zip(axes, names, strict=True):
-                over, field = shown.overlay(name), shown.maps.all[name]
-                pixels = paint(large, picture, over, AROUND[False])
-                edges = (window.left, window.right, window.bottom, window.top)
+                overlay, field = fields.overlay(name), fields.maps.quantities[name]
+                pixels = paint(large, picture, overlay, OUTSIDE_GREY[False])
+                edges = (window.x_min, window.x_max, window.y_max, window.y_min)
                 axis.imshow(pixels.view(np.uint8).reshape(*pixels.shape, 4), extent=edges)
-                limits = edges[:2], (window.top, window.bottom)
-                finish_picture(axis, *limits, first=axis is axes[0], unit=unit, factor=factor)
+                limits = edges[:2], (window.y_min, window.y_max)
+                finish_picture(axis, *limits, has_y_label=axis is axes[0], unit=unit, factor=factor)
                 axis.set_title(literal(field.label))
-                add_colour_bar(axis, Normalize(*over.ends), ListedColormap(over.colours), names=field.codes)
+                add_colour_bar(
+                    axis, Normalize(*overlay.colour_range), ListedColormap(overlay.colours), names=field.codes
+                )
             for lines in layers:
                 for colour, width in (("#15181c", 1.4), ("#ffffff", 0.7)):
                     segments = LineCollection(list(lines.reshape(-1, 2, 2)), colors=colour, linewidths=width)
                     axes[0].add_collection(segments)
             point = 0.55  # points to a pixel of the screen: letters of 5.5 points
-            wide = 72 * axes[0].get_position().width * cast("Figure", axes[0].figure).get_figwidth() / point
-            drawn = self.marks.drawn
-            sides = beside([(x, y, text) for *_, x, y, text in drawn], replace(window, width=round(wide)))
-            for (xs, ys, colour, x, y, text), (side, along, down) in zip(drawn, sides, strict=True):
+            screen_width = 72 * axes[0].get_position().width * cast("Figure", axes[0].figure).get_figwidth() / point
+            shapes = self.marks.shapes
+            placements = place_texts(
+                [(x, y, text) for *_, x, y, text in shapes], replace(window, width=round(screen_width))
+            )
+            for (xs, ys, colour, x, y, text), (alignment, x_offset, y_offset) in zip(shapes, placements, strict=True):
                 axes[0].plot(xs, ys, color=colour, marker="o" if len(xs) == 1 else "")
-                look: dict[str, Any] = {"color": "w", "size": 10 * point, "ha": side, "va": "bottom"}
+                look: dict[str, Any] = {"color": "w", "size": 10 * point, "ha": alignment, "va": "bottom"}
                 look["bbox"] = {"facecolor": "#15181c", "edgecolor": colour, "alpha": 0.75, "pad": 1}
-                shift = along * point, -down * point
+                shift = x_offset * point, -y_offset * point
                 axes[0].annotate(literal(text), (x, y), shift, textcoords="offset points", **look)
 
-        times = frame_times(shown.result, shown.maps.physical.scale)
-        title = shown.title(math.nan if times is None else float(times[view.frame]))
-        how = dict.fromkeys(shown.maps.how(name) for name in names)
-        aspect, title = window.height / window.width, f"{title}\n{'; '.join(filter(None, how))}".strip()
-        figure = draw_figure(draw, count=len(names), aspect=aspect, beside=BAR, title=title)
+        times = frame_times(fields.result, fields.maps.physical.scale)
+        title = fields.title(math.nan if times is None else float(times[view.frame]))
+        note = dict.fromkeys(fields.maps.processing_note(name) for name in names)
+        aspect, title = window.height / window.width, f"{title}\n{'; '.join(filter(None, note))}".strip()
+        figure = draw_figure(draw, count=len(names), aspect=aspect, right_room=BAR, title=title)
         figure.texts[0].set(fontsize=8, parse_math=False)  # two lines have room
         return figure
 
     def draw(self, picture: Picture) -> str:
         """Draw the fields over an image; returns what is to be said of the arrows."""
-        shown, names, window = self._shown, self._shown.names, self.canvas.window
+        fields, names, window = self._fields, self._fields.names, self.canvas.window
         self._arrange(len(names))
-        for canvas, name in zip((self.canvas, *self.beside), names, strict=False):
-            field, over = shown.maps.all[name], shown.overlay(name)
-            canvas.show(paint(window, picture, over, AROUND[self._dark]), window)
-            canvas.colour(over.ends, over.colours, field.label, field.codes)
-            canvas.number(*shown.maps.physical.axes)
-        return self._draw_layers(shown.nodes)
+        for canvas, name in zip((self.canvas, *self.side_canvases), names, strict=False):
+            field, overlay = fields.maps.quantities[name], fields.overlay(name)
+            canvas.show_picture(paint(window, picture, overlay, OUTSIDE_GREY[self._dark]), window)
+            canvas.set_colour_bar(overlay.colour_range, overlay.colours, field.label, field.codes)
+            canvas.number_axes(*fields.maps.physical.axes)
+        return self._draw_layers(fields.nodes)
 
     def _arrange(self, count: int) -> None:
         """Show so many canvases: side by side, two in a row, or one below the other where the field is wide.
 
         They take the place of the curves too where there are none.
         """
-        alone = count > 1 and not self._shown.view.marks
-        self.column.css_classes = [*(["several"] if count > 1 else []), *(["alone"] if alone else [])]
+        fills_page = count > 1 and not self._fields.view.marks
+        self.column.css_classes = [*(["several"] if count > 1 else []), *(["alone"] if fills_page else [])]
         if count == self._count:
             return
         self._count = count
-        while len(self.beside) < count - 1:
-            self.beside.append(Canvas(self._document, (), self.canvas.wanted, self._redraw, like=self.canvas))
-            self.beside[-1].plot.on_event(MouseMove, self._hover)
-            self.beside[-1].plot.name = f"plot_{len(self.beside) + 1}"
-        plots = [canvas.plot for canvas in (self.canvas, *self.beside)][:count]
-        wide = count == 2 and np.ptp(self._shown.result.nodes[:, 0]) > np.ptp(self._shown.result.nodes[:, 1])
-        across = 1 if wide or count == 1 else 2
-        rows = [bk.Row(children=plots[at : at + across], sizing_mode="stretch_both") for at in range(0, count, across)]
-        if count % across:  # a plot of another shape would distort what all show of the image
+        while len(self.side_canvases) < count - 1:
+            self.side_canvases.append(
+                Canvas(self._document, (), self.canvas.requested_edges, self._redraw, neighbour=self.canvas)
+            )
+            self.side_canvases[-1].plot.on_event(MouseMove, self._hover)
+            self.side_canvases[-1].plot.name = f"plot_{len(self.side_canvases) + 1}"
+        plots = [canvas.plot for canvas in (self.canvas, *self.side_canvases)][:count]
+        wide = count == 2 and np.ptp(self._fields.result.nodes[:, 0]) > np.ptp(self._fields.result.nodes[:, 1])
+        per_row = 1 if wide or count == 1 else 2
+        rows = [
+            bk.Row(children=plots[start : start + per_row], sizing_mode="stretch_both")
+            for start in range(0, count, per_row)
+        ]
+        if count % per_row:  # a plot of another shape would distort what all show of the image
             rows[-1].children = [*rows[-1].children, bk.Spacer(sizing_mode="stretch_both")]
         self.column.children = rows if count > 1 else plots
 
     def _draw_layers(self, nodes: FloatArray) -> str:
         """Draw what lies over the first field: lines, arrows, extremes, nodes without data, marks."""
-        shown, view, window = self._shown, self._shown.view, self.canvas.window
-        field, values = shown.maps.all[view.field], shown.values(view.field)
-        direction = shown.values("direction").values if view.directions else None
+        fields, view, window = self._fields, self._fields.view, self.canvas.window
+        field, values = fields.maps.quantities[view.field], fields.values(view.field)
+        direction = fields.values("direction").values if view.directions else None
         self._directions.show(None if direction is None else direction_lines(window, nodes, direction))
-        levels = np.linspace(*shown.ends(view.field), min(view.levels, VIEWER.contour_steps) + 1)[1:-1]
-        over = shown.overlay(view.field) if view.contours and not field.stepped else None
-        contours = None if over is None else contour_lines(over.nodes, over.elements, over.values, levels.tolist())
+        levels = np.linspace(*fields.colour_range(view.field), min(view.levels, VIEWER.contour_steps) + 1)[1:-1]
+        overlay = fields.overlay(view.field) if view.contours and not field.stepped else None
+        contours = (
+            None if overlay is None else contour_lines(overlay.nodes, overlay.elements, overlay.values, levels.tolist())
+        )
         self._contours.show(contours)
         arrows, title = None, "times their length (0: as there is room)"
         if view.vectors:
-            moved = shown.displacement[:2].T
-            if shown.maps.physical.rectified.camera is not None:  # that is on the plane, the arrows are on the image
-                first = shown.result.nodes if view.since < 0 else shown.maps.read("u", view.since).moved
-                moved = values.moved - first
-            arrows, longer = arrow_lines(window, nodes, moved, view.longer)
+            displacement = fields.displacement[:2].T
+            if fields.maps.physical.rectified.camera is not None:  # that is on the plane, the arrows are on the image
+                origin = fields.result.nodes if view.since < 0 else fields.maps.read("u", view.since).deformed_nodes
+                displacement = values.deformed_nodes - origin
+            arrows, longer = arrow_lines(window, nodes, displacement, view.longer)
             title = f"{title}: {longer:.3g}"
         self._arrows.show(arrows)
         missing = np.flatnonzero(values.status) if view.blank else ()
         colours = palette("codes")
-        self._blank.show([(*shown.result.nodes[node].tolist(), "", colours[values.status[node]]) for node in missing])
+        self._blank.show([(*fields.result.nodes[node].tolist(), "", colours[values.status[node]]) for node in missing])
         probes = probe_marks(view.marks).items()
-        gauge = shown.gauge
-        texts = {name: shown.probe_text(marks[0].kind, probe_place(marks, gauge)) for name, marks in probes}
+        gauge = fields.gauge
+        texts = {name: fields.probe_text(marks[0].kind, probe_position(marks, gauge)) for name, marks in probes}
         texts[SCALE] = f": {view.distance:g} mm" if view.distance else ""
-        self.marks.place(view.marks, shown.result.nodes, nodes, texts, gauge)
-        ends = shown.extremes if view.extremes else ()
-        names = zip(("smallest", "largest"), ("#56b4e9", "#e69f00"), ends, strict=False)
-        self._ends.show(
+        self.marks.draw_marks(view.marks, fields.result.nodes, nodes, texts, gauge)
+        extremes = fields.extremes if view.extremes else ()
+        names = zip(("smallest", "largest"), ("#56b4e9", "#e69f00"), extremes, strict=False)
+        self._extreme_labels.show(
             [
-                (*nodes[node].tolist(), f"{name} {field.text(values.values[node], values.std[node])}", colour)
+                (*nodes[node].tolist(), f"{name} {field.format(values.values[node], values.std[node])}", colour)
                 for name, colour, node in names
             ],
-            others=[(x, y, text) for *_, x, y, text in self.marks.drawn],
+            other_texts=[(x, y, text) for *_, x, y, text in self.marks.shapes],
         )
         return title

@@ -1,25 +1,25 @@
-// What the browser does by itself; the functions are called by `models.script` with parts of the page.
+// What the browser does by itself; the functions are called by `widgets.script` with parts of the page.
 const rgbmidic = {
   next: 0,
 
   // Ask for the frame of the slider, one at a time; while frames are played, for the next one at least `wait` ms later.
   pump({state, slider, play, step, wait}) {
-    if (state.asked !== state.shown) return;
-    if (slider.value !== state.shown) { state.asked = slider.value; return; }
+    if (state.requested_frame !== state.displayed_frame) return;
+    if (slider.value !== state.displayed_frame) { state.requested_frame = slider.value; return; }
     if (!play.active) return;
     setTimeout(() => {
-      if (!play.active || slider.value !== state.shown) return;
+      if (!play.active || slider.value !== state.displayed_frame) return;
       rgbmidic.next = performance.now() + wait;
       slider.value = slider.value + step.value > slider.end ? slider.start : slider.value + step.value;
     }, Math.max(0, rgbmidic.next - performance.now()));
   },
 
   // Mark the frame that is shown in the time line, and keep the view in the address.
-  shown({state, now}) {
-    now.setv({location: state.shown}, {sync: false});
+  showFrame({state, now}) {
+    now.setv({location: state.displayed_frame}, {sync: false});
     const path = new URL(location.href).searchParams.get("path");
     const kept = path === null ? "?" : "?path=" + encodeURIComponent(path) + "&";
-    history.replaceState(null, "", kept + "frame=" + state.shown + (state.query && "&" + state.query));
+    history.replaceState(null, "", kept + "frame=" + state.displayed_frame + (state.query && "&" + state.query));
   },
 
   // Take the tool of the button that was pressed; of two groups of buttons one is pressed.

@@ -15,20 +15,20 @@ from bokeh.document import Document
 from bokeh.events import DocumentReady, Tap
 
 from rgbmidic.errors import RgbmidicError
-from rgbmidic.report.style import embedded
+from rgbmidic.report.style import data_url
 from rgbmidic.results import Result
 from rgbmidic.results.histories import history_csv
 from rgbmidic.settings import ChannelSettings, ProbeSettings
-from rgbmidic.text import uncertain
-from rgbmidic.view.address import BESIDE, OVER, SCALE, UNCERTAINTY, Mark, Steps, ViewState
+from rgbmidic.text import format_with_std
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
+from rgbmidic.view.curves import CurvePanel, FrameProgress, TimeLine
+from rgbmidic.view.fields import FieldsInView
 from rgbmidic.view.line_panel import LinePanel
 from rgbmidic.view.map_panel import MapPanel
-from rgbmidic.view.models import ResultControls, SharedState, every, guarded, script, warning
+from rgbmidic.view.panels import FileButtons, MovieButton, ProbeNames
 from rgbmidic.view.picture import Canvas
-from rgbmidic.view.sections import FileButtons, FilmButton, ProbeNames
-from rgbmidic.view.shown import ShownFields
+from rgbmidic.view.url_state import BACKGROUNDS, EXTRA_FIELDS, SCALE, UNCERTAINTY, Mark, UndoHistory, ViewState
+from rgbmidic.view.widgets import ResultControls, SharedState, call_periodically, run_guarded, script, warning
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,174 +49,187 @@ class ResultPage:
         Status of the frames, which other pages of the result may have filled.
     """
 
-    def __init__(self, document: Document, result: Result, view: ViewState, progress: Progress) -> None:
+    def __init__(self, document: Document, result: Result, view: ViewState, progress: FrameProgress) -> None:
         self.document, self.progress = document, progress
-        self.shown = ShownFields(result, view.with_channels(result.section(ChannelSettings)))
-        self.shown.view = view = self.shown.view.with_probes(result.section(ProbeSettings), self.shown.gauge)
-        self._told = False
+        self.fields = FieldsInView(result, view.with_channels(result.section(ChannelSettings)))
+        self.fields.view = view = self.fields.view.with_probes(result.section(ProbeSettings), self.fields.gauge)
+        self._has_view = False
         self._pointer: tuple[float, float] | None = None
         self._grown = 0
-        self.state, dark = SharedState(name="state", asked=view.frame, shown=view.frame), view.theme == "dark"
-        self.steps = Steps(view.marks)
-        self.parts = p = ResultControls(len(result) - 1, view.frame, dark=dark)
-        self.maps = MapPanel(document, self.shown, self._redraw, self._hover, dark=dark)
-        self.names, self.film = ProbeNames(p, self.shown, self._take_marks), FilmButton(p, self.shown)
-        self.file, self.timeline = FileButtons(p, self.shown), TimeLine(len(result), view.frame)
-        self.curves = CurvePanel(document, self.shown, p)
-        self.line = LinePanel(document, self.shown, self.maps.canvas.colours, p.wide)
-        panels = [self.line.choice, self.curves.plot, *self.line.parts]
+        self.state, dark = (
+            SharedState(name="state", requested_frame=view.frame, displayed_frame=view.frame),
+            view.theme == "dark",
+        )
+        self.steps = UndoHistory(view.marks)
+        self.controls = controls = ResultControls(len(result) - 1, view.frame, dark=dark)
+        self.maps = MapPanel(document, self.fields, self._redraw, self._hover, dark=dark)
+        self.names, self.film = ProbeNames(controls, self.fields, self._take_marks), MovieButton(controls, self.fields)
+        self.file, self.timeline = FileButtons(controls, self.fields), TimeLine(len(result), view.frame)
+        self.curves = CurvePanel(document, self.fields, controls)
+        self.line = LinePanel(document, self.fields, self.maps.canvas.colours, controls.wide)
+        panels = [self.line.choice, self.curves.plot, *self.line.models]
         self.panel = bk.Column(children=panels, sizing_mode="stretch_both")
-        self._begin()
-        p.wire(self.state, self.maps.canvas.tools, self.timeline.now)
+        self._initialise_controls()
+        controls.wire(self.state, self.maps.canvas.tools, self.timeline.frame_mark)
         self._listen()
 
     @property
     def view(self) -> ViewState:
-        """What is looked at."""
-        return self.shown.view
+        """The present view."""
+        return self.fields.view
 
     @property
     def result(self) -> Result:
         """The result with the frames that there are."""
-        return self.shown.result
+        return self.fields.result
 
     @property
     def roots(self) -> dict[str, Any]:
         """The parts of the page by the names that its template gives their places."""
-        p = self.parts
-        drawn = {"maps": self.maps.column, "timeline": self.timeline.plot, "curves": self.panel}
-        return {"head": p.head, "under": p.under, "side": p.side, "player": p.player, **drawn}
+        controls = self.controls
+        plots = {"maps": self.maps.column, "timeline": self.timeline.plot, "curves": self.panel}
+        return {
+            "head": controls.head,
+            "under": controls.pointer_label,
+            "side": controls.side,
+            "player": controls.player,
+            **plots,
+        }
 
-    def _begin(self) -> None:
+    def _initialise_controls(self) -> None:
         """Set the controls to the view, and let them change it."""
-        p, view = self.parts, self.view
+        controls, view = self.controls, self.view
         self._offer_fields()
-        self.curves.offer()
-        self.names.offer()
-        p.of["since"].high = len(self.result) - 1
-        p.over.active = OVER.index(view.over)
+        self.curves.offer_choices()
+        self.names.offer_probes()
+        controls.entry_controls["since"].high = len(self.result) - 1
+        controls.over.active = BACKGROUNDS.index(view.over)
         self._draw_progress()
-        for entry, (kind, *_) in view.controls().items():
-            key = "active" if kind is bk.Checkbox else "value"
-            p.of[entry].update(**{key: getattr(view, entry)})
-            p.of[entry].on_change(key, partial(self._set, entry))
+        for entry, (widget, *_) in view.controls().items():
+            key = "active" if widget is bk.Checkbox else "value"
+            controls.entry_controls[entry].update(**{key: getattr(view, entry)})
+            controls.entry_controls[entry].on_change(key, partial(self._set, entry))
         for model, key, change in (
-            (self.state, "asked", lambda frame: {"frame": min(frame, len(self.result) - 1)}),
-            (p.over, "active", lambda place: {"over": OVER[place]}),
-            (p.curve, "value", lambda name: {"curve": name}),
+            (self.state, "requested_frame", lambda frame: {"frame": min(frame, len(self.result) - 1)}),
+            (controls.over, "active", lambda index: {"over": BACKGROUNDS[index]}),
+            (controls.curve, "value", lambda name: {"curve": name}),
         ):
-            model.on_change(key, lambda attr, old, new, change=change: self.show(**change(new)))
+            model.on_change(key, lambda attr, old, new, change=change: self.update_view(**change(new)))
 
     def _offer_fields(self) -> None:
         """Offer the fields, in the units that they have."""
         groups: dict[str, list[tuple[str, str]]] = {}
-        for field in self.shown.maps.all.values():
+        for field in self.fields.maps.quantities.values():
             groups.setdefault(field.group, []).append((field.name, field.label))
-        of = self.parts.of
-        of["field"].options = groups
-        for name in BESIDE:
-            of[name].options = {"": [("", "nothing"), (UNCERTAINTY, "its uncertainty")], **groups}
+        controls = self.controls.entry_controls
+        controls["field"].options = groups
+        for name in EXTRA_FIELDS:
+            controls[name].options = {"": [("", "nothing"), (UNCERTAINTY, "its uncertainty")], **groups}
 
     def _set(self, entry: str, attribute: str, old: Any, new: Any) -> None:
         """Take the value of a control into the view; a range by hand starts from that in view."""
-        low, high = (self.parts.of[name] for name in ("low", "high"))
+        low, high = (self.controls.entry_controls[name] for name in ("low", "high"))
         if new is None:  # a number that was deleted
             return
         if entry == "range" and new == "hand":
             mapper = self.maps.canvas.colours
-            self.shown.view = replace(self.view, range="hand")
+            self.fields.view = replace(self.view, range="hand")
             low.value, high.value = float(mapper.low), float(mapper.high)
-        if entry in ("low", "high", "range") and self.parts.of["range"].value == "hand":
-            whole = None not in (low.value, high.value) and low.value < high.value
-            self.show(range="hand", **({"low": low.value, "high": high.value} if whole else {}))
+        if entry in ("low", "high", "range") and self.controls.entry_controls["range"].value == "hand":
+            is_range = None not in (low.value, high.value) and low.value < high.value
+            self.update_view(range="hand", **({"low": low.value, "high": high.value} if is_range else {}))
         else:
-            self.show(**{entry: new})
+            self.update_view(**{entry: new})
 
     def _listen(self) -> None:
-        p = self.parts
-        self.maps.canvas.marks.on_change("data", lambda attr, old, new: self._marked())
-        for button, act in (
-            (p.write, self.file.write), (p.take, lambda: self._take_marks(self.file.probes())), (p.csv, self._save),
-            (p.lock, lambda: p.of["range"].update(value="hand")), (p.clear, lambda: self._take_marks(())),
-            (p.undo, lambda: self.show(marks=self.steps.go(back=True))),
-            (p.redo, lambda: self.show(marks=self.steps.go(back=False))),
+        controls = self.controls
+        self.maps.canvas.marks.on_change("data", lambda attr, old, new: self._receive_marks())
+        for button, action in (
+            (controls.write, self.file.write), (controls.csv, self._save),
+            (controls.load_probes, lambda: self._take_marks(self.file.read_probes())),
+            (controls.lock, lambda: controls.entry_controls["range"].update(value="hand")),
+            (controls.clear, lambda: self._take_marks(())),
+            (controls.undo, lambda: self.update_view(marks=self.steps.step(back=True))),
+            (controls.redo, lambda: self.update_view(marks=self.steps.step(back=False))),
         ):  # fmt: skip
-            button.on_click(partial(guarded, act, lambda text: p.written.update(text=warning(text))))
-        for button, act in ((p.print, self._print_maps), (p.png, self._print_curves)):
-            button.on_click(partial(guarded, act, self.complain))
-        p.drag.js_on_change("active", script("hold", toggle=p.drag, pan=self.curves.pan))
-        p.movie.on_change("active", lambda attr, old, new: guarded(self.film.press, self.film.stop))
+            button.on_click(partial(run_guarded, action, lambda text: controls.save_status.update(text=warning(text))))
+        for button, action in ((controls.print, self._print_maps), (controls.png, self._print_curves)):
+            button.on_click(partial(run_guarded, action, self.report_error))
+        controls.drag.js_on_change("active", script("hold", toggle=controls.drag, pan=self.curves.pan))
+        controls.movie.on_change("active", lambda attr, old, new: run_guarded(self.film.press, self.film.stop))
         self.line.choice.on_change("active", lambda attr, old, new: self._choose_line(self.line.names[new]))
         for plot in (self.timeline.plot, self.curves.plot, self.line.wave):
             plot.on_event(Tap, self._jump)
-        self.document.on_event(DocumentReady, lambda event: self._ready())
+        self.document.on_event(DocumentReady, lambda event: self._start())
 
-    def _ready(self) -> None:
+    def _start(self) -> None:
         self.maps.canvas.resize()
-        self.show()
-        every(VIEWER.progress_ms, self.document, lambda: self.progress.advance(self.result), self.complain)
-        every(VIEWER.ahead_ms, self.document, self.shown.read_ahead, self.complain)
-        for act in (self._grow, self._draw_progress, self.film.tell):
-            every(VIEWER.idle_ms, self.document, act, self.complain)
+        self.update_view()
+        call_periodically(
+            VIEWER.progress_ms, self.document, lambda: self.progress.advance(self.result), self.report_error
+        )
+        call_periodically(VIEWER.ahead_ms, self.document, self.fields.read_ahead, self.report_error)
+        for action in (self._grow, self._draw_progress, self.film.poll):
+            call_periodically(VIEWER.idle_ms, self.document, action, self.report_error)
 
-    def complain(self, text: str) -> None:
+    def report_error(self, text: str) -> None:
         """Report an error; the page goes on."""
-        self.parts.description.text = warning(text)
-        self.state.shown = self.state.asked
+        self.controls.description.text = warning(text)
+        self.state.displayed_frame = self.state.requested_frame
 
-    def show(self, **changes: Any) -> None:
+    def update_view(self, **changes: Any) -> None:
         """Draw the page with other values of some entries of the view."""
-        self.shown.view = replace(self.view, **changes)
+        self.fields.view = replace(self.view, **changes)
         self.document.hold("combine")
         try:
-            guarded(self._draw, self._blank)
+            run_guarded(self._draw, self._blank)
             self.curves.update(self.maps.marks.colours)
-            self.names.offer()
+            self.names.offer_probes()
         finally:
             self.document.unhold()
 
     def _blank(self, text: str) -> None:
         """Show an error and nothing of the view that cannot be drawn, nor of the one before it."""
-        self._told = False
+        self._has_view = False
         self.maps.clear()
         self._read_out()
-        self.line.show(None)
+        self.line.show_profile(None)
         self.state.query = self.view.query()
-        self.complain(text)
+        self.report_error(text)
 
     def _draw(self) -> None:
-        view, shown, of = self.view, self.shown, self.parts.of
+        view, fields, controls = self.view, self.fields, self.controls.entry_controls
         self._choose()
-        field, values = shown.maps.all[view.field], shown.values(view.field)
-        picture, remark = shown.picture
-        self._told = True
-        if view.range == "hand" and (of["low"].value, of["high"].value) != (view.low, view.high):
+        field, values = fields.maps.quantities[view.field], fields.values(view.field)
+        picture, remark = fields.picture
+        self._has_view = True
+        if view.range == "hand" and (controls["low"].value, controls["high"].value) != (view.low, view.high):
             remark = f"The colours go from {view.low:g} to {view.high:g}: the lowest number must be below the highest."
-        of["longer"].title = self.maps.draw(picture)
-        of["low"].visible = of["high"].visible = view.range == "hand"
-        of["symmetric"].visible = field.signed and view.range != "hand"
-        self.parts.description.text = shown.text(remark)
+        controls["longer"].title = self.maps.draw(picture)
+        controls["low"].visible = controls["high"].visible = view.range == "hand"
+        controls["symmetric"].visible = field.is_signed and view.range != "hand"
+        self.controls.description.text = fields.description(remark)
         self._read_out()
         self.curves.plot.visible = not self.line.update(values)
-        self.state.query, self.state.shown = view.query(), self.state.asked
+        self.state.query, self.state.displayed_frame = view.query(), self.state.requested_frame
 
     def _choose(self) -> None:
         """Derive fields as the view has it."""
         try:
-            if self.shown.rescale():
+            if self.fields.rescale():
                 self._offer_fields()
-            scale, told = self.shown.scale, ""
+            scale, scale_text = self.fields.scale, ""
             if scale and not self.view.camera and scale.mm_per_pixel is not None:
-                told = uncertain(scale.mm_per_pixel, scale.mm_per_pixel_std, "mm/px")
-            self.parts.scaled.text = told
+                scale_text = format_with_std(scale.mm_per_pixel, scale.mm_per_pixel_std, "mm/px")
+            self.controls.scale_label.text = scale_text
         except RgbmidicError as error:
-            self.parts.scaled.text = warning(str(error))
-        self.shown.choose()
+            self.controls.scale_label.text = warning(str(error))
+        self.fields.derive_fields()
 
     def _redraw(self) -> None:
         """Draw another part of the image."""
-        wanted = self.maps.canvas.wanted
-        self.show(window=() if wanted == Canvas.around(self.result.nodes) else wanted)
+        edges = self.maps.canvas.requested_edges
+        self.update_view(window=() if edges == Canvas.edges_around(self.result.nodes) else edges)
 
     def _hover(self, event: Any) -> None:
         if event.x is not None and event.y is not None:
@@ -225,33 +238,33 @@ class ResultPage:
 
     def _read_out(self) -> None:
         """Show the value under the pointer, of the field and the frame in view."""
-        text = self.shown.text_at(*self._pointer) if self._told and self._pointer is not None else ""
-        self.parts.under.text = text
+        text = self.fields.pointer_text(*self._pointer) if self._has_view and self._pointer is not None else ""
+        self.controls.pointer_label.text = text
 
-    def _marked(self) -> None:
+    def _receive_marks(self) -> None:
         """Take marks that were set, moved or removed."""
-        if not self._told:
+        if not self._has_view:
             return
-        marks = self.maps.marks.taken(self.shown.nodes, self.result.nodes)
+        marks = self.maps.marks.read_marks(self.fields.nodes, self.result.nodes)
         if marks is not None:
-            ends = [mark for mark in marks if mark.kind == SCALE]  # a third place begins another one
-            dropped = ends[:2] if len(ends) > 2 else []
+            scale_marks = [mark for mark in marks if mark.kind == SCALE]  # a third place begins another one
+            dropped = scale_marks[:2] if len(scale_marks) > 2 else []
             self._take_marks(tuple(mark for mark in marks if mark not in dropped))
 
     def _take_marks(self, marks: tuple[Mark, ...]) -> None:
         """Take marks as a step that can be undone."""
-        self.steps.keep(marks)
-        self.show(marks=marks)
+        self.steps.record(marks)
+        self.update_view(marks=marks)
 
     def _choose_line(self, name: str) -> None:
         if name != self.view.line:
-            self.show(line=name)
+            self.update_view(line=name)
 
     def _save(self) -> None:
         if self.curves.reading:
-            self.parts.message.text = "The curves are still being read: save them once they are drawn."
+            self.controls.message.text = "The curves are still being read: save them once they are drawn."
         elif self.curves.histories is None or not self.curves.histories.quantities:
-            self.parts.message.text = "There is no curve yet: set a mark on the field first."
+            self.controls.message.text = "There is no curve yet: set a mark on the field first."
         else:
             history_csv(self.curves.histories, file := io.BytesIO())
             self.state.csv = file.getvalue().decode("utf-8")
@@ -267,36 +280,36 @@ class ResultPage:
     def _print(self, name: str, figure: Figure | None) -> None:
         """Send a picture for print, light whatever the page is, as a data URL, a space and the file name."""
         if figure is None:
-            self.parts.message.text = "There is no curve yet, or its frames are still being read."
+            self.controls.message.text = "There is no curve yet, or its frames are still being read."
             return
-        source = embedded(figure, dpi=round(VIEWER.print_columns / figure.get_figwidth()))
+        source = data_url(figure, dpi=round(VIEWER.print_columns / figure.get_figwidth()))
         self.state.png = f"{source} {name}.png"
 
     def _jump(self, event: Any) -> None:
         """Go to the frame that was clicked in the time line or among the curves."""
         if event.x is None:
             return
-        clocks = {self.curves.plot: self.curves.frame, self.line.wave: self.line.frame}
+        clocks = {self.curves.plot: self.curves.frame_at, self.line.wave: self.line.frame_at}
         frame = clocks[event.model](event.x) if event.model in clocks else event.x
-        self.parts.frame.value = min(max(round(float(frame)), 0), len(self.result) - 1)
+        self.controls.frame.value = min(max(round(float(frame)), 0), len(self.result) - 1)
 
     def _draw_progress(self) -> None:
         self.timeline.draw(self.progress)
         summary = self.progress.summary(int(self.result.finished.sum()))
-        self.parts.head.text = f"<b>{html.escape(str(self.result.path))}</b> &nbsp; {summary}"
+        self.controls.head.text = f"<b>{html.escape(str(self.result.path))}</b> &nbsp; {summary}"
 
     def _grow(self) -> None:
         """Take in frames that a run has added or measured again; a view of the last frame follows it."""
         grown = (self.result.path / "solution").stat().st_mtime_ns
         if grown == self._grown and time.time_ns() > grown + VIEWER.settled_ns:
             return
-        self._grown, new = grown, self.result.refresh()
-        if np.array_equal(new.table.written, self.result.table.written):
+        self._grown, refreshed = grown, self.result.refresh()
+        if np.array_equal(refreshed.table.write_times, self.result.table.write_times):
             return
-        before, after = np.flatnonzero(self.result.finished), np.flatnonzero(new.finished)
-        self.shown.grow(new)
-        follows = not len(before) or self.view.frame == before[-1]
-        if follows and self.parts.frame.value != after[-1]:
-            self.parts.frame.value = int(after[-1])
+        finished_before, finished_after = np.flatnonzero(self.result.finished), np.flatnonzero(refreshed.finished)
+        self.fields.grow(refreshed)
+        follows_last = not len(finished_before) or self.view.frame == finished_before[-1]
+        if follows_last and self.controls.frame.value != finished_after[-1]:
+            self.controls.frame.value = int(finished_after[-1])
         else:
-            self.show()
+            self.update_view()

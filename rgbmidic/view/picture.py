@@ -21,52 +21,52 @@ from rgbmidic._kernels.picture import paint_field
 from rgbmidic.errors import FrameError
 from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.frames.series import FrameSeries, open_series
-from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, resampled, view_limits
+from rgbmidic.report.style import STATUS_COLOURS, colour_range, ordinary_values, resample, view_limits
 from rgbmidic.results import MapValues, Profile, Result
 from rgbmidic.settings import TestSettings
 from rgbmidic.typing import AnyArray, FloatArray
-from rgbmidic.view.address import Mark
 from rgbmidic.view.constants import VIEWER
+from rgbmidic.view.url_state import Mark
 
 Picture = npt.NDArray[np.uint8]
 """A grey picture (H, W)."""
 
-AROUND = {False: 235, True: 30}
+OUTSIDE_GREY = {False: 235, True: 30}
 """Grey level outside the image, by whether the page is dark."""
-_SIDES, _APART = ("#010203", "#ffffff"), 8
+_HATCH_COLOURS, _HATCH_SPACING = ("#010203", "#ffffff"), 8
 """Colours of what lies below and above 0, of which the first is no grey, and pixels from one hatch to the next."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Window:
+class ImageWindow:
     """The part of the image that the screen shows.
 
     Attributes
     ----------
-    left, top, right, bottom
+    x_min, y_min, x_max, y_max
         Edges in px of the image, where the centre of the first pixel is (0, 0).
     width, height
         Pixels of the screen.
     """
 
-    left: float
-    top: float
-    right: float
-    bottom: float
+    x_min: float
+    y_min: float
+    x_max: float
+    y_max: float
     width: int
     height: int
 
     @property
     def edges(self) -> tuple[float, float, float, float]:
         """Left, top, right, bottom."""
-        return self.left, self.top, self.right, self.bottom
+        return self.x_min, self.y_min, self.x_max, self.y_max
 
-    def fitted(self) -> Window:
+    def fit_aspect(self) -> ImageWindow:
         """Widen the window to as many screen pixels per px in both directions, about the same centre."""
-        step = max((self.right - self.left) / self.width, (self.bottom - self.top) / self.height)
-        x, y = (self.left + self.right) / 2, (self.top + self.bottom) / 2
+        step = max((self.x_max - self.x_min) / self.width, (self.y_max - self.y_min) / self.height)
+        x, y = (self.x_min + self.x_max) / 2, (self.y_min + self.y_max) / 2
         half_x, half_y = step * self.width / 2, step * self.height / 2
-        return replace(self, left=x - half_x, top=y - half_y, right=x + half_x, bottom=y + half_y)
+        return replace(self, x_min=x - half_x, y_min=y - half_y, x_max=x + half_x, y_max=y + half_y)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -78,12 +78,12 @@ class Window:
     def steps(self) -> tuple[float, float]:
         """Px of the image to a pixel of the picture, along x and y."""
         rows, columns = self.size
-        return (self.right - self.left) / columns, (self.bottom - self.top) / rows
+        return (self.x_max - self.x_min) / columns, (self.y_max - self.y_min) / rows
 
-    def place(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def to_picture(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return column and row of points (N, 2) in the picture."""
-        across, down = self.steps
-        return (points[:, 0] - self.left) / across - 0.5, (points[:, 1] - self.top) / down - 0.5
+        x_step, y_step = self.steps
+        return (points[:, 0] - self.x_min) / x_step - 0.5, (points[:, 1] - self.y_min) / y_step - 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,7 +98,7 @@ class Overlay:
         Nodes of the triangles.
     values : ndarray, shape (N,)
         Values at the nodes; triangles with a NaN are not painted.
-    ends
+    colour_range
         Values of the first and the last colour.
     colours
         As ``"#rrggbb"``.
@@ -106,21 +106,23 @@ class Overlay:
         Opacity of the field, from 0 to 1.
     stepped
         Whether values between those of two nodes mean nothing.
-    beyond : ndarray, shape (N,), or None
+    hatch_margin : ndarray, shape (N,), or None
         What is hatched where it is below 0; None: nothing.
     """
 
     nodes: FloatArray
     elements: npt.NDArray[np.int32]
     values: FloatArray
-    ends: tuple[float, float]
+    colour_range: tuple[float, float]
     colours: tuple[str, ...]
     opacity: float = 1.0
     stepped: bool = False
-    beyond: FloatArray | None = None
+    hatch_margin: FloatArray | None = None
 
 
-def paint(window: Window, picture: AnyArray, over: Overlay | None = None, around: int = 40) -> npt.NDArray[np.uint32]:
+def paint(
+    window: ImageWindow, picture: AnyArray, overlay: Overlay | None = None, outside_grey: int = 40
+) -> npt.NDArray[np.uint32]:
     """Paint a grey picture, and a field over it, as the window shows them.
 
     Parameters
@@ -129,9 +131,9 @@ def paint(window: Window, picture: AnyArray, over: Overlay | None = None, around
         Part of the image and size of the screen.
     picture : ndarray, shape (H, W), uint8
         The image.
-    over
+    overlay
         The field; None: the picture alone.
-    around
+    outside_grey
         Grey level outside the image.
 
     Returns
@@ -139,19 +141,42 @@ def paint(window: Window, picture: AnyArray, over: Overlay | None = None, around
     ndarray, shape (rows, columns), uint32
         Red, green, blue, 255, the lowest byte first; the first row is the top.
     """
-    first = (window.left + window.steps[0] / 2, window.top + window.steps[1] / 2)
-    grey = resampled(picture, window.steps, first, window.size, around, nearest=min(window.steps) <= 0.5)
-    if over is None:
+    origin = (window.x_min + window.steps[0] / 2, window.y_min + window.steps[1] / 2)
+    grey = resample(picture, window.steps, origin, window.size, outside_grey, nearest=min(window.steps) <= 0.5)
+    if overlay is None:
         return grey * np.uint32(0x010101) | np.uint32(0xFF000000)
     out = np.empty(grey.shape, dtype=np.uint32)
-    (x, y), grey_part = window.place(over.nodes), round(256 * (1 - over.opacity))
-    packed = _packed(over.colours, grey_part)
-    paint_field(out, grey, x, y, over.elements, over.values, *map(float, over.ends), packed, grey_part, over.stepped)
-    if over.beyond is not None:
-        below, lines = np.empty_like(out), sum(np.indices(out.shape)) % _APART < 2
-        reach = float(np.nanmax(np.abs(over.beyond), initial=0)) or 1.0
-        paint_field(below, grey, x, y, over.elements, over.beyond, -reach, reach, _packed(_SIDES, 0), 0, False)
-        out[lines & (below == _packed(_SIDES, 0)[0])] = 0xFF000000
+    (x, y), grey_part = window.to_picture(overlay.nodes), round(256 * (1 - overlay.opacity))
+    packed = _packed(overlay.colours, grey_part)
+    paint_field(
+        out,
+        grey,
+        x,
+        y,
+        overlay.elements,
+        overlay.values,
+        *map(float, overlay.colour_range),
+        packed,
+        grey_part,
+        overlay.stepped,
+    )
+    if overlay.hatch_margin is not None:
+        hatched, lines = np.empty_like(out), sum(np.indices(out.shape)) % _HATCH_SPACING < 2
+        reach = float(np.nanmax(np.abs(overlay.hatch_margin), initial=0)) or 1.0
+        paint_field(
+            hatched,
+            grey,
+            x,
+            y,
+            overlay.elements,
+            overlay.hatch_margin,
+            -reach,
+            reach,
+            _packed(_HATCH_COLOURS, 0),
+            0,
+            False,
+        )
+        out[lines & (hatched == _packed(_HATCH_COLOURS, 0)[0])] = 0xFF000000
     return out
 
 
@@ -168,15 +193,15 @@ def palette(name: str, levels: int = 256) -> tuple[str, ...]:
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
-    places = np.linspace(0, 1, min(max(levels, 2), 256))
-    return STATUS_COLOURS if name == "codes" else tuple(map(to_hex, colormaps[name](places)))
+    positions = np.linspace(0, 1, min(max(levels, 2), 256))
+    return STATUS_COLOURS if name == "codes" else tuple(map(to_hex, colormaps[name](positions)))
 
 
 def grey_picture(frame: Mosaic | ChannelFrame) -> Picture:
     """Return a raw frame as one stretched picture: the mean of its channels, or of the cell around each sample."""
     if isinstance(frame, Mosaic):
-        return stretched(cv2.blur(frame.values.astype(np.float32), (2, 2)))
-    return stretched(frame.values.mean(axis=0, dtype=np.float32))
+        return stretch_to_uint8(cv2.blur(frame.values.astype(np.float32), (2, 2)))
+    return stretch_to_uint8(frame.values.mean(axis=0, dtype=np.float32))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -208,15 +233,15 @@ class RawPictures:
 
 def reference_picture(result: Result) -> Picture:
     """Return the mean of the lights' reference images that a result keeps, grey where none was kept."""
-    images, (left, top) = result.reference, result.reference_origin
+    images, (column, row) = result.reference, result.reference_origin
     columns, rows = np.ceil(result.nodes.max(axis=0) + 1).astype(int)
     picture = np.full(result.frame_shape or (rows, columns), 60, dtype=np.uint8)
     if images is not None:
-        picture[top : top + images.shape[1], left : left + images.shape[2]] = images.mean(axis=0)
+        picture[row : row + images.shape[1], column : column + images.shape[2]] = images.mean(axis=0)
     return picture
 
 
-def stretched(image: AnyArray) -> Picture:
+def stretch_to_uint8(image: AnyArray) -> Picture:
     """Stretch an image (H, W) between its 1 % and 99 % quantiles, of every fourth pixel, to 0 to 255; NaN is 0."""
     finite = image[::4, ::4][np.isfinite(image[::4, ::4])]
     low, high = np.percentile(finite, [1, 99]) if finite.size else (0.0, 1.0)
@@ -231,14 +256,14 @@ def element_at(
     with np.errstate(divide="ignore", invalid="ignore"):
         areas = np.roll(xs, -1, axis=1) * np.roll(ys, 1, axis=1) - np.roll(xs, 1, axis=1) * np.roll(ys, -1, axis=1)
         shape = areas / areas.sum(axis=1, keepdims=True)  # of the triangles between the place and the opposite sides
-        inside = np.flatnonzero(shape.min(axis=1) >= -1e-9)
-    return (elements[inside[0]], shape[inside[0]]) if len(inside) else None
+        containing = np.flatnonzero(shape.min(axis=1) >= -1e-9)
+    return (elements[containing[0]], shape[containing[0]]) if len(containing) else None
 
 
-def robust_range(read: MapValues | Profile) -> tuple[float, float] | None:
+def robust_range(field_values: MapValues | Profile) -> tuple[float, float] | None:
     """Return the colour range of what was read without doubtful nodes and outliers; None where nothing is measured."""
-    ordinary = ordinary_values(read.values, read.std)
-    return colour_range(ordinary) if ordinary.size else None
+    colour_values = ordinary_values(field_values.values, field_values.std)
+    return colour_range(colour_values) if colour_values.size else None
 
 
 IMAGE = "image x y dw dh"
@@ -246,16 +271,16 @@ IMAGE = "image x y dw dh"
 
 
 def plain_plot(**options: Any) -> Any:
-    """Plot as large as its place, with the text size of the page and no tools; `options` of bokeh's `figure` count."""
-    plain = {"sizing_mode": "stretch_both", "min_border": 4, "tools": [], "toolbar_location": None}
-    plot = figure(**{**plain, **options})
+    """Make a plot that fills its place, with the text size of the page and no tools; `options` of bokeh's `figure`."""
+    defaults = {"sizing_mode": "stretch_both", "min_border": 4, "tools": [], "toolbar_location": None}
+    plot = figure(**{**defaults, **options})
     for axis in plot.axis:
         axis.update(major_label_text_font_size="12px", axis_label_text_font_size="12px")
     return plot
 
 
 def columns(names: str, rows: Iterable[Sequence[Any]] = ()) -> dict[str, list[Any]]:
-    """Columns of a data source, by their names with spaces between them, from rows of values."""
+    """Return the columns of a data source, by their names with spaces between them, from rows of values."""
     values = [list(column) for column in zip(*rows, strict=True)]
     return dict(zip(names.split(), values or [[] for _ in names.split()], strict=True))
 
@@ -298,21 +323,23 @@ class Canvas:
         kinds: Sequence[str],
         edges: Sequence[float],
         redraw: Callable[[], None],
-        like: Canvas | None = None,
+        neighbour: Canvas | None = None,
     ) -> None:
         self.plot: Any
-        left, top, right, bottom = self.wanted = tuple(map(float, edges))
-        self.window = Window(left=left, top=top, right=right, bottom=bottom, width=800, height=600).fitted()
-        self._document, self._redraw, self._coming = document, redraw, False
+        x_min, y_min, x_max, y_max = self.requested_edges = tuple(map(float, edges))
+        self.window = ImageWindow(
+            x_min=x_min, y_min=y_min, x_max=x_max, y_max=y_max, width=800, height=600
+        ).fit_aspect()
+        self._document, self._redraw, self._redraw_pending = document, redraw, False
         self.plot = plain_plot(
-            x_range=like.plot.x_range if like else bk.Range1d(self.window.left, self.window.right),
-            y_range=like.plot.y_range if like else bk.Range1d(self.window.bottom, self.window.top),
+            x_range=neighbour.plot.x_range if neighbour else bk.Range1d(self.window.x_min, self.window.x_max),
+            y_range=neighbour.plot.y_range if neighbour else bk.Range1d(self.window.y_max, self.window.y_min),
             **{"title": " ", "min_border_right": VIEWER.bar_width, "toolbar_location": "above"},
         )
         self.plot.grid.visible = False
         self._numbered: tuple[str, float] | None = None
-        self.number("px", 1.0)
-        names = ("image", "colours", "marks") if like is None else (None,) * 3
+        self.number_axes("px", 1.0)
+        names = ("image", "colours", "marks") if neighbour is None else (None,) * 3
         self._image = bk.ColumnDataSource(columns(IMAGE), name=names[0])
         self.plot.image_rgba(*IMAGE.split(), source=self._image)
         self.colours = bk.LinearColorMapper(palette=["#000000"], low=0, high=1, name=names[1])
@@ -321,19 +348,19 @@ class Canvas:
         self.bar = bk.ColorBar(color_mapper=self.colours, visible=False, ticker=bk.BasicTicker(), **look)
         self.plot.add_layout(self.bar, "right")
         self.marks = bk.ColumnDataSource(columns("x y kind name 0"), name=names[2])
-        self._states, self.set = {0: list[Mark]()}, list[Mark]()
-        self.marks.on_change("data", lambda attr, old, new: self._merge())
+        self._states, self.current_marks = {0: list[Mark]()}, list[Mark]()
+        self.marks.on_change("data", lambda attr, old, new: self._merge_marks())
         dot = {"size": 9, "fill_color": "white", "line_color": "black", "line_width": 1.5}
         dots = self.plot.scatter("x", "y", source=self.marks, level="overlay", **dot)
         pan, wheel = bk.PanTool(), bk.WheelZoomTool(zoom_on_axis=False)
-        hidden = {"renderers": [dots], "visible": False}
-        draw = [bk.PointDrawTool(default_overrides={"kind": kind, "name": ""}, **hidden) for kind in kinds]
+        tool_options = {"renderers": [dots], "visible": False}
+        draw = [bk.PointDrawTool(default_overrides={"kind": kind, "name": ""}, **tool_options) for kind in kinds]
         self.tools = (pan, *draw)
         box, reset, save = bk.BoxZoomTool(match_aspect=True), bk.ResetTool(), bk.SaveTool(filename="field")
         self.plot.add_tools(pan, wheel, box, reset, save, *draw)
         self.plot.toolbar.active_drag, self.plot.toolbar.active_scroll, self.plot.toolbar.logo = pan, wheel, None
-        self.plot.on_event(RangesUpdate, (like or self)._moved)
-        if like:
+        self.plot.on_event(RangesUpdate, (neighbour or self)._receive_ranges)
+        if neighbour:
             self.plot.toolbar_location = None
             return
         self.plot.name = "plot"
@@ -341,17 +368,19 @@ class Canvas:
             self.plot.on_change(name, lambda attr, old, new: self.resize())
 
     @staticmethod
-    def around(points: FloatArray) -> tuple[float, ...]:
+    def edges_around(points: FloatArray) -> tuple[float, ...]:
         """Return the edges (left, top, right, bottom) of a view of points (N, 2) with a margin."""
         low, high = view_limits(points)
         return (*low.tolist(), *high.tolist())
 
-    def show(self, image: AnyArray, window: Window | None = None) -> None:
+    def show_picture(self, image: AnyArray, window: ImageWindow | None = None) -> None:
         """Show a picture (rows, columns), uint32, of the window, or of that of the canvas beside it."""
-        w = window or self.window
-        self._image.data = columns(IMAGE, [(image, w.left, w.top, w.right - w.left, w.bottom - w.top)])
+        view = window or self.window
+        self._image.data = columns(
+            IMAGE, [(image, view.x_min, view.y_min, view.x_max - view.x_min, view.y_max - view.y_min)]
+        )
 
-    def number(self, unit: str, factor: float) -> None:
+    def number_axes(self, unit: str, factor: float) -> None:
         """Number the axes in a unit of which a px has `factor`, at round numbers."""
         if self._numbered == (unit, factor):  # as in nearly every frame
             return
@@ -367,7 +396,9 @@ class Canvas:
         self._image.data = columns(IMAGE)
         self.plot.title.text, self.bar.visible = " ", False
 
-    def colour(self, ends: tuple[float, float], colours: Sequence[str], title: str, codes: Sequence[str] = ()) -> None:
+    def set_colour_bar(
+        self, limits: tuple[float, float], colours: Sequence[str], title: str, codes: Sequence[str] = ()
+    ) -> None:
         """Set the colour bar: values of its ends, colours and title; names of `codes` as numbers."""
         self.plot.title.text, self.bar.visible = title, True
         names = dict(enumerate(codes))
@@ -375,40 +406,42 @@ class Canvas:
             size = "10px" if codes else "12px"  # the plot keeps its size
             self.bar.update(major_label_overrides=names, major_label_text_font_size=size)
             self.bar.ticker.min_interval = int(bool(codes))  # the page does not see another ticker
-        self.colours.update(low=ends[0], high=ends[1])
+        self.colours.update(low=limits[0], high=limits[1])
         if self.colours.palette != list(colours):  # which takes as long to check as a frame to paint
             self.colours.palette = list(colours)
 
-    def place(self, marks: Sequence[Mark]) -> None:
+    def place_marks(self, marks: Sequence[Mark]) -> None:
         """Place marks on the plot, unless they are there."""
-        self.set, last = list(marks), max(self._states)
-        if self._states[last] != self.set:
-            self._states[last + 1] = self.set
+        self.current_marks, last_state = list(marks), max(self._states)
+        if self._states[last_state] != self.current_marks:
+            self._states[last_state + 1] = self.current_marks
             self._states = dict(list(self._states.items())[-VIEWER.mark_states :])
             rows = [(mark.x, mark.y, mark.kind, mark.name, 0) for mark in marks]
-            self.marks.data = columns(f"x y kind name {last + 1}", rows)
+            self.marks.data = columns(f"x y kind name {last_state + 1}", rows)
 
-    def _merge(self) -> None:
+    def _merge_marks(self) -> None:
         """Take what the browser has set, moved or removed since the state that it had."""
         data = self.marks.data
         state = max((int(key) for key in data if key.isdigit()), default=max(self._states))
         rows = zip(*(data[key] for key in ("kind", "x", "y", "name")), strict=True)
-        now = [Mark(str(kind), float(x), float(y), str(name)) for kind, x, y, name in rows]
-        before = kept = self._states[state]
-        if len(now) < len(before):  # some were removed, the others are in their order
-            kept = []
-            for mark in before:
-                if now[len(kept) : len(kept) + 1] == [mark]:
-                    kept.append(mark)
-        now = [replace(mark, key=same.key) for mark, same in zip(now, kept, strict=False)] + now[len(kept) :]
-        self._states[state] = now
-        old, new = ({mark.key: mark for mark in marks} for marks in (before, now))
-        moved = {key: mark for key, mark in new.items() if mark != old.get(key, mark)}
-        self.set = [
-            replace(mark, x=moved[mark.key].x, y=moved[mark.key].y) if mark.key in moved else mark
-            for mark in self.set
-            if mark.key in new or mark.key not in old
-        ] + [mark for key, mark in new.items() if key not in old]
+        present = [Mark(str(kind), float(x), float(y), str(name)) for kind, x, y, name in rows]
+        previous = remaining = self._states[state]
+        if len(present) < len(previous):  # some were removed, the others are in their order
+            remaining = []
+            for mark in previous:
+                if present[len(remaining) : len(remaining) + 1] == [mark]:
+                    remaining.append(mark)
+        present = [replace(mark, key=match.key) for mark, match in zip(present, remaining, strict=False)] + present[
+            len(remaining) :
+        ]
+        self._states[state] = present
+        old_marks, new_marks = ({mark.key: mark for mark in marks} for marks in (previous, present))
+        moved_marks = {key: mark for key, mark in new_marks.items() if mark != old_marks.get(key, mark)}
+        self.current_marks = [
+            replace(mark, x=moved_marks[mark.key].x, y=moved_marks[mark.key].y) if mark.key in moved_marks else mark
+            for mark in self.current_marks
+            if mark.key in new_marks or mark.key not in old_marks
+        ] + [mark for key, mark in new_marks.items() if key not in old_marks]
 
     def resize(self) -> None:
         """Take the size that the browser reports."""
@@ -417,27 +450,27 @@ class Canvas:
         except UnsetValueError:  # it has not reported yet
             return
         if min(width, height) > 1 and (width, height) != (self.window.width, self.window.height):
-            edges = dict(zip(("left", "top", "right", "bottom"), self.wanted, strict=True))
-            self._set(replace(self.window, **edges, width=width, height=height))
+            edges = dict(zip(("left", "top", "right", "bottom"), self.requested_edges, strict=True))
+            self._set_window(replace(self.window, **edges, width=width, height=height))
 
-    def _moved(self, event: Any) -> None:
-        (left, right), (top, bottom) = sorted((event.x0, event.x1)), sorted((event.y0, event.y1))
-        new = replace(self.window, left=left, top=top, right=right, bottom=bottom)
-        if not np.allclose(new.edges, self.window.edges, rtol=0, atol=1e-6 * (right - left)):
-            self.wanted = new.edges
-            self._set(new)
+    def _receive_ranges(self, event: Any) -> None:
+        (x_min, x_max), (y_min, y_max) = sorted((event.x0, event.x1)), sorted((event.y0, event.y1))
+        window = replace(self.window, x_min=x_min, y_min=y_min, x_max=x_max, y_max=y_max)
+        if not np.allclose(window.edges, self.window.edges, rtol=0, atol=1e-6 * (x_max - x_min)):
+            self.requested_edges = window.edges
+            self._set_window(window)
 
-    def _set(self, window: Window) -> None:
+    def _set_window(self, window: ImageWindow) -> None:
         """Show another window, once for all moves within a few ms."""
-        self.window = window.fitted()
+        self.window = window.fit_aspect()
         if not np.allclose(self.window.edges, window.edges):
-            self.plot.x_range.update(start=self.window.left, end=self.window.right)
-            self.plot.y_range.update(start=self.window.bottom, end=self.window.top)
+            self.plot.x_range.update(start=self.window.x_min, end=self.window.x_max)
+            self.plot.y_range.update(start=self.window.y_max, end=self.window.y_min)
 
-        def come() -> None:
-            self._coming = False
+        def redraw_once() -> None:
+            self._redraw_pending = False
             self._redraw()
 
-        if not self._coming:
-            self._coming = True
-            self._document.add_timeout_callback(come, VIEWER.view_ms)
+        if not self._redraw_pending:
+            self._redraw_pending = True
+            self._document.add_timeout_callback(redraw_once, VIEWER.view_ms)

@@ -34,14 +34,14 @@ from rgbmidic.report.page import render
 from rgbmidic.results import Maps, Result
 from rgbmidic.results.provenance import PROVENANCE
 from rgbmidic.settings import read_table, read_toml
-from rgbmidic.view.address import ViewState
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.curves import Progress
-from rgbmidic.view.draft import Draft
-from rgbmidic.view.models import page_file
+from rgbmidic.view.curves import FrameProgress
 from rgbmidic.view.page import ResultPage
 from rgbmidic.view.setup import SetupPage
 from rgbmidic.view.setup_panel import DraftFrames, Run
+from rgbmidic.view.test_file_editor import Draft
+from rgbmidic.view.url_state import ViewState
+from rgbmidic.view.widgets import page_file
 
 _HOST = "127.0.0.1"
 
@@ -69,7 +69,7 @@ def serve(
     *,
     port: int = 0,
     browser: bool = True,
-    tell: Callable[[str], None] = print,
+    report_address: Callable[[str], None] = print,
     statement: Mapping[str, Any] | None = None,
 ) -> None:
     """Show a result in the browser until the process is interrupted.
@@ -82,7 +82,7 @@ def serve(
         0: any that is free.
     browser
         Whether to open the browser.
-    tell
+    report_address
         Called with the address.
     statement
         Keys of ``[frames]`` that the files of frames do not state.
@@ -96,10 +96,10 @@ def serve(
     """
     for library in ("bokeh", "tornado"):  # their messages on a malformed request are for programmers
         logging.getLogger(library).setLevel(logging.CRITICAL)
-    server, address = start(path, port=port, statement=statement)
+    server, address = start_server(path, port=port, statement=statement)
     gc.collect()
     gc.freeze()  # what is there now stays: two thirds of what each collection would go through
-    tell(address)
+    report_address(address)
     if browser:
         server.io_loop.add_callback(webbrowser.open, address)
     try:
@@ -108,7 +108,7 @@ def serve(
         server.stop()
 
 
-def start(path: Path, *, port: int = 0, statement: Mapping[str, Any] | None = None) -> tuple[BaseServer, str]:
+def start_server(path: Path, *, port: int = 0, statement: Mapping[str, Any] | None = None) -> tuple[BaseServer, str]:
     """Start a server, which answers once its loop runs; return it and its address. Errors as `serve`."""
     pages = _pages(path, statement or {})
     token = secrets.token_urlsafe(24)
@@ -144,46 +144,46 @@ def _pages(path: Path, statement: Mapping[str, Any]) -> dict[str, Callable[[Docu
 
     Bad input is reported at once. `statement` holds keys of ``[frames]``; for frames only.
     """
-    shared: dict[tuple[Path, str], Progress] = {}
+    shared: dict[tuple[Path, str], FrameProgress] = {}
     runs: list[Run] = []
 
-    def opened(place: Path) -> Callable[[Document], None]:
-        if (place / PROVENANCE).exists():
-            Result.open(place, partial=True, check=False)
-            return partial(_fill, place, shared)
-        DraftFrames(Draft.of(place, statement))
+    def make_page(source_path: Path) -> Callable[[Document], None]:
+        if (source_path / PROVENANCE).exists():
+            Result.open(source_path, partial=True, check=False)
+            return partial(_fill_result, source_path, shared)
+        DraftFrames(Draft.from_path(source_path, statement))
 
         def setup(document: Document) -> None:
-            dark = _asked(document, "theme") == "dark"
-            page = SetupPage(document, Draft.of(place, statement), runs, dark=dark)
-            _place(document, page.roots, f"rgbmidic: {place.name}")
+            dark = _query_value(document, "theme") == "dark"
+            page = SetupPage(document, Draft.from_path(source_path, statement), runs, dark=dark)
+            _place_page(document, page.roots, f"rgbmidic: {source_path.name}")
 
         return setup
 
-    def one(document: Document) -> None:
-        name = _asked(document, "path")
-        if (found := {str(file.relative_to(path)): file for file in _found(path)}.get(name)) is None:
+    def listed_page(document: Document) -> None:
+        name = _query_value(document, "path")
+        if (entry_path := {str(file.relative_to(path)): file for file in _find_tests(path)}.get(name)) is None:
             raise InputError(f"{path} has no result and no test {name!r}")
-        opened(found)(document)
+        make_page(entry_path)(document)
         document.template_variables["back"] = True
 
     def result(document: Document) -> None:
         if not runs:
             raise ResultError("no run was started yet")
-        _fill(runs[-1].out, shared, document)
+        _fill_result(runs[-1].out, shared, document)
 
     finished = (path / PROVENANCE).exists()
-    several = not finished and path.is_dir() and any(_found(path))
+    several = not finished and path.is_dir() and any(_find_tests(path))
     if statement and (finished or several or path.suffix.lower() == ".toml"):
-        kind = "a result" if finished else "a folder of results and tests" if several else "a TEST.toml"
+        description = "a result" if finished else "a folder of results and tests" if several else "a TEST.toml"
         options = ", ".join(f"--{key.replace('_', '-')}" for key in statement)
-        raise InputError(f"{options}: for raw frames only, which do not state it; {path} is {kind}")
+        raise InputError(f"{options}: for raw frames only, which do not state it; {path} is {description}")
     pages: dict[str, Callable[[Document], None]]
-    pages = {"/": partial(_fill_list, path), "/open": one} if several else {"/": opened(path)}
+    pages = {"/": partial(_fill_list, path), "/open": listed_page} if several else {"/": make_page(path)}
     return {route: partial(_or_error, page) for route, page in {**pages, "/result": result}.items()}
 
 
-def _found(folder: Path) -> dict[Path, float]:
+def _find_tests(folder: Path) -> dict[Path, float]:
     """Return the results and TEST.toml files in a folder and two levels below with the time of change, newest first."""
     times: dict[Path, float] = {}
     for pattern in ("", "*/", "*/*/"):
@@ -193,24 +193,26 @@ def _found(folder: Path) -> dict[Path, float]:
                     times[file.parent if file.name == PROVENANCE else file] = file.stat().st_mtime
             except (ConfigurationError, OSError):  # of another program, or gone by now
                 continue
-    return dict(sorted(times.items(), key=lambda pair: pair[1], reverse=True)[: VIEWER.listed])
+    return dict(sorted(times.items(), key=lambda item: item[1], reverse=True)[: VIEWER.max_listed_tests])
 
 
 def _fill_list(folder: Path, document: Document) -> None:
     """Fill the page that lists the results and tests of a folder."""
     rows = []
-    for file, changed in _found(folder).items():
-        about = "test to set up or run"
+    for file, modified in _find_tests(folder).items():
+        description = "test to set up or run"
         if file.suffix != ".toml":
             try:
                 result = Result.open(file, partial=True, check=False)
-                about = f"result: {int(result.finished.sum())} of {len(result)} frames, {', '.join(result.lights)}"
+                description = (
+                    f"result: {int(result.finished.sum())} of {len(result)} frames, {', '.join(result.lights)}"
+                )
             except RgbmidicError as error:
-                about = f"result that cannot be opened: {error}"
-        rows.append((file.relative_to(folder), about, f"{datetime.fromtimestamp(changed):%Y-%m-%d %H:%M}"))
+                description = f"result that cannot be opened: {error}"
+        rows.append((file.relative_to(folder), description, f"{datetime.fromtimestamp(modified):%Y-%m-%d %H:%M}"))
     name = folder.resolve().name
     table = render("list.html", Path(__file__).parent, heading=name, rows=rows)
-    _place(document, {"list": Div(text=table, sizing_mode="stretch_width")}, f"rgbmidic: {name}")
+    _place_page(document, {"list": Div(text=table, sizing_mode="stretch_width")}, f"rgbmidic: {name}")
 
 
 def _or_error(fill: Callable[[Document], None], document: Document) -> None:
@@ -219,7 +221,7 @@ def _or_error(fill: Callable[[Document], None], document: Document) -> None:
         fill(document)
     except RgbmidicError as error:
         document.clear()
-        _place(document, {"head": Div(text=html.escape(str(error)))}, "rgbmidic")
+        _place_page(document, {"head": Div(text=html.escape(str(error)))}, "rgbmidic")
 
 
 def _query(document: Document) -> dict[str, list[bytes]]:
@@ -227,25 +229,25 @@ def _query(document: Document) -> dict[str, list[bytes]]:
     return {} if context is None or context.request is None else context.request.arguments
 
 
-def _asked(document: Document, key: str) -> str:
+def _query_value(document: Document, key: str) -> str:
     return _query(document).get(key, [b""])[-1].decode("utf-8", "replace")
 
 
-def _fill(path: Path, shared: dict[tuple[Path, str], Progress], document: Document) -> None:
+def _fill_result(path: Path, shared: dict[tuple[Path, str], FrameProgress], document: Document) -> None:
     """Fill the page of a result as it is now, with the view of the address."""
     result = Result.open(path, partial=True, check=False)
-    there = np.flatnonzero(result.finished)
-    last = int(there[-1]) if len(there) else 0
-    names = list(Maps.of(result).all)
-    view = ViewState.from_query(_query(document), frames=len(result), names=names, frame=last)
-    progress = shared.setdefault((path, result.provenance["created"]), Progress(len(result)))
+    finished_frames = np.flatnonzero(result.finished)
+    last_frame = int(finished_frames[-1]) if len(finished_frames) else 0
+    names = list(Maps.from_result(result).quantities)
+    view = ViewState.from_query(_query(document), frames=len(result), names=names, frame=last_frame)
+    progress = shared.setdefault((path, result.provenance["created"]), FrameProgress(len(result)))
     page = ResultPage(document, result, view, progress)
-    _place(document, page.roots, f"rgbmidic: {result.path.name}")
+    _place_page(document, page.roots, f"rgbmidic: {result.path.name}")
 
 
-def _place(document: Document, roots: Mapping[str, Model], title: str) -> None:
+def _place_page(document: Document, roots: Mapping[str, Model], title: str) -> None:
     """Place the parts of a page in its template, with its style, its keys and the theme of its address."""
-    theme = _asked(document, "theme")
+    theme = _query_value(document, "theme")
     with document.models.freeze():  # else all models are counted anew for each
         for name, root in roots.items():
             root.name = name

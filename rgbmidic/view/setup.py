@@ -22,10 +22,18 @@ from rgbmidic.report.style import colour_range
 from rgbmidic.results.files import write_complete
 from rgbmidic.settings import ELEMENT_SIZE, RegionSettings, TestSettings, read_section
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.draft import SHAPES, Confirmation, Draft, check_complete, marks_of, region_of, region_section
-from rgbmidic.view.models import Background, SharedState, every, guarded, script, warning
-from rgbmidic.view.picture import AROUND, Canvas, Overlay, paint, palette
+from rgbmidic.view.picture import OUTSIDE_GREY, Canvas, Overlay, paint, palette
 from rgbmidic.view.setup_panel import RAW, DraftFrames, RegionDrawing, Run, SetupControls, overview, pictures
+from rgbmidic.view.test_file_editor import (
+    SHAPES,
+    Confirmation,
+    Draft,
+    check_complete,
+    marks_of_region,
+    region_of,
+    region_section,
+)
+from rgbmidic.view.widgets import Background, SharedState, call_periodically, run_guarded, script, warning
 
 _EXPECTED = "expected uncertainty"
 _GLARE = np.uint32(0xFF2030FF)
@@ -57,16 +65,16 @@ class SetupPage:
         self.source = DraftFrames(draft)
         self.pictures: dict[str, Any] = {}
         self._expected: Overlay | None = None
-        self._inspected, self._opened = 0, draft
+        self._inspected, self._stored_draft = 0, draft
         reference, out = draft.frames.reference[0], runs[-1].out if runs else draft.file.parent / "result"
-        self.state = SharedState(name="state", asked=reference, shown=reference)
-        self.parts = SetupControls(draft, len(self.source.series) - 1, out, dark=dark)
+        self.state = SharedState(name="state", requested_frame=reference, displayed_frame=reference)
+        self.controls = SetupControls(draft, len(self.source.series) - 1, out, dark=dark)
         self._reader = Background(document)
         rows, columns = self.source.shape
-        self.canvas = Canvas(document, tuple(SHAPES), (-0.5, -0.5, columns - 0.5, rows - 0.5), self.show)
+        self.canvas = Canvas(document, tuple(SHAPES), (-0.5, -0.5, columns - 0.5, rows - 0.5), self.update_picture)
         self._edges, thin = ColumnDataSource({"xs": [], "ys": []}), {"line_width": 0.7, "line_alpha": 0.7}
         self.canvas.plot.multi_line("xs", "ys", source=self._edges, line_color="#ffd166", **thin)
-        self.drawing = RegionDrawing(document, self.canvas, marks_of(draft), self._remesh)
+        self.drawing = RegionDrawing(document, self.canvas, marks_of_region(draft), self._remesh)
         self.confirmation = Confirmation()
         self._offer_lights()
         self._listen()
@@ -74,90 +82,112 @@ class SetupPage:
     @property
     def roots(self) -> dict[str, Any]:
         """The parts of the page by the names that its template gives their places."""
-        p = self.parts
-        beside = column(p.message, p.file, p.write, p.out, p.go, p.ran, p.tiles, sizing_mode="stretch_width")
-        return {"head": p.head, "side": p.side, "plot": self.canvas.plot, "curves": beside, "player": p.player}
+        controls = self.controls
+        side_column = column(
+            controls.message,
+            controls.file,
+            controls.write,
+            controls.out,
+            controls.run_button,
+            controls.run_status,
+            controls.tiles,
+            sizing_mode="stretch_width",
+        )
+        return {
+            "head": controls.head,
+            "side": controls.side,
+            "plot": self.canvas.plot,
+            "curves": side_column,
+            "player": controls.player,
+        }
 
     def _listen(self) -> None:
-        p, tools = self.parts, list(self.canvas.tools)
-        for model, key in ((self.state, "asked"), (p.picture, "value"), (p.glare, "active")):
-            model.on_change(key, lambda attr, old, new: self.show())
-        p.size.on_change("value", lambda attr, old, new: self._remesh())
-        p.light.on_change("value", lambda attr, old, new: self._choose_light())
-        p.calibration.on_change("value", lambda attr, old, new: self._guarded(self._reopen))
-        for button, act in (
-            (p.undo, partial(self.drawing.go, back=True)), (p.redo, partial(self.drawing.go, back=False)),
-            (p.next, self.drawing.next_hole), (p.clear, partial(self.drawing.keep, ())),
-            (p.inspect, self._inspect), (p.write, self._write), (p.go, self._run),
+        controls, tools = self.controls, list(self.canvas.tools)
+        for model, key in ((self.state, "requested_frame"), (controls.picture, "value"), (controls.glare, "active")):
+            model.on_change(key, lambda attr, old, new: self.update_picture())
+        controls.size.on_change("value", lambda attr, old, new: self._remesh())
+        controls.light.on_change("value", lambda attr, old, new: self._choose_light())
+        controls.calibration.on_change("value", lambda attr, old, new: self._run_guarded(self._reopen))
+        for button, action in (
+            (controls.undo, partial(self.drawing.step, back=True)),
+            (controls.redo, partial(self.drawing.step, back=False)),
+            (controls.next_shape, self.drawing.next_hole), (controls.clear, partial(self.drawing.take_marks, ())),
+            (controls.inspect, self._inspect), (controls.write, self._write), (controls.run_button, self._run),
         ):  # fmt: skip
-            button.on_click(partial(self._guarded, act))
-        p.ask(self.state)
-        p.mode.js_on_change("active", script("choose", group=p.mode, tools=tools[:4], other=p.hole))
-        p.hole.js_on_change("active", script("choose", group=p.hole, tools=tools[4:], other=p.mode))
-        self.document.on_event(DocumentReady, lambda event: self._ready())
-        every(VIEWER.run_ms, self.document, self._tick, self._complain)
+            button.on_click(partial(self._run_guarded, action))
+        controls.request_frames(self.state)
+        controls.mode.js_on_change(
+            "active", script("choose", group=controls.mode, tools=tools[:4], other=controls.hole)
+        )
+        controls.hole.js_on_change(
+            "active", script("choose", group=controls.hole, tools=tools[4:], other=controls.mode)
+        )
+        self.document.on_event(DocumentReady, lambda event: self._start())
+        call_periodically(VIEWER.run_ms, self.document, self._tick, self._report)
 
-    def _ready(self) -> None:
+    def _start(self) -> None:
         self.canvas.resize()
-        self.show()
+        self.update_picture()
         self.drawing.draw()
 
-    def _complain(self, text: str) -> None:
-        self.parts.message.text = warning(text)
+    def _report(self, text: str) -> None:
+        self.controls.message.text = warning(text)
 
-    def _guarded(self, act: Callable[[], object]) -> None:
-        guarded(act, self._complain)
+    def _run_guarded(self, action: Callable[[], object]) -> None:
+        run_guarded(action, self._report)
 
-    def show(self) -> None:
+    def update_picture(self) -> None:
         """Draw the picture."""
-        self._guarded(self._draw)
-        self.state.shown = self.state.asked
+        self._run_guarded(self._draw)
+        self.state.displayed_frame = self.state.requested_frame
 
     def _draw(self) -> None:
-        index = min(self.state.asked, len(self.source.series) - 1)
+        index = min(self.state.requested_frame, len(self.source.series) - 1)
         name = html.escape(self.source.series.name(index))
-        self.parts.description.text = f"Frame {index} of 0 to {len(self.source.series) - 1}: {name}"
-        raw, full = self.source.raw(index)
-        chosen = self.parts.picture.value
-        picture = self.pictures.get(chosen, raw)
-        over, window = self._expected if chosen == _EXPECTED else None, self.canvas.window
-        image = paint(window, picture, over, AROUND[self.dark])
-        if self.parts.glare.active:
-            saturated = paint(window, full.astype(np.uint8) * 255, around=0)
+        self.controls.description.text = f"Frame {index} of 0 to {len(self.source.series) - 1}: {name}"
+        raw, is_saturated = self.source.raw(index)
+        picture_name = self.controls.picture.value
+        picture = self.pictures.get(picture_name, raw)
+        overlay, window = self._expected if picture_name == _EXPECTED else None, self.canvas.window
+        image = paint(window, picture, overlay, OUTSIDE_GREY[self.dark])
+        if self.controls.glare.active:
+            saturated = paint(window, is_saturated.astype(np.uint8) * 255, outside_grey=0)
             image = np.where((saturated & 0xFF) > 64, _GLARE, image)
-        self.canvas.show(image)
-        title = f"{chosen} (px)" if over else chosen
-        if chosen != RAW and index != self._inspected:  # what was inspected stays while other frames are looked at
+        self.canvas.show_picture(image)
+        title = f"{picture_name} (px)" if overlay else picture_name
+        if (
+            picture_name != RAW and index != self._inspected
+        ):  # what was inspected stays while other frames are looked at
             title += f", of frame {self._inspected}: {self.source.series.name(self._inspected)}"
-        self.canvas.colour(over.ends if over else (0.0, 1.0), palette("plasma"), title)
-        self.canvas.bar.visible = over is not None
+        self.canvas.set_colour_bar(overlay.colour_range if overlay else (0.0, 1.0), palette("plasma"), title)
+        self.canvas.bar.visible = overlay is not None
 
     def _remesh(self) -> None:
         """Draw the mesh of the region; drop the inspection, of another region, element size or calibration."""
-        self._reader.drop()
+        self._reader.cancel()
         if self._expected is not None:
             self._expected, self.pictures = None, {}
-            self.parts.tiles.text = ""
-            self.parts.picture.value, self.parts.picture.options = RAW, [RAW]
+            self.controls.tiles.text = ""
+            self.controls.picture.value, self.controls.picture.options = RAW, [RAW]
         self._edges.data = {"xs": [], "ys": []}
-        self._guarded(self._make_mesh)
+        self._run_guarded(self._make_mesh)
 
     def _make_mesh(self) -> None:
-        if (made := self._meshed()) is None:
-            self.parts.message.text = _HELP
+        if (built := self._build_mesh()) is None:
+            self.controls.message.text = _HELP
             return
-        mesh = made[0]
-        self.parts.message.text = f"{len(mesh.nodes)} nodes, {len(mesh.elements)} elements.<br>{_HELP}"
+        mesh = built[0]
+        self.controls.message.text = f"{len(mesh.nodes)} nodes, {len(mesh.elements)} elements.<br>{_HELP}"
         if len(mesh.elements) <= VIEWER.mesh_edges:
             corners = mesh.nodes[mesh.elements][:, [0, 1, 2, 0]]
             self._edges.data = {"xs": list(corners[..., 0]), "ys": list(corners[..., 1])}
 
-    def _meshed(self) -> tuple[Tri3Mesh, Region, float] | None:
+    def _build_mesh(self) -> tuple[Tri3Mesh, Region, float] | None:
         """Make the mesh and region of the run, with the element size: ``mesh.file``, which what is drawn restricts.
 
         None where there is neither a file nor a region with an element size.
         """
-        content, size = region_of(self.drawing.marks), self.parts.size.value
+        content, size = region_of(self.drawing.marks), self.controls.size.value
         if self.draft.section("mesh").get("file"):
             document = {**self.draft.document, "region": content or self.draft.section("region")}
             settings = TestSettings.from_mapping(document, self.draft.file.parent)
@@ -171,67 +201,71 @@ class SetupPage:
     def _inspect(self) -> None:
         """Inspect the frame in view as `rgbmidic inspect` does, in another thread."""
         self.drawing.settle()  # else it drops the inspection
-        if (made := self._meshed()) is None:
-            self.parts.message.text = "Draw the region and state the size of the elements first."
+        if (built := self._build_mesh()) is None:
+            self.controls.message.text = "Draw the region and state the size of the elements first."
             return
-        self.parts.message.text = "inspecting …"
-        index = int(self.parts.frame.value)
-        work = partial(self.source.inspected, index, *made[1:])
-        self._reader.ask(work, lambda found: self._guarded(partial(self._have, found, index)))
+        self.controls.message.text = "inspecting …"
+        index = int(self.controls.frame.value)
+        work = partial(self.source.inspect, index, *built[1:])
+        self._reader.submit(
+            work, lambda read_inspection: self._run_guarded(partial(self._receive, read_inspection, index))
+        )
 
-    def _have(self, inspected: Callable[[], Inspection], index: int) -> None:
-        found, self._inspected = inspected(), index
-        self.pictures = pictures(found, self.source.shape)
-        self.parts.tiles.text = overview(found, self.pictures, self.source.raw(index)[0])
-        self.parts.picture.options = [RAW, *self.pictures, _EXPECTED]
-        known = found.prediction.std[np.isfinite(found.prediction.std)]
-        mesh: dict[str, Any] = {"nodes": found.mesh.nodes, "elements": found.mesh.elements}
-        look: dict[str, Any] = {"ends": colour_range(known) if known.size else (0.0, 1.0), "opacity": 0.8}
-        self._expected = Overlay(**mesh, values=found.prediction.std, colours=palette("plasma"), **look)
-        expected = f"median uncertainty to expect {np.median(known):.2g} px" if known.size else "no node is measured"
-        lines = [f"<b>{html.escape(found.name)}</b>: {expected}"]
-        self.parts.message.text = "<br>".join(lines + [f"• {html.escape(finding.text)}" for finding in found.findings])
-        if self.parts.picture.value == _EXPECTED:
-            self.show()
+    def _receive(self, read_inspection: Callable[[], Inspection], index: int) -> None:
+        inspection, self._inspected = read_inspection(), index
+        self.pictures = pictures(inspection, self.source.shape)
+        self.controls.tiles.text = overview(inspection, self.pictures, self.source.raw(index)[0])
+        self.controls.picture.options = [RAW, *self.pictures, _EXPECTED]
+        finite = inspection.prediction.std[np.isfinite(inspection.prediction.std)]
+        mesh: dict[str, Any] = {"nodes": inspection.mesh.nodes, "elements": inspection.mesh.elements}
+        look: dict[str, Any] = {"colour_range": colour_range(finite) if finite.size else (0.0, 1.0), "opacity": 0.8}
+        self._expected = Overlay(**mesh, values=inspection.prediction.std, colours=palette("plasma"), **look)
+        expected = f"median uncertainty to expect {np.median(finite):.2g} px" if finite.size else "no node is measured"
+        lines = [f"<b>{html.escape(inspection.name)}</b>: {expected}"]
+        self.controls.message.text = "<br>".join(
+            lines + [f"• {html.escape(finding.text)}" for finding in inspection.findings]
+        )
+        if self.controls.picture.value == _EXPECTED:
+            self.update_picture()
         else:  # which shows it
-            self.parts.picture.value = _EXPECTED
+            self.controls.picture.value = _EXPECTED
 
-    def _changed(self) -> Draft:
+    def _edited_draft(self) -> Draft:
         """Return the draft with the values of all controls."""
-        p, end = self.parts, len(self.source.series) - 1
-        frames: dict[str, Any] = {"first": int(p.first.value) or None}
-        frames["last"] = None if int(p.last.value) == end else int(p.last.value)
-        if int(p.reference.value) != self.draft.frames.reference[0]:
-            frames["reference"] = [int(p.reference.value)]
+        controls, last_frame = self.controls, len(self.source.series) - 1
+        frames: dict[str, Any] = {"first": int(controls.first_frame.value) or None}
+        frames["last"] = None if int(controls.last_frame.value) == last_frame else int(controls.last_frame.value)
+        if int(controls.reference.value) != self.draft.frames.reference[0]:
+            frames["reference"] = [int(controls.reference.value)]
         changes: dict[str, dict[str, Any]] = {"frames": frames}
-        mesh, size = self.draft.section("mesh"), float(p.size.value)
+        mesh, size = self.draft.section("mesh"), float(controls.size.value)
         if not mesh.get("file") and not (mesh.get("element_size") == "auto" and size == ELEMENT_SIZE):
             changes["mesh"] = {"element_size": size}
-        if p.calibration.value:
-            changes["calibration"] = {"file": p.calibration.value}
+        if controls.calibration.value:
+            changes["calibration"] = {"file": controls.calibration.value}
         if region := region_section(self.draft, self.drawing.marks):
             changes["region"] = region
-        return self.draft.changed(changes)
+        return self.draft.with_values(changes)
 
     def _reopen(self) -> None:
         """Take the values of the controls, once the frames can be read with them."""
-        draft = self._changed()
-        other = draft.section("calibration") != self.draft.section("calibration")
+        draft = self._edited_draft()
+        is_recalibrated = draft.section("calibration") != self.draft.section("calibration")
         self.draft, self.source = draft, DraftFrames(draft)
-        if other:
+        if is_recalibrated:
             self._offer_lights()
             self._remesh()
-        self.show()
+        self.update_picture()
 
     def _offer_lights(self) -> None:
         """Offer the lights for masks."""
-        self.parts.light.options = list(self.source.lights)
-        self.parts.light.value = next(iter(self.source.lights), "")
+        self.controls.light.options = list(self.source.lights)
+        self.controls.light.value = next(iter(self.source.lights), "")
         self._choose_light()
 
     def _choose_light(self) -> None:
         """Let masks that are drawn from now on be of the light chosen, each of its own."""
-        self.drawing.light = self.parts.light.value
+        self.drawing.light = self.controls.light.value
         self.drawing.next_hole()
 
     def _write(self) -> bool:
@@ -239,32 +273,34 @@ class SetupPage:
         self.drawing.settle()  # else it takes the place of what is reported here
         check_complete(self.drawing.marks)
         self._reopen()
-        draft = self.draft.at(Path(self.parts.file.value))
+        draft = self.draft.with_path(Path(self.controls.file.value))
         draft, pictures = draft.with_masks(self.drawing.marks, self.source.lights, self.source.shape)
         draft.check()
-        same = draft.file == self._opened.file
-        files = [*pictures, *([] if same and self._opened.is_file else [draft.file])]
-        what = f"it{', which has another content than this page read' * same}" if files == [draft.file] else "them"
-        if asked := self.confirmation.question(files, what):
-            self.parts.message.text = warning(asked)
+        is_same_file = draft.file == self._stored_draft.file
+        files = [*pictures, *([] if is_same_file and self._stored_draft.is_file else [draft.file])]
+        subject = (
+            f"it{', which has another content than this page read' * is_same_file}" if files == [draft.file] else "them"
+        )
+        if question := self.confirmation.question(files, subject):
+            self.controls.message.text = warning(question)
             return False
         for file, content in pictures.items():
             write_complete(file, methodcaller("write", content))
         draft.write()
-        self.draft = self._opened = draft
-        written, region = html.escape(", ".join(map(str, (draft.file, *pictures)))), draft.section("region")
-        held = [f"a {key}" for key in ("rectangle", "polygon", "mask") if key in region]
-        held += [f"{len(region['holes'])} holes"] if "holes" in region else []
-        told = f", with {' and '.join(held)} as its region" if held else ""
-        self.parts.message.text = f"{written} {'are' if pictures else 'is'} written{told}."
+        self.draft = self._stored_draft = draft
+        file_names, region = html.escape(", ".join(map(str, (draft.file, *pictures)))), draft.section("region")
+        region_parts = [f"a {key}" for key in ("rectangle", "polygon", "mask") if key in region]
+        region_parts += [f"{len(region['holes'])} holes"] if "holes" in region else []
+        region_note = f", with {' and '.join(region_parts)} as its region" if region_parts else ""
+        self.controls.message.text = f"{file_names} {'are' if pictures else 'is'} written{region_note}."
         return True
 
     def _run(self) -> None:
-        if self.runs and self.runs[-1].going:
-            self.parts.message.text = "The run still goes on."
+        if self.runs and self.runs[-1].is_running:
+            self.controls.message.text = "The run still goes on."
         elif self._write():
-            self.runs.append(Run(self.draft.file, Path(self.parts.out.value)))
+            self.runs.append(Run(self.draft.file, Path(self.controls.out.value)))
 
     def _tick(self) -> None:
         if self.runs:
-            self.parts.ran.text = self.runs[-1].text()
+            self.controls.run_status.text = self.runs[-1].text()

@@ -30,11 +30,11 @@ from rgbmidic.report.page import render
 from rgbmidic.report.style import OKABE_ITO
 from rgbmidic.results import Result
 from rgbmidic.settings import ELEMENT_SIZE
-from rgbmidic.view.address import Mark, Steps
 from rgbmidic.view.constants import VIEWER
-from rgbmidic.view.draft import HOLES, MASK, Draft, arranged, masks_of, rings
-from rgbmidic.view.models import Controls
-from rgbmidic.view.picture import Canvas, Picture, columns, grey_picture, stretched
+from rgbmidic.view.picture import Canvas, Picture, columns, grey_picture, stretch_to_uint8
+from rgbmidic.view.test_file_editor import HOLES, MASK, Draft, keep_one_outline, masks_of, rings
+from rgbmidic.view.url_state import Mark, UndoHistory
+from rgbmidic.view.widgets import Controls
 
 RAW = "raw frame"
 
@@ -73,20 +73,20 @@ class DraftFrames:
     @property
     def lights(self) -> tuple[str, ...]:
         """Names of the lights as the calibration has them, else as the run names those of monochrome frames."""
-        known = self.calibration or Calibration()
-        for part in (known.crosstalk, known.registration):
-            if part is not None:
-                return tuple(part.lights)
+        calibration = self.calibration or Calibration()
+        for section in (calibration.crosstalk, calibration.registration):
+            if section is not None:
+                return tuple(section.lights)
         count = max(self.series.n_lights, len(self.series.lights))
         return ("light",) if count == 1 else tuple(f"light {number + 1}" for number in range(count))
 
     def raw(self, index: int) -> tuple[Picture, npt.NDArray[np.bool_]]:
         """Read a raw frame as a picture (H, W), and where a channel is saturated (H, W)."""
         frame = self.series.read(index)[0]
-        full = frame.values >= frame.white_level
-        return grey_picture(frame), np.asarray(full if full.ndim == 2 else full.any(axis=0))
+        saturated = frame.values >= frame.white_level
+        return grey_picture(frame), np.asarray(saturated if saturated.ndim == 2 else saturated.any(axis=0))
 
-    def inspected(self, index: int, region: Region, element_size: float) -> Inspection:
+    def inspect(self, index: int, region: Region, element_size: float) -> Inspection:
         """Inspect a frame before the test, as `inspect_frame` does."""
         options: dict[str, Any] = {"region": region, "element_size": element_size, "name": self.series.name(index)}
         return inspect_frame(self.series.read(index), calibration=self.calibration, **options)
@@ -94,20 +94,24 @@ class DraftFrames:
 
 def pictures(inspection: Inspection, shape: tuple[int, int]) -> dict[str, Picture]:
     """Return the separated lights and their reflection index by their names, each a picture of the whole frame."""
-    images, (left, top) = inspection.images, map(int, inspection.origin)
-    parts = {f"light: {name}": stretched(values) for name, values in zip(images.names, images.values, strict=True)}
+    images, (column, row) = inspection.images, map(int, inspection.origin)
+    images_by_name = {
+        f"light: {name}": stretch_to_uint8(values) for name, values in zip(images.names, images.values, strict=True)
+    }
     if inspection.reflection_index is not None:
         for name, index in zip(images.names, inspection.reflection_index, strict=True):
-            parts[f"reflection index: {name}"] = np.asarray(255 * np.clip(np.nan_to_num(index), 0, 1), dtype=np.uint8)
+            images_by_name[f"reflection index: {name}"] = np.asarray(
+                255 * np.clip(np.nan_to_num(index), 0, 1), dtype=np.uint8
+            )
     height, width = images.values.shape[1:]
-    around = (top, shape[0] - top - height), (left, shape[1] - left - width)
-    return {name: np.pad(part, around) for name, part in parts.items()}
+    padding = (row, shape[0] - row - height), (column, shape[1] - column - width)
+    return {name: np.pad(image, padding) for name, image in images_by_name.items()}
 
 
-def overview(inspection: Inspection, named: Mapping[str, Picture], raw: Picture) -> str:
+def overview(inspection: Inspection, pictures_by_name: Mapping[str, Picture], raw: Picture) -> str:
     """Return small pictures in rows, as HTML: the raw frame and the separated lights, their reflection index."""
     tiles = []
-    for name, picture in ((RAW, raw), *named.items()):
+    for name, picture in ((RAW, raw), *pictures_by_name.items()):
         height, width = picture.shape
         size = (VIEWER.tile_columns, max(1, round(VIEWER.tile_columns * height / width)))
         png = cv2.imencode(".png", cv2.resize(picture, size, interpolation=cv2.INTER_AREA))[1]
@@ -140,24 +144,24 @@ class RegionDrawing:
     """
 
     def __init__(
-        self, document: Document, canvas: Canvas, marks: tuple[Mark, ...], changed: Callable[[], None]
+        self, document: Document, canvas: Canvas, marks: tuple[Mark, ...], on_change: Callable[[], None]
     ) -> None:
-        self._document, self._canvas, self._changed = document, canvas, changed
+        self._document, self._canvas, self._on_change = document, canvas, on_change
         self.light = ""
-        self._steps, self._hole, self._coming = Steps(marks), 1, False
+        self._steps, self._hole, self._redraw_pending = UndoHistory(marks), 1, False
         self._rings = bk.ColumnDataSource(columns("xs ys colour"), name="rings")
         canvas.plot.multi_line("xs", "ys", source=self._rings, line_color="colour", line_width=2.5)
-        canvas.place(marks)
-        canvas.marks.on_change("data", lambda attr, old, new: self._marked())
+        canvas.place_marks(marks)
+        canvas.marks.on_change("data", lambda attr, old, new: self._receive_marks())
 
     @property
     def marks(self) -> tuple[Mark, ...]:
         """The marks."""
-        return self._steps.now
+        return self._steps.marks
 
-    def go(self, *, back: bool) -> None:
+    def step(self, *, back: bool) -> None:
         """Return to the marks before the last step, or do it again."""
-        self._canvas.place(self._steps.go(back=back))
+        self._canvas.place_marks(self._steps.step(back=back))
         self.draw()
 
     def next_hole(self) -> None:
@@ -167,42 +171,44 @@ class RegionDrawing:
 
     def settle(self) -> None:
         """Draw the lines of marks that were set just now."""
-        if self._coming:
+        if self._redraw_pending:
             self.draw()
 
     def draw(self) -> None:
         """Draw the lines."""
-        self._coming = False
+        self._redraw_pending = False
         outline, holes = rings(self.marks)
-        drawn = [(outline, "#56b4e9"), *((hole, "#e69f00") for hole in holes)]
-        for at, own in enumerate(masks_of(self.marks).values()):
-            drawn += [(ring, _COLOURS[2 + at % (len(_COLOURS) - 2)]) for ring in own]
-        closed = [([*ring, *ring[:1]], colour) for ring, colour in drawn]
-        rows = [([x for x, _ in ring], [y for _, y in ring], colour) for ring, colour in closed]
+        coloured_rings = [(outline, "#56b4e9"), *((hole, "#e69f00") for hole in holes)]
+        for index, light_rings in enumerate(masks_of(self.marks).values()):
+            coloured_rings += [(ring, _COLOURS[2 + index % (len(_COLOURS) - 2)]) for ring in light_rings]
+        closed_rings = [([*ring, *ring[:1]], colour) for ring, colour in coloured_rings]
+        rows = [([x for x, _ in ring], [y for _, y in ring], colour) for ring, colour in closed_rings]
         self._rings.data = columns("xs ys colour", rows)
-        self._changed()
+        self._on_change()
 
-    def _marked(self) -> None:
+    def _receive_marks(self) -> None:
         """Take the marks as they are on the plot; a new mark of a hole gets the number of its hole.
 
         A polygon's number is that of the present hole; a round hole is complete with two marks.
         """
-        known, now = {mark.key for mark in self.marks}, list[Mark]()
-        for mark in self._canvas.set:
+        previous_keys, marks = {mark.key for mark in self.marks}, list[Mark]()
+        for mark in self._canvas.current_marks:
             kind, number = mark.kind, self._hole
             if kind == "round hole":
-                number = 1 + sum(other.kind.startswith("round hole ") for other in now) // HOLES["round hole"]
+                number = 1 + sum(earlier.kind.startswith("round hole ") for earlier in marks) // HOLES["round hole"]
             kind = f"{MASK} {number} {self.light}" if kind == MASK else f"{kind} {number}" if kind in HOLES else kind
-            now.append(replace(mark, kind=kind))
-        if tuple(now) != self.marks:
-            self.keep(arranged(now, next((mark.kind for mark in now if mark.key not in known), "")))
+            marks.append(replace(mark, kind=kind))
+        if tuple(marks) != self.marks:
+            self.take_marks(
+                keep_one_outline(marks, next((mark.kind for mark in marks if mark.key not in previous_keys), ""))
+            )
 
-    def keep(self, marks: tuple[Mark, ...]) -> None:
+    def take_marks(self, marks: tuple[Mark, ...]) -> None:
         """Take marks as a step that can be undone, and draw their lines."""
-        self._steps.keep(marks)
-        self._canvas.place(marks)
-        if not self._coming:
-            self._coming = True
+        self._steps.record(marks)
+        self._canvas.place_marks(marks)
+        if not self._redraw_pending:
+            self._redraw_pending = True
             self._document.add_timeout_callback(self.settle, VIEWER.mark_ms)
 
 
@@ -226,9 +232,9 @@ class SetupControls(Controls):
         The column left of the frame.
     """
 
-    def __init__(self, draft: Draft, last: int, out: Path, *, dark: bool) -> None:
+    def __init__(self, draft: Draft, last_index: int, out: Path, *, dark: bool) -> None:
         frames = draft.frames
-        super().__init__(last, frames.reference[0], dark=dark)
+        super().__init__(last_index, frames.reference[0], dark=dark)
         wide, size = self.wide, draft.section("mesh").get("element_size", "auto")
         size = ELEMENT_SIZE if size == "auto" else size
         self.head.text = f"<b>{html.escape(str(draft.file))}</b> &nbsp; a test to set up"
@@ -237,37 +243,37 @@ class SetupControls(Controls):
         self.mode = self.group("mode", "shape that a click begins", ["Move", "Rectangle", "Polygon", "Circle"])
         self.hole = self.group("hole", "what is left out", ["Hole", "Round hole", "Lamp mask"], active=None)
         labels = ("Undo", "Redo", "Next", "Clear", "Inspect", "Write TEST.toml")
-        self.undo, self.redo, self.next, self.clear, self.inspect, self.write = (
+        self.undo, self.redo, self.next_shape, self.clear, self.inspect, self.write = (
             bk.Button(label=name, name=name.lower(), **wide) for name in labels
         )
         self.light = bk.Select(title="Masks are of", name="light", **wide)
         self.size = bk.Spinner(title="Element size (px)", name="size", low=4, value=size, step=1, **wide)
-        end = last if frames.last is None else frames.last
-        chosen = {"Reference": frames.reference[0], "First": frames.first, "Last": end}
-        self.reference, self.first, self.last = (
-            bk.Spinner(title=title, name=title.lower(), value=at, low=0, high=last, step=1, **wide)
-            for title, at in chosen.items()
+        final_frame = last_index if frames.last is None else frames.last
+        frame_values = {"Reference": frames.reference[0], "First": frames.first, "Last": final_frame}
+        self.reference, self.first_frame, self.last_frame = (
+            bk.Spinner(title=title, name=title.lower(), value=number, low=0, high=last_index, step=1, **wide)
+            for title, number in frame_values.items()
         )
         if (count := len(frames.reference)) > 1:  # the control has the first of them; another value is one frame
 
-            def state(_name: str, _old: object, at: float) -> None:
-                self.reference.title = f"Reference, {count} from" if at == frames.reference[0] else "Reference"
+            def update_title(_name: str, _old: object, number: float) -> None:
+                self.reference.title = f"Reference, {count} from" if number == frames.reference[0] else "Reference"
 
-            self.reference.on_change("value", state)
-            state("value", None, frames.reference[0])
+            self.reference.on_change("value", update_title)
+            update_title("value", None, frames.reference[0])
         calibration = str(draft.section("calibration").get("file", ""))
         texts = {"Calibration file": calibration, "Write to": str(draft.file), "Result folder": str(out)}
         self.calibration, self.file, self.out = (
             bk.TextInput(title=title, name=name, value=text, **wide)
             for name, (title, text) in zip(("calibration", "file", "out"), texts.items(), strict=True)
         )
-        self.go = bk.Button(label="Run", button_type="primary", **wide)
-        self.ran, self.tiles = bk.Div(name="ran", **wide), bk.Div(name="tiles", **wide)
+        self.run_button = bk.Button(label="Run", button_type="primary", **wide)
+        self.run_status, self.tiles = bk.Div(name="ran", **wide), bk.Div(name="tiles", **wide)
         line = partial(row, sizing_mode="stretch_width")
-        buttons = line(self.undo, self.redo, self.next, self.clear)
-        sizes, numbers = line(self.light, self.size), line(self.reference, self.first, self.last)
-        shown = (self.description, self.picture, self.glare, self.mode, self.hole, buttons, sizes, numbers)
-        self.side = column(*shown, self.calibration, self.inspect, self.theme, sizing_mode="stretch_width")
+        buttons = line(self.undo, self.redo, self.next_shape, self.clear)
+        sizes, numbers = line(self.light, self.size), line(self.reference, self.first_frame, self.last_frame)
+        widgets = (self.description, self.picture, self.glare, self.mode, self.hole, buttons, sizes, numbers)
+        self.side = column(*widgets, self.calibration, self.inspect, self.theme, sizing_mode="stretch_width")
 
 
 class Run:
@@ -288,19 +294,19 @@ class Run:
         self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
 
     @property
-    def going(self) -> bool:
-        """Whether it goes on."""
+    def is_running(self) -> bool:
+        """True while the run goes on."""
         return self._process.poll() is None
 
     def text(self) -> str:
         """Return how many frames are measured, with a link to them, or how the run ended, as HTML."""
-        going, far, link = self.going, "preparing the reference", ""
+        is_running, progress, link = self.is_running, "preparing the reference", ""
         with suppress(ResultError):
             result = Result.open(self.out, partial=True, check=False)
-            far = f"{int(result.finished.sum())} of {len(result)} frames measured"
+            progress = f"{int(result.finished.sum())} of {len(result)} frames measured"
             link = '<br><a id="result" href="result">look at the result as it grows</a>'
-        if going or not self._process.returncode:
-            return f"{'running' if going else 'ended'}: {far}{link}"
+        if is_running or not self._process.returncode:
+            return f"{'running' if is_running else 'ended'}: {progress}{link}"
         self._output.seek(0)
         lines = [line for line in self._output.read().decode("utf-8", "replace").splitlines() if line.strip()]
         errors = [line for line in lines if line.startswith("error: ")]

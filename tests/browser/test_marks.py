@@ -102,10 +102,10 @@ def test_a_name_is_undone_kept_in_address_and_csv_and_written_with_the_probe(dri
         driver.execute_script(*click("Save CSV"))
         assert ",left grip_extension_px," in page.until("window.saved").splitlines()[0]
         driver.execute_script(*click("Write"))
-        page.until("model('written').text.includes('TEST.toml exists: press again')")
+        page.until("model('save_status').text.includes('TEST.toml exists: press again')")
         assert file.read_text(encoding="utf-8") == TEXT
         driver.execute_script(*click("Write"))
-        page.until("model('written').text.includes('written')")
+        page.until("model('save_status').text.includes('written')")
         stated = read_test(file).probes
         place = tuple(value for end in ends(page, "gauge") for value in end)
         np.testing.assert_allclose(stated.gauges, [place], atol=6e-4)
@@ -121,10 +121,10 @@ def test_a_name_is_undone_kept_in_address_and_csv_and_written_with_the_probe(dri
         for name, words in (("elsewhere.txt", "must end in .toml"), ("/other/TEST.toml", "and be in")):
             page.do(f"model('file').value = {name!r}")
             driver.execute_script(*click("Write"))
-            page.until(f"model('written').text.includes({words!r})")
+            page.until(f"model('save_status').text.includes({words!r})")
         page.do("model('file').value = 'new.toml'")
         driver.execute_script(*click("Write"))
-        page.until("model('written').text.includes('new.toml is written')")
+        page.until("model('save_status').text.includes('new.toml is written')")
         assert read_test(file.with_name("new.toml")).probes == stated
 
 
@@ -140,7 +140,7 @@ def test_channels_are_dragged_triggered_correlated_and_make_stress_over_strain(d
         page = Page(driver, f"{told}?frame=20&marks=gauge:30,40;gauge:90,40")
         page.until("model('lines').data.name[0] === 'gauge 1 extension'")
         page.do("model('channels').value = 'none.csv'")
-        page.until("model('told').text.includes('none.csv')")
+        page.until("model('channel_status').text.includes('none.csv')")
         page.do("model('channels').value = 'daq.csv'; model('beside').value = 'load_kN'")
         page.until("model('recorded').data.xs.length === 1")
         page.until("model('curves_plot').below[0].axis_label === 'time (ms)'")
@@ -182,11 +182,11 @@ def test_channels_are_dragged_triggered_correlated_and_make_stress_over_strain(d
         page = Page(driver, driver.current_url)
         page.until("model('lines').data.name[0] === 'stress'")
         np.testing.assert_allclose(line(page), found["stress"].values, atol=1e-6)
-        page.do("model('what').active = [1]")
+        page.do("model('sections_to_write').active = [1]")
         driver.execute_script(*click("Write"))
-        page.until("model('written').text.includes('press again')")
+        page.until("model('save_status').text.includes('press again')")
         driver.execute_script(*click("Write"))
-        page.until("model('written').text.includes('is written')")
+        page.until("model('save_status').text.includes('is written')")
         stated = read_test(folder / "TEST.toml").channels
         assert stated == ChannelSettings(file=folder / "daq.csv", align=("load_kN", "gauge_1_strain"), area=20)
         assert 'file = "daq.csv"' in (folder / "TEST.toml").read_text(encoding="utf-8")
@@ -213,16 +213,16 @@ def test_two_points_of_a_distance_are_the_scale_of_the_page_and_of_the_file(driv
         read = read_histories(result, ProbeSettings(gauges=((30, 40, 90, 40),)), scale=scale)
         last = float(read["gauge_1_extension"].values[40])
         page.until(f"Math.abs(model('lines').data.ys[0][40] - {last!r}) < 1e-6")
-        page.do("model('what').active = [2]")
+        page.do("model('sections_to_write').active = [2]")
         driver.execute_script(*click("Write"))
-        page.until("model('written').text.includes('press again')")
+        page.until("model('save_status').text.includes('press again')")
         driver.execute_script(*click("Write"))
-        page.until("model('written').text.includes('is written')")
+        page.until("model('save_status').text.includes('is written')")
         stated = read_test(result.path.parent / "TEST.toml").scale
         assert stated.mm_per_pixel == float(f"{units.mm_per_pixel:.6g}")
         assert stated.mm_per_pixel_std == float(f"{units.mm_per_pixel_std:.2g}")
         page.do("model('camera').value = 'none.json'")
-        page.until("model('scaled').text.includes('none.json')")
+        page.until("model('scale_label').text.includes('none.json')")
 
 
 def test_masks_are_painted_undone_and_written_as_images_that_are_replaced_when_confirmed(driver, tmp_path):

@@ -79,7 +79,7 @@ def test_a_region_with_a_hole_is_drawn_written_run_and_watched(test_file, tmp_pa
         page.until("model('ran').text.includes('href')", patience=120)
         followed = Page(driver, f"{address}result")
         followed.until("model('head').text.includes('3 of 3 frames measured')", patience=120)
-        followed.until("model('state').shown === 2")
+        followed.until("model('state').displayed_frame === 2")
         result = Result.open(tmp_path / "measured")
         np.testing.assert_array_equal(result.nodes, mesh.nodes)
         assert np.nanmedian(result.u[2]) == pytest.approx(0.6, abs=0.02)

@@ -12,12 +12,12 @@ import pytest
 from results import NODES, corrupt, make_origin, make_result, smooth_record
 from viewer import MISSING, Page, chromium, click, serving
 
-from rgbmidic.report import Movie, write_movie
+from rgbmidic.report import FieldMovie, write_movie
 from rgbmidic.results import FrameRecord, Maps, Result, ResultStore
 from rgbmidic.results.histories import read_histories
 from rgbmidic.results.profiles import read_profile
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings
-from rgbmidic.view import sections
+from rgbmidic.view import panels
 from rgbmidic.view.picture import element_at, robust_range
 
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=MISSING)
@@ -49,7 +49,7 @@ def driver():
 
 def shown(page, frame):
     """The words on the page once it shows a frame."""
-    page.until(f"model('state').shown === {frame} && model('description').text.startsWith('Frame {frame} ')")
+    page.until(f"model('state').displayed_frame === {frame} && model('description').text.startsWith('Frame {frame} ')")
     return page.run("model('description').text")
 
 
@@ -63,7 +63,7 @@ def test_frames_are_scrubbed_and_the_address_holds_what_is_shown(driver, address
     page.do("model('quantity').value = 'v'")
     page.do("model('frame').value = 2")
     shown(page, 2)
-    low, high = robust_range(Maps.of(result).read("v", 2))
+    low, high = robust_range(Maps.from_result(result).read("v", 2))
     mapper = "model('colours')"
     page.until(f"{mapper}.low === {low!r} && {mapper}.high === {high!r}")
     held = parse_qs(urlsplit(driver.current_url).query)
@@ -94,11 +94,11 @@ def test_the_value_stays_that_of_what_is_shown(driver, address, result):
     page.until("model('under').text.includes('u = ')")
     page.do("model('mode').active = 1")
     page.pointer(("click", 90, 50))
-    fields = Maps.of(result)
+    fields = Maps.from_result(result)
 
     def check(frame, name):
-        field = fields.all[name]
-        page.until(f"model('state').shown === {frame} && model('plot').title.text === {field.label!r}")
+        field = fields.quantities[name]
+        page.until(f"model('state').displayed_frame === {frame} && model('plot').title.text === {field.label!r}")
         text = page.until(f"model('under').text.includes('{field.symbol} = ') && model('under').text")
         x, y, value = (float(n) for n in re.findall(r"-?[\d.]+(?:e-?\d+)?", text)[:3])
         values = fields.read(name, frame)
@@ -117,10 +117,13 @@ def test_the_value_stays_that_of_what_is_shown(driver, address, result):
     page.do("model('frame').value = 4")
     check(4, "magnitude")
     page.do("model('step').value = 2; model('play').active = true")
-    page.until("model('state').shown === 6")
+    page.until("model('state').displayed_frame === 6")
     page.do("model('play').active = false; model('step').value = 1")
-    page.until("model('state').shown === model('frame').value && model('state').shown === model('state').asked")
-    check(page.run("model('state').shown"), "magnitude")
+    page.until(
+        "model('state').displayed_frame === model('frame').value && "
+        "model('state').displayed_frame === model('state').requested_frame"
+    )
+    check(page.run("model('state').displayed_frame"), "magnitude")
     page.keys(HOME, RIGHT, RIGHT, RIGHT)
     shown(page, 3)
     assert "not measured" in page.run("model('under').text")
@@ -158,7 +161,7 @@ def test_no_control_is_cut_off(driver, address, size, theme):
     more = "range=hand&low=-1&high=1&second=uncertainty&frame=3&clock=correlation"
     page = Page(driver, f"{address}?theme={theme}&{more}")
     page.until("model('low').visible && model('plot_2') !== null")
-    for name in ("step", "over", "section", "scale", "what"):
+    for name in ("step", "over", "section", "scale", "sections_to_write"):
         assert page.run(f"Bokeh.index.get_one(model('{name}')).el.getAttribute('aria-label')")
     assert driver.execute_script("return [innerWidth, innerHeight]") == list(size)
     for section in range(7):
@@ -186,7 +189,7 @@ def test_a_derived_field_and_its_uncertainty_are_those_of_the_library(driver, ad
     page.until("model('plot_3') && model('plot_3').title.text === '|du/dt| (px/frame)'")
     page.until("model('description').text.includes('since frame 2')")
     assert "Hencky, virtual strain gauge of 80 px" in page.run("model('description').text")
-    maps = Maps.of(result, gauge=80.0, measure="hencky", since=2, rigid_removed=True)
+    maps = Maps.from_result(result, gauge=80.0, measure="hencky", since=2, rigid_removed=True)
     read, speed = maps.read("exx", 5), maps.read("velocity", 5)
     node = int(np.argmin(np.hypot(*(result.nodes - [70, 45]).T)))
     for _ in range(30):  # while the plots take their new sizes the pointer is elsewhere
@@ -232,7 +235,7 @@ def test_a_second_field_is_moved_with_the_first_and_painted_anew(driver, address
 def test_extremes_arrows_contours_and_colours(driver, address, result):
     page = Page(driver, f"{address}?frame=5&field=u")
     shown(page, 5)
-    values = Maps.of(result).read("u", 5).values
+    values = Maps.from_result(result).read("u", 5).values
     page.do("['extremes', 'contours', 'vectors'].forEach((name) => { model(name).active = true; })")
     page.do("model('levels').value = 8; model('palette').value = 'PuOr_r'")
     page.until("model('colours').palette.length === 8 && model('extreme nodes').data.x.length === 2")
@@ -241,7 +244,7 @@ def test_extremes_arrows_contours_and_colours(driver, address, result):
     np.testing.assert_allclose(np.transpose([x, y]), result.nodes[nodes])
     assert [numbers(text)[0] for text in texts] == pytest.approx(values[nodes], rel=1e-4)
     assert f"largest {values.max():.3f} ± 0.010 px" in page.run("model('description').text")
-    low, high = robust_range(Maps.of(result).read("u", 5))
+    low, high = robust_range(Maps.from_result(result).read("u", 5))
     at = np.array(page.run("Array.from(model('contour lines').data.x0)"))
     levels = np.unique(np.round(0.01 * (at - 60), 9))
     np.testing.assert_allclose(levels, np.linspace(low, high, 9)[1:-1], atol=1e-6)
@@ -257,7 +260,7 @@ def test_a_range_is_locked_where_it_is(driver, address, result):
     shown(page, 5)
     page.do("model('section').active = 1")
     page.until("document.querySelector('.side')")
-    ends = robust_range(Maps.of(result).read("u", 5))
+    ends = robust_range(Maps.from_result(result).read("u", 5))
     page.driver.execute_script(*click("Lock the range"))
     page.until("model('range').value === 'hand' && model('low').visible")
     page.do("model('frame').value = 2")
@@ -426,10 +429,10 @@ def test_a_line_shows_its_profile_and_position_against_time(driver, wave):
         page.until("model('beside_map').visible")
         assert page.run("model('beside_map').labels") == ["over time", "along line 1"]
         page.driver.execute_script(*click("along line 1"))
-        page.until("model('wave').data.image.length && !model('told_of_line').visible")
+        page.until("model('wave').data.image.length && !model('line_status').visible")
         data = page.run("[Array.from(model('marks').data.x), Array.from(model('marks').data.y)]")
         place = tuple(np.transpose(data).ravel())
-        expected = read_profile(Maps.of(wave), "exx", place)
+        expected = read_profile(Maps.from_result(wave), "exx", place)
         image = array(page, "model('wave').data.image[0]").reshape(page.run("model('wave').data.image[0].shape"))
         np.testing.assert_allclose(image, expected.values.T, rtol=1e-5)
         assert np.isnan(image[:, 3]).all()
@@ -437,18 +440,18 @@ def test_a_line_shows_its_profile_and_position_against_time(driver, wave):
         apart = expected.positions[1]
         assert (x, y, wide) == pytest.approx((-0.5, -apart / 2, 12))
         assert tall == pytest.approx(expected.positions[-1] + apart)
-        page.until("model('wave_now').location === 5")
+        page.until("model('wave_frame_mark').location === 5")
         for frame in (5, 8):
             page.do(f"model('frame').value = {frame}")
             shown(page, frame)
-            page.until(f"model('wave_now').location === {frame}")
+            page.until(f"model('wave_frame_mark').location === {frame}")
             curve = array(page, "model('profile').data.y")
             np.testing.assert_allclose(curve, expected.values[frame], atol=1e-12)
             np.testing.assert_allclose(array(page, "model('profile').data.x"), expected.positions)
             rim = array(page, "model('profile bands').data.ys[0]")
             known = np.isfinite(curve)
             np.testing.assert_allclose(rim[: known.sum()], (curve - 2 * expected.std[frame])[known])
-            for name, read in (("colours", Maps.of(wave).read("exx", frame)), ("wave_colours", expected)):
+            for name, read in (("colours", Maps.from_result(wave).read("exx", frame)), ("wave_colours", expected)):
                 ends = page.run(f"[model('{name}').low, model('{name}').high]")
                 assert ends == pytest.approx(robust_range(read)), "the map has those of the frame, the line of the test"
         held = parse_qs(urlsplit(driver.current_url).query)
@@ -463,18 +466,18 @@ def test_a_line_shows_its_profile_and_position_against_time(driver, wave):
         actions.perform()
         shown(page, 2)
         page.do("model('since').value = 1")
-        longer = read_profile(Maps.of(wave, since=1), "exx", place).values.T.ravel()
+        longer = read_profile(Maps.from_result(wave, since=1), "exx", place).values.T.ravel()
         place_of = int(np.nanargmax(np.abs(longer - expected.values.T.ravel())))
         page.until(f"Math.abs(model('wave').data.image[0]?.[{place_of}] - {float(longer[place_of])!r}) < 1e-6")
         np.testing.assert_allclose(array(page, "model('wave').data.image[0]"), longer, rtol=1e-5, atol=1e-9)
         page.do("model('since').value = -1; model('quantity').value = 'u'")
-        other = read_profile(Maps.of(wave), "u", place)
+        other = read_profile(Maps.from_result(wave), "u", place)
         page.until("model('wave_plot').title.text.startsWith('u ') && model('wave').data.image.length")
-        page.until("!model('told_of_line').visible")
+        page.until("!model('line_status').visible")
         np.testing.assert_allclose(array(page, "model('wave').data.image[0]"), other.values.T.ravel(), rtol=1e-5)
         page.do("model('quantity').value = 'node_status'")
         page.until(
-            "model('told_of_line').text.includes('a field with an uncertainty') && !model('wave').data.image.length"
+            "model('line_status').text.includes('a field with an uncertainty') && !model('wave').data.image.length"
         )
         page.driver.execute_script(*click("over time"))
         page.until("!model('wave_plot').visible && model('lines').data.ys.length")
@@ -523,7 +526,7 @@ def test_the_picture_that_is_saved_is_of_the_plot_that_is_there(driver, wave):
         page.pointer(("click", *ALONG[:2]), ("click", *ALONG[2:]))
         page.until("model('beside_map').visible")
         page.driver.execute_script(*click("along line 1"))
-        page.until("model('wave').data.image.length && !model('told_of_line').visible")
+        page.until("model('wave').data.image.length && !model('line_status').visible")
         driver.execute_script("window.kept = []; rgbmidic.keep = (blob, name) => window.kept.push([name, blob.size])")
         page.driver.execute_script(*click("Save PNG"))
         page.until("window.kept.length === 1")
@@ -547,32 +550,36 @@ def test_a_movie_of_what_is_in_view_is_written_beside_the_others(driver, wave, t
         view = "frame=5&field=exx&second=u&range=hand&low=-0.01&high=0.02&opacity=0.5&gauge=60&since=1&measure=hencky"
         page = Page(driver, f"{told}?{view}")
         shown(page, 5)
-        monkeypatch.setattr(sections, "find_spec", lambda name: None)
+        monkeypatch.setattr(panels, "find_spec", lambda name: None)
         page.driver.execute_script(*click("Movie"))
-        page.until("model('said').text.startsWith('movie_exx_u') && model('movie').label === '■ Movie'")
-        page.until(f"model('said').text.startsWith('written: {first} (a .gif; for .mp4: pip install')", patience=60)
+        page.until("model('movie_status').text.startsWith('movie_exx_u') && model('movie').label === '■ Movie'")
+        page.until(
+            f"model('movie_status').text.startsWith('written: {first} (a .gif; for .mp4: pip install')", patience=60
+        )
         assert not page.run("model('movie').active")
-        maps = Maps.of(wave, gauge=60.0, since=1, measure="hencky")
-        movie = Movie(maps=maps, fields=["exx", "u"], limits={"exx": (-0.01, 0.02)}, opacity=0.5)
+        maps = Maps.from_result(wave, gauge=60.0, since=1, measure="hencky")
+        movie = FieldMovie(maps=maps, fields=["exx", "u"], limits={"exx": (-0.01, 0.02)}, opacity=0.5)
         write_movie(movie, tmp_path / "a.gif")
         before = first.read_bytes()
         assert before == (tmp_path / "a.gif").read_bytes()
         page.keys("m")
-        page.until(f"model('said').text.startsWith('written: {second}')", patience=60)
+        page.until(f"model('movie_status').text.startsWith('written: {second}')", patience=60)
         assert first.read_bytes() == before
         monkeypatch.undo()
         if there:
             page.keys("m")
-            page.until(f"model('said').text === 'written: {other}'", patience=60)
+            page.until(f"model('movie_status').text === 'written: {other}'", patience=60)
         page.do("model('quantity').value = 'node_status'")
         page.keys("m")
-        page.until("model('said').text.includes('a movie shows fields of numbers, not node_status')", patience=60)
+        page.until(
+            "model('movie_status').text.includes('a movie shows fields of numbers, not node_status')", patience=60
+        )
         page.until("!model('movie').active")  # which is told after the text
         page.do("model('quantity').value = 'v'")
         page.keys("m")
-        page.until("model('movie').active && model('said').text.startsWith('movie_v')")
+        page.until("model('movie').active && model('movie_status').text.startsWith('movie_v')")
         page.keys("m")
-        page.until("model('said').text.includes('was stopped; no file is left')")
+        page.until("model('movie_status').text.includes('was stopped; no file is left')")
         assert sorted(file.name for file in wave.path.glob("*movie*")) == sorted(names[: 2 + there])
 
 
@@ -586,8 +593,8 @@ def test_a_line_of_a_result_that_grows_takes_the_new_frames_in(driver, tmp_path)
         for index in range(3, 6):
             store.write_frame(index, smooth_record(index))
         store.finish()
-        page.until("model('wave').data.image[0].shape[1] === 6 && !model('told_of_line').visible")
-        expected = read_profile(Maps.of(Result.open(store.path)), "u", (25, 40, 95, 45))
+        page.until("model('wave').data.image[0].shape[1] === 6 && !model('line_status').visible")
+        expected = read_profile(Maps.from_result(Result.open(store.path)), "u", (25, 40, 95, 45))
         np.testing.assert_allclose(
             array(page, "model('wave').data.image[0]"), expected.values.T.ravel(), rtol=1e-5, atol=1e-7
         )

@@ -24,7 +24,7 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.report import write_report
 from rgbmidic.results import FrameRecord, Maps, Origin, Result, ResultStore, export_result
 from rgbmidic.results.histories import read_histories
-from rgbmidic.results.physical import Physical
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import FrameSettings, ProbeSettings, RegionSettings, ScaleSettings, TestSettings, read_test
 from rgbmidic.typing import FloatArray
 from rgbmidic_calibration.camera import estimate_lens, estimate_plane
@@ -90,13 +90,13 @@ def result_of(path: Path, fields: list[FloatArray], scale: ScaleSettings) -> Res
         for index, (u, v) in enumerate(fields):
             std = {"u_std": np.full(NODES, STD[0]), "v_std": np.full(NODES, STD[1])}
             head = {"number": index, "status": 0, "node_status": np.zeros(NODES)}
-            store.write_frame(index, FrameRecord.of(nodes=NODES, lights=1, **head, u=u, v=v, **std))
+            store.write_frame(index, FrameRecord.from_values(nodes=NODES, lights=1, **head, u=u, v=v, **std))
         store.finish()
     return Result.open(path)
 
 
 def largest_error(result: Result, exact: tuple[float, float], scale: ScaleSettings | None = None) -> float:
-    values = Physical.of(result, scale).frame(0)
+    values = ResultInUnits.from_result(result, scale).frame(0)
     return float(max(np.nanmax(np.abs(values[name] - true)) for name, true in zip(("e1", "e2"), exact, strict=True)))
 
 
@@ -171,7 +171,7 @@ def test_every_output_has_the_same_millimetres(stretched: tuple[Result, Path]) -
     node = int(np.argmin(np.hypot(*(MESH.nodes - [400, 300]).T)))
     place = MESH.nodes[node]
     ends = (*MESH.nodes[node], *MESH.nodes[0])
-    physical = Physical.of(result)
+    physical = ResultInUnits.from_result(result)
     values = physical.frame(1)
     u, v = (float(values[name][node]) for name in "uv")
     now = place + np.array([result.u[1][node], result.v[1][node]])
@@ -206,10 +206,10 @@ def test_every_output_has_the_same_millimetres(stretched: tuple[Result, Path]) -
     np.testing.assert_allclose(data.strain[1, :, 0], values["exx"], rtol=1e-5)
     assert data.u.units == "mm"
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(data)).strain, data.strain)
-    viewed = Maps.of(result)
+    viewed = Maps.from_result(result)
     assert viewed.read("u", 1).values[node] == pytest.approx(u, abs=1e-6)
     np.testing.assert_allclose(viewed.read("exx", 1).values, values["exx"])
-    np.testing.assert_allclose(viewed.read("u", 1).moved[node], now)
+    np.testing.assert_allclose(viewed.read("u", 1).deformed_nodes[node], now)
     write_report(result, folder / "report.html")
     text = (folder / "report.html").read_text(encoding="utf-8")
     assert "lens and plane" in text
@@ -223,11 +223,11 @@ def test_another_camera_takes_its_place_and_contradictions_are_refused(
     camera = CameraCalibration.read(folder / "camera.json")
     double = np.diag([2.0, 2, 1]) @ camera.homography
     replace(camera, homography=double).write(folder / "double.json")
-    again = Physical.of(result, ScaleSettings(camera=folder / "double.json")).frame(1)["u"]
-    np.testing.assert_allclose(again, 2 * Physical.of(result).frame(1)["u"], rtol=1e-6)
+    again = ResultInUnits.from_result(result, ScaleSettings(camera=folder / "double.json")).frame(1)["u"]
+    np.testing.assert_allclose(again, 2 * ResultInUnits.from_result(result).frame(1)["u"], rtol=1e-6)
     replace(camera, homography=None, covariance=np.zeros((16, 16))).write(folder / "lens.json")
     with pytest.raises(InputError, match=r"lens\.json holds no plane"):
-        Physical.of(result, ScaleSettings(camera=folder / "lens.json"))
+        ResultInUnits.from_result(result, ScaleSettings(camera=folder / "lens.json"))
     replace(camera, shape=(480, 600)).write(folder / "other.json")
     with pytest.raises(CalibrationError, match=r"other\.json \(scale\.camera\) .* 600 x 480 px, .* 640 x 480 px"):
         read_histories(result, ProbeSettings(points=((300, 200),)), scale=ScaleSettings(camera=folder / "other.json"))
@@ -235,7 +235,7 @@ def test_another_camera_takes_its_place_and_contradictions_are_refused(
         result.to_xarray(ScaleSettings(camera=folder / "none.json"))
     replace(camera, lens=camera.lens * [1, 1, 1, -40, 1, 1, 1, 1]).write(folder / "bent.json")
     with pytest.raises(InputError, match=r"bent\.json does not image all of the mesh"):
-        Physical.of(result, ScaleSettings(camera=folder / "bent.json"))
+        ResultInUnits.from_result(result, ScaleSettings(camera=folder / "bent.json"))
     with pytest.raises(ConfigurationError, match=r"scale\.camera .* scale\.mm_per_pixel"):
         ScaleSettings(camera=folder / "camera.json", mm_per_pixel=0.1)
     test = folder / "TEST.toml"
@@ -267,8 +267,8 @@ def test_speckle_on_a_tilted_specimen_is_measured_without_its_false_strain(tmp_p
     }
     result = measure(TestSettings.from_mapping(document, tmp_path), tmp_path / "result")
     index = len(result) - 1
-    plane = Physical.of(result).frame(index)
-    plain = Physical.of(result, ScaleSettings(mm_per_pixel=0.1)).frame(index)
+    plane = ResultInUnits.from_result(result).frame(index)
+    plain = ResultInUnits.from_result(result, ScaleSettings(mm_per_pixel=0.1)).frame(index)
     assert np.nanmean(np.hypot(plane["u"], plane["v"])) == pytest.approx(np.hypot(*motion), rel=1e-4)
     mean = {name: float(np.sqrt(np.nanmean(values["e1"] ** 2))) for name, values in (("plane", plane), ("px", plain))}
     assert mean["px"] > 1e-3

@@ -18,7 +18,7 @@ from rgbmidic.fields import NodalCovariance, StrainGauges
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan
 from rgbmidic.results import export_result
-from rgbmidic.results.physical import Physical, placement_of
+from rgbmidic.results.result_in_units import ResultInUnits, placement_of
 from rgbmidic.settings import read_test
 from rgbmidic.typing import FloatArray
 
@@ -130,7 +130,7 @@ def test_a_test_is_measured_on_the_mesh_of_a_file(result: Result) -> None:
     placement = placement_of(result)
     assert placement is not None
     assert placement.to_px(result.node_mm) == pytest.approx(result.nodes)
-    assert Physical.untimed(result).units.mm_per_pixel == pytest.approx(0.1)
+    assert ResultInUnits.without_times(result).units.mm_per_pixel == pytest.approx(0.1)
 
 
 def test_every_output_has_the_numbers_and_the_mesh_s_own_coordinates(result: Result, tmp_path: Path) -> None:
@@ -186,10 +186,10 @@ def test_small_elements_and_bad_input_are_told(
 def test_the_set_up_page_draws_the_mesh_of_the_file_and_keeps_its_section(test_file: Path) -> None:
     document = pytest.importorskip("bokeh.document")
     setup = pytest.importorskip("rgbmidic.view.setup")
-    page = setup.SetupPage(document.Document(), setup.Draft.of(test_file), [], dark=False)
+    page = setup.SetupPage(document.Document(), setup.Draft.from_path(test_file), [], dark=False)
     page._make_mesh()
     assert len(page._edges.data["xs"]) == len(MESH.elements)
-    assert page._changed().text == test_file.read_text()
+    assert page._edited_draft().text == test_file.read_text()
 
 
 def test_with_a_camera_the_mesh_lies_on_its_plane(test_file: Path) -> None:

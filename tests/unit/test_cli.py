@@ -23,7 +23,15 @@ from results import corrupt, make_origin, make_result, random_record, smooth_rec
 from small_tests import colour_test
 
 from rgbmidic import __version__, cli, report
-from rgbmidic.command import FRAME_OPTIONS, execute, gather, print_table, read_frames, read_place, read_shape
+from rgbmidic.command import (
+    FRAME_OPTIONS,
+    collect_options,
+    execute,
+    print_table,
+    read_coordinates,
+    read_frames,
+    read_shape,
+)
 from rgbmidic.errors import FrameError, InputError
 from rgbmidic.results import FrameRecord, Origin, Result, ResultStore
 
@@ -252,7 +260,9 @@ def _measure_of(*ends: str, light: str = "light") -> Callable[..., Result]:
         names = [f"f{index}" for index in range(1 + len(ends))]
         origin = Origin(nodes=np.zeros((4, 2)), elements=[[0, 1, 2]], names=names, lights=[light])
         store = ResultStore.create(out, origin, overwrite=True)
-        good = FrameRecord.of(nodes=4, lights=1, status=0, node_status=[0, 0, 0, 1], light_fraction=np.ones((4, 1)))
+        good = FrameRecord.from_values(
+            nodes=4, lights=1, status=0, node_status=[0, 0, 0, 1], light_fraction=np.ones((4, 1))
+        )
         for index, reason in enumerate(("", *ends)):
             failed = FrameRecord.failed(reason, nodes=4, lights=1, unread=reason == "torn")
             store.write_frame(index, failed if reason else good)
@@ -540,7 +550,7 @@ def test_a_parameter_is_gathered_from_its_options():
     options = {"a": Annotated[int | None, typer.Option("--a")], "b": Annotated[str | None, typer.Option("--b")]}
 
     @app.command()
-    @gather("sizes", options, dict)
+    @collect_options("sizes", options, dict)
     def command(
         path: Annotated[str, typer.Argument()],
         sizes: dict[str, Any],
@@ -613,10 +623,10 @@ def test_batch_goes_on_after_a_failure_and_ends_with_status_1(command: Run, tmp_
 @pytest.mark.parametrize("form", ["X0,Y0:X1,Y1", "X0,Y0,X1,Y1"])
 @pytest.mark.parametrize("text", ["40,60:200,160.5", "40,60,200,160.5"])
 def test_two_corners_have_one_grammar_in_all_commands(form: str, text: str) -> None:
-    assert read_place(text, "--region", form) == (40, 60, 200, 160.5)
+    assert read_coordinates(text, "--region", form) == (40, 60, 200, 160.5)
     for wrong in ("40,60:200", "40:60,200,160", "40,60,200,x", ""):
         with pytest.raises(InputError, match=f"--region is {form} in px, such as"):
-            read_place(wrong, "--region", form)
+            read_coordinates(wrong, "--region", form)
 
 
 def test_frames_have_one_grammar_in_all_commands() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rgbmidic.command import Once
+from rgbmidic.command import OnceFilter
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.settings import TestSettings
 
@@ -39,7 +39,7 @@ def test_settings_with_huge_texts_are_refused_in_a_line(sections: dict[str, obje
 
 
 def test_a_text_is_shown_once() -> None:
-    once = Once()
+    once = OnceFilter()
     records = [
         logging.makeLogRecord({"msg": text, "args": args}) for text, args in (("a %d", (1,)), ("b", ()), ("a 1", ()))
     ]

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from rgbmidic import timing
-from rgbmidic.timing import STAGES, each, stage, timed
+from rgbmidic.timing import STAGES, record_stages, stage, timed_items
 
 Pass = Callable[[float], None]
 
@@ -39,9 +39,9 @@ def starts(wait: Pass) -> Iterator[int]:
 
 
 def test_a_stage_within_a_stage_counts_for_itself_and_all_adds_up(wait):
-    with timed() as seconds:
+    with record_stages() as seconds:
         wait(1)
-        for _ in each("search", starts(wait)):
+        for _ in timed_items("search", starts(wait)):
             weigh(wait)
     assert seconds == dict.fromkeys(STAGES, 0.0) | {"weights": 2, "iteration": 5, "search": 7, "rest": 1}
 
@@ -53,11 +53,11 @@ def fail(wait: Pass) -> None:
 
 
 def test_an_error_leaves_the_stage_and_nothing_is_measured_unasked(wait):
-    with timed() as seconds:
+    with record_stages() as seconds:
         with pytest.raises(ValueError, match="no"):
             fail(wait)
         wait(3)
     assert seconds == dict.fromkeys(STAGES, 0.0) | {"equations": 2, "rest": 3}
-    with timed(False) as unasked:
+    with record_stages(False) as unasked:
         weigh(wait)
     assert unasked == {}

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rgbmidic.arguments import checked
-from rgbmidic.errors import ConfigurationError, FrameError, InputError, legible
+from rgbmidic.errors import ConfigurationError, FrameError, InputError, printable
 from rgbmidic.frames import open_series, open_source
 from rgbmidic.frames.data import ChannelFrame, Mosaic, Window, sampled_channels
 from rgbmidic.illumination.calibration import Calibration
@@ -35,7 +35,7 @@ from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.pipeline.plan import finite_elements_of, read_region
 from rgbmidic.pipeline.suitability import clipping, repetition, separation_doubts
 from rgbmidic.settings import ELEMENT_SIZE, FrameSettings, TestSettings
-from rgbmidic.typing import BoolArray, FloatArray, FloatImage, Progress
+from rgbmidic.typing import BoolArray, FloatArray, FloatImage, ProgressCallback
 
 
 def inspect_files(
@@ -79,7 +79,7 @@ def inspect_files(
     if files:
         paths = [Path(file) for file in files]
         frames = tuple(open_source(path, user_metadata, read_calibration).read(0) for path in paths)
-        name, file_names = " + ".join(legible(path.name) for path in paths), " + ".join(map(str, paths))
+        name, file_names = " + ".join(printable(path.name) for path in paths), " + ".join(map(str, paths))
     elif test is not None:
         series, index = open_series(user_metadata, test.base, read_calibration), user_metadata.reference[0]
         frames = series.read(index)
@@ -117,7 +117,7 @@ def inspect_frame(
     name: str = "frame",
     seed: int = 0,
     accept: Sequence[str] = (),
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
 ) -> Inspection:
     """Inspect one frame before a test: exposure, lights, reflections, speckle, noise, expected uncertainty.
 

@@ -209,4 +209,4 @@ def _finish(axis: Axes, inspection: Inspection, title: str) -> None:
     if not inspection.region.all():
         axes_coordinates = np.arange(x_low + 0.5, x_high), np.arange(y_low + 0.5, y_high)
         axis.contour(*axes_coordinates, inspection.region, [0.5], colors=["#f2c037"], linewidths=0.8)
-    finish_picture(axis, (x_low, x_high), (y_low, y_high), first=axis.get_subplotspec().is_first_col())  # type: ignore[union-attr]
+    finish_picture(axis, (x_low, x_high), (y_low, y_high), has_y_label=axis.get_subplotspec().is_first_col())  # type: ignore[union-attr]

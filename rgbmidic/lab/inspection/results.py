@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rgbmidic.errors import renamed_attributes
 from rgbmidic.illumination.checks import Check, reported
 from rgbmidic.illumination.contrast import CONTRAST
 from rgbmidic.illumination.images import IlluminationImages
@@ -18,6 +16,7 @@ from rgbmidic.lab.inspection.channels import CONSTANTS
 from rgbmidic.lab.inspection.prediction import Prediction
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.suitability import SPECKLES, SUITABILITY
+from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
@@ -105,6 +104,7 @@ class LightSummary:
     std_alone: Spread
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inspection:
     """Results of the inspection of one frame before a test.
@@ -195,9 +195,6 @@ class Inspection:
     clipping: str
     repetition: str
     doubts: tuple[Check, ...]
-
-    if not TYPE_CHECKING:  # mypy would accept any name
-        __getattr__ = renamed_attributes("Inspection", hidden="lacks_contrast", unmeasured="unmeasured_fraction")
 
     @property
     def unmeasured_fraction(self) -> float:

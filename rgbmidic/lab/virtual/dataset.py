@@ -24,19 +24,19 @@ from rgbmidic.frames.images import write_dng, write_tiff
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.frame_check import Frame
 from rgbmidic.lab.virtual.rendering import render
-from rgbmidic.results.files import writing
+from rgbmidic.results.files import write_errors
 from rgbmidic.scene.camera import Camera, Light, green_signs, mosaic_samples
 from rgbmidic.scene.scene import DatasetSettings, Plate, Scene, State, Target, read_scene
 from rgbmidic.scene.surface import Finish, Surface
 from rgbmidic.scene.zones import region_in_view, truth
-from rgbmidic.typing import FloatImage, Progress
+from rgbmidic.typing import FloatImage, ProgressCallback
 
 EXPOSURES = tuple(0.13 * time for time in (0.5, 1, 2, 4, 6, 10))
 """Fraction of the full scale that the brightest sample of a white card reaches, .13 per ms of the exposure times that
 calibration/README.md states; in the last it saturates."""
 
 
-def write_dataset(scene_toml: Path | str, out: Path | str, progress: Progress | None = None) -> Path:
+def write_dataset(scene_toml: Path | str, out: Path | str, progress: ProgressCallback | None = None) -> Path:
     """Render the virtual test that a SCENE.toml describes.
 
     Written to `out`: ``frames/`` (frame 0 shows the body at rest; a monochrome camera gets one folder per light),
@@ -103,7 +103,7 @@ def _check_output(scene: Scene, out: Path) -> None:
             raise InputError(f"a light's name becomes a folder's: letters, digits, - and _ only, not {light.name!r}")
         if light.name in ("all", "dark"):
             raise InputError(f"a light cannot be called {light.name!r}: that is the name of a folder of captures")
-    with writing(out):
+    with write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         has_files = any(out.iterdir())
     if has_files:

@@ -22,7 +22,7 @@ from rgbmidic.frames.data import ChannelFrame, Mosaic
 from rgbmidic.illumination.calibration import Calibration, TargetLights
 from rgbmidic.illumination.images import Registration, frame_geometry
 from rgbmidic.settings import FrameSettings
-from rgbmidic.text import uncertain
+from rgbmidic.text import format_with_std
 from rgbmidic_calibration.camera import estimate_lens, estimate_plane
 from rgbmidic_calibration.cli import app
 from rgbmidic_calibration.jobs import calibrate_camera
@@ -362,14 +362,14 @@ def test_the_command_writes_what_the_library_reads(tmp_path: Path, capsys: pytes
     assert (np.abs(read.lens - LENS)[:4] < 4 * std[:4]).all()
     tilt, tilt_std = read.tilt_deg
     assert tilt == pytest.approx(2.0, abs=4 * tilt_std + 0.005)
-    assert f"tilt {uncertain(tilt, tilt_std)}" in " ".join(capsys.readouterr().out.split())
+    assert f"tilt {format_with_std(tilt, tilt_std)}" in " ".join(capsys.readouterr().out.split())
     width = cv2.imread(str(picture)).shape[1]
     picture.unlink()
     assert command.execute(app, ["show", str(out), "--picture", str(picture)]) == 0
     assert cv2.imread(str(picture)).shape[1] == pytest.approx(2 / 3 * width, abs=2)  # a file has no residuals to show
     output = " ".join(capsys.readouterr().out.split())
     assert "6 views" in output
-    assert f"tilt {uncertain(tilt, tilt_std)}" in output
+    assert f"tilt {format_with_std(tilt, tilt_std)}" in output
     # the lens of this file with another photograph of the plane
     again = tmp_path / "again.json"
     assert command.execute(app, [*options[:-1], str(again), "--lens", str(out), "--plane", plane]) == 0

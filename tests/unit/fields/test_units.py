@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from rgbmidic.fields import rounded, uncertain
+from rgbmidic.fields import format_value, format_with_std
 
 
 @pytest.mark.parametrize(
@@ -28,11 +28,11 @@ from rgbmidic.fields import rounded, uncertain
     ],
 )
 def test_value_and_uncertainty_end_at_one_place(value: float, std: float, unit: str, text: str) -> None:
-    assert uncertain(value, std, unit) == text
+    assert format_with_std(value, std, unit) == text
 
 
 def test_two_digits_of_any_uncertainty_are_kept() -> None:
     for std in 10 ** np.random.default_rng(0).uniform(-12, 8, 500):
-        text = rounded(std, std)
+        text = format_value(std, std)
         assert float(text) == pytest.approx(std, rel=0.05)
-        assert rounded(std * 3, std).partition("e")[0][-1].isdigit()
+        assert format_value(std * 3, std).partition("e")[0][-1].isdigit()

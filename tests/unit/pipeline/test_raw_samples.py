@@ -202,7 +202,7 @@ def test_the_reason_names_the_node_that_still_moves(tmp_path):
     assert result.status[1] == Status.NOT_CONVERGED
     x, y, motion = map(float, re.search(r"x (\d+), y (\d+): by ([\d.]+) px", result.reasons[1]).groups())
     assert np.hypot(*(result.nodes - [x, y]).T).min() < 1
-    assert motion == pytest.approx(next(result.each("history", [1]))[-1], rel=0.01)
+    assert motion == pytest.approx(next(result.iterate("history", [1]))[-1], rel=0.01)
     assert "solver.max_iterations is 1: allow more" in result.reasons[1]
 
 

@@ -30,7 +30,7 @@ from rgbmidic.frames.data import ChannelFrame
 from rgbmidic.pipeline import Plan, engine, frame, measure, run
 from rgbmidic.pipeline.plan import ProcessState
 from rgbmidic.results import Maps, Result, finish_result
-from rgbmidic.results.physical import Physical
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ScaleSettings, TestSettings
 
 COUNT, SHAPE = 36, (72, 80)
@@ -340,7 +340,7 @@ def test_a_finished_result_is_gone_on_with_only_where_it_is_damaged(
 ) -> None:
     out = Path(shutil.copytree(whole.path, tmp_path / "result"))
     kept = (out / "provenance.json").read_bytes()
-    monkeypatch.setattr("rgbmidic.results.result.now", lambda: "later")
+    monkeypatch.setattr("rgbmidic.results.result.current_time", lambda: "later")
     measured: list[str] = []
     same(in_order(settings(movie), out, resume=True, progress=counted(measured)), whole)
     assert "is finished and whole: nothing is left to be measured" in caplog.text
@@ -390,7 +390,9 @@ def test_how_a_result_is_read_is_stated_anew_by_going_on_with_it(movie: Path, wh
     plane = TestSettings.from_mapping(
         {**settings(movie).to_mapping(), "scale": {"camera": str(tmp_path / "camera.json")}}, movie
     )
-    (u,), (again,) = (np.array([Physical.of(one).frame(3)["u"]]) for one in (result, measure(plane, out, resume=True)))
+    (u,), (again,) = (
+        np.array([ResultInUnits.from_result(one).frame(3)["u"]]) for one in (result, measure(plane, out, resume=True))
+    )
     np.testing.assert_allclose(again, u, rtol=1e-6, atol=1e-9)
 
 
@@ -490,12 +492,12 @@ def test_the_discretisation_error_is_kept_where_it_is_asked_for(movie: Path, tmp
     for asked in (False, "key", True):
         document["mesh"]["error"] = asked
         result = kept[asked] = measure(TestSettings.from_mapping(document, movie), tmp_path / str(asked))
-        known = [bool(values.size) for values in result.each("u_mesh_error")]
+        known = [bool(values.size) for values in result.iterate("u_mesh_error")]
         assert known == [asked is True or (asked == "key" and frame in (0, 16, 17)) for frame in range(18)]
     assert np.array_equal(kept[True].u, kept[False].u, equal_nan=True)
-    assert kept["key"].exx_mesh_error.shape == kept["key"].u.shape
-    maps, plain = Maps.of(kept[True]), Maps.of(kept[False])
-    assert "finer_mesh" not in plain.all
+    assert kept["key"].nodal_exx_mesh_error.shape == kept["key"].u.shape
+    maps, plain = Maps.from_result(kept[True]), Maps.from_result(kept[False])
+    assert "finer_mesh" not in plain.quantities
     total, error = (maps.read(f"u_{name}", 17).values for name in ("total", "mesh_error"))
     assert np.allclose(total, np.hypot(error, kept[True].u_std[17]), equal_nan=True)
     assert np.isfinite(maps.read("finer_mesh", 17).values).any()

@@ -111,9 +111,9 @@ def test_renewed_references_have_windows_of_their_own(tmp_path: Path, settings: 
             tmp_path / f"f{index}.tif", ChannelFrame(values=values, black_level=np.array([64.0]), white_level=4095)
         )
     parts, whole = both(settings('kind = "monochrome"\nupdate_reference = true'))
-    reference_updates = [list(of) for of in parts.each("reference_updates")]
+    reference_updates = [list(of) for of in parts.iterate("reference_updates")]
     assert len(reference_updates[-1]) > 1
-    assert reference_updates == [list(of) for of in whole.each("reference_updates")]
+    assert reference_updates == [list(of) for of in whole.iterate("reference_updates")]
     assert apart(parts, whole).max() < ROUNDING
 
 

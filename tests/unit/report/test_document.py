@@ -22,7 +22,7 @@ from rgbmidic.illumination.linear import NoiseModel
 from rgbmidic.report import curves, document, remove_pictures, style, write_batch_page, write_report
 from rgbmidic.report.noise_floor import noise_floor
 from rgbmidic.results import UNKNOWN_TIME, FrameRecord, Maps, Result, ResultStore, read_profile
-from rgbmidic.results.physical import Physical
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import (
     ChannelSettings,
     FrameSettings,
@@ -82,7 +82,7 @@ def settings(**sections: Any) -> TestSettings:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """No pictures: drawing them takes nearly all of the time."""
-    monkeypatch.setattr(style, "embedded", lambda _: "data:image/png;base64,")
+    monkeypatch.setattr(style, "data_url", lambda _: "data:image/png;base64,")
     for method in ("fields", "strip"):
         monkeypatch.setattr(document.figures.MapDrawer, method, lambda *_, **__: None)
     for module in (curves, document.figures, style):
@@ -102,11 +102,13 @@ def still(index: int, noise: float, **values: Any) -> FrameRecord:
     u, v = np.random.default_rng(index).normal(0, noise, (2, NODES))
     std = np.full(NODES, noise)
     given = {"number": index, "status": 0, "u": u, "v": v, "u_std": std, "v_std": std} | values
-    return FrameRecord.of(nodes=NODES, lights=len(LIGHTS), node_status=np.zeros(NODES, dtype=np.uint8), **given)
+    return FrameRecord.from_values(
+        nodes=NODES, lights=len(LIGHTS), node_status=np.zeros(NODES, dtype=np.uint8), **given
+    )
 
 
 def test_the_page_is_whole_and_needs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(style, "embedded", partial(style.embedded, dpi=40))  # coarse: for the time
+    monkeypatch.setattr(style, "data_url", partial(style.data_url, dpi=40))  # coarse: for the time
     for name in ("brightness", "convergence", "residual"):  # have tests of their own
         monkeypatch.setattr(document.figures, f"{name}_figure", lambda *_: Figure(facecolor="red"))
     image = np.random.default_rng(0).normal(1000, 100, (3, 80, 120))
@@ -224,7 +226,7 @@ def test_key_frames_share_the_change_of_the_field(tmp_path: Path) -> None:
     """At rest, then a fast event, then slow motion: frames where the path of the field has equal parts."""
     moved = np.r_[np.zeros(10), np.linspace(0, 9, 10), np.linspace(9, 10, 11)[1:]]
     result = make(tmp_path / "r", [still(i, 1e-9, u=np.full(NODES, u)) for i, u in enumerate(moved)])
-    history = curves.TimeHistory(Physical.of(result), range(len(moved)))
+    history = curves.TimeHistory(ResultInUnits.from_result(result), range(len(moved)))
     assert history.key_frames(5) == (12, 14, 16, 18, 29)
 
 
@@ -334,18 +336,20 @@ def test_the_noise_floor_is_what_a_frame_scatters_by_against_the_reference(tmp_p
     frames = FrameSettings(path=("a",), reference=tuple(range(count)))
     stated = TestSettings(frames=frames, region=RegionSettings(rectangle=(0, 0, 9, 9)))
     origin = {"references": range(count), "settings": stated}
-    floor = noise_floor(Physical.of(make(tmp_path / "r", records, **origin), ScaleSettings(mm_per_pixel=0.1)))
+    floor = noise_floor(
+        ResultInUnits.from_result(make(tmp_path / "r", records, **origin), ScaleSettings(mm_per_pixel=0.1))
+    )
     assert floor is not None
     assert floor.count == count
     accuracy = 4 / np.sqrt(2 * (count - 1) * NODES)
     for name, field in (("u", u), ("v", v)):
-        assert floor.measured[name] == pytest.approx(0.1 * 0.02 * np.sqrt(1 + 1 / count), rel=accuracy)
+        assert floor.single_frame[name] == pytest.approx(0.1 * 0.02 * np.sqrt(1 + 1 / count), rel=accuracy)
         common = np.std(field.mean(axis=1), ddof=1) * np.sqrt(1 + 1 / count)
-        assert floor.common[name] == pytest.approx(0.1 * common, rel=1e-4)
+        assert floor.common_mode[name] == pytest.approx(0.1 * common, rel=1e-4)
 
 
 def test_one_static_frame_tells_no_noise(tmp_path: Path) -> None:
-    assert noise_floor(Physical.of(make(tmp_path / "r", [still(0, 0.0), still(1, 0.1)]))) is None
+    assert noise_floor(ResultInUnits.from_result(make(tmp_path / "r", [still(0, 0.0), still(1, 0.1)]))) is None
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
@@ -388,7 +392,7 @@ def test_position_against_time_is_along_the_stated_lines(
     assert len(seen) == bool(expected)
     for profile in seen:
         ends = lines[0] if lines else (X.min(), np.mean([Y.min(), Y.max()]), X.max(), np.mean([Y.min(), Y.max()]))
-        read = read_profile(Maps.of(result), profile.field.name, ends, range(1, count))
+        read = read_profile(Maps.from_result(result), profile.field.name, ends, range(1, count))
         np.testing.assert_array_equal(profile.values, read.values)
         np.testing.assert_allclose(profile.times, 2e-5 * np.arange(1, count))
         assert f"against time in {count - 1} of {count - 1} measured frames" in words

@@ -38,13 +38,13 @@ def _one_frame(
 ) -> Result:
     """A result of one frame with the quantities given."""
     with ResultStore.create(path, make_origin(1, reference=reference, notes=notes or {})) as store:
-        store.write_frame(0, FrameRecord.of(nodes=NODES, lights=len(LIGHTS), **values))
+        store.write_frame(0, FrameRecord.from_values(nodes=NODES, lights=len(LIGHTS), **values))
     return Result.open(path)
 
 
 def _maps(result: Result, frame: int, kind: str) -> Any:
     """Maps of a kind in a frame."""
-    return figures.MapDrawer(Maps.of(result)).fields(frame, figures.MAPS[kind])
+    return figures.MapDrawer(Maps.from_result(result)).fields(frame, figures.MAPS[kind])
 
 
 def _places(picture: Any) -> tuple[AnyArray, AnyArray]:
@@ -75,7 +75,9 @@ def test_a_map_of_a_mesh_with_a_crack_has_the_values_of_both_sides(tmp_path: Pat
     with ResultStore.create(tmp_path / "out", origin) as store:
         zero = np.zeros(len(mesh.nodes))
         jump = np.where(left, np.where(above, -1.0, 1.0), 0.0)
-        store.write_frame(0, FrameRecord.of(nodes=len(mesh.nodes), lights=1, u=zero, v=jump, u_std=zero, v_std=zero))
+        store.write_frame(
+            0, FrameRecord.from_values(nodes=len(mesh.nodes), lights=1, u=zero, v=jump, u_std=zero, v_std=zero)
+        )
     picture = _maps(Result.open(tmp_path / "out"), 0, "displacement").axes[1].images[-1]
     x, y = _places(picture)
     shown = picture.get_array()
@@ -102,7 +104,7 @@ def test_a_reference_that_shows_a_part_of_the_frame_lies_where_it_belongs(tmp_pa
     assert whole.shape == (80, 120)
     np.testing.assert_array_equal(whole[4:, 8:], result.reference[0])
     assert (whole[:4] == whole[0, 0]).all()
-    image, shade = figures.MapDrawer(Maps.of(result)).reflections(0).axes[0].images
+    image, shade = figures.MapDrawer(Maps.from_result(result)).reflections(0).axes[0].images
     assert image.get_extent() == [7.5, 119.5, 79.5, 3.5]
     places, rows = _places(shade)
     seen = shade.get_array()[..., 3] > 0
@@ -112,7 +114,7 @@ def test_a_reference_that_shows_a_part_of_the_frame_lies_where_it_belongs(tmp_pa
 
 def test_axes_that_are_drawn_once_look_as_if_drawn_for_each_map(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=3, reference=np.stack([IMAGE] * 3))
-    maps = figures.MapDrawer(Maps.of(result), 60)
+    maps = figures.MapDrawer(Maps.from_result(result), 60)
     before = _pixels(maps.fields(1, figures.MAPS["displacement"]))
     frozen = _pixels(maps.fields(2, figures.MAPS["displacement"]))
     anew = _pixels(_maps(result, 2, "displacement"))
@@ -132,7 +134,7 @@ def test_every_map_shows_its_quantities_around_the_mesh(tmp_path: Path, kind: st
     ramp = np.linspace(1, 2, NODES)
     given = {"u": 0.01 * X**2 / 60, "v": 0.02 * Y, "u_std": ramp, "v_std": 2 * ramp, "misfit": ramp}
     result = _one_frame(tmp_path / "out", np.ones((3, 500, 700)), **given)
-    figure, maps = _maps(result, 0, kind), Maps.of(result)
+    figure, maps = _maps(result, 0, kind), Maps.from_result(result)
     for axis, name in zip(figure.axes, figures.MAPS[kind], strict=False):
         assert axis.get_title() == maps.field(name).label
         picture, values = axis.images[-1].get_array(), maps.read(name, 0).values
@@ -148,7 +150,7 @@ def test_a_derived_field_has_its_uncertainty_beside_it_and_hatches_where_it_may_
 ) -> None:
     still = {"u": 0.01 * (X - 60), "v": 0 * X, "u_std": np.full(NODES, 0.01), "v_std": np.full(NODES, 0.01)}
     result = _one_frame(tmp_path / "out", np.stack([IMAGE] * 3), **still)
-    maps = Maps.of(result, gauge=70.0, measure="engineering")
+    maps = Maps.from_result(result, gauge=70.0, measure="engineering")
     drawer = figures.MapDrawer(maps)
     figure, read = drawer.fields(0, ["exx"], std=True, hatched=True), maps.read("exx", 0)
     assert [axis.get_title() for axis in figure.axes] == ["εxx", "σ(εxx)"]
@@ -210,7 +212,7 @@ def test_all_figures_can_be_written_by_two_processes(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=12, reference=np.stack([IMAGE] * 3))
     told_once = {"convergence", "residual", "brightness"}
     with_pictures = {*EVERY_FRAME, "masks", "reflections"}
-    files = write_figures(Maps.of(result), tmp_path / "figures", [4], processes=2, few=5)
+    files = write_figures(Maps.from_result(result), tmp_path / "figures", [4], processes=2, min_pictures=5)
     assert {file.stem for file in files} == told_once | {f"{name}_000004" for name in with_pictures}
     assert all(file.stat().st_size > 5000 for file in files)
 
@@ -218,7 +220,7 @@ def test_all_figures_can_be_written_by_two_processes(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("unsaved")
 def test_each_frame_has_the_pictures_it_can_have(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=12, reference=np.stack([IMAGE] * 3))
-    files = write_figures(Maps.of(result), tmp_path / "figures", [3, 4])
+    files = write_figures(Maps.from_result(result), tmp_path / "figures", [3, 4])
     assert {file.stem.split("_")[0] for file in files if "000004" in file.stem} == {
         *EVERY_FRAME,
         "masks",
@@ -229,18 +231,18 @@ def test_each_frame_has_the_pictures_it_can_have(tmp_path: Path) -> None:
 
 def test_a_profile_shows_the_first_the_last_and_busy_frames_between() -> None:
     values = np.full((20, 5), np.nan)
-    assert curves._rows_shown(values) == [0, 19]
-    assert curves._rows_shown(values[:6]) == [0, 1, 2, 3, 4, 5]
+    assert curves._select_rows(values) == [0, 19]
+    assert curves._select_rows(values[:6]) == [0, 1, 2, 3, 4, 5]
     values[8:12] = 1.0
-    assert curves._rows_shown(values) == [0, 8, 9, 10, 11, 19]
+    assert curves._select_rows(values) == [0, 8, 9, 10, 11, 19]
     values[:] = 1.0
-    assert curves._rows_shown(values)[::5] == [0, 19]
-    assert curves._rows_shown(values[:1]) == [0]
+    assert curves._select_rows(values)[::5] == [0, 19]
+    assert curves._select_rows(values[:1]) == [0]
 
 
 def test_three_deformed_frames_get_pictures_and_the_reference_none() -> None:
-    assert figures.spread(tuple(range(1, 12)), 3) == (1, 6, 11)
-    assert figures.spread((5,), 3) == (5,)
+    assert figures.select_evenly(tuple(range(1, 12)), 3) == (1, 6, 11)
+    assert figures.select_evenly((5,), 3) == (5,)
 
 
 def test_the_reference_is_left_out_of_what_happens_over_the_frames(tmp_path: Path) -> None:
@@ -258,21 +260,25 @@ def test_the_reference_is_left_out_of_what_happens_over_the_frames(tmp_path: Pat
 @pytest.mark.usefixtures("unsaved")
 def test_pictures_are_of_frames_that_were_measured(tmp_path: Path) -> None:
     """The last frames failed: the last picture is of the last one before them."""
-    records = [FrameRecord.of(nodes=NODES, lights=len(LIGHTS), status=0, u=X, v=Y) for _ in range(8)]
+    records = [FrameRecord.from_values(nodes=NODES, lights=len(LIGHTS), status=0, u=X, v=Y) for _ in range(8)]
     records += [FrameRecord.failed("the fragment has left", nodes=NODES, lights=len(LIGHTS)) for _ in range(2)]
     result = make_result(tmp_path / "out", frames=10, record=records.__getitem__)
     drawn = {
-        int(file.stem[-6:]) for file in write_figures(Maps.of(result), tmp_path / "figures") if file.stem[-1].isdigit()
+        int(file.stem[-6:])
+        for file in write_figures(Maps.from_result(result), tmp_path / "figures")
+        if file.stem[-1].isdigit()
     }
     assert drawn == {1, 4, 7}
     none = make_result(tmp_path / "none", frames=4, record=lambda index: records[-1])
-    assert figures.measured_frames(none) == figures.shown_frames(none)
+    assert figures.measured_frames(none) == figures.frames_to_draw(none)
 
 
 def test_displacements_are_in_mm_where_the_scale_is_known(tmp_path: Path) -> None:
     scale = {"mm_per_pixel": 0.05, "mm_per_pixel_std": 0.001}
     settings = TestSettings.from_mapping({**SETTINGS, "scale": scale})
-    record = FrameRecord.of(nodes=NODES, lights=len(LIGHTS), u=X, v=Y, u_std=X / 100, v_std=Y / 100, exx=X)
+    record = FrameRecord.from_values(
+        nodes=NODES, lights=len(LIGHTS), u=X, v=Y, u_std=X / 100, v_std=Y / 100, nodal_exx=X
+    )
     result = make_result(tmp_path / "out", frames=1, record=lambda index: record, settings=settings)
     u, v, *_ = _maps(result, 0, "displacement").axes
     assert (u.get_title(), v.get_title()) == ("u (mm)", "v (mm)")
@@ -288,7 +294,7 @@ def test_displacements_are_in_mm_where_the_scale_is_known(tmp_path: Path) -> Non
 def test_a_status_has_its_names_and_one_colour_a_code(tmp_path: Path) -> None:
     status = np.where(X > 60, 1, 0)
     result = _one_frame(tmp_path / "out", u=X, v=Y, node_status=status)
-    axis = figures.MapDrawer(Maps.of(result)).fields(0, ["node_status"]).axes[0]
+    axis = figures.MapDrawer(Maps.from_result(result)).fields(0, ["node_status"]).axes[0]
     picture = axis.images[-1]
     colours = {tuple(row) for row in picture.cmap(picture.norm(np.arange(4)))}
     assert colours == {to_rgba(colour) for colour in style.STATUS_COLOURS}
@@ -299,15 +305,15 @@ def test_run_xarray_and_maps_have_one_strain_and_say_which(tmp_path: Path) -> No
     """The picture of `run`, the Dataset and the maps: the same numbers, and the title has measure and gauge."""
     stretch = {"u": 0.1 * (X - 60), "v": 0 * Y, "u_std": np.full(NODES, 0.01), "v_std": np.full(NODES, 0.01)}
     result = _one_frame(tmp_path / "out", **stretch)
-    figure, maps = _maps(result, 0, "strain"), Maps.of(result)
+    figure, maps = _maps(result, 0, "strain"), Maps.from_result(result)
     expected = 0.1 + 0.1**2 / 2
     assert np.nanmean(figure.axes[0].images[-1].get_array()) == pytest.approx(expected, rel=1e-3)
-    assert maps.how("exx") in figure.texts[0].get_text()
-    assert "Green-Lagrange" in maps.how("exx")
-    assert "Hencky" in maps.how("equivalent")
+    assert maps.processing_note("exx") in figure.texts[0].get_text()
+    assert "Green-Lagrange" in maps.processing_note("exx")
+    assert "Hencky" in maps.processing_note("equivalent")
     data = result.to_xarray()
     np.testing.assert_array_equal(data.strain[0].sel(component="exx"), maps.read("exx", 0).values.astype(np.float32))
-    assert maps.how("exx") in data.strain.attrs["description"]
+    assert maps.processing_note("exx") in data.strain.attrs["description"]
 
 
 NASTY = ("a$x^2$_1", "_hidden", "r$ed", "x\\alpha_{2}", "кадр", "写真", "no\udcffutf8", "two\nlines", "n" * 200)
@@ -319,13 +325,13 @@ def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
     still = {"u": 0 * X, "v": 0 * X, "light_fraction": np.full((NODES, 3), 0.3), "history": [1.0, 0.1]}
     store = ResultStore.create(tmp_path / "out", origin)
     for index in range(8):
-        store.write_frame(index, FrameRecord.of(nodes=NODES, lights=3, status=0, residual=np.ones(3), **still))
+        store.write_frame(index, FrameRecord.from_values(nodes=NODES, lights=3, status=0, residual=np.ones(3), **still))
     store.finish()
     result = Result.open(tmp_path / "out")
     for figure, names in (
         (figures.convergence_figure(result), NASTY[1:5]),
         (figures.residual_figure(result), NASTY[:3]),
-        (figures.MapDrawer(Maps.of(result)).fractions(0), NASTY[:3]),
+        (figures.MapDrawer(Maps.from_result(result)).fractions(0), NASTY[:3]),
     ):
         figure.savefig(io.BytesIO(), format="png", dpi=30)
         texts = [text for text in figure.findobj(match=Text) if "mathdefault" not in text.get_text()]
@@ -355,7 +361,7 @@ def test_times_are_told_in_the_unit_that_suits_them(reach: float, unit: str) -> 
 def test_numbers_along_an_axis_do_not_touch(tmp_path: Path, numbers: range) -> None:
     def record(index: int) -> FrameRecord:
         known = {"node_status": np.zeros(NODES), "light_fraction": np.full((NODES, 3), 1 / 3)}
-        return FrameRecord.of(nodes=NODES, lights=3, residual=np.ones(3), number=numbers[index], **known)
+        return FrameRecord.from_values(nodes=NODES, lights=3, residual=np.ones(3), number=numbers[index], **known)
 
     result = make_result(tmp_path / "out", frames=len(numbers), record=record)
     assert all(number.is_integer() for number in _numbers(figures.residual_figure(result)))
@@ -365,7 +371,9 @@ def test_numbers_under_a_narrow_map_do_not_touch(tmp_path: Path) -> None:
     tall = Tri3Mesh.from_region(Region.from_rectangle((4010, 5, 4110, 1175), (1200, 4200)), 20)
     origin = make_origin(1, nodes=tall.nodes, elements=tall.elements)
     with ResultStore.create(tmp_path / "out", origin) as store:
-        store.write_frame(0, FrameRecord.of(nodes=len(tall.nodes), lights=len(LIGHTS), exx=tall.nodes[:, 0]))
+        store.write_frame(
+            0, FrameRecord.from_values(nodes=len(tall.nodes), lights=len(LIGHTS), nodal_exx=tall.nodes[:, 0])
+        )
     _numbers(_maps(Result.open(tmp_path / "out"), 0, "strain"))
 
 
@@ -386,7 +394,7 @@ def _numbers(figure: Any) -> list[float]:
 @pytest.mark.usefixtures("unsaved")
 def test_pictures_of_an_earlier_run_are_removed_and_no_others(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out", frames=3, reference=np.stack([IMAGE] * 3))
-    files = write_figures(Maps.of(result), tmp_path / "figures", [2])
+    files = write_figures(Maps.from_result(result), tmp_path / "figures", [2])
     mine = tmp_path / "figures" / "my_displacement.png"
     mine.write_bytes(b"kept")
     remove_pictures(tmp_path)
@@ -396,7 +404,7 @@ def test_pictures_of_an_earlier_run_are_removed_and_no_others(tmp_path: Path) ->
 
 
 def test_frame_where_nothing_is_measured_still_has_figures(tmp_path: Path) -> None:
-    for file in write_figures(Maps.of(_one_frame(tmp_path / "out", reason="damaged")), tmp_path / "figures"):
+    for file in write_figures(Maps.from_result(_one_frame(tmp_path / "out", reason="damaged")), tmp_path / "figures"):
         assert file.stat().st_size > 2000
 
 
@@ -405,14 +413,17 @@ def test_mask_shades_what_is_excluded(tmp_path: Path) -> None:
     weights[0, :20] = 0
     still = {"u": 0 * X, "v": 0 * X, "reflection_thumbnail": 255 - weights}
     result = _one_frame(tmp_path / "out", np.stack([IMAGE] * 3), weights_thumbnail=weights, **still)
-    for figure in (figures.MapDrawer(Maps.of(result)).masks(0), figures.MapDrawer(Maps.of(result)).reflections(0)):
+    for figure in (
+        figures.MapDrawer(Maps.from_result(result)).masks(0),
+        figures.MapDrawer(Maps.from_result(result)).reflections(0),
+    ):
         assert figure is not None
         shade = figure.axes[0].images[-1]
         alpha = shade.get_array()[..., 3]
         assert alpha[:20].min() > 0.5
         assert alpha[20:].max() == 0
         assert shade.get_extent() == [-0.5, 119.5, 79.5, -0.5]
-    figure = figures.MapDrawer(Maps.of(result)).masks(0)
+    figure = figures.MapDrawer(Maps.from_result(result)).masks(0)
     assert figure is not None
     top, bottom = sorted(figure.axes[0].get_ylim())
     share = (40 - top) / (bottom - top)
@@ -425,7 +436,10 @@ def test_pictures_of_a_frame_have_one_unit_and_the_options_of_the_maps(tmp_path:
     notes = {"settings": {"scale": {"mm_per_pixel": 0.5}}}
     dark = {"weights_thumbnail": np.zeros((3, 40, 60)), "reflection_thumbnail": np.full((3, 40, 60), 255)}
     result = _one_frame(tmp_path / "out", np.stack([IMAGE] * 3), notes, u=X / 100, v=Y / 200, **dark)
-    for unit, maps in (("mm", Maps.of(result)), ("px", Maps.of(result, ScaleSettings(unit="px"), gauge=70))):
+    for unit, maps in (
+        ("mm", Maps.from_result(result)),
+        ("px", Maps.from_result(result, ScaleSettings(unit="px"), gauge=70)),
+    ):
         drawer = figures.MapDrawer(maps)
         drawn = drawer.fields(0, ["u"]), drawer.masks(0), drawer.reflections(0)
         assert {figure.axes[0].get_xlabel() for figure in drawn} == {f"x ({unit})"}
@@ -436,8 +450,8 @@ def test_pictures_of_a_frame_have_one_unit_and_the_options_of_the_maps(tmp_path:
 def test_weights_that_exclude_nothing_have_no_picture(tmp_path: Path) -> None:
     weights = np.full((3, 40, 60), 255)
     result = _one_frame(tmp_path / "out", np.stack([IMAGE] * 3), weights_thumbnail=weights)
-    assert figures.MapDrawer(Maps.of(result)).masks(0) is None
-    assert figures.MapDrawer(Maps.of(result)).reflections(0) is None
+    assert figures.MapDrawer(Maps.from_result(result)).masks(0) is None
+    assert figures.MapDrawer(Maps.from_result(result)).reflections(0) is None
 
 
 def test_impossible_frame_and_file(tmp_path: Path) -> None:
@@ -445,7 +459,7 @@ def test_impossible_frame_and_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no frame 2"):
         _maps(result, 2, "displacement")
     with pytest.raises(InputError, match="no frame 7"):
-        write_figures(Maps.of(result), tmp_path / "figures", [0, 7])
+        write_figures(Maps.from_result(result), tmp_path / "figures", [0, 7])
     assert not list((tmp_path / "figures").iterdir())
     with pytest.raises(ResultError, match="cannot be written"):
         save_figure(figures.residual_figure(result), tmp_path / "none" / "a.png")

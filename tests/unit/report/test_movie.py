@@ -20,7 +20,7 @@ from rgbmidic.command import execute
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.report import movie, video
 from rgbmidic.report.curves import Curve
-from rgbmidic.report.movie import Movie, MovieConstants, _Canvas, write_movie
+from rgbmidic.report.movie import FieldMovie, MovieConstants, _Canvas, write_movie
 from rgbmidic.results import FrameRecord, Maps
 from rgbmidic.view.picture import RawPictures
 
@@ -29,7 +29,7 @@ from rgbmidic.view.picture import RawPictures
 def maps(tmp_path_factory: pytest.TempPathFactory) -> Maps:
     folder = tmp_path_factory.mktemp("movie") / "result"
     more = {"notes": {"frame_rate": 1e5}, "reference": np.full((3, 80, 120), 90.0)}
-    return Maps.of(make_result(folder, frames=6, record=smooth_record, **more))
+    return Maps.from_result(make_result(folder, frames=6, record=smooth_record, **more))
 
 
 def decoded(path: Path) -> np.ndarray:
@@ -41,7 +41,7 @@ def decoded(path: Path) -> np.ndarray:
 
 @pytest.mark.parametrize("ending", [".mp4", ".webm", ".gif"])
 def test_a_movie_shows_the_field_in_each_frame(maps: Maps, tmp_path: Path, ending: str) -> None:
-    shown = Movie(maps=maps, fields=("u", "exx"), frames=[1, 3, 5], width=640)
+    shown = FieldMovie(maps=maps, fields=("u", "exx"), frames=[1, 3, 5], width=640)
     out = write_movie(shown, tmp_path / f"m{ending}")
     frames = decoded(out).astype(int)
     assert frames.shape[0] == 3
@@ -54,8 +54,8 @@ def test_a_movie_shows_the_field_in_each_frame(maps: Maps, tmp_path: Path, endin
 def test_the_colour_of_a_node_is_that_of_its_value(maps: Maps) -> None:
     from matplotlib import colormaps
 
-    canvas = _Canvas(Movie(maps=maps, fields=("u",), frames=[5], limits=(-0.5, 0.5)))
-    page, step, (left, top) = canvas.page(5), canvas._step, canvas._first
+    canvas = _Canvas(FieldMovie(maps=maps, fields=("u",), frames=[5], limits=(-0.5, 0.5)))
+    page, step, (left, top) = canvas.page(5), canvas._step, canvas._origin
     rows, columns = canvas._boxes[0]
     for x, y in ((30, 40), (60, 30), (95, 60)):
         value = 0.01 * (x - 60)
@@ -65,11 +65,11 @@ def test_the_colour_of_a_node_is_that_of_its_value(maps: Maps) -> None:
 
 def test_a_page_states_how_its_fields_are_derived(maps: Maps) -> None:
     since = replace(maps, since=2)
-    canvas = _Canvas(Movie(maps=since, fields=("u", "exx_std"), frames=[4]))
+    canvas = _Canvas(FieldMovie(maps=since, fields=("u", "exx_std"), frames=[4]))
     canvas.page(4)
     first, how = canvas._title.get_text().splitlines()
     assert first.endswith("frame 4")
-    assert how == since.how("exx")
+    assert how == since.processing_note("exx")
     assert how.endswith(", since frame 2")
     page, box = canvas.figure.bbox, canvas._title.get_window_extent()
     assert page.y0 <= box.y0 < box.y1 <= page.y1
@@ -77,7 +77,7 @@ def test_a_page_states_how_its_fields_are_derived(maps: Maps) -> None:
 
 @pytest.mark.parametrize("width", [601, 640, 727])
 def test_panels_have_one_size_however_their_edges_are_rounded(maps: Maps, width: int) -> None:
-    boxes = _Canvas(Movie(maps=maps, fields=("u", "v", "exx"), frames=[5], width=width))._boxes
+    boxes = _Canvas(FieldMovie(maps=maps, fields=("u", "v", "exx"), frames=[5], width=width))._boxes
     assert len({(rows.stop - rows.start, columns.stop - columns.start) for rows, columns in boxes}) == 1
 
 
@@ -90,8 +90,8 @@ def test_pages_are_the_same_for_any_number_of_processes(maps: Maps, monkeypatch:
 
     monkeypatch.setattr(SpawnProcess, "start", starting)
     before = signal.getsignal(signal.SIGINT)
-    curve = Curve(name="force_N", times=np.linspace(0, 5e-5, 9), values=np.arange(9.0), timed=True)
-    canvas = _Canvas(Movie(maps=maps, fields=("exx", "velocity"), frames=[0, 2, 4], curve=curve))
+    curve = Curve(name="force_N", times=np.linspace(0, 5e-5, 9), values=np.arange(9.0), has_times=True)
+    canvas = _Canvas(FieldMovie(maps=maps, fields=("exx", "velocity"), frames=[0, 2, 4], curve=curve))
     alone, shared = (list(movie._pages(canvas, [0, 2, 4], count)) for count in (1, 2))
     assert all(np.array_equal(a, b) for a, b in zip(alone, shared, strict=True))
     assert not np.array_equal(alone[0], alone[1])
@@ -100,7 +100,7 @@ def test_pages_are_the_same_for_any_number_of_processes(maps: Maps, monkeypatch:
 
 
 def test_a_process_whose_pages_nobody_takes_ends_in_silence(maps: Maps) -> None:
-    shown = Movie(maps=maps, fields=("u",), frames=[0, 1])
+    shown = FieldMovie(maps=maps, fields=("u",), frames=[0, 1])
     receive, send = multiprocessing.Pipe(duplex=False)
     receive.close()
     before = signal.getsignal(signal.SIGINT)
@@ -118,15 +118,15 @@ def test_over_raw_frames_the_field_lies_where_the_specimen_is(tmp_path: Path) ->
             "u_std": np.ones(NODES),
             "v_std": np.ones(NODES),
         }
-        rest = {"exx": np.zeros(NODES), "misfit": np.ones(NODES), "light_fraction": np.full((NODES, 3), 1 / 3)}
-        return FrameRecord.of(
+        rest = {"nodal_exx": np.zeros(NODES), "misfit": np.ones(NODES), "light_fraction": np.full((NODES, 3), 1 / 3)}
+        return FrameRecord.from_values(
             nodes=NODES, lights=3, number=index, status=0, node_status=np.zeros(NODES), **both, **rest
         )
 
-    maps = Maps.of(make_result(tmp_path / "r", frames=2, record=shifted, notes={"frame_shape": [80, 200]}))
+    maps = Maps.from_result(make_result(tmp_path / "r", frames=2, record=shifted, notes={"frame_shape": [80, 200]}))
     grey = lambda index: np.full((80, 200), 100, dtype=np.uint8)  # noqa: E731
-    canvas = _Canvas(Movie(maps=maps, fields=("u",), frames=[0, 1], images=grey))
-    step, (left, top) = canvas._step, canvas._first
+    canvas = _Canvas(FieldMovie(maps=maps, fields=("u",), frames=[0, 1], images=grey))
+    step, (left, top) = canvas._step, canvas._origin
     rows, columns = canvas._boxes[0]
     page = canvas.page(1)[rows, columns]
     grey_at = lambda x: np.ptp(page[round((40 - top) / step), round((x - left) / step), :3]) == 0  # noqa: E731
@@ -140,7 +140,7 @@ def test_nothing_is_left_of_a_movie_that_is_interrupted(maps: Maps, tmp_path: Pa
 
     for ending in (".mp4", ".gif"):
         with pytest.raises(KeyboardInterrupt):
-            write_movie(Movie(maps=maps, fields=["u"], width=320), tmp_path / f"m{ending}", progress=stop)
+            write_movie(FieldMovie(maps=maps, fields=["u"], width=320), tmp_path / f"m{ending}", progress=stop)
     assert not list(tmp_path.iterdir())
 
 
@@ -164,7 +164,7 @@ def test_an_ffmpeg_that_does_not_do_its_work_is_an_error_and_nothing_is_left(
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(exe))
     constants = MovieConstants(patience=0.2 if "sleep" in does else 300.0)
     with pytest.raises(ResultError, match=told):
-        write_movie(Movie(maps=maps, fields=["u"], width=320, constants=constants), out / "m.mp4")
+        write_movie(FieldMovie(maps=maps, fields=["u"], width=320, constants=constants), out / "m.mp4")
     assert not list(out.iterdir())
 
 
@@ -174,7 +174,7 @@ def test_a_movie_is_in_the_file_of_its_name_whatever_that_means_to_ffmpeg(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path(name).parent.mkdir(exist_ok=True)
-    write_movie(Movie(maps=maps, fields=["u"], width=320, frames=[1, 3]), name)
+    write_movie(FieldMovie(maps=maps, fields=["u"], width=320, frames=[1, 3]), name)
     assert decoded(tmp_path / name).shape[0] == 2
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [tmp_path / name]
 
@@ -187,7 +187,7 @@ def test_nothing_is_left_of_a_movie_whose_command_is_terminated(
         os.kill(os.getpid(), signal.SIGTERM)
         raise AssertionError("still writing")
 
-    monkeypatch.setattr(movie, "gif", terminated)
+    monkeypatch.setattr(movie, "write_gif", terminated)
     before = signal.getsignal(signal.SIGTERM)
     out = tmp_path / "m.gif"
     assert execute(cli.app, ["movie", str(maps.result.path), "--out", str(out), "--width", "320"]) == 130
@@ -207,7 +207,7 @@ def test_an_interruption_while_its_timer_starts_ends_the_timer(tmp_path: Path, m
     monkeypatch.setattr(video, "Timer", Interrupted)
     pages = iter([np.zeros((2, 2, 4), dtype=np.uint8)] * 2)
     with (tmp_path / "m.mp4").open("wb") as file, pytest.raises(KeyboardInterrupt):
-        video.video(file, pages, 25.0, ["cat"], 300.0)
+        video.encode_video(file, pages, 25.0, ["cat"], 300.0)
     for timer in timers:
         timer.join(10)
     assert timers
@@ -227,13 +227,13 @@ def test_wrong_input_is_refused_and_nothing_is_overwritten(maps: Maps, tmp_path:
     ):
         options = {"fps": more.pop("fps")} if "fps" in more else {}
         with pytest.raises(InputError, match=message):
-            write_movie(Movie(maps=maps, fields=fields, **more), tmp_path / name, **options)
+            write_movie(FieldMovie(maps=maps, fields=fields, **more), tmp_path / name, **options)
     with pytest.raises(FrameError, match=r"result does not state where its raw frames are"):
-        write_movie(Movie(maps=maps, fields=["u"], images=RawPictures(result=maps.result)), tmp_path / "m.gif")
+        write_movie(FieldMovie(maps=maps, fields=["u"], images=RawPictures(result=maps.result)), tmp_path / "m.gif")
     assert not list(tmp_path.iterdir())
     (tmp_path / "there.gif").write_text("kept")
     with pytest.raises(ResultError, match="already exists"):
-        write_movie(Movie(maps=maps, fields=["u"]), tmp_path / "there.gif")
+        write_movie(FieldMovie(maps=maps, fields=["u"]), tmp_path / "there.gif")
     assert (tmp_path / "there.gif").read_text() == "kept"
 
 

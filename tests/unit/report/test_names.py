@@ -32,7 +32,7 @@ from rgbmidic.results import (
 )
 from rgbmidic.results.histories import read_histories
 from rgbmidic.settings import ProbeSettings, ScaleSettings
-from rgbmidic.text import rounded
+from rgbmidic.text import format_value
 
 FIELDS = ("u", "exx", "e1", "direction", "equivalent", "u_velocity")
 STATED = re.compile(r"(\S+) ± (\d\S*?)(?=[\s<,;)]|$)")
@@ -43,7 +43,7 @@ SCALES = (None, ScaleSettings(mm_per_pixel=0.05), ScaleSettings(mm_per_pixel=0.0
 def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     def record(index: int) -> FrameRecord:
         smooth = smooth_record(index)
-        std = dict.fromkeys(("exx_std", "eyy_std", "exy_std"), np.full(NODES, 1e-3))
+        std = dict.fromkeys(("nodal_exx_std", "nodal_eyy_std", "nodal_exy_std"), np.full(NODES, 1e-3))
         return FrameRecord(values={**smooth.values, "time_ns": index * 1_000_000, **std}, sizes=smooth.sizes)
 
     return make_result(tmp_path_factory.mktemp("names") / "out", frames=6, record=record)
@@ -51,7 +51,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
 
 @pytest.mark.parametrize("scale", SCALES, ids=["px", "mm", "mm known, px asked"])
 def test_a_field_has_one_name_and_one_unit(result: Result, scale: ScaleSettings | None, tmp_path: Path) -> None:
-    maps = Maps.of(result, scale)
+    maps = Maps.from_result(result, scale)
     length = "mm" if scale is not None and scale.unit == "mm" else "px"
     data = result.to_xarray(scale)
     export_result(result, "csv", tmp_path / "all.csv", scale=scale)
@@ -98,7 +98,7 @@ def test_histories_have_one_name_and_one_unit_in_picture_table_and_page(result: 
         re.sub(r"data:image[^\"]*|<svg.*?</svg>", "", (tmp_path / "page.html").read_text(), flags=re.DOTALL)
     )
     for name in ("u", "v", "exx", "eyy", "exy"):
-        field = Maps.of(result).field(f"{name}_std")
+        field = Maps.from_result(result).field(f"{name}_std")
         assert f"<tr><td>{field.symbol}</td><td>{field.unit or 1}</td>" in page
     printed = " ".join(cell for row in history_rows(histories)[1] for cell in row)
     stated = (
@@ -108,8 +108,8 @@ def test_histories_have_one_name_and_one_unit_in_picture_table_and_page(result: 
     )
     assert len(stated) >= 4
     for value, std in stated:
-        assert std == rounded(float(std), float(std))
-        assert value == rounded(float(value), float(std))
+        assert std == format_value(float(std), float(std))
+        assert value == format_value(float(value), float(std))
 
 
 def test_no_number_with_an_uncertainty_is_written_but_by_one_function() -> None:

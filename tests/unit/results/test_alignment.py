@@ -33,9 +33,9 @@ def test_the_stated_uncertainty_of_an_offset_knows_the_interval_and_the_noise_of
         random = np.random.default_rng(seed)
         recorded = np.arange(-10e-3, 10e-3, sampling) + random.uniform(0, sampling)
         offset = random.uniform(-2e-3, 2e-3)
-        found, std, _ = channel(
-            recorded - offset, edge(recorded, width) + random.normal(0, 0.02, len(recorded))
-        ).aligned("load", frames, edge(frames - 1.5e-3, width) + random.normal(0, 0.02, len(frames)))
+        found, std, _ = channel(recorded - offset, edge(recorded, width) + random.normal(0, 0.02, len(recorded))).align(
+            "load", frames, edge(frames - 1.5e-3, width) + random.normal(0, 0.02, len(frames))
+        )
         pulls.append((found.offset - offset - 1.5e-3) / std)
         stds.append(std)
     assert np.sqrt(np.mean(np.square(pulls))) < 1.2
@@ -60,7 +60,7 @@ def test_a_channel_much_longer_than_the_frames_is_aligned(caplog: pytest.LogCapt
     recorded, frames = np.arange(0, 200, 5e-4), STEP * np.arange(1000)
     values = np.exp(-(((recorded - 77.7) / 3e-3) ** 2)) + random.normal(0, 0.02, len(recorded))
     history = np.exp(-(((frames - 4e-3) / 3e-3) ** 2)) + random.normal(0, 0.05, len(frames))
-    found, std, _ = channel(recorded, values).aligned("load", frames, history)
+    found, std, _ = channel(recorded, values).align("load", frames, history)
     assert abs(found.offset + 77.696) < 3 * std < 1e-3
     assert not caplog.messages
 
@@ -69,18 +69,18 @@ def test_too_many_offsets_are_refused(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(alignment, "_MAX_OFFSETS", 1000)
     times = np.arange(600.0)
     with pytest.raises(InputError, match=r"1218 offsets would have to be tried, 0\.5 s apart; at most 1000 are"):
-        channel(times, np.sin(times)).aligned("load", times[:11], np.sin(times[:11]))
+        channel(times, np.sin(times)).align("load", times[:11], np.sin(times[:11]))
 
 
 def test_what_correlates_as_well_elsewhere_is_stated(caplog: pytest.LogCaptureFixture):
     times = np.arange(0, 100, 0.2)
-    channel(times, np.sin(times)).aligned("load", times[:100], np.sin(times[:100] - 1))
+    channel(times, np.sin(times)).align("load", times[:100], np.sin(times[:100] - 1))
     assert "correlates as well with other offsets of its clock, such as" in caplog.text
 
 
 def test_a_ramp_has_no_offset():
     times = np.arange(50.0)
-    _, std, coefficient = channel(times, times).aligned("load", times[:20], times[:20] + 1)
+    _, std, coefficient = channel(times, times).align("load", times[:20], times[:20] + 1)
     assert coefficient == pytest.approx(1)
     assert std > 1e3
 
@@ -89,5 +89,5 @@ def test_rounding_is_no_correlation():
     """A channel that is constant but for its last digits is not the edge that lies elsewhere."""
     times, frames = np.arange(-10e-3, 10e-3, 200e-6), STEP * np.arange(200)
     history = edge(frames - 1e-3, 50e-6) + np.random.default_rng(0).normal(0, 0.02, 200)
-    found, std, _ = channel(times, edge(times - 1e-3, 50e-6)).aligned("load", frames, history)
+    found, std, _ = channel(times, edge(times - 1e-3, 50e-6)).align("load", frames, history)
     assert abs(found.offset) < 3 * std < 3e-4

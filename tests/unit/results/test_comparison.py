@@ -19,7 +19,7 @@ from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_m
 from rgbmidic.report.comparison import scale_text
 from rgbmidic.results import FrameRecord, Result
 from rgbmidic.results.comparison import Comparison, measured_mesh
-from rgbmidic.results.simulation import Levelling, Simulation, place
+from rgbmidic.results.simulation import Levelling, Simulation, find_placement
 
 NODES, STD, MM = len(MESH.nodes), 0.01, 0.05
 PLACEMENT = Placement.fit([[0, 0, 10, 170], [10, 0, 210, 170], [0, 8, 10, 10]])
@@ -52,7 +52,7 @@ def measured(
         stated = {"u_std": np.full(NODES, std), "v_std": np.full(NODES, std)}
         stated |= {"u_bias_std": np.full(NODES, bias), "v_bias_std": np.full(NODES, bias)}
         stated |= {"time_ns": 1_000_000 * index} if timed else {}
-        return FrameRecord.of(nodes=NODES, lights=3, number=index, status=0, u=u, v=v, **stated)
+        return FrameRecord.from_values(nodes=NODES, lights=3, number=index, status=0, u=u, v=v, **stated)
 
     mesh = {"nodes": MESH.nodes, "elements": MESH.elements, "references": []}
     return make_result(path, frames=len(displacement), record=record, **{**mesh, **options})
@@ -71,7 +71,7 @@ def compared(result: Result, displacement: np.ndarray, mesh: Tri3Mesh = MESH, **
 @pytest.mark.parametrize("mesh", [MESH, OTHER], ids=["own nodes", "other nodes"])
 def test_chi_square_is_1_and_scatters_as_its_degrees_of_freedom_state(tmp_path, mesh):
     comparison = compared(measured(tmp_path / "r", noise(60)), np.zeros((len(mesh.nodes), 2)), mesh)
-    frames = list(comparison.each())
+    frames = list(comparison.iterate())
     for name in ("displacement", "u", "exx", "eyy", "exy"):
         agreements = [made.agreement["levelled", name] for made in frames]
         squares = np.array([one.chi_square for one in agreements])
@@ -90,7 +90,7 @@ def test_the_lights_bias_is_alike_over_its_range_and_leaves_fewer_degrees_of_fre
     moved = noise(60) + bias + 0.05 * stretch()
     comparison = compared(measured(tmp_path / "r", moved, std=5**0.5 * STD, bias=2 * STD), field, mesh)
     plain = compared(measured(tmp_path / "p", moved[:1], std=5**0.5 * STD), field, mesh).frame(0)
-    frames = list(comparison.each())
+    frames = list(comparison.iterate())
     for name, tolerance in {"u": 0.15, "exx": 0.1, "exy": 0.1}.items():
         agreements = [made.agreement["levelled", name] for made in frames]
         squares = np.array([one.chi_square for one in agreements])
@@ -116,7 +116,7 @@ def test_the_scale_of_several_frames_holds_its_uncertainty(tmp_path):
             mesh=finite_elements(), displacement=np.stack([0 * field, field]), times=np.array([0, 4e-3])
         )
         comparison = Comparison(result, simulation, PLACEMENT)
-        fits = [one.fit for one in comparison.each()]
+        fits = [one.fit for one in comparison.iterate()]
         scale, std = comparison.best_scale(fits)
         pulls.append((scale - 1.05) / std)
         alone += [(fit.scale - 1.05) / fit.scale_std for fit in fits]
@@ -134,7 +134,7 @@ def test_the_uncertain_scale_of_the_image_counts_as_one_factor(tmp_path):
     factors = 1 + relative * random.normal(size=60)
     comparison = compared(measured(tmp_path / "b", factors[:, None, None] * field, std=1e-4), field)
     comparison.relative_std = relative
-    frames = list(comparison.each())
+    frames = list(comparison.iterate())
     agreements = [made.agreement["nodes", "displacement"] for made in frames]
     assert np.mean([one.chi_square for one in agreements]) == pytest.approx(1, abs=0.5)
     assert agreements[0].degrees_of_freedom < 1.5  # all differences are the same factor
@@ -178,7 +178,7 @@ def test_a_rigid_motion_is_stated_and_taken_off(tmp_path):
     x, y = (points - points.mean(axis=0)).T
     moved = field + 0.03 + angle * np.stack([-y, x], axis=1)
     result = measured(tmp_path / "r", moved + noise(30))
-    kept, taken = (list(compared(result, field, remove_rigid=one).each()) for one in (False, True))
+    kept, taken = (list(compared(result, field, remove_rigid=one).iterate()) for one in (False, True))
     pulls = [(made.fit.rigid - [0.03, 0.03, np.degrees(angle)]) / made.fit.rigid_std for made in kept]
     assert 0.85 < np.sqrt(np.mean(np.square(pulls))) < 1.2
     assert kept[0].agreement["nodes", "displacement"].chi_square > 100
@@ -197,7 +197,7 @@ def test_nodes_without_data_are_left_out_and_so_is_their_strain(tmp_path):
     field = stretch()
     field[7] = np.nan
     frames = np.stack([field, np.full(field.shape, np.nan)]) + noise(2)
-    made, blank = compared(measured(tmp_path / "r", frames), stretch()).each()
+    made, blank = compared(measured(tmp_path / "r", frames), stretch()).iterate()
     assert np.isnan(blank.fit.scale)
     assert blank.agreement["levelled", "displacement"].values == 0
     assert np.flatnonzero(np.isnan(made.ratio("levelled", "u"))).tolist() == [7]
@@ -240,7 +240,7 @@ def test_a_simulation_is_read_with_its_times_and_interpolated(states, name):
     interval = 1e-3 if name == "simulated" else None
     read = Simulation.read(states.parent / name, mesh=finite_elements(), interval=interval, offset=0.5)
     assert read.times == pytest.approx([0.5, 0.504])
-    assert read.at(0.501) == pytest.approx(stretch(), abs=1e-9)
+    assert read.interpolate(0.501) == pytest.approx(stretch(), abs=1e-9)
     assert read.mesh.node_numbers.tolist() == finite_elements().node_numbers.tolist()
 
 
@@ -250,7 +250,7 @@ def test_signs_and_fractions_in_the_names_of_states_count(tmp_path, numbers):
         write_state(tmp_path / f"plate_{number}.vtu", number * stretch())
     read = Simulation.read(tmp_path, interval=2.0)
     assert read.times.tolist() == [2.0 * number for number in numbers]
-    assert read.at(2.0 * numbers[1]) == pytest.approx(numbers[1] * stretch(), abs=1e-9)
+    assert read.interpolate(2.0 * numbers[1]) == pytest.approx(numbers[1] * stretch(), abs=1e-9)
 
 
 def test_what_may_be_meant_otherwise_is_stated(tmp_path, states, caplog):
@@ -273,7 +273,7 @@ def test_frames_beyond_the_times_of_the_simulation_are_left_out_and_those_asked_
     result = measured(tmp_path / "r", np.arange(7)[:, None, None] * stretch() + noise(7))
     simulation = Simulation.read(states.parent / "all.pvd", offset=1e-3)
     comparison = Comparison(result, simulation, PLACEMENT)
-    assert (comparison.frames, comparison.left_out) == ((1, 2, 3, 4, 5), (0, 6))
+    assert (comparison.frames, comparison.frames_outside) == ((1, 2, 3, 4, 5), (0, 6))
     assert np.median(comparison.frame(3).measured["v"] / comparison.frame(3).simulated["nodes"]["v"]) == pytest.approx(
         1.5, rel=0.01
     )
@@ -297,7 +297,7 @@ def test_the_command_writes_what_it_found_with_the_simulation_s_numbers(tmp_path
     assert "<h2>Warnings</h2>" in (out / "comparison.html").read_text()
     written = read_mesh(out / "comparison_000003.vtu")
     made = Comparison(
-        result, Simulation.read(states.parent / "all.pvd"), place(result, pairs=PLACEMENT.pairs.tolist())
+        result, Simulation.read(states.parent / "all.pvd"), find_placement(result, point_pairs=PLACEMENT.pairs.tolist())
     ).frame(3)
     assert written.node_numbers.tolist() == finite_elements().node_numbers.tolist()
     assert written.fields["displacement"][:, 0] == pytest.approx(made.measured["u"])
@@ -322,7 +322,7 @@ def test_a_result_of_mesh_file_is_compared_by_number_where_the_simulation_has_an
     rows = [f"{mesh.node_numbers[i]},{stretch()[i, 0]},{stretch()[i, 1]}" for i in order]
     (tmp_path / "t.csv").write_text("\n".join(["node,u_mm,v_mm", *rows]))
     simulation = Simulation.read(tmp_path / "t.csv", mesh=measured_mesh(result))
-    made = Comparison(result, simulation, place(result)).frame(1)
+    made = Comparison(result, simulation, find_placement(result)).frame(1)
     assert np.abs(made.difference("nodes", "u")).max() < 1e-9
     assert np.abs(made.ratio("nodes", "v")).max() < 1e-6
     (tmp_path / "t.csv").write_text("\n".join(["node,u_mm,v_mm", *rows, rows[3]]))
@@ -378,11 +378,11 @@ def test_nodes_on_two_sides_of_a_crack_are_told_apart_by_their_numbers(tmp_path)
     def record(index: int) -> FrameRecord:
         u, v = PLACEMENT.vectors_to_px(mesh.points, field).T
         stated = {"u_std": np.full(count, STD), "v_std": np.full(count, STD)}
-        return FrameRecord.of(nodes=count, lights=3, number=index, status=0, u=u, v=v, **stated)
+        return FrameRecord.from_values(nodes=count, lights=3, number=index, status=0, u=u, v=v, **stated)
 
     options = {"nodes": cracked.nodes, "elements": cracked.elements, **known}
     result = make_result(tmp_path / "r", frames=1, record=record, **options)
-    made = Comparison(result, Simulation.read(tmp_path / "plate.vtu"), place(result)).frame(0)
+    made = Comparison(result, Simulation.read(tmp_path / "plate.vtu"), find_placement(result)).frame(0)
     assert np.abs(made.difference("nodes", "v")).max() < 1e-8
 
 

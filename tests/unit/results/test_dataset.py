@@ -13,7 +13,7 @@ from results import LIGHTS, MESH, NODES, corrupt, make_origin, make_result, rand
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results import QUANTITIES, FrameRecord, Result, ResultStore
-from rgbmidic.results.physical import Physical
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ScaleSettings
 
 xr = pytest.importorskip("xarray")
@@ -30,14 +30,14 @@ def test_every_stackable_quantity_is_there_in_its_unit(result: Result) -> None:
     sizes = {"frame": 5, "node": NODES, "light": 3, "element": len(MESH.elements), "corner": 3, "component": 3}
     assert sizes.items() <= dict(data.sizes).items()
     for name, entry in QUANTITIES.items():
-        if entry.stackable and name not in STRAIN and name != "time_ns":
+        if entry.is_stackable and entry.file_name not in STRAIN and name != "time_ns":
             np.testing.assert_array_equal(data[name], getattr(result, name), err_msg=name)
             assert data[name].attrs["units"] == (entry.unit or "1")
-            assert data[name].attrs["long_name"] == entry.meaning
+            assert data[name].attrs["long_name"] == entry.description
             assert data[name].dims[0] == "frame"
     for end in ("", "_std"):
         for name in ("exx", "eyy", "exy"):
-            values = [Physical.of(result).frame(frame)[name + end] for frame in range(5)]
+            values = [ResultInUnits.from_result(result).frame(frame)[name + end] for frame in range(5)]
             np.testing.assert_array_equal(data[f"strain{end}"].sel(component=name), np.float32(values))
     np.testing.assert_array_equal(data.elements, result.elements)
     np.testing.assert_array_equal(data.x, result.nodes[:, 0])
@@ -57,7 +57,7 @@ def test_coordinates_are_in_px_mm_and_s_where_these_are_known(result: Result, tm
     assert (scaled.x.units, scaled.u.units, scaled.u_std.units, scaled.time.units) == ("mm", "mm", "mm", "s")
     np.testing.assert_allclose(scaled.time, np.arange(5) * 1.000003e-3)
     with ResultStore.create(tmp_path / "untimed", make_origin(1)) as store:
-        store.write_frame(0, FrameRecord.of(nodes=NODES, lights=len(LIGHTS)))
+        store.write_frame(0, FrameRecord.from_values(nodes=NODES, lights=len(LIGHTS)))
     untimed = Result.open(tmp_path / "untimed").to_xarray()
     assert not {"time", "time_ns"} & {*untimed.variables}
 
@@ -74,7 +74,7 @@ def test_coordinates_are_in_px_mm_and_s_where_these_are_known(result: Result, tm
     ],
 )
 def test_a_part_is_the_part_of_the_array(result: Result, key: dict[str, object]) -> None:
-    physical = Physical.of(result)
+    physical = ResultInUnits.from_result(result)
     frames = [np.stack([physical.frame(frame)[name] for name in ("exx", "eyy", "exy")], axis=-1) for frame in range(5)]
     whole = xr.Variable(("frame", "node", "component"), np.float32(frames))
     part = result.to_xarray().strain.isel(key)

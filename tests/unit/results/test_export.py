@@ -16,12 +16,12 @@ from rgbmidic.results import (
     QUANTITIES,
     FrameRecord,
     Origin,
-    Quantity,
     Result,
+    ResultQuantity,
     ResultStore,
     export_result,
 )
-from rgbmidic.results.physical import Physical
+from rgbmidic.results.result_in_units import ResultInUnits
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray
 
@@ -46,10 +46,12 @@ def test_npz_holds_every_array(result: Result, tmp_path: Path) -> None:
         assert archive["u"].shape == archive["v_std"].shape == (3, NODES)
         assert archive["names"].tolist() == ["frame 0", "frame 1", "frame 2"]
         assert archive["lights"].tolist() == list(LIGHTS)
-        stackable = {name for name, quantity in QUANTITIES.items() if quantity.stackable} - {"time_ns"}
-        assert set(archive.files) == {"nodes", "elements", "names", "lights", "time_s"} | stackable
+        stackable = {
+            entry.file_name: name for name, entry in QUANTITIES.items() if entry.is_stackable and name != "time_ns"
+        }
+        assert set(archive.files) == {"nodes", "elements", "names", "lights", "time_s"} | stackable.keys()
         for name in {*archive.files} - {"time_s"}:
-            np.testing.assert_array_equal(archive[name], getattr(result, name), err_msg=name)
+            np.testing.assert_array_equal(archive[name], getattr(result, stackable.get(name, name)), err_msg=name)
         np.testing.assert_allclose(archive["time_s"], result.time_ns * 1e-9)
 
 
@@ -79,7 +81,7 @@ def test_csv_is_in_millimetres_where_the_scale_is_known(result: Result, tmp_path
 
 def test_an_unknown_time_is_left_out_of_csv_and_nan_in_npz(tmp_path: Path) -> None:
     with ResultStore.create(tmp_path / "out", make_origin(1)) as store:
-        store.write_frame(0, FrameRecord.of(nodes=NODES, lights=len(LIGHTS)))
+        store.write_frame(0, FrameRecord.from_values(nodes=NODES, lights=len(LIGHTS)))
     export_result(Result.open(tmp_path / "out"), "csv", tmp_path / "fields.csv")
     assert "time" not in (tmp_path / "fields.csv").read_text(encoding="utf-8")
     export_result(Result.open(tmp_path / "out"), "npz", tmp_path / "fields.npz")
@@ -89,11 +91,11 @@ def test_an_unknown_time_is_left_out_of_csv_and_nan_in_npz(tmp_path: Path) -> No
 def test_a_quantity_of_the_table_is_kept_read_and_exported_by_its_entry_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(QUANTITIES, "depth", Quantity("depth", ("node",), "px", "", "how deep"))
+    monkeypatch.setitem(QUANTITIES, "depth", ResultQuantity("depth", ("node",), "px", "", "how deep"))
     depth = np.arange(3.0)
     origin = Origin(nodes=np.eye(3)[:, :2], elements=[[0, 1, 2]], names=["only"], lights=["one"])
     with ResultStore.create(tmp_path / "out", origin) as store:
-        store.write_frame(0, FrameRecord.of(nodes=3, lights=1, depth=depth))
+        store.write_frame(0, FrameRecord.from_values(nodes=3, lights=1, depth=depth))
     result = Result.open(tmp_path / "out")
     np.testing.assert_array_equal(result.stack("depth"), [depth])
     for to in ("npz", "csv", "hdf5"):
@@ -136,7 +138,7 @@ def test_nodemaps_are_those_that_crackpy_reads(result: Result, tmp_path: Path) -
     out = tmp_path / "nodemaps"
     export_result(result, "crackpy", out, scale=scale)
     assert sorted(file.name for file in out.iterdir()) == ["result_0.txt", "result_1.txt", "result_2.txt"]
-    physical = Physical.of(result, scale)
+    physical = ResultInUnits.from_result(result, scale)
     table = np.genfromtxt(out / "result_2.txt", delimiter=";")
     values = physical.frame(2)
     x, y = 0.05 * result.nodes.T
@@ -176,7 +178,7 @@ def test_crackpy_reads_the_nodemaps(result: Result, tmp_path: Path) -> None:
     scale, out = ScaleSettings(mm_per_pixel=0.05, frame_rate=1000), tmp_path / "nodemaps"
     export_result(result, "crackpy", out, scale=scale)
     read = reader.InputData(Nodemap(name="result_1.txt", folder=str(out)))
-    values = Physical.of(result, scale).frame(1)
+    values = ResultInUnits.from_result(result, scale).frame(1)
     known = np.isfinite(values["exx"] + values["u"])  # CrackPy leaves rows with a NaN out
     assert known.any()
     x, y = 0.05 * result.nodes[known].T
@@ -190,4 +192,4 @@ def test_crackpy_reads_the_nodemaps(result: Result, tmp_path: Path) -> None:
         "eps_xy": -values["exy"][known],
     }.items():
         np.testing.assert_allclose(getattr(read, name), expected, rtol=1e-6, atol=1e-9, err_msg=name)
-    assert read.time == pytest.approx(Physical.of(result, scale).times[1])
+    assert read.time == pytest.approx(ResultInUnits.from_result(result, scale).times[1])

@@ -46,7 +46,9 @@ def linear_record(index: int) -> FrameRecord:
         status[0] = 1
     shares = np.arange(NODES)[:, None] + np.arange(len(LIGHTS)) / 10
     values = {"u": u, "v": v, "u_std": std, "v_std": std, "node_status": status, "light_fraction": shares}
-    return FrameRecord.of(nodes=NODES, lights=len(LIGHTS), number=10 + index, status=0, misfit=X + index, **values)
+    return FrameRecord.from_values(
+        nodes=NODES, lights=len(LIGHTS), number=10 + index, status=0, misfit=X + index, **values
+    )
 
 
 @pytest.fixture

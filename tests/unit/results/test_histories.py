@@ -87,7 +87,7 @@ def make(
             std = np.full(NODES, 0.01 if index else 0.0)
             if index == 5:
                 u[LOST_NODE] = v[LOST_NODE] = std[LOST_NODE] = np.nan
-            record = FrameRecord.of(
+            record = FrameRecord.from_values(
                 nodes=NODES,
                 lights=1,
                 status=0,
@@ -339,12 +339,12 @@ def test_a_trigger_channel_and_a_correlation_find_the_recorder_s_clock(tmp_path:
     for seed in range(40):
         noise = np.random.default_rng(seed).normal(0, 0.02, len(times))
         history = -3e-4 * (np.exp(-(((times - 4.7e-3) / 1e-3) ** 2)) + noise)
-        found, std, coefficient = Channels.read(tmp_path / "c.csv").aligned("force_N", times, history)
+        found, std, coefficient = Channels.read(tmp_path / "c.csv").align("force_N", times, history)
         errors.append((found.offset + 7.3e-3) / std)
         assert coefficient < -0.99
     assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.25
     with pytest.raises(InputError, match=r"correlates with the history by -?0\.\d+ at best, 0\.7 is needed"):
-        Channels.read(tmp_path / "c.csv").aligned("force_N", times, np.random.default_rng(1).normal(0, 1, len(times)))
+        Channels.read(tmp_path / "c.csv").align("force_N", times, np.random.default_rng(1).normal(0, 1, len(times)))
     (tmp_path / "d.csv").write_text("time_s,ttl\n0,1\n1,1\n")
     with pytest.raises(InputError, match="is constant: it marks no time"):
         Channels.read(tmp_path / "d.csv", trigger="ttl")
@@ -519,7 +519,7 @@ def cracked(path: Path, scale: ScaleSettings | None = SCALE) -> Result:
             v = np.where(behind, np.where(above, -0.5, 0.5) * index, 0.0)
             std = np.full(count, 0.01 if index else 0.0)
             record = {"u": np.zeros(count), "v": v, "u_std": std, "v_std": std}
-            store.write_frame(index, FrameRecord.of(nodes=count, lights=1, status=0, number=index, **record))
+            store.write_frame(index, FrameRecord.from_values(nodes=count, lights=1, status=0, number=index, **record))
         store.finish()
     return Result.open(path)
 
@@ -587,9 +587,9 @@ def test_names_that_make_no_column_are_refused(names: list[list[str]], told: str
 
 def test_a_window_longer_than_the_test_is_one_rule_for_maps_and_histories(result: Result) -> None:
     """Rates are those of all frames that are measured, and say so, in both alike."""
-    maps = Maps.of(result, window=30)
+    maps = Maps.from_result(result, window=30)
     said = "parabolas over 8 frames (a window of 30 was stated), polynomials of degree 4 over 8"
-    assert maps.how("velocity") == said
+    assert maps.processing_note("velocity") == said
     found = read_histories(result, ProbeSettings(points=(PLACE,), window=30))
     assert f"rates: {said}" in found.remarks
     alike = read_histories(result, ProbeSettings(points=(PLACE,), window=8))

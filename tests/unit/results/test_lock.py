@@ -19,7 +19,7 @@ from results import make_origin, make_result, random_record
 
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results import Result, ResultStore, finish_result
-from rgbmidic.results.claim import Claim
+from rgbmidic.results.lock import FrameLock
 
 
 def _create(path: Path, *, overwrite: bool = False) -> ResultStore:
@@ -80,7 +80,7 @@ def test_only_the_claim_of_a_dead_process_of_this_host_is_taken_over(tmp_path: P
 
 
 def test_a_claim_is_released_by_who_holds_it_only(tmp_path: Path) -> None:
-    Claim(file=_write_claim(tmp_path, 1, "elsewhere"), process=os.getpid() + 1).release()
+    FrameLock(file=_write_claim(tmp_path, 1, "elsewhere"), process=os.getpid() + 1).release()
     assert _claims(tmp_path)
 
 
@@ -126,14 +126,14 @@ def test_a_folder_replaced_between_the_check_and_the_end_of_a_record_is_not_writ
 ) -> None:
     path = tmp_path / "out"
 
-    def check(claim: Claim) -> None:
+    def check(claim: FrameLock) -> None:
         monkeypatch.undo()
         claim.check()
         path.rename(tmp_path / "moved")
         make_result(path)
 
     with _create(path) as store:
-        monkeypatch.setattr(Claim, "check", check)
+        monkeypatch.setattr(FrameLock, "check", check)
         with pytest.raises(ResultError, match="cannot be written"):
             store.write_frame(0, random_record(5))
     np.testing.assert_array_equal(Result.open(path).frame(0).u, random_record(0).u)

@@ -15,7 +15,7 @@ from results import make_result, smooth_record
 from rgbmidic.errors import InputError
 from rgbmidic.fields import strain_of_gradient
 from rgbmidic.results import FrameRecord, Maps, Result
-from rgbmidic.results.maps import _composed
+from rgbmidic.results.maps import _relative_gradient
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import FloatArray
 
@@ -43,7 +43,7 @@ def result_of(path: Path, field: FloatArray) -> Result:
         u, v = field[index].T
         head = {"number": index, "status": 0, "time_ns": round(TEST.times[index] * 1e9)}
         std = {"u_std": TEST.std[index], "v_std": TEST.std[index]}
-        return FrameRecord.of(nodes=NODES, lights=3, node_status=np.zeros(NODES), u=u, v=v, **std, **head)
+        return FrameRecord.from_values(nodes=NODES, lights=3, node_status=np.zeros(NODES), u=u, v=v, **std, **head)
 
     mesh = {"nodes": MESH.nodes, "elements": MESH.elements}
     return make_result(path, frames=FRAMES, record=record, references=[0], **mesh)
@@ -62,7 +62,7 @@ def noisy(tmp_path_factory: pytest.TempPathFactory) -> list[Result]:
 @pytest.mark.parametrize("frame", [12, 20])
 def test_rates_are_the_derivatives_in_the_units_of_the_reader(exact: Result, frame: int) -> None:
     """Frames of two of the blocks that are computed at once."""
-    maps, time = Maps.of(exact, SCALE), TEST.times[frame]
+    maps, time = Maps.from_result(exact, SCALE), TEST.times[frame]
     slope = FIRST + 2 * SECOND * time
     velocity = 0.5 * ((MESH.nodes - CENTRE) @ slope.T + PUSH[0] + 2 * PUSH[1] * time)
     acceleration = 0.5 * (2 * (MESH.nodes - CENTRE) @ SECOND.T + 2 * PUSH[1])
@@ -75,12 +75,12 @@ def test_rates_are_the_derivatives_in_the_units_of_the_reader(exact: Result, fra
     }  # fmt: skip
     for name, truth in expected.items():
         np.testing.assert_allclose(maps.read(name, frame).values, np.broadcast_to(truth, NODES), rtol=2e-3, atol=1e-6)
-    assert maps.all["velocity"].label == "|du/dt| (mm/s)"
-    assert (maps.all["acceleration"].unit, maps.all["exx_rate"].unit) == ("mm/s²", "1/s")
+    assert maps.quantities["velocity"].label == "|du/dt| (mm/s)"
+    assert (maps.quantities["acceleration"].unit, maps.quantities["exx_rate"].unit) == ("mm/s²", "1/s")
 
 
 def test_what_lies_between_two_frames_is_the_motion_of_the_material_from_one_to_the_other(exact: Result) -> None:
-    maps, times = Maps.of(exact, since=SINCE), TEST.times
+    maps, times = Maps.from_result(exact, since=SINCE), TEST.times
     np.testing.assert_allclose(maps.read("u", 20).values, (TEST.truth[20] - TEST.truth[SINCE])[:, 0], atol=1e-9)
     f = (np.eye(2) + gradient(times[20])) @ np.linalg.inv(np.eye(2) + gradient(times[SINCE]))
     truth = strain_of_gradient((f - np.eye(2))[None], np.zeros((1, 4, 4)))
@@ -90,8 +90,8 @@ def test_what_lies_between_two_frames_is_the_motion_of_the_material_from_one_to_
     assert not here.values.any()
     assert not here.std.any()
     assert maps.read("exx", SINCE).std.max() < 1e-9
-    assert "since frame 7" in maps.how("exx")
-    assert "since frame 7" in maps.how("u")
+    assert "since frame 7" in maps.processing_note("exx")
+    assert "since frame 7" in maps.processing_note("u")
 
 
 def test_the_covariance_between_two_states_is_that_of_their_gradients() -> None:
@@ -100,7 +100,7 @@ def test_the_covariance_between_two_states_is_that_of_their_gradients() -> None:
     states, root = random.normal(scale=0.4, size=(2, 2, 2)), random.normal(size=(8, 8))
     joint = root @ root.T
     parts = [(states[0][None], joint[None, :4, :4]), (states[1][None], joint[None, 4:, 4:])]
-    found, covariance = _composed(*parts, joint[None, :4, 4:])
+    found, covariance = _relative_gradient(*parts, joint[None, :4, 4:])
 
     def between(both: FloatArray) -> FloatArray:
         now, first = np.eye(2) + both.reshape(2, 2, 2)
@@ -117,12 +117,12 @@ def test_a_rigid_motion_that_is_removed_leaves_the_deformation(tmp_path: Path) -
     stretch, turn = np.array([[1.02, 0.0], [0.0, 0.99]]), np.array([[c, -s], [s, c]])
     moved = (MESH.nodes - MESH.nodes.mean(axis=0)) @ (turn @ stretch).T + [5.0, -3.0] + MESH.nodes.mean(axis=0)
     field = np.stack([np.zeros((NODES, 2)), *[moved - MESH.nodes] * (FRAMES - 1)])
-    maps = Maps.of(result_of(tmp_path / "result", field), rigid_removed=True, measure="engineering")
+    maps = Maps.from_result(result_of(tmp_path / "result", field), rigid_removed=True, measure="engineering")
     left = (MESH.nodes - MESH.nodes.mean(axis=0)) @ (stretch - np.eye(2)).T
     np.testing.assert_allclose(maps.read("u", 3).values, left[:, 0], atol=1e-3)
     np.testing.assert_allclose(maps.read("magnitude", 3).values, np.hypot(*left.T), atol=1e-3)
     np.testing.assert_allclose(maps.read("exx", 3).values, np.full(NODES, 0.02), atol=1e-5)
-    assert np.abs(Maps.of(maps.result, measure="engineering").read("exx", 3).values).min() > 0.1
+    assert np.abs(Maps.from_result(maps.result, measure="engineering").read("exx", 3).values).min() > 0.1
 
 
 CHOICES = {
@@ -135,11 +135,11 @@ CHOICES = {
 
 @pytest.mark.parametrize("choice", CHOICES)
 def test_errors_are_as_large_as_stated(exact: Result, noisy: list[Result], choice: str) -> None:
-    right = Maps.of(exact, **CHOICES[choice])
+    right = Maps.from_result(exact, **CHOICES[choice])
     found: dict[str, list[FloatArray]] = {}
     for result in noisy:
-        maps = Maps.of(result, **CHOICES[choice])
-        for name, field in right.all.items():
+        maps = Maps.from_result(result, **CHOICES[choice])
+        for name, field in right.quantities.items():
             if field.group not in ("Displacement", "Strain"):
                 continue
             for frame in (3, 12, 20):
@@ -156,7 +156,7 @@ def test_errors_are_as_large_as_stated(exact: Result, noisy: list[Result], choic
 def test_errors_of_rates_are_as_large_as_stated(exact: Result, noisy: list[Result]) -> None:
     """The mean over pieces of a series states its spread too (`rates`): .89 to .94 were found of six draws."""
     ratios = {}
-    right, maps = Maps.of(exact), [Maps.of(result) for result in noisy[:2]]
+    right, maps = Maps.from_result(exact), [Maps.from_result(result) for result in noisy[:2]]
     for name in ("velocity", "acceleration", "exx_rate"):
         parts = [each.read(name, frame) for each in maps for frame in (3, 12, 20)]
         truth = [right.read(name, frame).values for _ in maps for frame in (3, 12, 20)]
@@ -165,20 +165,20 @@ def test_errors_of_rates_are_as_large_as_stated(exact: Result, noisy: list[Resul
 
 
 def test_a_value_within_two_standard_uncertainties_of_zero_is_doubtful(noisy: list[Result]) -> None:
-    read = Maps.of(noisy[0]).read("eyy", 1)
-    np.testing.assert_array_equal(read.doubtful, np.abs(read.values) < 2 * read.std)
-    assert 0 < read.doubtful.sum() < NODES
+    read = Maps.from_result(noisy[0]).read("eyy", 1)
+    np.testing.assert_array_equal(read.is_doubtful, np.abs(read.values) < 2 * read.std)
+    assert 0 < read.is_doubtful.sum() < NODES
 
 
 @pytest.mark.parametrize(
     ("act", "says"),
     [
-        (lambda result: Maps.of(result).read("speed", 0), 'no field "speed"; the fields are u, v, magnitude'),
-        (lambda result: Maps.of(result, since=99), r"no frame 99 in a result of 26 frames \(0 to 25\)"),
-        (lambda result: Maps.of(result, gauge=10.0), "must be at least 60 px long"),
-        (lambda result: Maps.of(result, measure="small"), 'unknown strain measure "small"'),
-        (lambda result: Maps.of(result, window=3), "4 frames or more, not 3"),
-        (lambda result: Maps.of(result).read("u", 26), "no frame 26"),
+        (lambda result: Maps.from_result(result).read("speed", 0), 'no field "speed"; the fields are u, v, magnitude'),
+        (lambda result: Maps.from_result(result, since=99), r"no frame 99 in a result of 26 frames \(0 to 25\)"),
+        (lambda result: Maps.from_result(result, gauge=10.0), "must be at least 60 px long"),
+        (lambda result: Maps.from_result(result, measure="small"), 'unknown strain measure "small"'),
+        (lambda result: Maps.from_result(result, window=3), "4 frames or more, not 3"),
+        (lambda result: Maps.from_result(result).read("u", 26), "no frame 26"),
     ],
 )
 def test_bad_choices_are_refused(exact: Result, act: Callable[[Result], object], says: str) -> None:
@@ -189,15 +189,15 @@ def test_bad_choices_are_refused(exact: Result, act: Callable[[Result], object],
 def test_nothing_is_known_since_a_frame_that_failed(tmp_path: Path) -> None:
     def record(index: int) -> FrameRecord:
         bad = {"number": 1, "status": 2, "reason": "no texture", "node_status": np.ones(SMALL)}
-        return FrameRecord.of(nodes=SMALL, lights=3, **bad) if index == 1 else smooth_record(index)
+        return FrameRecord.from_values(nodes=SMALL, lights=3, **bad) if index == 1 else smooth_record(index)
 
     result = make_result(tmp_path / "r", frames=3, record=record)
     with pytest.raises(InputError, match="nothing is known since frame 1, in which nothing is measured: no texture"):
-        Maps.of(result, since=1)
+        Maps.from_result(result, since=1)
 
 
 def test_what_was_read_does_not_go_to_another_process(tmp_path):
-    maps = Maps.of(make_result(tmp_path / "result", frames=5, record=smooth_record), gauge=60.0)
+    maps = Maps.from_result(make_result(tmp_path / "result", frames=5, record=smooth_record), gauge=60.0)
     values = maps.read("exx_std", 4).values, maps.read("velocity", 4).values, maps.result.u
     sent = pickle.loads(pickle.dumps(maps))
     assert "u" in maps.result.__dict__

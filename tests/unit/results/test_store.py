@@ -19,7 +19,7 @@ from rgbmidic._version import __version__
 from rgbmidic.correlation import NodeStatus, Solution, Status
 from rgbmidic.errors import InputError, ResultError
 from rgbmidic.results import QUANTITIES, UNKNOWN_TIME, FrameRecord, Result, ResultStore
-from rgbmidic.results.records import Quantities
+from rgbmidic.results.records import QuantityAttributes
 from rgbmidic.settings import CalibrationSettings, FrameSettings, RegionSettings, TestSettings
 
 
@@ -46,15 +46,15 @@ def test_result_gives_every_frame_back(tmp_path: Path) -> None:
     assert len(result) == 4
     np.testing.assert_array_equal(result.nodes, MESH.nodes)
     np.testing.assert_array_equal(result.elements, MESH.elements)
-    stackable = [name for name, quantity in QUANTITIES.items() if quantity.stackable]
+    stackable = [name for name, quantity in QUANTITIES.items() if quantity.is_stackable]
     assert {"u", "v", "u_std", "v_std", "status", "node_status", "iterations", "residual"} <= set(stackable)
     for name in stackable:
         expected = np.array([getattr(record, name) for record in records])
         np.testing.assert_array_equal(getattr(result, name), expected, err_msg=name)
         assert getattr(result, name).dtype == QUANTITIES[name].dtype, name
-    np.testing.assert_array_equal(result.strain[..., 2], result.exy)
-    np.testing.assert_array_equal(result.strain_std[..., 0], result.exx_std)
-    for record, history in zip(records, result.each("history"), strict=True):
+    np.testing.assert_array_equal(result.nodal_strain[..., 2], result.nodal_exy)
+    np.testing.assert_array_equal(result.nodal_strain_std[..., 0], result.nodal_exx_std)
+    for record, history in zip(records, result.iterate("history"), strict=True):
         np.testing.assert_array_equal(history, record.history)
     assert result.reasons == tuple(record.reason for record in records)
     assert result.names == ("frame 0", "frame 1", "frame 2", "frame 3")
@@ -191,9 +191,9 @@ def test_a_record_is_an_npz_file(tmp_path: Path) -> None:
     with zipfile.ZipFile(file) as archive:
         assert archive.testzip() is None
     with np.load(file) as arrays:
-        assert list(arrays) == list(QUANTITIES)
-        for name in QUANTITIES:
-            np.testing.assert_array_equal(arrays[name], getattr(record, name), err_msg=name)
+        assert list(arrays) == [entry.file_name for entry in QUANTITIES.values()]
+        for name, entry in QUANTITIES.items():
+            np.testing.assert_array_equal(arrays[entry.file_name], getattr(record, name), err_msg=name)
 
 
 def test_a_result_of_the_last_schema_is_refused_in_one_line_and_can_be_overwritten(tmp_path: Path) -> None:
@@ -227,18 +227,18 @@ def test_the_deformed_frames_are_those_that_are_no_reference(tmp_path: Path) -> 
     assert make_result(tmp_path / "none", frames=2, references=()).deformed == (0, 1)
     result = make_result(tmp_path / "untold", frames=3)
     assert result.deformed == (1, 2)
-    assert [u[0] for u in result.each("u", result.deformed)] == pytest.approx(result.u[1:, 0].tolist(), nan_ok=True)
+    assert [u[0] for u in result.iterate("u", result.deformed)] == pytest.approx(result.u[1:, 0].tolist(), nan_ok=True)
 
 
 def test_result_and_record_have_the_attributes_that_the_table_declares() -> None:
-    stacked = {name for name, one in QUANTITIES.items() if one.stackable or one.estimated}
-    assert {name for name in vars(Quantities) if name[0] != "_"} == stacked
+    stacked = {name for name, one in QUANTITIES.items() if one.is_stackable or one.is_estimated}
+    assert {name for name in vars(QuantityAttributes) if name[0] != "_"} == stacked
     assert {name for one in FrameRecord.__mro__ for name in vars(one)} >= QUANTITIES.keys()
 
 
 def test_only_what_stacks_is_an_attribute(tmp_path: Path) -> None:
     result = make_result(tmp_path / "out")
-    assert {"u", "exy_std", "brightness", "nodes"} <= set(dir(result))
+    assert {"u", "nodal_exy_std", "brightness", "nodes"} <= set(dir(result))
     for name in ("history", "weights_thumbnail", "reason", "bogus"):
         assert name not in dir(result)
         with pytest.raises(AttributeError, match=name):
@@ -299,12 +299,12 @@ def test_failed_record_measures_nothing_and_says_why() -> None:
 @pytest.mark.parametrize("name", ["u", "rigid", "history"])
 def test_record_of_wrong_shape_is_refused(name: str) -> None:
     with pytest.raises(InputError, match=name):
-        FrameRecord.of(nodes=3, lights=2, **{name: np.zeros((3, 4, 5))})
+        FrameRecord.from_values(nodes=3, lights=2, **{name: np.zeros((3, 4, 5))})
 
 
 def test_record_of_an_unknown_quantity_is_refused() -> None:
     with pytest.raises(InputError, match="unknown: w"):
-        FrameRecord.of(nodes=3, lights=2, w=np.zeros(3))
+        FrameRecord.from_values(nodes=3, lights=2, w=np.zeros(3))
     with pytest.raises(AttributeError, match="'w'"):
         _ = FrameRecord.failed("", nodes=3, lights=2).w
 
@@ -337,12 +337,16 @@ def test_every_quantity_of_a_solution_is_taken_from_it() -> None:
     np.testing.assert_array_equal(np.stack([record.u, record.v], axis=1), solution.displacement)
     single = {name: getattr(solution, name).astype(np.float32) for name in ("displacement_std", "strain", "strain_std")}
     np.testing.assert_array_equal(np.stack([record.u_std, record.v_std], axis=1), single["displacement_std"])
-    np.testing.assert_array_equal(np.stack([record.exx, record.eyy, record.exy], axis=1), single["strain"])
-    np.testing.assert_array_equal(np.stack([record.exx_std, record.eyy_std, record.exy_std], 1), single["strain_std"])
+    np.testing.assert_array_equal(
+        np.stack([record.nodal_exx, record.nodal_eyy, record.nodal_exy], axis=1), single["strain"]
+    )
+    np.testing.assert_array_equal(
+        np.stack([record.nodal_exx_std, record.nodal_eyy_std, record.nodal_exy_std], 1), single["strain_std"]
+    )
     np.testing.assert_array_equal(record.v_bias_std, solution.bias_std[:, 1].astype(np.float32))
     np.testing.assert_array_equal(record.v_edge_std, solution.edge_std[:, 1].astype(np.float32))
     np.testing.assert_array_equal(record.v_mesh_error, solution.displacement_error[:, 1].astype(np.float32))
-    np.testing.assert_array_equal(record.exy_mesh_error, solution.strain_error[:, 2].astype(np.float32))
+    np.testing.assert_array_equal(record.nodal_exy_mesh_error, solution.strain_error[:, 2].astype(np.float32))
     for name in ("node_status", "light_fraction", "misfit", "rigid", "residual", "weight_fraction", "history"):
         single = np.asarray(getattr(solution, name), dtype=QUANTITIES[name].dtype)
         np.testing.assert_array_equal(getattr(record, name), single, err_msg=name)

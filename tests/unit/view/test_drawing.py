@@ -14,11 +14,11 @@ from small_tests import grey_frame
 
 from rgbmidic.frames.images import write_tiff
 from rgbmidic.settings import read_test
-from rgbmidic.view.address import Mark
-from rgbmidic.view.draft import Confirmation, Draft, region_of
 from rgbmidic.view.picture import Canvas
 from rgbmidic.view.setup import SetupPage
 from rgbmidic.view.setup_panel import DraftFrames, RegionDrawing
+from rgbmidic.view.test_file_editor import Confirmation, Draft, region_of
+from rgbmidic.view.url_state import Mark
 
 RECTANGLE = (Mark("rectangle", 10, 10), Mark("rectangle", 60, 60))
 CORNERS = [[12.0, 10.0], [135.0, 12.0], [130.0, 105.0], [15.0, 100.0]]
@@ -48,16 +48,16 @@ class Browser:
 
     def deliver_to_server(self):
         """As Bokeh does it: what the server sets meanwhile goes to the browser."""
-        message, place = self.sent.pop(0), self.canvas.place
+        message, place = self.sent.pop(0), self.canvas.place_marks
 
         def placing(marks):
             self.taking = False
             place(marks)
             self.taking = True
 
-        self.canvas.place, self.taking = placing, True
+        self.canvas.place_marks, self.taking = placing, True
         self.canvas.marks.data = message
-        self.canvas.place, self.taking = place, False
+        self.canvas.place_marks, self.taking = place, False
 
     def deliver_to_browser(self):
         self.data = self.copy(self.coming.pop(0))
@@ -97,7 +97,7 @@ def test_a_step_that_is_undone_while_a_mark_is_drawn_takes_nothing_else_away():
     browser.draw("hole", 20, 20)
     browser.settle()
     browser.draw("hole", 30, 20)
-    drawing.go(back=True)
+    drawing.step(back=True)
     browser.settle()
     assert [(mark.kind, mark.x) for mark in drawing.marks] == [("rectangle", 10), ("rectangle", 60), ("hole 1", 30)]
     assert [row[:2] for row in browser.rows] == [("hole 1", 30), ("rectangle", 10), ("rectangle", 60)]
@@ -129,7 +129,7 @@ def test_both_ends_have_every_mark_that_was_set_where_it_was_moved_to(seed):
             browser.draw("point", float(step), 0.0, f"m{step}")
         elif act == "place":
             expected[f"m{step}"] = (float(step), 1.0)
-            canvas.place([*canvas.set, Mark("point", float(step), 1.0, f"m{step}")])
+            canvas.place_marks([*canvas.current_marks, Mark("point", float(step), 1.0, f"m{step}")])
         elif act == "move" and names:
             at = choose.choice(names)
             browser.data["y"][at] = float(step)
@@ -143,16 +143,16 @@ def test_both_ends_have_every_mark_that_was_set_where_it_was_moved_to(seed):
             browser.send()
         elif act == "hear" and browser.sent:
             browser.deliver_to_server()
-            canvas.place(canvas.set)
+            canvas.place_marks(canvas.current_marks)
         elif act == "answer" and browser.coming:
             browser.deliver_to_browser()
     while browser.sent or browser.coming:
         if browser.sent:
             browser.deliver_to_server()
-            canvas.place(canvas.set)
+            canvas.place_marks(canvas.current_marks)
         else:
             browser.deliver_to_browser()
-    assert {mark.name: (mark.x, mark.y) for mark in canvas.set} == expected
+    assert {mark.name: (mark.x, mark.y) for mark in canvas.current_marks} == expected
     assert browser.rows == sorted(("point", x, y, name) for name, (x, y) in expected.items())
 
 
@@ -171,8 +171,8 @@ def page(tmp_path):
     for index in range(2):
         write_tiff(tmp_path / f"frame_{index}.tif", grey_frame(1, (0.0, 0.0), noise_seed=index, shape=(120, 150)))
     (tmp_path / "TEST.toml").write_text(TEXT, encoding="utf-8")
-    made = SetupPage(Document(), Draft.of(tmp_path / "TEST.toml"), [], dark=False)
-    made.press = lambda: (made._guarded(made._write), made.parts.message.text)[1]
+    made = SetupPage(Document(), Draft.from_path(tmp_path / "TEST.toml"), [], dark=False)
+    made.press = lambda: (made._run_guarded(made._write), made.controls.message.text)[1]
     return made
 
 
@@ -183,7 +183,7 @@ def test_write_states_what_was_written_and_refuses_what_would_be_left_out(page, 
     browser.settle()
     assert "the polygon needs 3 marks or more and has 2: finish or remove it" in page.press()
     assert file.read_text(encoding="utf-8") == TEXT
-    page.drawing.keep(())
+    page.drawing.take_marks(())
     assert "[region] is missing or empty" in page.press()
     assert file.read_text(encoding="utf-8") == TEXT
     for corner in CORNERS:
@@ -200,7 +200,7 @@ def test_a_file_that_was_edited_meanwhile_is_replaced_only_when_asked_twice(page
     assert "press again to replace it, which has another content than this page read" in page.press()
     assert file.read_text(encoding="utf-8") == edited
     file.write_bytes(edited.encode() + b"# \xe4\n")  # once more, in another encoding
-    page.confirmation._asked = None
+    page.confirmation._pending = None
     assert "press again" in page.press()
     assert file.read_bytes() == edited.encode() + b"# \xe4\n"
     assert "is written" in page.press()
@@ -208,11 +208,11 @@ def test_a_file_that_was_edited_meanwhile_is_replaced_only_when_asked_twice(page
 
 
 def test_an_inspection_that_measures_no_node_is_reported_and_drawn(page):
-    _, region, size = page._meshed()
-    found = page.source.inspected(0, region, size)
+    _, region, size = page._build_mesh()
+    found = page.source.inspect(0, region, size)
     nothing = replace(found.prediction, std=np.full_like(found.prediction.std, np.nan))
-    page._have(lambda: replace(found, prediction=nothing), 0)
-    assert "no node is measured" in page.parts.message.text
+    page._receive(lambda: replace(found, prediction=nothing), 0)
+    assert "no node is measured" in page.controls.message.text
     assert page.canvas.bar.visible
 
 
@@ -229,7 +229,7 @@ def test_masks_of_lights_of_any_names_have_files_of_their_own(page, monkeypatch,
     lights = ("rot-1", "rot 1", "красный", "红")
     monkeypatch.setattr(DraftFrames, "lights", lights)
     marks = [Mark(f"mask {n} {light}", 20 * n + x, y) for n, light in enumerate(lights, 1) for x, y in CORNER]
-    page.drawing.keep((*RECTANGLE, *marks))
+    page.drawing.take_marks((*RECTANGLE, *marks))
     assert "are written" in page.press()
     files = read_test(tmp_path / "TEST.toml").weights.images
     assert len(set(files)) == 4

@@ -4,18 +4,18 @@ from types import SimpleNamespace
 
 import pytest
 
-from rgbmidic.view import sections
+from rgbmidic.view import panels
 
 
 def test_an_unexpected_error_is_told_and_not_called_the_end_of_the_process(monkeypatch, tmp_path):
     def broken(*_, **__):
         raise ZeroDivisionError("a fault of ours")
 
-    monkeypatch.setattr(sections, "Movie", broken)
-    monkeypatch.setattr(sections.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(panels, "FieldMovie", broken)
+    monkeypatch.setattr(panels.signal, "signal", lambda *_: None)
     told = []
     with pytest.raises(ZeroDivisionError):
-        sections._write(SimpleNamespace(send=told.append), None, tmp_path / "movie.gif", ["u"], {"limits": {}})
+        panels._write(SimpleNamespace(send=told.append), None, tmp_path / "movie.gif", ["u"], {"limits": {}})
     ((text, ended),) = told
     assert ended
     assert "movie.gif: unexpected error: ZeroDivisionError: a fault of ours" in text

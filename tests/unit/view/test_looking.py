@@ -27,26 +27,26 @@ from rgbmidic.report.style import time_axis
 from rgbmidic.results import QUANTITIES, FrameRecord, Maps, MapValues, Result, ResultStore
 from rgbmidic.results.histories import read_histories, write_histories
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, TestSettings
-from rgbmidic.text import rounded, uncertain
+from rgbmidic.text import format_value, format_with_std
 from rgbmidic.view import curves
-from rgbmidic.view.address import (
+from rgbmidic.view.curves import CurvePanel, FrameProgress, TimeLine
+from rgbmidic.view.fields import FieldsInView, palette_name, range_over_test
+from rgbmidic.view.map_panel import LabelLayer, arrow_lines, contour_lines, place_texts
+from rgbmidic.view.page import ResultPage
+from rgbmidic.view.picture import ImageWindow, Overlay, element_at, paint, palette, robust_range
+from rgbmidic.view.url_state import (
     CLOCKS,
     MARKS,
     PALETTES,
     UNCERTAINTY,
     Mark,
-    Steps,
+    UndoHistory,
     ViewState,
-    marks_of,
+    marks_of_probes,
     probe_marks,
-    probes,
+    settings_of_marks,
 )
-from rgbmidic.view.curves import CurvePanel, Progress, TimeLine
-from rgbmidic.view.map_panel import LabelLayer, arrow_lines, beside, contour_lines
-from rgbmidic.view.models import ResultControls, watched
-from rgbmidic.view.page import ResultPage
-from rgbmidic.view.picture import Overlay, Window, element_at, paint, palette, robust_range
-from rgbmidic.view.shown import ShownFields, palette_name, range_of_test
+from rgbmidic.view.widgets import ResultControls, is_watched
 
 NAMES = ("u", "v", "e1")
 
@@ -56,7 +56,7 @@ def replace_name(mark, name):
 
 
 def read(result, *marks):
-    return read_histories(result, probes(marks, 60.0, ProbeSettings()))
+    return read_histories(result, settings_of_marks(marks, 60.0, ProbeSettings()))
 
 
 numbers = st.floats(-1e6, 1e6).map(lambda x: float(f"{x:.6g}"))
@@ -119,30 +119,30 @@ def test_an_address_of_nonsense_opens_something_that_can_be_shown(query):
 @given(st.lists(marks, max_size=6))
 @settings(max_examples=30)
 def test_every_step_is_undone_and_done_again(states):
-    steps = Steps(())
+    steps = UndoHistory(())
     for state in states:
-        steps.keep(state)
-    back = [steps.now]
-    while (state := steps.go(back=True)) != back[-1] or len(back) <= len(states):
+        steps.record(state)
+    back = [steps.marks]
+    while (state := steps.step(back=True)) != back[-1] or len(back) <= len(states):
         back.append(state)
         if len(back) > len(states) + 1:
             break
-    assert steps.now == ()
+    assert steps.marks == ()
     for _ in back:
-        steps.go(back=False)
-    assert steps.now == (states[-1] if states else ())
+        steps.step(back=False)
+    assert steps.marks == (states[-1] if states else ())
 
 
 def test_the_moves_of_a_drag_are_one_step_and_those_of_another_mark_another():
     one, two = Mark("point", 1, 1), Mark("point", 9, 9)
-    steps = Steps((one, two))
+    steps = UndoHistory((one, two))
     for x in (2, 3, 4):
-        steps.keep((replace(one, x=x), two))
-    steps.keep((replace(one, x=4), replace(two, y=5)))
-    assert steps.go(back=True) == (replace(one, x=4), two)
-    assert steps.go(back=True) == (one, two)
-    steps.keep((one,))
-    assert steps.go(back=False) == (one,)
+        steps.record((replace(one, x=x), two))
+    steps.record((replace(one, x=4), replace(two, y=5)))
+    assert steps.step(back=True) == (replace(one, x=4), two)
+    assert steps.step(back=True) == (one, two)
+    steps.record((one,))
+    assert steps.step(back=False) == (one,)
 
 
 @given(named, st.floats(1, 99))
@@ -150,8 +150,8 @@ def test_the_moves_of_a_drag_are_one_step_and_those_of_another_mark_another():
 def test_marks_of_the_probes_that_marks_make_make_the_same(set_, gauge):
     boxes = [mark for mark in set_ if mark.kind == "region"]
     assume(all(one.x != other.x and one.y != other.y for one, other in itertools.pairwise(boxes)))  # else it is refused
-    made = probes([mark for mark in set_ if mark.kind != "circle"], gauge, ProbeSettings())
-    assert probes(marks_of(made), gauge, ProbeSettings()) == made
+    made = settings_of_marks([mark for mark in set_ if mark.kind != "circle"], gauge, ProbeSettings())
+    assert settings_of_marks(marks_of_probes(made), gauge, ProbeSettings()) == made
 
 
 @pytest.mark.parametrize(
@@ -174,7 +174,7 @@ def test_channels_that_are_stated_are_those_of_the_address(stated):
 def test_a_thinned_curve_keeps_its_peaks():
     x, y = np.arange(100_000.0), np.zeros(100_000)
     y[[777, 50_001]] = 5, -3
-    thin = curves._thinned(x, y)
+    thin = curves._decimate(x, y)
     assert len(thin[0]) <= 3000
     assert (x[y.argmax()], x[y.argmin()]) == (thin[0][thin[1].argmax()], thin[0][thin[1].argmin()])
 
@@ -182,13 +182,13 @@ def test_a_thinned_curve_keeps_its_peaks():
 def test_channels_off_the_frames_are_shown_where_they_are_and_told(tmp_path):
     result = make_result(tmp_path / "result", frames=4, record=lambda index: timed(index, 20_000))
     (tmp_path / "daq.csv").write_text("time_s,a_N\n" + "".join(f"{5 + n},{n}\n" for n in range(9)), encoding="utf-8")
-    page = ResultPage(Document(), result, ViewState(channels="daq.csv", beside="a_N"), Progress(4))
-    page.show()
-    assert "span 5 to 13 s" in page.parts.told.text
+    page = ResultPage(Document(), result, ViewState(channels="daq.csv", beside="a_N"), FrameProgress(4))
+    page.update_view()
+    assert "span 5 to 13 s" in page.controls.channel_status.text
     assert list(page.curves._recorded.data["ys"][0]) == list(range(9))
-    page.parts.of["offset"].value = -5.0
-    assert "has no value in" not in page.parts.told.text
-    page.parts.of["area"].value = 2.0
+    page.controls.entry_controls["offset"].value = -5.0
+    assert "has no value in" not in page.controls.channel_status.text
+    page.controls.entry_controls["area"].value = 2.0
     np.testing.assert_allclose(page.curves.histories["stress"].values, 0.5 * 2e-5 * np.arange(4), atol=1e-15)
     page._save()
     assert page.state.csv.splitlines()[0] == "frame,number,status,time_s,a_N,stress_MPa"
@@ -207,16 +207,16 @@ def in_mm():
 
 
 def test_fields_are_those_of_the_table_in_the_units_of_the_reader(result):
-    fields = Maps.of(result)
-    assert list(fields.all)[:3] == ["u", "v", "magnitude"]
+    fields = Maps.from_result(result)
+    assert list(fields.quantities)[:3] == ["u", "v", "magnitude"]
     assert {"e1", "equivalent", "node_status", "u_std", *(f"fraction of {light}" for light in LIGHTS)} <= set(
-        fields.all
+        fields.quantities
     )
-    assert fields.all["u"].label == "u (mm)"
+    assert fields.quantities["u"].label == "u (mm)"
     read, record = fields.read("u", 3), result.frame(3)
     np.testing.assert_allclose(read.values, 0.5 * record.u)
     np.testing.assert_allclose(read.std, np.hypot(0.5 * record.u_std, 0.01 * record.u))
-    np.testing.assert_allclose(read.moved, result.nodes + np.stack([record.u, record.v], axis=1))
+    np.testing.assert_allclose(read.deformed_nodes, result.nodes + np.stack([record.u, record.v], axis=1))
     np.testing.assert_allclose(fields.read("magnitude", 3).values, 0.5 * np.hypot(record.u, record.v))
     bias = np.where(np.isfinite(record.u_std), 0.5 * np.nan_to_num(record.u_bias_std), np.nan)
     for found in (fields.read("u_bias_std", 3).values, fields.physical.frame(3)["u_bias_std"]):
@@ -227,7 +227,7 @@ def test_fields_are_those_of_the_table_in_the_units_of_the_reader(result):
     np.testing.assert_allclose(fields.read("e1", 3).values, fields.physical.frame(3)["e1"])
     fraction = fields.read("fraction of green", 3).values
     assert np.isnan(fraction[record.node_status != 0]).all()
-    for name in (name for name in fields.all if not any(word in name for word in TIMED)):
+    for name in (name for name in fields.quantities if not any(word in name for word in TIMED)):
         assert fields.read(name, 3).values.shape == (NODES,)
 
 
@@ -245,7 +245,7 @@ def test_a_contour_lies_where_the_field_has_its_level_and_nowhere_beside_nodes_w
 
 
 def test_arrows_point_along_the_displacement_and_the_longest_reaches_to_the_next():
-    window = Window(left=0, top=0, right=240, bottom=120, width=800, height=400)
+    window = ImageWindow(x_min=0, y_min=0, x_max=240, y_max=120, width=800, height=400)
     moved = np.tile([0.3, -0.4], (NODES, 1))
     lines, longer = arrow_lines(window, MESH.nodes, moved, 0.0)
     shaft = (lines[:, 2:] - lines[:, :2])[: len(lines) // 3]
@@ -257,11 +257,13 @@ def test_arrows_point_along_the_displacement_and_the_longest_reaches_to_the_next
 
 
 def test_what_is_hatched_lies_below_zero():
-    window = Window(left=10, top=5, right=110, bottom=75, width=400, height=280)
-    over = {"nodes": MESH.nodes, "elements": MESH.elements, "values": np.ones(NODES), "ends": (0.0, 2.0)}
+    window = ImageWindow(x_min=10, y_min=5, x_max=110, y_max=75, width=400, height=280)
+    over = {"nodes": MESH.nodes, "elements": MESH.elements, "values": np.ones(NODES), "colour_range": (0.0, 2.0)}
     over |= {"colours": palette("viridis")}
     grey = np.full((80, 120), 90, dtype=np.uint8)
-    plain, hatched = (paint(window, grey, Overlay(**over, beyond=beyond)) for beyond in (None, MESH.nodes[:, 0] - 60))
+    plain, hatched = (
+        paint(window, grey, Overlay(**over, hatch_margin=beyond)) for beyond in (None, MESH.nodes[:, 0] - 60)
+    )
     changed = plain != hatched
     assert not changed[:, 202:].any()
     assert changed[:, 2:198].mean() == pytest.approx(0.25, abs=0.02)
@@ -275,8 +277,8 @@ def label(shown, name, kind, *place):
 
 def shown_fields(result, **view):
     """The fields of a view, as a page that was opened just now has them."""
-    shown = ShownFields(result, ViewState(**view))
-    shown.choose()
+    shown = FieldsInView(result, ViewState(**view))
+    shown.derive_fields()
     return shown
 
 
@@ -289,7 +291,7 @@ def test_the_frames_beside_the_one_in_view_are_read_ahead_and_each_once(tmp_path
             raise FrameError("it is gone")
         seen.append((kind, frame))
 
-    monkeypatch.setattr(shown, "_read", lambda name, frame: read(name, frame))
+    monkeypatch.setattr(shown, "_read_field", lambda name, frame: read(name, frame))
     monkeypatch.setattr(shown, "_raw", lambda frame: read("raw", frame))
     for _ in range(4):
         shown.read_ahead()
@@ -331,27 +333,36 @@ def test_the_label_of_a_probe_is_its_history_in_that_frame_and_the_pointer_state
         mean = "" if kind == "point" else " mean"
         for name in "uv":
             value, std = history(kind, name)
-            assert label(shown, name, kind, *PLACES[kind]) == f"{mean}: {maps.all[name].text(value, std)}"
-            assert label(shown, f"{name}_std", kind, *PLACES[kind]) == f"{mean}: {maps.all[f'{name}_std'].text(std)}"
+            assert label(shown, name, kind, *PLACES[kind]) == f"{mean}: {maps.quantities[name].format(value, std)}"
+            assert (
+                label(shown, f"{name}_std", kind, *PLACES[kind])
+                == f"{mean}: {maps.quantities[f'{name}_std'].format(std)}"
+            )
     for name, of_gauge, unit in (("u", "extension", " mm"), ("exx", "strain", "")):
         value, std = history("gauge", of_gauge)
-        assert label(shown, name, "gauge", *PLACES["gauge"]) == f" {of_gauge}: {uncertain(value, std)}{unit}"
-        assert label(shown, f"{name}_std", "gauge", *PLACES["gauge"]) == f" {of_gauge}: {rounded(std, std)}{unit}"
+        assert label(shown, name, "gauge", *PLACES["gauge"]) == f" {of_gauge}: {format_with_std(value, std)}{unit}"
+        assert label(shown, f"{name}_std", "gauge", *PLACES["gauge"]) == f" {of_gauge}: {format_value(std, std)}{unit}"
     assert label(shown, "misfit", "gauge", *PLACES["gauge"]) == ""
     for name in ("exx", "eyy", "exy", "e1", "e2", "equivalent"):
         for kind in ("region", "circle"):
-            assert label(shown, name, kind, *PLACES[kind]) == f" mean: {maps.all[name].text(*history(kind, name))}"
+            assert (
+                label(shown, name, kind, *PLACES[kind])
+                == f" mean: {maps.quantities[name].format(*history(kind, name))}"
+            )
     for name in ("exx", "eyy", "exy", "e1", "e2", "direction", "equivalent"):
         value, std = history("strain_gauge", name)
-        assert label(shown, name, "strain_gauge", *PLACES["strain_gauge"]) == f": {maps.all[name].text(value, std)}"
+        assert (
+            label(shown, name, "strain_gauge", *PLACES["strain_gauge"])
+            == f": {maps.quantities[name].format(value, std)}"
+        )
         assert (
             label(shown, f"{name}_std", "strain_gauge", *PLACES["strain_gauge"])
-            == f": {maps.all[f'{name}_std'].text(std)}"
+            == f": {maps.quantities[f'{name}_std'].format(std)}"
         )
     for name in ("u", "v", "u_std"):
-        field = maps.all[name]
+        field = maps.quantities[name]
         shown.view = replace(shown.view, field=name)
-        told = shown.text_at(*PLACES["point"])
+        told = shown.pointer_text(*PLACES["point"])
         assert told.endswith(f"<b>{field.symbol} = {label(shown, name, 'point', *PLACES['point'])[2:]}</b>")
     assert label(shown, "u", "strain_gauge", *PLACES["strain_gauge"]) == label(shown, "u", "point", *PLACES["point"])
 
@@ -380,21 +391,23 @@ def test_a_strain_gauge_at_a_node_is_the_map_at_that_node_since_any_frame(tmp_pa
     node = int(np.argmin(np.hypot(*(result.nodes - [60, 40]).T)))
     for name in ("exx", "equivalent"):
         read = maps.read(name, 5)
-        stated = maps.all[name].text(read.values[node], read.std[node])
+        stated = maps.quantities[name].format(read.values[node], read.std[node])
         assert label(shown, name, "strain_gauge", *result.nodes[node], 60.0) == f": {stated}"
 
 
 def map_values(values, std):
     count = len(values)
-    return MapValues(values=values, std=std, moved=np.zeros((count, 2)), status=np.zeros(count, dtype=np.uint8))
+    return MapValues(
+        values=values, std=std, deformed_nodes=np.zeros((count, 2)), status=np.zeros(count, dtype=np.uint8)
+    )
 
 
 def test_the_magnitude_is_as_uncertain_as_along_itself(tmp_path):
     store = ResultStore.create(tmp_path / "result", make_origin(1))
     both = {"u": np.full(NODES, 3.0), "v": np.full(NODES, 4.0), "u_std": np.full(NODES, 0.1), "v_std": np.zeros(NODES)}
-    store.write_frame(0, FrameRecord.of(nodes=NODES, lights=3, status=0, node_status=np.zeros(NODES), **both))
+    store.write_frame(0, FrameRecord.from_values(nodes=NODES, lights=3, status=0, node_status=np.zeros(NODES), **both))
     store.finish()
-    read = Maps.of(Result.open(tmp_path / "result")).read("magnitude", 0)
+    read = Maps.from_result(Result.open(tmp_path / "result")).read("magnitude", 0)
     np.testing.assert_allclose([read.values[0], read.std[0]], [5.0, 0.06], rtol=1e-3)  # a noise of .1 adds 2e-5
 
 
@@ -408,14 +421,14 @@ def test_doubtful_nodes_and_outliers_do_not_rule_the_colours():
 
 
 def test_the_range_of_the_test_holds_that_of_every_frame(result):
-    fields = Maps.of(result)
-    low, high = range_of_test(fields, "v")
+    fields = Maps.from_result(result)
+    low, high = range_over_test(fields, "v")
     ends = [robust_range(fields.read("v", frame)) for frame in range(6)]
     assert (low, high) == (min(a for a, _ in ends), max(b for _, b in ends))
 
 
 def test_a_window_keeps_its_centre_and_shows_all_with_one_scale():
-    window = Window(left=0, top=10, right=100, bottom=30, width=200, height=200).fitted()
+    window = ImageWindow(x_min=0, y_min=10, x_max=100, y_max=30, width=200, height=200).fit_aspect()
     assert window.edges == (0, -30, 100, 70)
     assert window.steps == pytest.approx((0.5, 0.5))
 
@@ -425,17 +438,17 @@ def test_a_node_is_painted_where_its_pixel_of_the_image_is(zoom):
     """One bright pixel of the image, and a triangle around it whose corner values differ: both in the same place."""
     image = np.zeros((64, 64), dtype=np.uint8)
     image[20:24, 40:44] = 255  # centre (41.5, 21.5)
-    window = Window(left=-0.5, top=-0.5, right=63.5, bottom=63.5, width=int(64 * zoom), height=int(64 * zoom))
+    window = ImageWindow(x_min=-0.5, y_min=-0.5, x_max=63.5, y_max=63.5, width=int(64 * zoom), height=int(64 * zoom))
     shown = paint(window, image) & 0xFF
     rows, columns = np.nonzero(shown > 120)
-    x, y = window.place(np.array([[41.5, 21.5]]))
+    x, y = window.to_picture(np.array([[41.5, 21.5]]))
     assert (columns.mean(), rows.mean()) == pytest.approx((x[0], y[0]), abs=0.51)
     nodes = np.array([[38.0, 18.0], [45.0, 18.0], [41.5, 28.5]])
     elements, colours = np.array([[0, 1, 2]], dtype=np.int32), ("#000000", "#ff0000")
-    over = Overlay(nodes=nodes, elements=elements, values=np.ones(3), ends=(0, 1), colours=colours)
+    over = Overlay(nodes=nodes, elements=elements, values=np.ones(3), colour_range=(0, 1), colours=colours)
     painted = paint(window, np.zeros_like(image), over) & 0xFF
     rows, columns = np.nonzero(painted)
-    x, y = window.place(nodes.mean(axis=0)[None])
+    x, y = window.to_picture(nodes.mean(axis=0)[None])
     assert (columns.mean(), rows.mean()) == pytest.approx((x[0], y[0]), abs=0.6)
 
 
@@ -446,8 +459,8 @@ def test_a_place_is_found_in_its_element(result):
 
 
 def test_every_field_has_colours(result):
-    for field in Maps.of(result).all.values():
-        for symmetric in {False, field.signed}:
+    for field in Maps.from_result(result).quantities.values():
+        for symmetric in {False, field.is_signed}:
             assert all(len(colour) == 7 for colour in palette(palette_name(field, symmetric=symmetric)))
 
 
@@ -459,7 +472,7 @@ def test_marks_make_probes_in_the_order_set_and_a_lone_end_waits():
         Mark("gauge", 7, 8),
         Mark("strain_gauge", 9, 9),
     ]
-    made = probes(set_, 60.0, ProbeSettings(measure="hencky"))
+    made = settings_of_marks(set_, 60.0, ProbeSettings(measure="hencky"))
     assert made.gauges == ((1, 2, 3, 4),)
     assert made.points == ((5, 6),)
     assert made.strain_gauges == ((9, 9, 60.0),)
@@ -470,10 +483,12 @@ def test_curves_are_grouped_by_what_they_tell_and_saved_as_the_command_does(tmp_
     result = make_result(tmp_path / "result", frames=4, record=smooth_record)
     set_ = [Mark("point", 50, 40), Mark("gauge", 30, 30), Mark("gauge", 90, 30), Mark("point", 60, 40)]
     histories = read(result, *set_)
-    groups = {name: [told.name for told in own] for name, own in curves.groups(histories, probe_marks(set_)).items()}
+    groups = {
+        name: [told.name for told in own] for name, own in curves.group_quantities(histories, probe_marks(set_)).items()
+    }
     assert groups["u (px)"] == ["point_1_u", "point_2_u"]
     assert groups["extension (px)"] == ["gauge_1_extension"]
-    page = ResultPage(Document(), result, ViewState(), Progress(4))
+    page = ResultPage(Document(), result, ViewState(), FrameProgress(4))
     page.curves.histories = histories
     page._save()
     write_histories(histories, tmp_path / "own.csv")
@@ -484,7 +499,7 @@ def test_the_band_is_open_where_a_frame_is_missing():
     from rgbmidic.fields import History
 
     told = History(name="a", unit="", values=np.array([1.0, 2, np.nan, 4, 5, 6]), std=np.full(6, 0.5))
-    xs, ys = curves.band(np.arange(6.0), told)
+    xs, ys = curves.uncertainty_band(np.arange(6.0), told)
     assert [list(x) for x in xs] == [[0, 1, 1, 0], [3, 4, 5, 5, 4, 3]]
     assert list(ys[0]) == [0, 1, 3, 2]
 
@@ -494,10 +509,10 @@ def test_the_time_line_tells_failed_frames_and_lost_nodes(tmp_path):
     records = [random_record(0), FrameRecord.failed("no start", nodes=NODES, lights=3), random_record(3)]
     for index, record in enumerate(records):
         store.write_frame(index, record)
-    result, progress = Result.open(tmp_path / "result", partial=True), Progress(4)
+    result, progress = Result.open(tmp_path / "result", partial=True), FrameProgress(4)
     for _ in range(2):
         progress.advance(result)
-        assert progress.known == 3
+        assert progress.read_count == 3
     assert progress.status.tolist() == [0, 2, 1, -1]
     np.testing.assert_allclose(progress.fraction[:3], [(r.node_status == 0).mean() for r in records])
     assert progress.summary(3) == "3 of 4 frames measured, 1 not converged, 1 failed"
@@ -508,7 +523,7 @@ def test_a_frame_that_is_measured_again_or_taken_back_is_looked_at_again(tmp_pat
     store = ResultStore.create(tmp_path / "result", make_origin(3))
     for index in range(3):
         store.write_frame(index, FrameRecord.failed("no start", nodes=NODES, lights=3))
-    progress, line = Progress(3), TimeLine(3, 0)
+    progress, line = FrameProgress(3), TimeLine(3, 0)
     progress.advance(Result.open(store.path, partial=True))
     line.draw(progress)
     store.write_frame(1, smooth_record(1))
@@ -524,12 +539,12 @@ def test_a_frame_that_the_curves_do_not_hold_is_not_pointed_at(tmp_path):
     for index in (0, 1, 4):
         store.write_frame(index, smooth_record(index))
     result = Result.open(store.path, partial=True)
-    panel = CurvePanel(Document(), ShownFields(result, ViewState()), ResultControls(4, 0, dark=False))
+    panel = CurvePanel(Document(), FieldsInView(result, ViewState()), ResultControls(4, 0, dark=False))
     panel.histories = read(result, Mark("point", 50, 40))
     shown = []
     for frame in range(5):
-        panel.point(frame)
-        shown.append(panel.now.location)
+        panel.mark_frame(frame)
+        shown.append(panel.frame_mark.location)
     assert shown == [0, 1, None, None, 4]
     store.release()
 
@@ -540,7 +555,7 @@ def test_curves_go_over_the_time_in_the_unit_that_suits_it(tmp_path):
     x, name = time_axis(histories.times, histories.frames)
     assert name == "time (µs)"
     np.testing.assert_allclose(x, [0, 20, 40, 60])
-    assert "frame 3, 60 µs" in ShownFields(result, ViewState(frame=3)).text()
+    assert "frame 3, 60 µs" in FieldsInView(result, ViewState(frame=3)).description()
 
 
 def timed(index, step):
@@ -559,43 +574,45 @@ class Walk:
     def __init__(self, folder):
         self.store = ResultStore.create(folder / "result", make_origin(8))
         self.store.write_frame(0, smooth_record(1))
-        self.page = ResultPage(Document(), self.opened, ViewState(), Progress(8))
-        self.page.show()
+        self.page = ResultPage(Document(), self.opened, ViewState(), FrameProgress(8))
+        self.page.update_view()
 
     @property
     def opened(self):
         return Result.open(self.store.path, partial=True)
 
     def do(self, what, choose):
-        page, parts = self.page, self.page.parts
+        page, parts = self.page, self.page.controls
         if what == "point":
             x, y = choose.uniform(0, 120), choose.uniform(0, 80)
             page.maps.canvas.plot._trigger_event(MouseMove(page.maps.canvas.plot, sx=1, sy=1, x=x, y=y))
         elif what == "frame":
-            page.state.asked = choose.randrange(8)
+            page.state.requested_frame = choose.randrange(8)
         elif what == "field":
-            still = [name for name in page.shown.maps.all if not any(word in name for word in TIMED)]
-            parts.of["field"].value = choose.choice(still)
+            still = [name for name in page.fields.maps.quantities if not any(word in name for word in TIMED)]
+            parts.entry_controls["field"].value = choose.choice(still)
         elif what == "over":
             parts.over.active = choose.randrange(2)
         elif what == "range":
-            parts.of["range"].value = choose.choice(["frame", "test"])
+            parts.entry_controls["range"].value = choose.choice(["frame", "test"])
         else:
             self.store.write_frame(choose.randrange(8), smooth_record(choose.randrange(1, 9)))
             page._grow()
-            page.state.asked = parts.frame.value if parts.frame.value != page.view.frame else page.state.asked
+            page.state.requested_frame = (
+                parts.frame.value if parts.frame.value != page.view.frame else page.state.requested_frame
+            )
 
     def check(self):
         """All that is shown is of the frame and the field in view, as the result holds them now."""
         page, view, result = self.page, self.page.view, self.opened
-        fields = Maps.of(result)
-        field, values = fields.all[view.field], fields.read(view.field, view.frame)
-        shown = ShownFields(result, view)
-        assert page.parts.under.text == (shown.text_at(*page._pointer) if page._pointer else "")
-        assert page.parts.description.text == shown.text(shown.picture[1])
+        fields = Maps.from_result(result)
+        field, values = fields.quantities[view.field], fields.read(view.field, view.frame)
+        shown = FieldsInView(result, view)
+        assert page.controls.pointer_label.text == (shown.pointer_text(*page._pointer) if page._pointer else "")
+        assert page.controls.description.text == shown.description(shown.picture[1])
         assert page.maps.canvas.plot.title.text == field.label
-        if field.ends is None:
-            whole = range_of_test(fields, view.field)
+        if field.fixed_range is None:
+            whole = range_over_test(fields, view.field)
             ends = whole if view.range == "test" else robust_range(values) or (0.0, 1.0)
             assert (page.maps.canvas.colours.low, page.maps.canvas.colours.high) == ends
 
@@ -615,56 +632,56 @@ def test_what_is_told_is_always_that_of_what_is_shown(tmp_path, seed):
 
 def test_nothing_is_shown_of_a_frame_that_cannot_be_read(tmp_path):
     made = make_result(tmp_path / "result", frames=3, record=smooth_record)
-    page = ResultPage(Document(), made, ViewState(frame=0), Progress(3))
-    page.show()
+    page = ResultPage(Document(), made, ViewState(frame=0), FrameProgress(3))
+    page.update_view()
     page.maps.canvas.plot._trigger_event(MouseMove(page.maps.canvas.plot, sx=1, sy=1, x=50, y=40))
     corrupt(made, 1)
-    page.state.asked = 1
-    assert "damaged in frame 1" in page.parts.description.text
-    assert page.parts.under.text == ""
+    page.state.requested_frame = 1
+    assert "damaged in frame 1" in page.controls.description.text
+    assert page.controls.pointer_label.text == ""
     assert not len(page.maps.canvas._image.data["image"])
     assert not page.maps.canvas.bar.visible
-    page.state.asked = 2
-    assert page.parts.description.text.startswith("Frame 2 of 0 to 2")
-    assert "u = " in page.parts.under.text
+    page.state.requested_frame = 2
+    assert page.controls.description.text.startswith("Frame 2 of 0 to 2")
+    assert "u = " in page.controls.pointer_label.text
     assert page.maps.canvas.bar.visible
 
 
 def test_curves_that_are_being_read_are_not_saved(tmp_path):
-    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), Progress(2))
+    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), FrameProgress(2))
     page.curves.histories = read(page.result, Mark("point", 50, 40))
     page.curves.reading = True
     page._save()
     assert page.state.csv == ""
-    assert "still being read" in page.parts.message.text
+    assert "still being read" in page.controls.message.text
     page.curves.reading = False
     page._save()
     assert page.state.csv.startswith("frame,")
 
 
 def test_a_range_by_hand_that_makes_no_sense_is_told(tmp_path):
-    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), Progress(2))
-    page.show()
+    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), FrameProgress(2))
+    page.update_view()
     present = page.maps.canvas.colours.low, page.maps.canvas.colours.high
-    page.parts.of["range"].value = "hand"
+    page.controls.entry_controls["range"].value = "hand"
     assert (page.view.low, page.view.high) == present
-    page.parts.of["low"].value = 5.0
-    assert f"The colours go from {present[0]:g} to {present[1]:g}" in page.parts.description.text
-    page.parts.of["high"].value = 9.0
-    assert "The colours go" not in page.parts.description.text
+    page.controls.entry_controls["low"].value = 5.0
+    assert f"The colours go from {present[0]:g} to {present[1]:g}" in page.controls.description.text
+    page.controls.entry_controls["high"].value = 9.0
+    assert "The colours go" not in page.controls.description.text
     assert (page.maps.canvas.colours.low, page.maps.canvas.colours.high) == (5, 9)
 
 
 def test_a_choice_that_cannot_be_is_told_and_the_next_one_counts(tmp_path):
-    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), Progress(2))
-    page.parts.of["gauge"].value = 5.0
-    assert "at least 56.12 px long" in page.parts.description.text
-    assert not page._told
-    page.parts.of["gauge"].value = 70.0
-    page.parts.of["field"].value = "exx"
-    assert "virtual strain gauge of 70 px" in page.parts.description.text
-    page.parts.of["field"].value = "velocity"
-    assert "rates need 4 measured frames or more; there are 2" in page.parts.description.text
+    page = ResultPage(Document(), make_result(tmp_path / "result", record=smooth_record), ViewState(), FrameProgress(2))
+    page.controls.entry_controls["gauge"].value = 5.0
+    assert "at least 56.12 px long" in page.controls.description.text
+    assert not page._has_view
+    page.controls.entry_controls["gauge"].value = 70.0
+    page.controls.entry_controls["field"].value = "exx"
+    assert "virtual strain gauge of 70 px" in page.controls.description.text
+    page.controls.entry_controls["field"].value = "velocity"
+    assert "rates need 4 measured frames or more; there are 2" in page.controls.description.text
 
 
 def test_a_long_reason_is_short_until_more_is_asked_for(tmp_path):
@@ -672,7 +689,7 @@ def test_a_long_reason_is_short_until_more_is_asked_for(tmp_path):
     store = ResultStore.create(tmp_path / "result", make_origin(1))
     store.write_frame(0, FrameRecord.failed(reason, nodes=NODES, lights=3))
     store.finish()
-    text = ShownFields(Result.open(tmp_path / "result"), ViewState()).text()
+    text = FieldsInView(Result.open(tmp_path / "result"), ViewState()).description()
     summary, _, rest = text.partition("</summary>")
     assert "failed: the solve stopped because" in summary
     assert summary.endswith("… more")
@@ -683,17 +700,19 @@ def test_a_long_reason_is_short_until_more_is_asked_for(tmp_path):
 def test_a_camera_s_plane_is_that_of_the_page_and_a_wrong_file_changes_nothing(tmp_path):
     made = make_result(tmp_path / "result", record=smooth_record)
     CameraCalibration(shape=(80, 120), homography=np.diag([0.5, 0.5, 1])).write(tmp_path / "camera.json")
-    page = ResultPage(Document(), made, ViewState(frame=1), Progress(2))
-    page.show()
-    before = page.shown.values("u").values
-    page.parts.of["camera"].value = "camera.json"
+    page = ResultPage(Document(), made, ViewState(frame=1), FrameProgress(2))
+    page.update_view()
+    before = page.fields.values("u").values
+    page.controls.entry_controls["camera"].value = "camera.json"
     assert page.maps.canvas.plot.title.text == "u (mm)"
-    assert ("u", "u (mm)") in [tuple(pair) for group in page.parts.of["field"].options.values() for pair in group]
-    np.testing.assert_allclose(page.shown.values("u").values, 0.5 * before, atol=1e-9)
-    page.parts.of["camera"].value = "none.json"
-    assert "none.json" in page.parts.scaled.text
+    assert ("u", "u (mm)") in [
+        tuple(pair) for group in page.controls.entry_controls["field"].options.values() for pair in group
+    ]
+    np.testing.assert_allclose(page.fields.values("u").values, 0.5 * before, atol=1e-9)
+    page.controls.entry_controls["camera"].value = "none.json"
+    assert "none.json" in page.controls.scale_label.text
     assert page.maps.canvas.plot.title.text == "u (mm)"
-    page.parts.of["camera"].value = ""
+    page.controls.entry_controls["camera"].value = ""
     assert page.maps.canvas.plot.title.text == "u (px)"
 
 
@@ -708,10 +727,10 @@ def probed(tmp_path_factory):
 
 
 def test_probes_that_the_test_states_are_shown_at_opening(probed):
-    page = ResultPage(Document(), probed, ViewState(), Progress(4))
-    assert probes(page.view.marks, page.view.gauge, ProbeSettings()) == PROBES
+    page = ResultPage(Document(), probed, ViewState(), FrameProgress(4))
+    assert settings_of_marks(page.view.marks, page.view.gauge, ProbeSettings()) == PROBES
     own = (Mark("point", 30, 30),)
-    assert ResultPage(Document(), probed, ViewState(marks=own), Progress(4)).view.marks == own
+    assert ResultPage(Document(), probed, ViewState(marks=own), FrameProgress(4)).view.marks == own
     other = replace(PROBES, strain_gauges=((60, 40, 60), (60, 40, 80)))  # the page has one length for all
     assert {mark.kind for mark in ViewState().with_probes(other, 50.0).marks} == {"point", "line"}
     assert ViewState().with_probes(PROBES, 61.0).gauge == 0
@@ -720,8 +739,8 @@ def test_probes_that_the_test_states_are_shown_at_opening(probed):
 
 def test_a_picture_for_print_is_light_wide_and_says_what_it_shows(probed):
     view = ViewState(frame=3, field="exx", second="u", theme="dark", vectors=True, contours=True)
-    page = ResultPage(Document(), probed, view, Progress(4))
-    page.show()
+    page = ResultPage(Document(), probed, view, FrameProgress(4))
+    page.update_view()
     figure = page.maps.figure()
     title = figure.texts[0].get_text()
     assert "Frame 3 of 0 to 3" in title
@@ -740,17 +759,17 @@ def test_a_picture_for_print_is_light_wide_and_says_what_it_shows(probed):
 
 
 def test_there_is_no_colour_bar_before_there_are_colours(probed):
-    page = ResultPage(Document(), probed, ViewState(), Progress(4))
+    page = ResultPage(Document(), probed, ViewState(), FrameProgress(4))
     assert not page.maps.canvas.bar.visible
-    page.show()
+    page.update_view()
     assert page.maps.canvas.bar.visible
 
 
 def test_a_bar_of_codes_has_their_names_only(probed):
-    page = ResultPage(Document(), probed, ViewState(field="node_status"), Progress(4))
+    page = ResultPage(Document(), probed, ViewState(field="node_status"), FrameProgress(4))
     bar = page.maps.canvas.bar
     ticker = bar.ticker  # the page keeps the one that it was opened with
-    page.show()
+    page.update_view()
     assert bar.ticker is ticker
     assert ticker.min_interval == 1
     assert bar.major_label_overrides == dict(enumerate(QUANTITIES["node_status"].codes))
@@ -761,18 +780,18 @@ def test_a_page_whose_browser_has_gone_is_not_watched():
         session = None if connections is None else SimpleNamespace(connection_count=connections)
         return SimpleNamespace(session_context=SimpleNamespace(session=session))
 
-    assert [watched(document(connections)) for connections in (None, 0, 1)] == [True, False, True]
+    assert [is_watched(document(connections)) for connections in (None, 0, 1)] == [True, False, True]
 
 
 def test_texts_end_in_the_window_and_do_not_lie_on_each_other():
-    window = Window(left=0, top=0, right=500, bottom=400, width=500, height=400)
+    window = ImageWindow(x_min=0, y_min=0, x_max=500, y_max=400, width=500, height=400)
     texts = [(10, 50, "left"), (480, 50, "at the right edge"), (12, 55, "beside the first"), (14, 52, "and a third")]
-    placed = beside(texts, window)
+    placed = place_texts(texts, window)
     assert [side for side, *_ in placed] == ["left", "right", "left", "left"]
     lows = [y + down for (_, y, _), (_, _, down) in zip(texts, placed, strict=True)]
     near = sorted(lows[at] for at in (0, 2, 3))
     assert min(np.diff(near)) >= 20
     assert lows[1] == 50
     layer = LabelLayer(SimpleNamespace(window=window, plot=figure()), "extremes")
-    layer.show([(11, 51, "smallest", "black")], others=texts)
+    layer.show([(11, 51, "smallest", "black")], other_texts=texts)
     assert 51 + layer._points.data["down"][0] >= max(near) + 20

@@ -24,9 +24,9 @@ from viewer import serving
 from rgbmidic import cli
 from rgbmidic.command import execute
 from rgbmidic.frames.images import write_tiff
-from rgbmidic.view.address import ViewState
-from rgbmidic.view.draft import Draft
-from rgbmidic.view.server import _fill_list, _found, start
+from rgbmidic.view.server import _fill_list, _find_tests, start_server
+from rgbmidic.view.test_file_editor import Draft
+from rgbmidic.view.url_state import ViewState
 
 REQUESTS = 300
 """Enough for every kind of request below to come a few times; 20,000 were sent once before this was merged."""
@@ -137,7 +137,7 @@ def test_a_folder_lists_its_results_and_tests_newest_first_and_opens_only_those(
     (tmp_path / "test.toml").write_text("[frames]\npath = 'none/*.tif'\n")
     os.utime(tmp_path / "test.toml", (1.1e9, 1.1e9))
     (tmp_path / "pyproject.toml").write_text("[frames]\n")
-    assert list(_found(tmp_path)) == [newer, tmp_path / "test.toml", older]
+    assert list(_find_tests(tmp_path)) == [newer, tmp_path / "test.toml", older]
     _fill_list(tmp_path, document := Document())
     rows = re.findall("<tr>(.*?)</tr>", document.roots[0].text)
     assert re.findall('<th scope="col">(.*?)</th>', rows[0]) == ["Name", "What it is", "Changed"]
@@ -208,7 +208,7 @@ def test_a_test_is_set_up_from_frames_whose_properties_are_stated(tmp_path, monk
     stated = {"kind": "monochrome", "shape": frame.values.shape[-2:], "dtype": "uint16"}
     with serving(tmp_path / "frame.raw", **stated) as told:
         assert b"<title>rgbmidic: frame.raw</title>" in ask(told, "GET", urlsplit(told).path)[1]
-    draft = Draft.of(tmp_path / "frame.raw", stated)  # what is written, so that the run reads the same
+    draft = Draft.from_path(tmp_path / "frame.raw", stated)  # what is written, so that the run reads the same
     assert draft.section("frames") == {**stated, "shape": list(stated["shape"]), "path": str(tmp_path / "frame.raw")}
 
 
@@ -225,7 +225,7 @@ def test_others_are_served_while_pages_that_were_left_are_let_go(tmp_path):
     left = []
 
     async def leave() -> None:
-        server, address = start(make_result(tmp_path / "result").path)
+        server, address = start_server(make_result(tmp_path / "result").path)
         for _ in range(5):
             await AsyncHTTPClient().fetch(address)
         for session in server.get_sessions():

@@ -16,18 +16,18 @@ from bokeh.layouts import column, row
 from bokeh.model import DataModel
 
 from rgbmidic.errors import RgbmidicError
-from rgbmidic.view.address import ViewState
 from rgbmidic.view.constants import VIEWER
+from rgbmidic.view.url_state import ViewState
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
-READ_OUT = {"aria-live": "polite"}
+LIVE_REGION = {"aria-live": "polite"}
 """Attributes of a text whose changes screen readers read out."""
 
 
 def page_file(name: str) -> str:
-    """Text of a file of the page that lies beside this module."""
+    """Return the text of a file of the page that lies beside this module."""
     return files("rgbmidic.view").joinpath(name).read_text(encoding="utf-8")
 
 
@@ -36,9 +36,9 @@ def script(name: str, **parts: Any) -> bk.CustomJS:
     return bk.CustomJS(args=parts, code=f"rgbmidic.{name}({{{', '.join(parts)}}})")
 
 
-def labelled(says: str) -> dict[str, str]:
-    """Attributes of a group of controls whose purpose screen readers read out."""
-    return {"role": "group", "aria-label": says}
+def aria_group(label: str) -> dict[str, str]:
+    """Return HTML attributes of a group of controls with the label that screen readers read out."""
+    return {"role": "group", "aria-label": label}
 
 
 def warning(text: str) -> str:
@@ -46,26 +46,28 @@ def warning(text: str) -> str:
     return f'<b style="color:var(--warn)">{html.escape(text)}</b>'
 
 
-def guarded(act: Callable[[], object], complain: Callable[[str], None]) -> None:
-    """Call `act`; an error is reported in one line by `complain`, and the page goes on."""
+def run_guarded(action: Callable[[], object], report: Callable[[str], None]) -> None:
+    """Call `action`; an error is reported in one line by `report`, and the page goes on."""
     try:
-        act()
+        action()
     except (RgbmidicError, OSError) as error:
-        complain(str(error))
+        report(str(error))
     except Exception as error:  # the last resort of a page
         logger.exception("the page failed")
-        complain(f"{type(error).__name__}: {error}")
+        report(f"{type(error).__name__}: {error}")
 
 
-def watched(document: Document) -> bool:
+def is_watched(document: Document) -> bool:
     """Return whether a browser shows the page: one that was left exists for a while, and shall do nothing more."""
     session = document.session_context.session if document.session_context else None
     return session is None or session.connection_count > 0
 
 
-def every(milliseconds: int, document: Document, act: Callable[[], None], complain: Callable[[str], None]) -> None:
-    """Call `act`, as `guarded`, again and again while a browser shows the page."""
-    document.add_periodic_callback(lambda: guarded(act, complain) if watched(document) else None, milliseconds)
+def call_periodically(
+    milliseconds: int, document: Document, action: Callable[[], None], report: Callable[[str], None]
+) -> None:
+    """Call `action`, as `run_guarded`, again and again while a browser shows the page."""
+    document.add_periodic_callback(lambda: run_guarded(action, report) if is_watched(document) else None, milliseconds)
 
 
 class Background:
@@ -81,24 +83,24 @@ class Background:
         self._document, self._thread, self._task = document, ThreadPoolExecutor(1), Future[Any]()
         document.on_session_destroyed(lambda context: self._thread.shutdown(wait=False, cancel_futures=True))
 
-    def drop(self) -> None:
+    def cancel(self) -> None:
         """Forget the task that was asked for."""
         self._task.cancel()
         self._task = Future()
 
-    def ask(self, work: Callable[[], T], take: Callable[[Callable[[], T]], None]) -> None:
-        """Start a task; `take` gets the function that returns its result or raises its error, in the page's thread."""
-        self.drop()
+    def submit(self, work: Callable[[], T], receive: Callable[[Callable[[], T]], None]) -> None:
+        """Start a task; `receive` gets a function that returns its result or raises its error, in the page's thread."""
+        self.cancel()
         task = self._task = self._thread.submit(work)
-        taken = lambda: take(task.result) if task is self._task else None  # noqa: E731
-        task.add_done_callback(lambda _: self._document.add_next_tick_callback(taken))
+        deliver = lambda: receive(task.result) if task is self._task else None  # noqa: E731
+        task.add_done_callback(lambda _: self._document.add_next_tick_callback(deliver))
 
 
 class SharedState(DataModel):  # type: ignore[misc]  # see pyproject.toml
     """State that browser and server share: frame asked for, frame shown, rest of the address, files to keep."""
 
-    asked = Int(0)
-    shown = Int(0)
+    requested_frame = Int(0)
+    displayed_frame = Int(0)
     query = String("")
     csv = String("")
     png = String("")
@@ -124,34 +126,36 @@ class Controls:
         The row of play button, step and slider.
     """
 
-    def __init__(self, last: int, frame: int, *, dark: bool) -> None:
+    def __init__(self, last_frame: int, frame: int, *, dark: bool) -> None:
         styles = ("widgets.css", "dark.css") if dark else ("widgets.css",)
         self.small: dict[str, Any] = {"stylesheets": [bk.InlineStyleSheet(css=page_file(name)) for name in styles]}
         self.wide = wide = {**self.small, "sizing_mode": "stretch_width"}
-        other, most = "light" if dark else "dark", max(last, 1)
+        other_theme, max_frame = "light" if dark else "dark", max(last_frame, 1)
         self.head, self.message = bk.Div(**wide), bk.Div(name="message", **wide)
-        self.description = bk.Div(name="description", html_attributes=READ_OUT, **wide)
-        self.theme = bk.Button(label=f"{other.capitalize()} page", **wide)
-        self.theme.js_on_click(script("turn", theme=other))
+        self.description = bk.Div(name="description", html_attributes=LIVE_REGION, **wide)
+        self.theme = bk.Button(label=f"{other_theme.capitalize()} page", **wide)
+        self.theme.js_on_click(script("turn", theme=other_theme))
         self.frame = bk.Slider(
-            title="Frame", name="frame", start=0, end=most, step=1, value=frame, disabled=last < 1, **wide
+            title="Frame", name="frame", start=0, end=max_frame, step=1, value=frame, disabled=last_frame < 1, **wide
         )
         self.play = bk.Toggle(label="▶ Play", name="play", width=90, **self.small)
-        says = labelled("frames that Play and the arrow keys go on by")
-        self.step = bk.Spinner(name="step", low=1, high=most, value=1, width=70, html_attributes=says, **self.small)
+        label = aria_group("frames that Play and the arrow keys go on by")
+        self.step = bk.Spinner(
+            name="step", low=1, high=max_frame, value=1, width=70, html_attributes=label, **self.small
+        )
         self.player = row(self.play, self.step, self.frame, sizing_mode="stretch_width")
 
-    def group(self, name: str, says: str, labels: Iterable[str], active: int | None = 0) -> Any:
-        """Buttons of which one is pressed, with what they choose, for screen readers."""
-        look = {"html_attributes": labelled(says), **self.wide}
+    def group(self, name: str, label: str, labels: Iterable[str], active: int | None = 0) -> Any:
+        """Make buttons of which one is pressed, with a label for screen readers."""
+        look = {"html_attributes": aria_group(label), **self.wide}
         return bk.RadioButtonGroup(labels=list(labels), active=active, name=name, **look)
 
-    def ask(self, state: SharedState) -> None:
+    def request_frames(self, state: SharedState) -> None:
         """Let the slider ask for frames, and play them."""
-        asks = script("pump", state=state, slider=self.frame, play=self.play, step=self.step, wait=VIEWER.play_ms)
-        self.frame.js_on_change("value", asks)
-        self.play.js_on_change("active", asks)
-        state.js_on_change("shown", asks)
+        request = script("pump", state=state, slider=self.frame, play=self.play, step=self.step, wait=VIEWER.play_ms)
+        self.frame.js_on_change("value", request)
+        self.play.js_on_change("active", request)
+        state.js_on_change("displayed_frame", request)
 
 
 SECTIONS: Mapping[str, Sequence[str | tuple[str, ...]]] = {
@@ -161,12 +165,13 @@ SECTIONS: Mapping[str, Sequence[str | tuple[str, ...]]] = {
     "Derived": ("gauge", "measure", "since", "rigid", "rate_window"),
     "Probes": ("mode", ("curve", "along"), ("probe", "name"), ("undo", "redo", "clear"), ("csv", "png"), "message"),
     "Channels": ("channels", ("beside", "clock"), "trigger", ("align", "align_to"), "offset", "drag", ("force", "area"),
-                 "told"),
-    "File": ("scale", ("distance", "distance_std", "camera"), "scaled", "file", "what", ("write", "take"), "written"),
+                 "channel_status"),
+    "File": ("scale", ("distance", "distance_std", "camera"), "scale_label", "file", "sections_to_write",
+             ("write", "load_probes"), "save_status"),
 }  # fmt: skip
 """Controls of a result by the section under which they stand, some in one row: one section is shown at a time, and fits
 a screen of 720 rows."""
-WRITTEN = ("probes", "channels", "scale")
+WRITABLE_SECTIONS = ("probes", "channels", "scale")
 """Sections of a TEST.toml that the page can write."""
 MODES = ("Move", "Point", "Gauge", "Line", "Strain", "Box", "Circle")
 
@@ -176,58 +181,64 @@ class ResultControls(Controls):
 
     Attributes
     ----------
-    of : dict
+    entry_controls : dict
         The control of each entry of the view.
     """
 
-    def __init__(self, last: int, frame: int, *, dark: bool) -> None:
-        super().__init__(last, frame, dark=dark)
-        wide, self.of = self.wide, dict[str, Any]()
-        for entry, (kind, text, options) in ViewState.controls().items():
+    def __init__(self, last_frame: int, frame: int, *, dark: bool) -> None:
+        super().__init__(last_frame, frame, dark=dark)
+        wide, self.entry_controls = self.wide, dict[str, Any]()
+        for entry, (widget, text, options) in ViewState.controls().items():
             name = {"field": "quantity"}.get(entry, entry)
-            told, look = ("label", self.small) if kind is bk.Checkbox else ("title", wide)
-            self.of[entry] = kind(name=name, **{told: text}, **options, **look)
+            text_key, look = ("label", self.small) if widget is bk.Checkbox else ("title", wide)
+            self.entry_controls[entry] = widget(name=name, **{text_key: text}, **options, **look)
         self.over = self.group("over", "image", ["over the reference", "over the frame"], active=None)
         self.section = self.group("section", "controls shown", SECTIONS)
         self.mode = self.group("mode", "what a click sets", MODES)
         self.scale = self.group("scale", "points of the scale", ["Move", "Two points of a distance"], active=None)
-        look = {"html_attributes": labelled("sections that are written"), **wide}
-        self.what = bk.CheckboxButtonGroup(labels=list(WRITTEN), active=[0], name="what", **look)
+        look = {"html_attributes": aria_group("sections that are written"), **wide}
+        self.sections_to_write = bk.CheckboxButtonGroup(
+            labels=list(WRITABLE_SECTIONS), active=[0], name="sections_to_write", **look
+        )
         self.curve, self.probe = (bk.Select(title=text, name=text.lower(), **wide) for text in ("Curve", "Probe"))
         self.name = bk.TextInput(title="its name", name="name", **wide)
         self.file = bk.TextInput(title="TEST.toml, beside test or result", name="file", value="TEST.toml", **wide)
         self.drag = bk.Toggle(label="Drag the channel along the time", name="drag", **wide)
         self.movie = bk.Toggle(label="Movie", name="movie", width=90, **self.small)
         folded = {"max-height": "48px", "overflow": "auto", "overflow-wrap": "anywhere"}
-        look = {"styles": folded, "html_attributes": READ_OUT, **self.small}
-        self.said = bk.Div(name="said", width=300, visible=False, **look)
-        self.player = row(self.play, self.step, self.frame, self.movie, self.said, sizing_mode="stretch_width")
+        look = {"styles": folded, "html_attributes": LIVE_REGION, **self.small}
+        self.movie_status = bk.Div(name="movie_status", width=300, visible=False, **look)
+        self.player = row(self.play, self.step, self.frame, self.movie, self.movie_status, sizing_mode="stretch_width")
         labels = ("Lock the range", "Undo", "Redo", "Clear", "Save CSV", "Save PNG", "Write", "Take its probes")
-        self.lock, self.undo, self.redo, self.clear, self.csv, self.png, self.write, self.take = (
+        self.lock, self.undo, self.redo, self.clear, self.csv, self.png, self.write, self.load_probes = (
             bk.Button(label=name, name=name.lower(), **wide) for name in labels
         )
         self.print = bk.Button(label="Save PNG for print", name="print", **wide)
-        texts = ("under", "told", "written", "scaled")
-        self.under, self.told, self.written, self.scaled = (bk.Div(name=name, **wide) for name in texts)
+        texts = ("pointer_label", "channel_status", "save_status", "scale_label")
+        self.pointer_label, self.channel_status, self.save_status, self.scale_label = (
+            bk.Div(name=name, **wide) for name in texts
+        )
 
     @property
     def side(self) -> Any:
         """The column of all controls, of which one section is shown."""
-        flat, named = {"sizing_mode": "stretch_width"}, {**vars(self), **self.of}
-        shown: list[Any] = []
+        flat, models = {"sizing_mode": "stretch_width"}, {**vars(self), **self.entry_controls}
+        section_columns: list[Any] = []
         for names in SECTIONS.values():
-            parts = [named[name] if isinstance(name, str) else row(*map(named.get, name), **flat) for name in names]
-            shown.append(column(*parts, visible=not shown, **flat))
-        self.section.js_on_change("active", script("turnTo", group=self.section, sections=shown))
-        return column(self.description, self.section, *shown, self.theme, **flat)
+            section_models = [
+                models[name] if isinstance(name, str) else row(*map(models.get, name), **flat) for name in names
+            ]
+            section_columns.append(column(*section_models, visible=not section_columns, **flat))
+        self.section.js_on_change("active", script("turnTo", group=self.section, sections=section_columns))
+        return column(self.description, self.section, *section_columns, self.theme, **flat)
 
-    def wire(self, state: SharedState, tools: Sequence[Any], now: bk.Span) -> None:
-        """Let the browser itself act; `now` marks the frame that is shown."""
-        self.ask(state)
-        for name in ("shown", "query"):
-            state.js_on_change(name, script("shown", state=state, now=now))
+    def wire(self, state: SharedState, tools: Sequence[Any], frame_mark: bk.Span) -> None:
+        """Let the browser itself act; `frame_mark` marks the frame that is shown."""
+        self.request_frames(state)
+        for name in ("displayed_frame", "query"):
+            state.js_on_change(name, script("showFrame", state=state, now=frame_mark))
         state.js_on_change("csv", script("keepCsv", state=state))
         state.js_on_change("png", script("keepPng", state=state))
         groups = (self.mode, tools[:-1], self.scale), (self.scale, [tools[0], tools[-1]], self.mode)
-        for group, own, other in groups:
-            group.js_on_change("active", script("choose", group=group, tools=list(own), other=other))
+        for group, group_tools, other_group in groups:
+            group.js_on_change("active", script("choose", group=group, tools=list(group_tools), other=other_group))

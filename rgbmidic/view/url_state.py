@@ -21,8 +21,8 @@ KINDS = {"point": 1, "gauge": 2, "line": 2, "strain_gauge": 1, "region": 2, "cir
 SCALE = "scale"
 MARKS = (*KINDS, SCALE)
 """Kinds of marks: those of probes, and two points of a known distance."""
-OVER = ("reference", "deformed")
-BESIDE = ("second", "third", "fourth")
+BACKGROUNDS = ("reference", "deformed")
+EXTRA_FIELDS = ("second", "third", "fourth")
 """Entries of the view that name fields beside the first."""
 UNCERTAINTY = "uncertainty"
 """Name of the field beside the first that is its standard uncertainty, whatever that is."""
@@ -57,7 +57,7 @@ class Mark:
     key: object = field(default_factory=object, compare=False, repr=False, kw_only=True)
 
 
-class Steps:
+class UndoHistory:
     """Marks, which can be undone and done again; the moves of a mark that is dragged are one step.
 
     Parameters
@@ -71,85 +71,98 @@ class Steps:
         The marks.
     """
 
-    def __init__(self, now: tuple[Mark, ...]) -> None:
-        self.now, self._past, self._future, self._moved = now, list[Any](), list[Any](), -1
+    def __init__(self, marks: tuple[Mark, ...]) -> None:
+        self.marks, self._past, self._future, self._moved_mark = marks, list[Any](), list[Any](), -1
 
-    def keep(self, marks: tuple[Mark, ...]) -> None:
+    def record(self, marks: tuple[Mark, ...]) -> None:
         """Take marks as a step."""
-        other = [at for at, pair in enumerate(zip(self.now, marks, strict=False)) if pair[0] != pair[1]]
-        one = len(marks) == len(self.now) and len(other) == 1
-        moved = other[0] if one and replace(marks[other[0]], x=0, y=0) == replace(self.now[other[0]], x=0, y=0) else -1
-        if moved < 0 or moved != self._moved:
-            self._past = [*self._past[-VIEWER.undo_steps :], self.now]
-        self.now, self._future, self._moved = marks, [], moved
+        changed_indices = [
+            index for index, states in enumerate(zip(self.marks, marks, strict=False)) if states[0] != states[1]
+        ]
+        is_single_change = len(marks) == len(self.marks) and len(changed_indices) == 1
+        moved_index = (
+            changed_indices[0]
+            if is_single_change
+            and replace(marks[changed_indices[0]], x=0, y=0) == replace(self.marks[changed_indices[0]], x=0, y=0)
+            else -1
+        )
+        if moved_index < 0 or moved_index != self._moved_mark:
+            self._past = [*self._past[-VIEWER.undo_steps :], self.marks]
+        self.marks, self._future, self._moved_mark = marks, [], moved_index
 
-    def go(self, *, back: bool) -> tuple[Mark, ...]:
+    def step(self, *, back: bool) -> tuple[Mark, ...]:
         """Return to the marks before the last step, or do again the one that was undone last."""
         source, target = (self._past, self._future) if back else (self._future, self._past)
         if source:
-            target.append(self.now)
-            self.now, self._moved = source.pop(), -1
-        return self.now
+            target.append(self.marks)
+            self.marks, self._moved_mark = source.pop(), -1
+        return self.marks
 
 
 def probe_marks(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
     """Return the marks of each complete probe by its name, else kind and number: those of a kind in the order set."""
-    found: dict[str, list[Mark]] = {}
+    marks_by_name: dict[str, list[Mark]] = {}
     for kind, count in KINDS.items():
         of_kind = [mark for mark in marks if mark.kind == kind]
-        for n in range(len(of_kind) // count):
-            name = of_kind[n * count].name
-            usual = not name or name in found
-            found[f"{kind}_{n + 1}" if usual else name] = of_kind[n * count : (n + 1) * count]
-    return found
+        for number in range(len(of_kind) // count):
+            name = of_kind[number * count].name
+            has_default_name = not name or name in marks_by_name
+            marks_by_name[f"{kind}_{number + 1}" if has_default_name else name] = of_kind[
+                number * count : (number + 1) * count
+            ]
+    return marks_by_name
 
 
-def probe_place(marks: Sequence[Mark], gauge: float) -> tuple[float, ...]:
+def probe_position(marks: Sequence[Mark], gauge: float) -> tuple[float, ...]:
     """Return the numbers that place the probe of some marks, as ``[probes]`` has them; strain gauges of a length."""
-    places = [coordinate for mark in marks for coordinate in (mark.x, mark.y)]
+    coordinates = [coordinate for mark in marks for coordinate in (mark.x, mark.y)]
     if marks[0].kind == "strain_gauge":
-        return (*places, gauge)
+        return (*coordinates, gauge)
     if marks[0].kind == "circle":
-        return (*places[:2], math.dist(places[:2], places[2:]))
-    return tuple(places)
+        return (*coordinates[:2], math.dist(coordinates[:2], coordinates[2:]))
+    return tuple(coordinates)
 
 
-def probes(marks: Sequence[Mark], gauge: float, stated: ProbeSettings, measure: Any = None) -> ProbeSettings:
+def settings_of_marks(
+    marks: Sequence[Mark], gauge: float, defaults: ProbeSettings, measure: Any = None
+) -> ProbeSettings:
     """Return the probes that marks make, each kind in the order set; a last mark without its pair waits for it.
 
-    Strain gauges have the length `gauge` (px); window and, unless it is chosen, strain measure are those `stated`.
+    Strain gauges have the length `gauge` (px); window and, unless it is chosen, strain measure are those `defaults`.
     """
-    places: dict[str, Any] = {f"{kind}s": () for kind in KINDS}
+    positions: dict[str, Any] = {f"{kind}s": () for kind in KINDS}
     names = []
-    for name, pair in probe_marks(marks).items():
-        places[f"{pair[0].kind}s"] += (probe_place(pair, gauge),)
-        if name == pair[0].name:
-            names.append((f"{pair[0].kind}_{len(places[f'{pair[0].kind}s'])}", name))
-    return ProbeSettings(measure=measure or stated.measure, window=stated.window, names=tuple(names), **places)
+    for name, group in probe_marks(marks).items():
+        positions[f"{group[0].kind}s"] += (probe_position(group, gauge),)
+        if name == group[0].name:
+            names.append((f"{group[0].kind}_{len(positions[f'{group[0].kind}s'])}", name))
+    return ProbeSettings(measure=measure or defaults.measure, window=defaults.window, names=tuple(names), **positions)
 
 
-def marks_of(stated: ProbeSettings) -> tuple[Mark, ...]:
+def marks_of_probes(settings: ProbeSettings) -> tuple[Mark, ...]:
     """Return the marks of the probes stated, of those kinds that can be set with the pointer."""
-    marks, names = [], dict(stated.names)
-    for numbered, (kind, place) in zip(stated.labels, stated.kind_coordinates, strict=True):
+    marks, names = [], dict(settings.names)
+    for default_name, (kind, position) in zip(settings.labels, settings.kind_coordinates, strict=True):
         if kind not in KINDS:
             continue
-        x, y, *end = place
-        marks.append(Mark(kind, x, y, names.get(numbered, "")))
+        x, y, *second_point = position
+        marks.append(Mark(kind, x, y, names.get(default_name, "")))
         if KINDS[kind] > 1:
-            marks.append(Mark(kind, x + end[0], y) if kind == "circle" else Mark(kind, end[0], end[1]))
+            marks.append(
+                Mark(kind, x + second_point[0], y) if kind == "circle" else Mark(kind, second_point[0], second_point[1])
+            )
     return tuple(marks)
 
 
-def common_gauge(stated: ProbeSettings) -> float | None:
+def common_gauge(settings: ProbeSettings) -> float | None:
     """Return the length of the strain gauges stated, 0 without any; None where they differ: a page has one for all."""
-    lengths = {length for *_, length in stated.strain_gauges} or {0.0}
+    lengths = {length for *_, length in settings.strain_gauges} or {0.0}
     return lengths.pop() if len(lengths) == 1 else None
 
 
-def entry(usual: Any, kind: type[bk.Widget] | None = None, text: str = "", **options: Any) -> Any:
-    """Entry of the view with its usual value, and kind, text and options of its control, which limit the value too."""
-    return field(default=usual, metadata={"control": (kind, text, options)})
+def view_entry(default: Any, widget: type[bk.Widget] | None = None, text: str = "", **options: Any) -> Any:
+    """Declare an entry of the view: its default, and widget, text and options of its control, which limit the value."""
+    return field(default=default, metadata={"control": (widget, text, options)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -211,54 +224,54 @@ class ViewState:
     """
 
     frame: int = 0
-    field: str = entry("u", bk.Select, "Field")
-    over: str = entry(OVER[0], options=OVER)
-    range: str = entry("frame", bk.Select, "Colours from", options=_RANGES)
-    low: float = entry(-1.0, bk.NumericInput, "lowest", mode="float")
-    high: float = entry(1.0, bk.NumericInput, "highest", mode="float")
-    symmetric: bool = entry(False, bk.Checkbox, "symmetric about 0")
-    directions: bool = entry(False, bk.Checkbox, "principal directions")
-    opacity: float = entry(0.85, bk.Slider, "Opacity", start=0, end=1, step=0.05, value=1)
-    second: str = entry("", bk.Select, "Second field")
-    third: str = entry("", bk.Select, "Third field")
-    fourth: str = entry("", bk.Select, "Fourth field")
-    palette: str = entry("", bk.Select, "Palette", options=[("", "as suits the field"), *PALETTES])
-    levels: int = entry(256, bk.Spinner, "Number of colours", low=2, high=256)
-    hatched: bool = entry(False, bk.Checkbox, "hatch what is within 2 σ of 0")
-    vectors: bool = entry(False, bk.Checkbox, "displacement as arrows")
-    longer: float = entry(0.0, bk.NumericInput, "times their length (0: as there is room)", mode="float", low=0)
-    contours: bool = entry(False, bk.Checkbox, "contour lines")
-    extremes: bool = entry(False, bk.Checkbox, "smallest and largest value")
-    blank: bool = entry(False, bk.Checkbox, "nodes without data")
-    gauge: float = entry(0.0, bk.NumericInput, "Strain gauge length, px (0: shortest)", mode="float", low=0)
-    measure: str = entry(MEASURES[0], bk.Select, "Strain measure", options=list(MEASURES))
-    since: int = entry(-1, bk.Spinner, "Since frame (-1: the reference)", low=-1)
-    rigid: bool = entry(False, bk.Checkbox, "rigid motion removed")
-    rate_window: int = entry(0, bk.Spinner, "Rates over frames (0: as stated, or 9)", low=0)
-    curve: str = entry("")
-    along: str = entry("", bk.Select, "Along x")
-    channels: str = entry("", bk.TextInput, "CSV file beside the test")
-    clock: str = entry(CLOCKS[0], bk.Select, "Its time by", options=[*_CLOCKS.items()])
-    offset: float = entry(0.0, bk.NumericInput, "Offset, s", mode="float")
-    trigger: str = entry("", bk.Select, "Trigger channel")
-    align: str = entry("", bk.Select, "Channel")
-    align_to: str = entry("", bk.Select, "alike to")
-    area: float = entry(0.0, bk.NumericInput, "Section, mm²", mode="float", low=0)
-    force: str = entry("", bk.Select, "Force")
-    beside: str = entry("", bk.Select, "Beside the curves")
-    distance: float = entry(0.0, bk.NumericInput, "Length, mm", mode="float", low=0)
-    distance_std: float = entry(0.0, bk.NumericInput, "± mm", mode="float", low=0)
-    camera: str = entry("", bk.TextInput, "or camera")
-    line: str = entry("")
-    theme: str = entry("", options=("light", "dark"))
+    field: str = view_entry("u", bk.Select, "Field")
+    over: str = view_entry(BACKGROUNDS[0], options=BACKGROUNDS)
+    range: str = view_entry("frame", bk.Select, "Colours from", options=_RANGES)
+    low: float = view_entry(-1.0, bk.NumericInput, "lowest", mode="float")
+    high: float = view_entry(1.0, bk.NumericInput, "highest", mode="float")
+    symmetric: bool = view_entry(False, bk.Checkbox, "symmetric about 0")
+    directions: bool = view_entry(False, bk.Checkbox, "principal directions")
+    opacity: float = view_entry(0.85, bk.Slider, "Opacity", start=0, end=1, step=0.05, value=1)
+    second: str = view_entry("", bk.Select, "Second field")
+    third: str = view_entry("", bk.Select, "Third field")
+    fourth: str = view_entry("", bk.Select, "Fourth field")
+    palette: str = view_entry("", bk.Select, "Palette", options=[("", "as suits the field"), *PALETTES])
+    levels: int = view_entry(256, bk.Spinner, "Number of colours", low=2, high=256)
+    hatched: bool = view_entry(False, bk.Checkbox, "hatch what is within 2 σ of 0")
+    vectors: bool = view_entry(False, bk.Checkbox, "displacement as arrows")
+    longer: float = view_entry(0.0, bk.NumericInput, "times their length (0: as there is room)", mode="float", low=0)
+    contours: bool = view_entry(False, bk.Checkbox, "contour lines")
+    extremes: bool = view_entry(False, bk.Checkbox, "smallest and largest value")
+    blank: bool = view_entry(False, bk.Checkbox, "nodes without data")
+    gauge: float = view_entry(0.0, bk.NumericInput, "Strain gauge length, px (0: shortest)", mode="float", low=0)
+    measure: str = view_entry(MEASURES[0], bk.Select, "Strain measure", options=list(MEASURES))
+    since: int = view_entry(-1, bk.Spinner, "Since frame (-1: the reference)", low=-1)
+    rigid: bool = view_entry(False, bk.Checkbox, "rigid motion removed")
+    rate_window: int = view_entry(0, bk.Spinner, "Rates over frames (0: as stated, or 9)", low=0)
+    curve: str = view_entry("")
+    along: str = view_entry("", bk.Select, "Along x")
+    channels: str = view_entry("", bk.TextInput, "CSV file beside the test")
+    clock: str = view_entry(CLOCKS[0], bk.Select, "Its time by", options=[*_CLOCKS.items()])
+    offset: float = view_entry(0.0, bk.NumericInput, "Offset, s", mode="float")
+    trigger: str = view_entry("", bk.Select, "Trigger channel")
+    align: str = view_entry("", bk.Select, "Channel")
+    align_to: str = view_entry("", bk.Select, "alike to")
+    area: float = view_entry(0.0, bk.NumericInput, "Section, mm²", mode="float", low=0)
+    force: str = view_entry("", bk.Select, "Force")
+    beside: str = view_entry("", bk.Select, "Beside the curves")
+    distance: float = view_entry(0.0, bk.NumericInput, "Length, mm", mode="float", low=0)
+    distance_std: float = view_entry(0.0, bk.NumericInput, "± mm", mode="float", low=0)
+    camera: str = view_entry("", bk.TextInput, "or camera")
+    line: str = view_entry("")
+    theme: str = view_entry("", options=("light", "dark"))
     window: tuple[float, ...] = ()
     marks: tuple[Mark, ...] = ()
 
     @classmethod
     def controls(cls) -> dict[str, tuple[type[bk.Widget], str, dict[str, Any]]]:
         """Return kind, text and options of the controls, by the entries that they set."""
-        stated = {entry.name: entry.metadata.get("control", (None,)) for entry in fields(cls)}
-        return {name: control for name, control in stated.items() if control[0] is not None}
+        controls = {entry.name: entry.metadata.get("control", (None,)) for entry in fields(cls)}
+        return {name: control for name, control in controls.items() if control[0] is not None}
 
     @classmethod
     def from_query(cls, query: Mapping[str, Sequence[bytes]], *, frames: int, names: Sequence[str], frame: int) -> Self:
@@ -281,31 +294,36 @@ class ViewState:
             A valid view of the result.
         """
         texts = {key: values[-1].decode("utf-8", "replace") for key, values in query.items() if values}
-        asked = {entry.name: _value(entry, texts[entry.name], names) for entry in fields(cls) if entry.name in texts}
-        stated: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
-        view = cls(**{"frame": frame, **stated})
-        view, plain = replace(view, frame=min(max(view.frame, 0), frames - 1), since=min(view.since, frames - 1)), cls()
-        return view if view.low < view.high else replace(view, low=plain.low, high=plain.high, range="frame")
+        parsed = {
+            entry.name: _parse_entry(entry, texts[entry.name], names) for entry in fields(cls) if entry.name in texts
+        }
+        valid: dict[str, Any] = {name: value for name, value in parsed.items() if value is not None}
+        view = cls(**{"frame": frame, **valid})
+        view, defaults = (
+            replace(view, frame=min(max(view.frame, 0), frames - 1), since=min(view.since, frames - 1)),
+            cls(),
+        )
+        return view if view.low < view.high else replace(view, low=defaults.low, high=defaults.high, range="frame")
 
-    def with_probes(self, stated: ProbeSettings, least: float) -> Self:
+    def with_probes(self, settings: ProbeSettings, min_gauge: float) -> Self:
         """Return the view with the probes stated, where its address has none.
 
-        Strain gauges are among them if all have one length, `least` (px) or more, and the address states no other.
+        Strain gauges are among them if all have one length, `min_gauge` (px) or more, and the address states no other.
         """
-        gauge, marks = common_gauge(stated), marks_of(stated)
-        if not gauge or gauge < least or self.gauge not in (0, gauge):
+        gauge, marks = common_gauge(settings), marks_of_probes(settings)
+        if not gauge or gauge < min_gauge or self.gauge not in (0, gauge):
             gauge, marks = self.gauge, tuple(mark for mark in marks if mark.kind != "strain_gauge")
         return self if self.marks or not marks else replace(self, marks=marks, gauge=gauge)
 
-    def with_channels(self, stated: ChannelSettings) -> Self:
+    def with_channels(self, settings: ChannelSettings) -> Self:
         """Return the view with what ``[channels]`` states, unless its address names a file."""
-        if self.channels or stated.file is None:
+        if self.channels or settings.file is None:
             return self
-        align, align_to = stated.align or ("", "")
-        clock = CLOCKS[1] if stated.trigger else CLOCKS[2] if stated.align else CLOCKS[0]
-        keys: dict[str, Any] = {"clock": clock, "offset": stated.offset, "area": stated.area or 0.0}
-        keys |= {"trigger": stated.trigger or "", "align": align, "align_to": align_to, "force": stated.force or ""}
-        return replace(self, channels=str(stated.file), **keys)
+        align, align_to = settings.align or ("", "")
+        clock = CLOCKS[1] if settings.trigger else CLOCKS[2] if settings.align else CLOCKS[0]
+        keys: dict[str, Any] = {"clock": clock, "offset": settings.offset, "area": settings.area or 0.0}
+        keys |= {"trigger": settings.trigger or "", "align": align, "align_to": align_to, "force": settings.force or ""}
+        return replace(self, channels=str(settings.file), **keys)
 
     def channel_settings(self, base: Path) -> ChannelSettings:
         """Return ``[channels]`` as it is in view, its file relative to a folder; what is not chosen yet is left out."""
@@ -320,7 +338,7 @@ class ViewState:
             file=base / self.channels, area=max(self.area, 0) or None, force=self.force or None, **clocks[self.clock]
         )
 
-    def scale_settings(self, base: Path, kept: ScaleSettings) -> ScaleSettings | None:
+    def scale_settings(self, base: Path, stored: ScaleSettings) -> ScaleSettings | None:
         """Return ``[scale]`` as it is in view, its file relative to a folder, with the frame rate kept; None: none.
 
         Raises
@@ -329,23 +347,23 @@ class ViewState:
             Two scale marks and their distance make no scale.
         """
         if self.camera:
-            return ScaleSettings(camera=base / self.camera, frame_rate=kept.frame_rate)
-        ends = [(mark.x, mark.y) for mark in self.marks if mark.kind == SCALE]
-        if len(ends) < 2 or not self.distance:
+            return ScaleSettings(camera=base / self.camera, frame_rate=stored.frame_rate)
+        points = [(mark.x, mark.y) for mark in self.marks if mark.kind == SCALE]
+        if len(points) < 2 or not self.distance:
             return None
-        units = Units.from_points(ends, self.distance, length_std=self.distance_std)
+        units = Units.from_points(points, self.distance, length_std=self.distance_std)
         std = units.mm_per_pixel_std
-        return ScaleSettings(mm_per_pixel=units.mm_per_pixel, mm_per_pixel_std=std, frame_rate=kept.frame_rate)
+        return ScaleSettings(mm_per_pixel=units.mm_per_pixel, mm_per_pixel_std=std, frame_rate=stored.frame_rate)
 
     def query(self) -> str:
         """Return the address without the frame: all that differs from the defaults."""
-        plain = type(self)()
+        defaults = type(self)()
         entries = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "frame"}
-        texts = {name: _text(value) for name, value in entries.items() if value != getattr(plain, name)}
+        texts = {name: _format_entry(value) for name, value in entries.items() if value != getattr(defaults, name)}
         return urlencode(texts, safe=":,;")
 
 
-def _text(value: object) -> str:
+def _format_entry(value: object) -> str:
     if isinstance(value, tuple):
         if value and isinstance(value[0], Mark):
             return ";".join(f"{mark.kind}:{mark.x:.6g},{mark.y:.6g}{mark.name and f',{mark.name}'}" for mark in value)
@@ -355,7 +373,7 @@ def _text(value: object) -> str:
     return str(int(value) if isinstance(value, bool) else value)
 
 
-def _value(entry: Field[Any], text: str, names: Sequence[str]) -> object:
+def _parse_entry(entry: Field[Any], text: str, names: Sequence[str]) -> object:
     """Return the value that a text states for an entry; None where it is invalid."""
     _, _, options = entry.metadata.get("control", (None, "", {}))
     try:
@@ -366,20 +384,24 @@ def _value(entry: Field[Any], text: str, names: Sequence[str]) -> object:
             number = max(_number(text), -math.inf if low is None else low)
             return type(entry.default)(min(number, math.inf if high is None else high))
         if entry.name == "window":
-            left, top, right, bottom = map(_number, text.split(","))
-            return (left, top, right, bottom) if left < right and top < bottom else None
+            x_min, y_min, x_max, y_max = map(_number, text.split(","))
+            return (x_min, y_min, x_max, y_max) if x_min < x_max and y_min < y_max else None
         if entry.name == "marks":
-            places = [re.split("[:,]", mark) for mark in text.split(";")[: VIEWER.address_marks]]
-            marks = tuple(Mark(kind, _number(x), _number(y), *name) for kind, x, y, *name in places)
-            named = [mark.name for mark in marks if mark.name]
-            known = all(mark.kind in MARKS for mark in marks) and all(map(PROBE_NAME.fullmatch, named))
-            return marks if known and len(set(named)) == len(named) else None
+            tokens = [re.split("[:,]", mark) for mark in text.split(";")[: VIEWER.address_marks]]
+            marks = tuple(Mark(kind, _number(x), _number(y), *name) for kind, x, y, *name in tokens)
+            mark_names = [mark.name for mark in marks if mark.name]
+            are_valid = all(mark.kind in MARKS for mark in marks) and all(map(PROBE_NAME.fullmatch, mark_names))
+            return marks if are_valid and len(set(mark_names)) == len(mark_names) else None
     except (TypeError, ValueError):
         return None
-    if entry.name in ("field", *BESIDE):
-        return text if text in names or (text == UNCERTAINTY and entry.name in BESIDE) else None
+    if entry.name in ("field", *EXTRA_FIELDS):
+        return text if text in names or (text == UNCERTAINTY and entry.name in EXTRA_FIELDS) else None
     if "options" in options:
-        return text if text in [one if isinstance(one, str) else one[0] for one in options["options"]] else None
+        return (
+            text
+            if text in [option if isinstance(option, str) else option[0] for option in options["options"]]
+            else None
+        )
     return text[: VIEWER.address_letters]
 
 

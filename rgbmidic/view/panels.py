@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from rgbmidic.errors import ConfigurationError, InputError, RgbmidicError
-from rgbmidic.report import Movie, write_movie
+from rgbmidic.report import FieldMovie, write_movie
 from rgbmidic.results import Maps
 from rgbmidic.settings import PROBE_NAME, ChannelSettings, ProbeSettings, ScaleSettings, read_section, to_plain
-from rgbmidic.view.address import KINDS, SCALE, Mark, common_gauge, marks_of, probe_marks, probes
-from rgbmidic.view.draft import Confirmation, Draft
-from rgbmidic.view.models import WRITTEN, ResultControls, warning
+from rgbmidic.view.fields import FieldsInView
 from rgbmidic.view.picture import RawPictures
-from rgbmidic.view.shown import ShownFields
+from rgbmidic.view.test_file_editor import Confirmation, Draft
+from rgbmidic.view.url_state import KINDS, SCALE, Mark, common_gauge, marks_of_probes, probe_marks, settings_of_marks
+from rgbmidic.view.widgets import WRITABLE_SECTIONS, ResultControls, warning
 
 
 class ProbeNames:
@@ -37,34 +37,38 @@ class ProbeNames:
         Called with the marks of which one has another name.
     """
 
-    def __init__(self, parts: ResultControls, shown: ShownFields, take: Callable[[tuple[Mark, ...]], None]) -> None:
-        self._parts, self._shown, self._take = parts, shown, take
-        parts.name.on_change("value", lambda attr, old, new: self._rename(new.strip()))
-        parts.probe.on_change("value", lambda attr, old, new: self.offer())
+    def __init__(
+        self, controls: ResultControls, fields: FieldsInView, take_marks: Callable[[tuple[Mark, ...]], None]
+    ) -> None:
+        self._controls, self._fields, self._take_marks = controls, fields, take_marks
+        controls.name.on_change("value", lambda attr, old, new: self._rename(new.strip()))
+        controls.probe.on_change("value", lambda attr, old, new: self.offer_probes())
 
-    def offer(self) -> None:
+    def offer_probes(self) -> None:
         """Offer the probes that marks make, and the name of the one that is chosen."""
-        probe, probes = self._parts.probe, probe_marks(self._shown.view.marks)
+        probe, probes = self._controls.probe, probe_marks(self._fields.view.marks)
         probe.options = list(probes)
         if probe.value not in probes:
             probe.value = next(iter(probes), "")
-        self._parts.name.value = probes[probe.value][0].name if probes else ""
+        self._controls.name.value = probes[probe.value][0].name if probes else ""
 
     def _rename(self, name: str) -> None:
         """Give the chosen probe a name; empty: its kind and number."""
-        p, marks = self._parts, self._shown.view.marks
-        found = probe_marks(marks).get(p.probe.value)
-        if found is None or name == found[0].name:
+        controls, marks = self._controls, self._fields.view.marks
+        group = probe_marks(marks).get(controls.probe.value)
+        if group is None or name == group[0].name:
             return
         if name and (not PROBE_NAME.fullmatch(name) or any(mark.name == name for mark in marks)):
-            p.message.text = warning(
+            controls.message.text = warning(
                 f'a name has letters, digits, spaces, "." and "-", and no other probe has it; not "{name}"'
             )
-            self.offer()
+            self.offer_probes()
             return
-        self._take(tuple(replace(mark, name=name) if mark is found[0] else mark for mark in marks))
-        renamed = probe_marks(self._shown.view.marks)
-        p.probe.value = name or next(key for key, own in renamed.items() if own[1:] == found[1:])
+        self._take_marks(tuple(replace(mark, name=name) if mark is group[0] else mark for mark in marks))
+        renamed = probe_marks(self._fields.view.marks)
+        controls.probe.value = name or next(
+            key for key, renamed_group in renamed.items() if renamed_group[1:] == group[1:]
+        )
 
 
 class FileButtons:
@@ -78,56 +82,63 @@ class FileButtons:
         The fields in view.
     """
 
-    def __init__(self, parts: ResultControls, shown: ShownFields) -> None:
-        self._parts, self._shown, self._confirmation = parts, shown, Confirmation()
+    def __init__(self, controls: ResultControls, fields: FieldsInView) -> None:
+        self._controls, self._fields, self._confirmation = controls, fields, Confirmation()
 
     def write(self) -> None:
         """Write the chosen sections into a TEST.toml, which must be confirmed where it exists."""
-        p, shown = self._parts, self._shown
-        draft = Draft.of_result(shown.result, Path(p.file.value))
-        made = probes(shown.view.marks, shown.gauge, shown.result.section(ProbeSettings), shown.measure)
-        ready: dict[str, Callable[[], dict[str, Any]]] = {
-            "probes": lambda: probe_section(draft, made),
-            "channels": lambda: channel_section(draft, shown.channels),
-            "scale": lambda: scale_section(draft, shown.scale),
+        controls, fields = self._controls, self._fields
+        draft = Draft.from_result(fields.result, Path(controls.file.value))
+        probe_settings = settings_of_marks(
+            fields.view.marks, fields.gauge, fields.result.section(ProbeSettings), fields.measure
+        )
+        section_makers: dict[str, Callable[[], dict[str, Any]]] = {
+            "probes": lambda: probe_section(draft, probe_settings),
+            "channels": lambda: channel_section(draft, fields.channels),
+            "scale": lambda: scale_section(draft, fields.scale),
         }
-        names = [WRITTEN[at] for at in sorted(p.what.active)]
+        names = [WRITABLE_SECTIONS[index] for index in sorted(controls.sections_to_write.active)]
         if not names:
-            raise InputError(f"choose what is written: {', '.join(WRITTEN)}")
-        changed = draft.changed({name: ready[name]() for name in names})
-        changed.check()
+            raise InputError(f"choose what is written: {', '.join(WRITABLE_SECTIONS)}")
+        edited = draft.with_values({name: section_makers[name]() for name in names})
+        edited.check()
         sections = " and ".join(f"[{name}]" for name in names)
-        if asked := self._confirmation.question([draft.file], f"{sections} in it"):
-            p.written.text = warning(asked)
+        if question := self._confirmation.question([draft.file], f"{sections} in it"):
+            controls.save_status.text = warning(question)
             return
-        changed.write()
-        p.written.text = html.escape(f"{sections} of {draft.file} {'is' if len(names) == 1 else 'are'} written.")
+        edited.write()
+        controls.save_status.text = html.escape(
+            f"{sections} of {draft.file} {'is' if len(names) == 1 else 'are'} written."
+        )
 
-    def probes(self) -> tuple[Mark, ...]:
+    def read_probes(self) -> tuple[Mark, ...]:
         """Return the marks of the probes that a TEST.toml states, and those of the scale; sets the gauge."""
-        draft = Draft.of_result(self._shown.result, Path(self._parts.file.value))
-        stated = read_section(ProbeSettings, "probes", draft.section("probes"))
-        if (gauge := common_gauge(stated)) is None:
+        draft = Draft.from_result(self._fields.result, Path(self._controls.file.value))
+        settings = read_section(ProbeSettings, "probes", draft.section("probes"))
+        if (gauge := common_gauge(settings)) is None:
             raise InputError(f"the strain gauges of {draft.file} have different lengths; the page has one for all")
         if gauge:
-            self._parts.of["gauge"].value = gauge
-        self._parts.written.text = (
-            f"{len(stated.kind_coordinates)} probes are read from {html.escape(str(draft.file))}."
+            self._controls.entry_controls["gauge"].value = gauge
+        self._controls.save_status.text = (
+            f"{len(settings.kind_coordinates)} probes are read from {html.escape(str(draft.file))}."
         )
-        return (*marks_of(stated), *(mark for mark in self._shown.view.marks if mark.kind == SCALE))
+        return (*marks_of_probes(settings), *(mark for mark in self._fields.view.marks if mark.kind == SCALE))
 
 
-def probe_section(draft: Draft, made: ProbeSettings) -> dict[str, Any]:
+def probe_section(draft: Draft, new_probes: ProbeSettings) -> dict[str, Any]:
     """Return the keys of ``[probes]`` for probes set with the pointer, to a thousandth of a pixel; others stay."""
-    kept = read_section(ProbeSettings, "probes", draft.section("probes"))
-    keys = {f"{kind}s": [[round(value, 3) for value in place] for place in getattr(made, f"{kind}s")] for kind in KINDS}
-    names = [list(pair) for pair in kept.names if pair[0].rpartition("_")[0] not in KINDS]
-    names += [list(pair) for pair in made.names]
-    measure = {"measure": made.measure} if made.measure != kept.measure else {}
+    stored = read_section(ProbeSettings, "probes", draft.section("probes"))
+    keys = {
+        f"{kind}s": [[round(value, 3) for value in position] for position in getattr(new_probes, f"{kind}s")]
+        for kind in KINDS
+    }
+    names = [list(pair) for pair in stored.names if pair[0].rpartition("_")[0] not in KINDS]
+    names += [list(pair) for pair in new_probes.names]
+    measure = {"measure": new_probes.measure} if new_probes.measure != stored.measure else {}
     return {**{key: value or None for key, value in keys.items()}, "names": names or None, **measure}
 
 
-def channel_section(draft: Draft, stated: ChannelSettings) -> dict[str, Any]:
+def channel_section(draft: Draft, settings: ChannelSettings) -> dict[str, Any]:
     """Return the keys of ``[channels]``, the file relative to the TEST.toml where it is beside it.
 
     Raises
@@ -135,13 +146,13 @@ def channel_section(draft: Draft, stated: ChannelSettings) -> dict[str, Any]:
     ConfigurationError
         No file is stated.
     """
-    if stated.file is None:
+    if settings.file is None:
         raise ConfigurationError("state the channels' file first (channels.file)")
-    keys = {**to_plain(stated), "file": _path(draft, stated.file)}
+    keys = {**to_plain(settings), "file": _path(draft, settings.file)}
     return {key: value or None for key, value in keys.items()}
 
 
-def scale_section(draft: Draft, stated: ScaleSettings | None) -> dict[str, Any]:
+def scale_section(draft: Draft, settings: ScaleSettings | None) -> dict[str, Any]:
     """Return the keys of ``[scale]``, the scale rounded as `rgbmidic scale` prints it.
 
     Raises
@@ -149,13 +160,13 @@ def scale_section(draft: Draft, stated: ScaleSettings | None) -> dict[str, Any]:
     ConfigurationError
         No scale is stated.
     """
-    if stated is None:
+    if settings is None:
         raise ConfigurationError("set two points and state their distance in mm, or name the camera file")
     keys: dict[str, Any] = dict.fromkeys(("mm_per_pixel", "mm_per_pixel_std", "camera"))
-    if stated.camera is not None:
-        return {**keys, "camera": _path(draft, stated.camera)}
-    std = float(f"{stated.mm_per_pixel_std:.2g}")
-    return {**keys, "mm_per_pixel": float(f"{stated.mm_per_pixel:.6g}"), "mm_per_pixel_std": std}
+    if settings.camera is not None:
+        return {**keys, "camera": _path(draft, settings.camera)}
+    std = float(f"{settings.mm_per_pixel_std:.2g}")
+    return {**keys, "mm_per_pixel": float(f"{settings.mm_per_pixel:.6g}"), "mm_per_pixel_std": std}
 
 
 def _path(draft: Draft, file: Path) -> str:
@@ -163,7 +174,7 @@ def _path(draft: Draft, file: Path) -> str:
     return file.name if file.resolve().parent == draft.file.parent else str(file.resolve())
 
 
-class FilmButton:
+class MovieButton:
     """Movies of the fields in view.
 
     Parameters
@@ -174,22 +185,22 @@ class FilmButton:
         The fields in view.
     """
 
-    def __init__(self, parts: ResultControls, shown: ShownFields) -> None:
-        self._parts, self._shown, self._out = parts, shown, Path()
+    def __init__(self, controls: ResultControls, fields: FieldsInView) -> None:
+        self._controls, self._fields, self._out = controls, fields, Path()
         self._process: Any = None
         self._reports: Any = None
 
     def press(self) -> None:
         """Write a movie of what is in view, into a file that is not there yet; or stop the one that is written."""
-        if not self._parts.movie.active:
+        if not self._controls.movie.active:
             if self._process is not None:
                 self.stop(f"{self._out.name} was stopped; no file is left")
             return
-        shown, view, names = self._shown, self._shown.view, self._shown.names
-        limited = {"test": names, "hand": names[:1]}.get(view.range, [])
-        maps = shown.maps
+        fields, view, names = self._fields, self._fields.view, self._fields.names
+        limited_fields = {"test": names, "hand": names[:1]}.get(view.range, [])
+        maps = fields.maps
         options = {
-            "limits": {name: shown.ends(name) for name in limited},
+            "limits": {name: fields.colour_range(name) for name in limited_fields},
             "opacity": view.opacity,
             "colours": (view.palette if len(names) == 1 else "") or None,
             "images": RawPictures(result=maps.result) if view.over == "deformed" else None,
@@ -203,13 +214,13 @@ class FilmButton:
         self._process = context.Process(target=_write, args=(send, maps, self._out, names, options), daemon=True)
         self._process.start()
         send.close()
-        self._tell(f"{html.escape(self._out.name)}: starting")
+        self._show_status(f"{html.escape(self._out.name)}: starting")
 
-    def tell(self) -> None:
+    def poll(self) -> None:
         """Show how far the movie is, where its file is, or why there is none."""
         try:
             while self._process is not None and self._reports.poll():
-                self._tell(*self._reports.recv())
+                self._show_status(*self._reports.recv())
         except EOFError:
             self.stop(f"no {self._out.name}: its process was ended")
 
@@ -218,14 +229,14 @@ class FilmButton:
         if self._process is not None:
             self._process.terminate()
             self._process.join()
-        self._tell(warning(text), ended=True)
+        self._show_status(warning(text), ended=True)
 
-    def _tell(self, text: str, ended: bool = False) -> None:
-        p = self._parts
-        p.said.text, p.said.visible = text, True
-        p.movie.label = "Movie" if ended else "■ Movie"
+    def _show_status(self, text: str, ended: bool = False) -> None:
+        controls = self._controls
+        controls.movie_status.text, controls.movie_status.visible = text, True
+        controls.movie.label = "Movie" if ended else "■ Movie"
         if ended:
-            self._process, p.movie.active = None, False
+            self._process, controls.movie.active = None, False
 
 
 def _write(send: Any, maps: Maps, out: Path, fields: list[str], options: dict[str, Any]) -> None:
@@ -238,7 +249,7 @@ def _write(send: Any, maps: Maps, out: Path, fields: list[str], options: dict[st
             send.send((f"{html.escape(out.name)}: {done} of {total} frames",))
 
     try:
-        write_movie(Movie(maps=maps, fields=fields, **options), out, progress=progress)
+        write_movie(FieldMovie(maps=maps, fields=fields, **options), out, progress=progress)
         gif = ' (a .gif; for .mp4: pip install "rgbmidic[movie]")' if out.suffix == ".gif" else ""
         send.send((f"written: {html.escape(str(out))}{gif}", True))
     except (RgbmidicError, OSError) as error:

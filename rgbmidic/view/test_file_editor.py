@@ -21,8 +21,8 @@ from rgbmidic.mesh import Region
 from rgbmidic.results import Result
 from rgbmidic.results.files import write_text
 from rgbmidic.settings import FrameSettings, RegionSettings, TestSettings, read_section, read_toml
-from rgbmidic.view.address import Mark
 from rgbmidic.view.constants import VIEWER
+from rgbmidic.view.url_state import Mark
 
 _FILES = (
     *("frames.path", "calibration.file", "region.mask", "mesh.file", "scale.camera", "channels.file"),
@@ -47,7 +47,7 @@ class Draft:
     text: str
 
     @classmethod
-    def of(cls, path: Path, statement: Mapping[str, Any] | None = None) -> Self:
+    def from_path(cls, path: Path, statement: Mapping[str, Any] | None = None) -> Self:
         """Read a TEST.toml, or begin one in the working directory for frames.
 
         Parameters
@@ -76,13 +76,13 @@ class Draft:
                 raise ConfigurationError(f"{path}: {error}") from None
             return draft
         file = Path.cwd() / "TEST.toml"
-        stated = {key: list(value) if isinstance(value, tuple) else value for key, value in (statement or {}).items()}
-        draft = cls(file=file, text="").changed({"frames": {"path": str(path.resolve()), **stated}})
+        keys = {key: list(value) if isinstance(value, tuple) else value for key, value in (statement or {}).items()}
+        draft = cls(file=file, text="").with_values({"frames": {"path": str(path.resolve()), **keys}})
         _ = draft.frames
         return draft
 
     @classmethod
-    def of_result(cls, result: Result, file: Path) -> Self:
+    def from_result(cls, result: Result, file: Path) -> Self:
         """Read a TEST.toml beside a result, or begin one with the settings that the result was measured with.
 
         Parameters
@@ -100,23 +100,23 @@ class Draft:
         Raises
         ------
         ConfigurationError
-            As `of`; or the file lies neither beside the result nor in the folder of its test.
+            As `from_path`; or the file lies neither beside the result nor in the folder of its test.
         """
         base = Path(result.provenance.get("base", result.path.parent))
         folders, file = {base.resolve(), result.path.resolve().parent}, (base / file).resolve()
         if file.suffix.lower() != ".toml" or file.parent not in folders:
             raise ConfigurationError(f"{file} must end in .toml and be in {' or '.join(sorted(map(str, folders)))}")
         if file.exists():
-            return cls.of(file)
-        stated = result.provenance.get("settings", {})
-        settings = {name: dict(section) for name, section in stated.items() if section}
+            return cls.from_path(file)
+        stored_settings = result.provenance.get("settings", {})
+        settings = {name: dict(section) for name, section in stored_settings.items() if section}
         frames = settings.setdefault("frames", {})
         frames["path"] = [str(base / path) for path in frames.get("path", ())]
-        return cls(file=file, text="").changed(settings)
+        return cls(file=file, text="").with_values(settings)
 
     @property
     def is_file(self) -> bool:
-        """Whether the file has this content."""
+        """True if the file has this content."""
         return self.file.exists() and self.file.read_text(encoding="utf-8-sig", errors="replace") == self.text
 
     @property
@@ -126,15 +126,15 @@ class Draft:
 
     def section(self, name: str) -> dict[str, Any]:
         """Return one section; empty where it is not there."""
-        found = self.document.get(name, {})
-        return found if isinstance(found, dict) else {}
+        content = self.document.get(name, {})
+        return content if isinstance(content, dict) else {}
 
     @property
     def frames(self) -> FrameSettings:
         """The settings of the frames; errors as `TestSettings.from_mapping`."""
         return read_section(FrameSettings, "frames", self.section("frames"), self.file.parent)
 
-    def changed(self, sections: Mapping[str, Mapping[str, Any]]) -> Self:
+    def with_values(self, sections: Mapping[str, Mapping[str, Any]]) -> Self:
         """Return the draft with other values of some keys; comments and order stay.
 
         Parameters
@@ -165,12 +165,12 @@ class Draft:
                             target[key] = value
         except (TOMLKitError, TypeError, AttributeError) as error:
             raise ConfigurationError(f"{self.file} cannot be changed: {error}") from None
-        changed = replace(self, text=tomlkit.dumps(document))
-        if changed.document != expected:
+        edited = replace(self, text=tomlkit.dumps(document))
+        if edited.document != expected:
             raise ConfigurationError(f"{self.file} cannot be changed without losing something; edit it by hand")
-        return changed
+        return edited
 
-    def at(self, file: Path) -> Self:
+    def with_path(self, file: Path) -> Self:
         """Return the draft at another path.
 
         Parameters
@@ -191,9 +191,9 @@ class Draft:
         file = self.file.parent / file
         if file.suffix.lower() != ".toml":
             raise ConfigurationError(f"{file} must end in .toml")
-        stated = [self.section(section).get(key, []) for section, _, key in (name.partition(".") for name in _FILES)]
-        named = [text for value in stated for text in ([value] if isinstance(value, str) else value)]
-        if file.parent != self.file.parent and any(not Path(text).is_absolute() for text in named):
+        values = [self.section(section).get(key, []) for section, _, key in (name.partition(".") for name in _FILES)]
+        names = [text for value in values for text in ([value] if isinstance(value, str) else value)]
+        if file.parent != self.file.parent and any(not Path(text).is_absolute() for text in names):
             raise ConfigurationError(
                 f"{file} must stay in {self.file.parent}: what it names is relative to that folder"
             )
@@ -213,14 +213,16 @@ class Draft:
         """
         if not (masks := masks_of(marks)):
             return self, {}
-        if other := [light for light in masks if light not in lights]:
-            raise ConfigurationError(f"there is a mask of {', '.join(other)}, but the lights are {', '.join(lights)}")
-        whole, files = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1), shape), dict[Path, bytes]()
+        if unknown_lights := [light for light in masks if light not in lights]:
+            raise ConfigurationError(
+                f"there is a mask of {', '.join(unknown_lights)}, but the lights are {', '.join(lights)}"
+            )
+        frame_region, files = Region.from_rectangle((0, 0, shape[1] - 1, shape[0] - 1), shape), dict[Path, bytes]()
         for number, light in enumerate(lights, 1):
-            picture = np.uint8(255) * whole.without(masks.get(light, ())).mask.astype(np.uint8)
+            picture = np.uint8(255) * frame_region.without(masks.get(light, ())).mask.astype(np.uint8)
             name = f"{self.file.stem}_mask_{number}_{re.sub(r'[^A-Za-z0-9]+', '_', light)}.png"
             files[self.file.parent / name] = cv2.imencode(".png", picture)[1].tobytes()
-        return self.changed({"weights": {"method": "images", "images": [file.name for file in files]}}), files
+        return self.with_values({"weights": {"method": "images", "images": [file.name for file in files]}}), files
 
     def check(self) -> None:
         """Check that the draft is a complete test; errors as `write`."""
@@ -244,14 +246,18 @@ class Confirmation:
     """Second press of a button, which lets files that exist be replaced."""
 
     def __init__(self) -> None:
-        self._asked: object = None
+        self._pending: object = None
 
-    def question(self, files: Sequence[Path], what: str) -> str:
+    def question(self, files: Sequence[Path], subject: str) -> str:
         """Return what to confirm; empty where no file exists, or where the same was asked just before."""
-        there = {str(file): file.stat().st_mtime_ns for file in files if file.exists()}
-        asked = (there, what) if there and self._asked != (there, what) else None
-        self._asked = asked
-        return f"{', '.join(there)} exists: press again to replace {what}." if asked else ""
+        modification_times = {str(file): file.stat().st_mtime_ns for file in files if file.exists()}
+        request = (
+            (modification_times, subject)
+            if modification_times and self._pending != (modification_times, subject)
+            else None
+        )
+        self._pending = request
+        return f"{', '.join(modification_times)} exists: press again to replace {subject}." if request else ""
 
 
 OUTLINES = {"rectangle": 2, "polygon": 3, "circle": 2}
@@ -266,22 +272,22 @@ SHAPES = {**OUTLINES, **HOLES, MASK: 3}
 Ring = list[list[float]]
 
 
-def arranged(marks: Sequence[Mark], new: str) -> tuple[Mark, ...]:
-    """Return the marks after one of the kind `new` was set: there is one outline, of the kind drawn last."""
-    if new not in OUTLINES:
+def keep_one_outline(marks: Sequence[Mark], new_kind: str) -> tuple[Mark, ...]:
+    """Return the marks after one of the kind `new_kind` was set: there is one outline, of the kind drawn last."""
+    if new_kind not in OUTLINES:
         return tuple(marks)
-    kept = [mark for mark in marks if mark.kind == new or mark.kind not in OUTLINES]
-    of_kind = [mark for mark in kept if mark.kind == new]
-    if new != "polygon" and len(of_kind) > OUTLINES[new]:  # a third place begins another one
-        kept = [mark for mark in kept if mark.kind != new or mark is of_kind[-1]]
-    return tuple(kept)
+    remaining = [mark for mark in marks if mark.kind == new_kind or mark.kind not in OUTLINES]
+    of_kind = [mark for mark in remaining if mark.kind == new_kind]
+    if new_kind != "polygon" and len(of_kind) > OUTLINES[new_kind]:  # a third place begins another one
+        remaining = [mark for mark in remaining if mark.kind != new_kind or mark is of_kind[-1]]
+    return tuple(remaining)
 
 
 def region_section(draft: Draft, marks: Sequence[Mark]) -> dict[str, Any]:
     """Return the keys of ``[region]`` for what is drawn; without an outline a mask that is stated stays."""
-    outline, holes, stated = region_of(marks), [*_complete(marks, HOLES).values()], draft.section("region")
-    keys = {"mask": None if outline else stated.get("mask"), "holes": holes or None, **(outline or {})}
-    return {"rectangle": None, "polygon": None, **keys} if stated or any(keys.values()) else {}
+    outline, holes, stored = region_of(marks), [*_complete_shapes(marks, HOLES).values()], draft.section("region")
+    keys = {"mask": None if outline else stored.get("mask"), "holes": holes or None, **(outline or {})}
+    return {"rectangle": None, "polygon": None, **keys} if stored or any(keys.values()) else {}
 
 
 def _shape(mark: str) -> str:
@@ -289,27 +295,27 @@ def _shape(mark: str) -> str:
     return next(shape for shape in SHAPES if mark.startswith(shape))
 
 
-def _complete(marks: Sequence[Mark], shapes: Iterable[str]) -> dict[str, Ring]:
+def _complete_shapes(marks: Sequence[Mark], shapes: Iterable[str]) -> dict[str, Ring]:
     """Return the corners of the complete shapes of some kinds, by the kind of their marks.
 
     They are rounded to a tenth of a pixel: a pointer's precision.
     """
-    found = {}
+    corners_by_kind = {}
     for kind in dict.fromkeys(mark.kind for mark in marks):
-        places = [(mark.x, mark.y) for mark in marks if mark.kind == kind]
-        if _shape(kind) in shapes and len(places) >= SHAPES[_shape(kind)]:
+        points = [(mark.x, mark.y) for mark in marks if mark.kind == kind]
+        if _shape(kind) in shapes and len(points) >= SHAPES[_shape(kind)]:
             if _shape(kind) in ("circle", "round hole"):
-                (x, y), on = places[:2]
-                radius, corners = math.dist((x, y), on), VIEWER.circle_corners
+                (x, y), rim_point = points[:2]
+                radius, corners = math.dist((x, y), rim_point), VIEWER.circle_corners
                 angles = np.arange(corners) * 2 * np.pi / corners
-                places = list(zip(x + radius * np.cos(angles), y + radius * np.sin(angles), strict=True))
-            found[kind] = [[round(float(x), 1), round(float(y), 1)] for x, y in places]
-    return found
+                points = list(zip(x + radius * np.cos(angles), y + radius * np.sin(angles), strict=True))
+            corners_by_kind[kind] = [[round(float(x), 1), round(float(y), 1)] for x, y in points]
+    return corners_by_kind
 
 
 def region_of(marks: Sequence[Mark]) -> dict[str, Any] | None:
     """Return the keys of ``[region]`` for an outline and its holes; None where no outline is complete."""
-    outline, holes = _complete(marks, OUTLINES), [*_complete(marks, HOLES).values()]
+    outline, holes = _complete_shapes(marks, OUTLINES), [*_complete_shapes(marks, HOLES).values()]
     if not outline:
         return None
     (kind, corners), *_ = outline.items()
@@ -327,20 +333,20 @@ def check_complete(marks: Sequence[Mark]) -> None:
         One does: it would be left out.
     """
     for kind, count in Counter(mark.kind for mark in marks).items():
-        if count < (least := SHAPES[_shape(kind)]):
-            raise ConfigurationError(f"the {kind} needs {least} marks or more and has {count}: finish or remove it")
+        if count < (min_count := SHAPES[_shape(kind)]):
+            raise ConfigurationError(f"the {kind} needs {min_count} marks or more and has {count}: finish or remove it")
 
 
 def rings(marks: Sequence[Mark]) -> tuple[Ring, list[Ring]]:
     """Return the corners of the outline, as far as it is drawn, and of the complete holes."""
-    region, holes = region_of(marks) or {}, [*_complete(marks, HOLES).values()]
+    region, holes = region_of(marks) or {}, [*_complete_shapes(marks, HOLES).values()]
     if "rectangle" in region:
         x0, y0, x1, y1 = region["rectangle"]
         return [[x0, y0], [x1, y0], [x1, y1], [x0, y1]], holes
     return region.get("polygon") or [[mark.x, mark.y] for mark in marks if mark.kind in OUTLINES], holes
 
 
-def marks_of(draft: Draft) -> tuple[Mark, ...]:
+def marks_of_region(draft: Draft) -> tuple[Mark, ...]:
     """Return the marks that make the region of a draft; none for a mask."""
     if not (content := draft.section("region")):
         return ()
@@ -356,7 +362,7 @@ def marks_of(draft: Draft) -> tuple[Mark, ...]:
 
 def masks_of(marks: Sequence[Mark]) -> dict[str, list[Ring]]:
     """Return the corners of the complete masks of each light that has some."""
-    found: dict[str, list[Ring]] = {}
-    for kind, ring in _complete(marks, [MASK]).items():
-        found.setdefault(kind.split(" ", 2)[2], []).append(ring)
-    return found
+    by_light: dict[str, list[Ring]] = {}
+    for kind, ring in _complete_shapes(marks, [MASK]).items():
+        by_light.setdefault(kind.split(" ", 2)[2], []).append(ring)
+    return by_light

@@ -21,15 +21,15 @@ from rgbmidic.fields.plane import CameraCalibration, Rectification
 from rgbmidic.fields.strain import MEASURES, Strain, StrainGauges, strain_of_gradient
 from rgbmidic.fields.units import Units
 from rgbmidic.mesh import Placement, Tri3Mesh
-from rgbmidic.results.quantities import ELEMENT_STRAIN, QUANTITIES, STRAIN, UNKNOWN_TIME, Quantity
+from rgbmidic.results.quantities import ELEMENT_STRAIN, QUANTITIES, STRAIN, UNKNOWN_TIME, ResultQuantity
 from rgbmidic.results.result import Portable, Result
 from rgbmidic.settings import ScaleSettings
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray
 
 logger = logging.getLogger(__name__)
 
-MOVED = ("u", "v", "u_std", "v_std", "u_bias_std", "v_bias_std")
-EDGE = ("u_edge_std", "v_edge_std")
+DISPLACEMENT_QUANTITIES = ("u", "v", "u_std", "v_std", "u_bias_std", "v_bias_std")
+EDGE_QUANTITIES = ("u_edge_std", "v_edge_std")
 """Displacement, its standard uncertainty and the part that the lights' bias leaves, as functions take them."""
 
 
@@ -54,24 +54,34 @@ def rectification_of(
     InputError
         The camera holds no plane.
     """
-    stated, camera = result.section(ScaleSettings) if scale is None else scale, None
-    stated = replace(stated, unit=unit or stated.unit)
-    if stated.unit == "px":
-        stated = replace(stated, mm_per_pixel=None, mm_per_pixel_std=0.0, camera=None)
+    effective_scale, camera = result.section(ScaleSettings) if scale is None else scale, None
+    effective_scale = replace(effective_scale, unit=unit or effective_scale.unit)
+    if effective_scale.unit == "px":
+        effective_scale = replace(effective_scale, mm_per_pixel=None, mm_per_pixel_std=0.0, camera=None)
     elif scale is None:
-        camera = _kept_camera(result)
+        camera = _stored_camera(result)
     elif scale.camera is not None:
         camera = CameraCalibration.read(scale.camera)
     if camera is not None:
         camera.check(result.frame_shape or camera.shape)
-    elif stated.unit == "mm" and stated.mm_per_pixel is None and (placed := placement_of(result)) is not None:
-        stated = replace(stated, mm_per_pixel=placed.mm_per_pixel, mm_per_pixel_std=placed.mm_per_pixel_std)
-    return Rectification.of(Tri3Mesh(nodes=result.nodes, elements=result.elements), stated, camera)
+    elif (
+        effective_scale.unit == "mm"
+        and effective_scale.mm_per_pixel is None
+        and (placement := placement_of(result)) is not None
+    ):
+        effective_scale = replace(
+            effective_scale, mm_per_pixel=placement.mm_per_pixel, mm_per_pixel_std=placement.mm_per_pixel_std
+        )
+    return Rectification.of(Tri3Mesh(nodes=result.nodes, elements=result.elements), effective_scale, camera)
 
 
-def _kept_camera(result: Result) -> CameraCalibration | None:
-    kept = result.provenance.get("camera")
-    return None if kept is None else CameraCalibration.from_document(kept, str(result.section(ScaleSettings).camera))
+def _stored_camera(result: Result) -> CameraCalibration | None:
+    document = result.provenance.get("camera")
+    return (
+        None
+        if document is None
+        else CameraCalibration.from_document(document, str(result.section(ScaleSettings).camera))
+    )
 
 
 def placement_of(result: Result) -> Placement | None:
@@ -86,8 +96,8 @@ def placement_of(result: Result) -> Placement | None:
     -------
     Placement or None
     """
-    kept = result.provenance.get("finite_elements")
-    return None if kept is None else Placement.from_document(kept["placement"], _kept_camera(result))
+    document = result.provenance.get("finite_elements")
+    return None if document is None else Placement.from_document(document["placement"], _stored_camera(result))
 
 
 def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArray | None:
@@ -107,24 +117,29 @@ def frame_times(result: Result, scale: ScaleSettings | None = None) -> FloatArra
     -------
     ndarray, shape (T,), or None
         In seconds, NaN for frames that are not measured yet; None where no time is known.
+
+    Examples
+    --------
+    >>> frame_times(Result.open("my_result"), ScaleSettings(frame_rate=100.0))[:2].tolist()
+    [0.0, 0.01]
     """
     scale = result.section(ScaleSettings) if scale is None else scale
-    there = result.finished
-    stamps, numbers = result.time_ns[there], result.number[there]
+    finished = result.finished
+    stamps, numbers = result.time_ns[finished], result.number[finished]
     if (stamps == UNKNOWN_TIME).any():
-        recorded, taken = result.provenance.get("frame_rate"), "the camera was set to %.6g: the former is taken"
+        recorded, choice = result.provenance.get("frame_rate"), "the camera was set to %.6g: the former is taken"
         rate = scale.frame_rate or recorded
         seconds = numbers / rate if rate else None
     else:
-        seconds, taken = stamps * 1e-9, "the frames' own times %.6g: these are taken"
+        seconds, choice = stamps * 1e-9, "the frames' own times %.6g: these are taken"
         recorded = np.median(np.maximum(np.diff(numbers), 1) / np.diff(seconds)) if len(seconds) > 1 else None
     # stamps in whole microseconds give the median interval of 10,000 frames per second to 1 %
     if recorded and scale.frame_rate and abs(recorded / scale.frame_rate - 1) > 0.01:
-        logger.warning(f"scale.frame_rate states %g frames per second, {taken}", scale.frame_rate, recorded)
+        logger.warning(f"scale.frame_rate states %g frames per second, {choice}", scale.frame_rate, recorded)
     if seconds is None:
         return None
     times = np.full(len(result), np.nan)
-    times[there] = seconds
+    times[finished] = seconds
     return times
 
 
@@ -143,7 +158,7 @@ def reference_frames(result: Result) -> BoolArray:
     return np.isin(np.arange(len(result)), result.provenance["references"])
 
 
-def shared_part(result: Result) -> float:
+def common_variance_fraction(result: Result) -> float:
     """Return the fraction of a frame's variance that all frames have in common (see `reference_fraction`).
 
     Parameters
@@ -154,28 +169,39 @@ def shared_part(result: Result) -> float:
     Returns
     -------
     float
+
+    Examples
+    --------
+    >>> common_variance_fraction(Result.open("my_result"))  # one frame is the reference
+    0.5
     """
     return reference_fraction(len(result.setting("frames", "reference", [0])))
 
 
 def displacements(result: Result, rectified: Rectification, frames: Iterable[int]) -> Iterator[FloatArray]:
     """Read u, v and their uncertainties (6, N) in some frames, in rectified px."""
-    return (_moved(rectified, read) for read in result.table.each(MOVED, frames))
+    return (
+        _rectified_displacement(rectified, record) for record in result.table.iterate(DISPLACEMENT_QUANTITIES, frames)
+    )
 
 
-def _moved(rectified: Rectification, read: Mapping[str, AnyArray]) -> FloatArray:
-    moved = np.stack([np.asarray(read[name], np.float64) for name in MOVED])
-    moved[4:][np.isnan(moved[4:]) & np.isfinite(moved[2:4])] = 0.0  # of records that were made without it
-    return np.stack(rectified.displacement(*moved))
+def _rectified_displacement(rectified: Rectification, record: Mapping[str, AnyArray]) -> FloatArray:
+    displacement = np.stack([np.asarray(record[name], np.float64) for name in DISPLACEMENT_QUANTITIES])
+    displacement[4:][np.isnan(displacement[4:]) & np.isfinite(displacement[2:4])] = (
+        0.0  # of records that were made without it
+    )
+    return np.stack(rectified.displacement(*displacement))
 
 
 def edge_std(rectified: Rectification, read: Mapping[str, AnyArray]) -> FloatArray:
     """Return what the recovery misses near edges (2, N), in rectified px."""
-    return np.stack(rectified.displacement(*(np.asarray(read[name], np.float64) for name in ("u", "v", *EDGE)))[2:])
+    return np.stack(
+        rectified.displacement(*(np.asarray(read[name], np.float64) for name in ("u", "v", *EDGE_QUANTITIES)))[2:]
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Physical(Portable):
+class ResultInUnits(Portable):
     """A result with its units.
 
     Attributes
@@ -205,15 +231,15 @@ class Physical(Portable):
     measure: str = MEASURES[0]
 
     @classmethod
-    def of(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
+    def from_result(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
         """Take the scale and the times of the result, or another ``[scale]`` in place of its own."""
-        untimed, times = cls.untimed(result, scale), frame_times(result, scale)
+        base, times = cls.without_times(result, scale), frame_times(result, scale)
         if times is None or not (np.diff(times) > 0).all():
-            return untimed
-        return replace(untimed, times=times, units=replace(untimed.units, timed=True))
+            return base
+        return replace(base, times=times, units=replace(base.units, timed=True))
 
     @classmethod
-    def untimed(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
+    def without_times(cls, result: Result, scale: ScaleSettings | None = None) -> Self:
         """Leave out the times, for which every frame is read: for single frames, or a result that still grows."""
         rectified, times = rectification_of(result, scale), np.arange(len(result), dtype=np.float64)
         return cls(result=result, scale=scale, units=rectified.units, times=times, rectified=rectified)
@@ -224,31 +250,38 @@ class Physical(Portable):
         return self.rectified.mesh
 
     @property
-    def places(self) -> list[tuple[Quantity, FloatArray]]:
+    def coordinates(self) -> list[tuple[ResultQuantity, FloatArray]]:
         """Coordinates of the nodes, each with its values (N,): with a camera those on the image too."""
         image, camera = "the reference image", self.rectified.camera
-        plane, ways = "the plane of the specimen at the reference", ("to the right", "down")
-        stated = [("", self.units.length, self.length * self.mesh.nodes, image if camera is None else plane, ways)]
+        plane, directions = "the plane of the specimen at the reference", ("to the right", "down")
+        systems = [
+            ("", self.units.length, self.length * self.mesh.nodes, image if camera is None else plane, directions)
+        ]
         if camera is not None:
-            stated.append(("_image", "px", self.result.nodes, image, ways))
+            systems.append(("_image", "px", self.result.nodes, image, directions))
         if self.result.node_mm is not None:
-            ways = ("along its axis x", "along its axis y")
-            stated.append(("_mesh", "mm", self.result.node_mm, "the mesh of mesh.file", ways))
+            directions = ("along its axis x", "along its axis y")
+            systems.append(("_mesh", "mm", self.result.node_mm, "the mesh of mesh.file", directions))
         return [
-            (Quantity(f"{axis}{end}", ("node",), unit, "", f"position of the node on {on}, {way}"), values)
-            for end, unit, nodes, on, each_way in stated
-            for axis, way, values in zip("xy", each_way, nodes.T, strict=True)
+            (
+                ResultQuantity(
+                    f"{axis}{suffix}", ("node",), unit, "", f"position of the node on {surface}, {direction}"
+                ),
+                values,
+            )
+            for suffix, unit, nodes, surface, axis_directions in systems
+            for axis, direction, values in zip("xy", axis_directions, nodes.T, strict=True)
         ]
 
     @property
-    def facts(self) -> dict[str, Any]:
-        """What other programs' formats state of the result as a whole."""
-        facts: dict[str, Any] = {"title": f"result {self.result.path.name}", "source": f"rgbmidic {__version__}"}
+    def file_attributes(self) -> dict[str, Any]:
+        """Attributes of the result as a whole in the files of other programs."""
+        attributes: dict[str, Any] = {"title": f"result {self.result.path.name}", "source": f"rgbmidic {__version__}"}
         if (scale := self.units).mm_per_pixel is not None:
-            facts |= {"mm_per_pixel": scale.mm_per_pixel, "mm_per_pixel_std": scale.mm_per_pixel_std}
+            attributes |= {"mm_per_pixel": scale.mm_per_pixel, "mm_per_pixel_std": scale.mm_per_pixel_std}
         if (camera := self.rectified.camera) is not None:
-            facts["camera"] = f"{camera.name}: {camera.summary()}"
-        return facts
+            attributes["camera"] = f"{camera.name}: {camera.summary()}"
+        return attributes
 
     @cached_property
     def covariance(self) -> NodalCovariance:
@@ -265,7 +298,7 @@ class Physical(Portable):
         """Name of the strain measure with capitals."""
         return self.measure.title()
 
-    def strain_words(self, name: str = "") -> str:
+    def strain_description(self, name: str = "") -> str:
         """Name measure and gauge of a strain; the equivalent strain is that of the Hencky strain whatever is chosen."""
         measure = "Hencky" if name.startswith("equivalent") else self.measure_name
         return f"{measure}, virtual strain gauge of {self.in_units(self.gauges.length)}"
@@ -275,7 +308,7 @@ class Physical(Portable):
         """Unit of the axes of pictures of the image, and that unit over px: mm where each px is as long."""
         return ("px", 1.0) if self.rectified.camera is not None else (self.units.length, self.length)
 
-    def place_text(self, x: float, y: float) -> str:
+    def position_text(self, x: float, y: float) -> str:
         """Write a place of the image (px) as text, in the unit of the axes."""
         unit, factor = self.axes
         return f"({x:.0f}, {y:.0f}) px" if unit == "px" else f"({x * factor:.4g}, {y * factor:.4g}) {unit}"
@@ -286,11 +319,12 @@ class Physical(Portable):
         return f"{length:.4g} px" + ("" if scale is None else f" ({length * scale:.3g} mm)")
 
     @cached_property
-    def quantities(self) -> dict[str, Quantity]:
+    def quantities(self) -> dict[str, ResultQuantity]:
         """Entries of what `frame` returns: the stackable quantities of the table, and strain; lengths in `units`."""
-        kept = [entry for entry in QUANTITIES.values() if entry.stackable and entry.name != "time_ns"]
-        kept = [entry for entry in kept if not self.is_strain(entry.name)]  # small strain gives way to finite strain
-        return {entry.name: entry.in_units(self.units) for entry in (*kept, *STRAIN, *ELEMENT_STRAIN)}
+        stored = [entry for entry in QUANTITIES.values() if entry.is_stackable and entry.name != "time_ns"]
+        # small strain gives way to finite strain
+        stored = [entry for entry in stored if not self.is_strain(entry.file_name)]
+        return {entry.name: entry.with_units(self.units) for entry in (*stored, *STRAIN, *ELEMENT_STRAIN)}
 
     def is_strain(self, name: str) -> bool:
         """Report whether a quantity depends on strain measure and gauge."""
@@ -305,17 +339,17 @@ class Physical(Portable):
         """Return the `quantities` of one frame, each in its type; errors as `Result.frame`."""
         record = self.result.frame(index)
         values = {name: np.asarray(record.values[name]) for name in self.quantities if name in record.values}
-        moved = _moved(self.rectified, values)
-        for component, (value, std, bias) in zip("uv", moved.reshape(3, 2, -1).swapaxes(0, 1), strict=True):
+        displacement = _rectified_displacement(self.rectified, values)
+        for component, (value, std, bias) in zip("uv", displacement.reshape(3, 2, -1).swapaxes(0, 1), strict=True):
             values |= zip((component, f"{component}_std"), self.units.lengths(value, std), strict=True)
             values[f"{component}_bias_std"] = self.length * bias
-        values |= zip(EDGE, self.length * edge_std(self.rectified, record.values), strict=True)
-        values |= named(self.gauges.strain(*moved, measure=self.measure))
-        gradient = self.mesh.element_gradient(moved[:2].T)
+        values |= zip(EDGE_QUANTITIES, self.length * edge_std(self.rectified, record.values), strict=True)
+        values |= strain_by_name(self.gauges.strain(*displacement, measure=self.measure))
+        gradient = self.mesh.element_gradient(displacement[:2].T)
         elements = strain_of_gradient(gradient, np.zeros((len(gradient), 4, 4)), self.measure)
-        return values | {entry.name: entry.of(elements) for entry in ELEMENT_STRAIN}
+        return values | {entry.name: entry.read_from(elements) for entry in ELEMENT_STRAIN}
 
 
-def named(strain: Strain) -> dict[str, FloatArray]:
+def strain_by_name(strain: Strain) -> dict[str, FloatArray]:
     """Return the quantities of a strain by name."""
-    return {entry.name: entry.of(strain) for entry in STRAIN}
+    return {entry.name: entry.read_from(strain) for entry in STRAIN}

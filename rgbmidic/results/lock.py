@@ -1,4 +1,4 @@
-"""Claims on a result folder: files that name a process that writes into it, and the frames that it writes."""
+"""Locks of a result folder: files that name a process that writes into it, and the frames that it writes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from rgbmidic.errors import ResultError
-from rgbmidic.results.files import may_live, read_json, writing
+from rgbmidic.results.files import may_be_alive, read_json, write_errors
 
 ALL_FRAMES = range(sys.maxsize)
 """All frames that a folder has or will have."""
@@ -25,55 +25,57 @@ lets one be first. A process of an array looks at a folder in some ms."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Claim:
-    """A claim that this process holds; other processes of copies cannot release it.
+class FrameLock:
+    """A lock on frames that this process holds; copies in other processes cannot release it.
 
     Attributes
     ----------
     file
-        The file of the claim.
+        The file of the lock.
     process
-        Who holds it.
+        Number of the process that holds it.
     """
 
     file: Path
     process: int
 
     @classmethod
-    def take(cls, folder: Path, frames: range) -> Self:
-        """Claim frames (consecutive) of a folder; claims that dead processes of this host left are removed.
+    def acquire(cls, folder: Path, frames: range) -> Self:
+        """Lock frames (consecutive) of a folder; locks that dead processes of this host left are removed.
 
         Raises
         ------
         ResultError
-            Another run holds some of them, or the claim cannot be written.
+            Another run holds some of them, or the lock cannot be written.
         """
         for pause in _PAUSES:
             file = folder / f"in_use.{secrets.token_hex(8)}.json"
-            if not (other := next(_others(file, frames), None)):
+            if not (conflict := next(_conflicting_locks(file, frames), None)):
                 holder = {"process": os.getpid(), "host": socket.gethostname()}
-                part = file.with_name(f"{file.name}.{holder['host']}.{holder['process']}.part")
-                with writing(file):  # whole at once; it need not outlive the machine
-                    part.write_text(json.dumps(holder | {"first": frames.start, "stop": frames.stop}), encoding="utf-8")
-                    part.replace(file)
-                if not (other := next(_others(file, frames), None)):
+                temporary = file.with_name(f"{file.name}.{holder['host']}.{holder['process']}.part")
+                with write_errors(file):  # whole at once; it need not outlive the machine
+                    temporary.write_text(
+                        json.dumps(holder | {"first": frames.start, "stop": frames.stop}), encoding="utf-8"
+                    )
+                    temporary.replace(file)
+                if not (conflict := next(_conflicting_locks(file, frames), None)):
                     return cls(file=file, process=os.getpid())
                 file.unlink(missing_ok=True)
             time.sleep(random.uniform(0, pause))
-        assert other
-        name, holder = other
+        assert conflict
+        name, holder = conflict
         raise ResultError(
             f"{folder} is in use by process {holder.get('process', '?')} on {holder.get('host', '?')}; "
             f"give another folder, or delete {name} if that run is dead"
         )
 
     def check(self) -> None:
-        """Refuse to write into a folder that no longer has this claim: another one lies in its place.
+        """Refuse to write into a folder that no longer has this lock: another one lies in its place.
 
         Raises
         ------
         ResultError
-            The claim is gone.
+            The lock is gone.
         """
         if not self.file.exists():
             raise ResultError(
@@ -82,16 +84,16 @@ class Claim:
             )
 
     def release(self) -> None:
-        """Remove the claim, so that other processes can write the frames."""
+        """Remove the lock, so that other processes can write the frames."""
         if self.process == os.getpid():
-            with writing(self.file):
+            with write_errors(self.file):
                 self.file.unlink(missing_ok=True)
 
 
-def _others(mine: Path, frames: range) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Yield the claims of other processes on any of these frames; one that cannot be read is on all of them."""
-    for file in mine.parent.glob("in_use.*.json"):
-        if file == mine:
+def _conflicting_locks(lock_file: Path, frames: range) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Yield the locks of other processes on any of these frames; one that cannot be read is on all of them."""
+    for file in lock_file.parent.glob("in_use.*.json"):
+        if file == lock_file:
             continue
         try:
             document = read_json(file)
@@ -100,8 +102,10 @@ def _others(mine: Path, frames: range) -> Iterator[tuple[Path, dict[str, Any]]]:
         except ResultError:
             document = {}
         holder = document if isinstance(document, dict) else {}
-        first, end = holder.get("first"), holder.get("stop")
-        if not may_live(holder):
+        first, stop = holder.get("first"), holder.get("stop")
+        if not may_be_alive(holder):
             file.unlink(missing_ok=True)
-        elif not (isinstance(first, int) and isinstance(end, int)) or max(first, frames.start) < min(end, frames.stop):
+        elif not (isinstance(first, int) and isinstance(stop, int)) or max(first, frames.start) < min(
+            stop, frames.stop
+        ):
             yield file, holder
