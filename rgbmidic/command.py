@@ -394,7 +394,7 @@ _DERIVED: dict[str, Any] = {
     "px": Pixels,
 }
 derived_options = collect_options("derived", _DERIVED, dict, rigid_removed=False, px=False)
-"""Decorator of a command whose parameter `derived` states how fields are derived, as `rgbmidic.results.Maps.of`."""
+"""Decorator of a command whose parameter `derived` states how fields are derived, see `rgbmidic.results.Maps`."""
 
 
 def note(text: str) -> None:

@@ -59,7 +59,7 @@ class Profile:
     Attributes
     ----------
     field, how
-        What it is, and how it is derived (`Maps.how`).
+        What it is, and how it is derived (`Maps.processing_note`).
     line
         The points; its positions are in rectified px.
     frames, numbers : ndarray, shape (T,), int

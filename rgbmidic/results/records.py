@@ -193,7 +193,7 @@ class FrameRecord(QuantityAttributes, HtmlRepr):
         Parameters
         ----------
         solution
-            Provides the quantities that have a `Quantity.source`.
+            Provides the quantities that have a `ResultQuantity.source`.
         **quantities
             The others, such as `number`, `time_ns`, `inputs` and `weights_thumbnail`, as in `from_values`.
 

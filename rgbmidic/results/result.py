@@ -202,7 +202,7 @@ class Result(Portable, QuantityAttributes, HtmlRepr):
             f"frames: {len(self)}, {done} measured" if done < len(self) else f"frames: {len(self)}",
             f"mesh:   {len(self.nodes)} nodes, {len(self.elements)} elements",
             f"lights: {lights}",
-            "read:   result.u (T, N), .u_std, .nodal_strain, .misfit, ...; .frame(i), .each(name), .to_xarray()",
+            "read:   result.u (T, N), .u_std, .nodal_strain, .misfit, ...; .frame(i), .iterate(name), .to_xarray()",
         ]
         return "\n".join(lines)
 

@@ -40,7 +40,7 @@ LETTERS = {
     "text_font_size": "12px",
     "padding": 2,
 }
-"""Look of a text over the image, where `beside` places it."""
+"""Look of a text over the image, where `place_texts` places it."""
 _TEXT_OFFSET, _LETTER, _LINE = 8, 7, 20
 """Pixels of the screen: from a place to its text; width of a letter and height of a line of 12 px."""
 
