@@ -55,10 +55,10 @@ class ScaleSettings(Checked):
 
     section = "scale"
 
-    mm_per_pixel: float | None = bounded(None, above=0)
-    mm_per_pixel_std: float = bounded(0.0, at_least=0)
+    mm_per_pixel: float | None = bounded(None, above=0, at_most=1e6)
+    mm_per_pixel_std: float = bounded(0.0, at_least=0, at_most=1e6)
     camera: Path | None = None
-    frame_rate: float | None = bounded(None, above=0)
+    frame_rate: float | None = bounded(None, above=0, at_most=1e15)
     unit: Literal["mm", "px"] = "mm"
 
     def _problems(self) -> Iterator[str]:
@@ -129,7 +129,7 @@ class ProbeSettings(Checked):
     strain_gauges: _Place3 = ()
     cracks: _Place4 = ()
     tips: _Place4 = ()
-    youngs_modulus: float | None = bounded(None, above=0)
+    youngs_modulus: float | None = bounded(None, above=0, at_most=1e12)
     poissons_ratio: float | None = bounded(None, above=-1, at_most=0.5)
     plane: Literal["stress", "strain"] | None = None
     terms: int = bounded(0, at_least=0, at_most=20)
@@ -209,10 +209,10 @@ class ChannelSettings(Checked):
     section = "channels"
 
     file: Path | None = None
-    offset: float = 0.0
+    offset: float = bounded(0.0, at_least=-1e15, at_most=1e15)
     trigger: str | None = None
     align: tuple[str, str] | None = None
-    area: float | None = bounded(None, above=0)
+    area: float | None = bounded(None, above=0, at_most=1e15)
     force: str | None = None
 
     def _problems(self) -> Iterator[str]:

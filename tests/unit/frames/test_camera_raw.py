@@ -344,7 +344,5 @@ def test_a_jpeg_that_announces_more_than_its_tile_is_not_decoded(tmp_path: Path)
     begin = content.index(b"\xff\xc3") + 5
     content[begin : begin + 4] = b"\xff\xe0\xff\xd2"
     path.write_bytes(content)
-    with pytest.raises(
-        FrameError, match=r"large\.dng is damaged .* announce 65504 rows of 65490 x 1 samples"
-    ):
+    with pytest.raises(FrameError, match=r"large\.dng is damaged .* announce 65504 rows of 65490 x 1 samples"):
         read_frame(path)
