@@ -372,6 +372,11 @@ def at_pixels(mesh: Tri3Mesh, values: FloatArray, shape: tuple[int, int]) -> Flo
     -------
     ndarray, shape (C, H, W), float32
         NaN outside the mesh and in elements with a NaN node.
+
+    Raises
+    ------
+    InputError
+        The values are not those of the nodes, or there is no such image.
     """
     if values.ndim != 2 or len(values) != len(mesh.nodes) or min(shape) < 1:
         raise InputError(
@@ -399,6 +404,11 @@ def at_nodes(field: FloatArray, nodes: FloatArray) -> FloatArray:
     -------
     ndarray, shape (N, C)
         NaN where one of the four pixels around is NaN.
+
+    Raises
+    ------
+    InputError
+        No such field, or no such nodes.
     """
     if field.ndim != 3 or min(field.shape[1:]) < 2 or nodes.shape[1:] != (2,) or not np.isfinite(nodes).all():
         raise InputError(
@@ -434,6 +444,11 @@ def field_rms(mesh: Tri3Mesh, values: FloatArray, truth: FloatArray, *, border: 
     Returns
     -------
     float
+
+    Raises
+    ------
+    InputError
+        The values are not those of the nodes, or the truth has other components.
     """
     if truth.ndim != 3 or values.shape[1:] != truth.shape[:1]:
         raise InputError(f"a truth (C, H, W) is compared with values (N, C), not {truth.shape} with {values.shape}")

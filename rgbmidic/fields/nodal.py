@@ -218,6 +218,11 @@ def reference_fraction(count: int) -> float:
     Returns
     -------
     float
+
+    Raises
+    ------
+    InputError
+        There is no reference frame.
     """
     if count < 1:
         raise InputError(f"a reference is of one frame or more, not {count}")
@@ -246,6 +251,11 @@ def frame_covariance(std: FloatArray, common_fraction: float, references: Sequen
     Returns
     -------
     ndarray, shape (T, T, ...)
+
+    Raises
+    ------
+    InputError
+        The fraction is not in 0 to 1/2, or not every frame has a statement of its reference.
     """
     variance, reference = np.asarray(std, dtype=np.float64) ** 2, np.asarray(references, dtype=bool)
     if not 0 < common_fraction <= 0.5 or reference.ndim != 1 or variance.shape[:1] != reference.shape:
@@ -275,6 +285,11 @@ def difference_std(first: FloatArray, second: FloatArray, common_fraction: float
     Returns
     -------
     ndarray
+
+    Raises
+    ------
+    InputError
+        The uncertainties are not of one shape.
     """
     first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if 1 not in (first.size, second.size) and first.shape != second.shape:

@@ -143,10 +143,13 @@ class ProfileLine:
         mesh, length = covariance.mesh, math.hypot(x1 - x0, y1 - y0)
         if not length > 0:
             raise InputError(f"a line needs two different points, not ({x0:g}, {y0:g}) twice")
-        points = np.linspace((x0, y0), (x1, y1), max(math.ceil(length / (_CONSTANTS.step * mesh.size)), 1) + 1)
-        if (places := Places.of(mesh, points)).inside.mean() < _CONSTANTS.least:
+        longest = float(np.hypot(*np.ptp(mesh.nodes, axis=0))) / _CONSTANTS.least  # of which so much can be inside
+        steps = max(math.ceil(min(length, longest) / (_CONSTANTS.step * mesh.size)), 1)
+        points = np.linspace((x0, y0), (x1, y1), steps + 1)
+        if not length <= longest or (places := Places.of(mesh, points)).inside.mean() < _CONSTANTS.least:
             raise InputError(
-                f"half or more of the line from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) px is outside {places.where}"
+                f"half or more of the line from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) px is outside "
+                f"{Places.of(mesh, mesh.nodes[:1]).where}"
             )
         self.points, self.positions = points, np.linspace(0, length, len(points))
         self.nodes, self.places = places.nearby()

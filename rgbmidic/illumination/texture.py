@@ -377,6 +377,11 @@ def speckle_diameter(picture: FloatArray, *, background: float = 20.0) -> float 
     -------
     float or None
         Full width at half maximum of the autocorrelation, averaged over all directions, px; None without a texture.
+
+    Raises
+    ------
+    InputError
+        It is no picture, or the width is not positive.
     """
     if picture.ndim != 2 or min(picture.shape) < 2 or not 0 < background < 1e6:
         raise InputError(f"a picture (H, W) and a width above 0 px are needed, not {picture.shape}, {background:g}")

@@ -58,10 +58,10 @@ class ScaleSettings(CheckedSettings):
 
     section = "scale"
 
-    mm_per_pixel: float | None = bounded(None, above=0)
-    mm_per_pixel_std: float = bounded(0.0, at_least=0)
+    mm_per_pixel: float | None = bounded(None, above=0, at_most=1e6)
+    mm_per_pixel_std: float = bounded(0.0, at_least=0, at_most=1e6)
     camera: Path | None = None
-    frame_rate: float | None = bounded(None, above=0)
+    frame_rate: float | None = bounded(None, above=0, at_most=1e15)
     unit: Literal["mm", "px"] = "mm"
 
     def _problems(self) -> Iterator[str]:
@@ -132,7 +132,7 @@ class ProbeSettings(CheckedSettings):
     strain_gauges: _Coordinates3 = ()
     cracks: _Coordinates4 = ()
     tips: _Coordinates4 = ()
-    youngs_modulus: float | None = bounded(None, above=0)
+    youngs_modulus: float | None = bounded(None, above=0, at_most=1e12)
     poissons_ratio: float | None = bounded(None, above=-1, at_most=0.5)
     plane: Literal["stress", "strain"] | None = None
     terms: int = bounded(0, at_least=0, at_most=20)
@@ -212,10 +212,10 @@ class ChannelSettings(CheckedSettings):
     section = "channels"
 
     file: Path | None = None
-    offset: float = 0.0
+    offset: float = bounded(0.0, at_least=-1e15, at_most=1e15)
     trigger: str | None = None
     align: tuple[str, str] | None = None
-    area: float | None = bounded(None, above=0)
+    area: float | None = bounded(None, above=0, at_most=1e15)
     force: str | None = None
 
     def _problems(self) -> Iterator[str]:

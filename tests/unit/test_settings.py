@@ -226,6 +226,8 @@ def test_file_with_a_byte_order_mark(tmp_path: Path) -> None:
         (LEAST + "[solver]\ncurvature = true", r'unknown key "curvature" in \[solver\]'),
         (LEAST + "[solver]\ntolerance = inf", r"solver\.tolerance must be finite"),
         (LEAST + "[scale]\nmm_per_pixel = 0", r"scale\.mm_per_pixel must be above 0"),
+        (LEAST + "[scale]\nmm_per_pixel = 1e308", r"scale\.mm_per_pixel must be at most 1e\+06, not 1e\+308"),
+        (LEAST + "[scale]\nframe_rate = 1e300", r"scale\.frame_rate must be at most 1e\+15"),
         (LEAST + '[scale]\nmm_per_pixel = 1\ncamera = "c.json"', r"scale\.camera \(.*c\.json\).*scale\.mm_per_pixel"),
         (LEAST + "[calibration]\nfile = 1", r"calibration\.file must be a file name in quotes, not 1"),
         ("[frames\n", r"not a readable settings file \(TOML\)"),

@@ -171,7 +171,12 @@ def test_the_correlation_of_rates_between_frames_is_that_of_slopes_in_noise() ->
 
 
 @pytest.mark.parametrize(
-    ("line", "message"), [((20, 50, 20, 50), "two different points"), ((20, 50, 20, 5000), "half or more of the line")]
+    ("line", "message"),
+    [
+        ((20, 50, 20, 50), "two different points"),
+        ((20, 50, 20, 5000), "half or more of the line"),
+        ((20, 50, 1e18, 50), "half or more of the line"),
+    ],
 )
 def test_a_line_that_is_none_is_refused(line: tuple[float, ...], message: str) -> None:
     with pytest.raises(InputError, match=message):
