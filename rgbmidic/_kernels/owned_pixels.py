@@ -128,38 +128,24 @@ def weighted_block_sums(start, stop, values, weight, lines, run_offsets, offsets
 
 
 @compiled("lines", fastmath=FAST)
-def corrected_difference(start, stop, lines, reference, unit, difference, gain, offset, least, side, out):
-    """Residual ``(f - (g - b) / a) / unit`` of one light, from the `reference` f (P,) and the `difference` f - g (P,).
+def correct_brightness(start, stop, lines, reference, inverse_level, scales, offset, difference, constant, scale):
+    """Correct the `difference` f - g of one light: it becomes ``constant - scale g``.
 
-    The `gain` a (h, w) at the centres of blocks of `side` px is interpolated between them, and is `least` at least. The
-    `offset` b has a constant and slopes along columns and rows. `unit` and `out` are (P,) float32.
+    ``scale`` (P,) receives that of the image `scales` (H, W) over the rectangle around the pixels, times the
+    `inverse_level`; ``constant`` the `reference` f in this unit, plus the scaled `offset`, which has a constant and
+    slopes along columns and rows.
     """
-    height, width = gain.shape
-    half, step = np.float32(0.5), np.float32(1.0 / side)
     for q in range(start, stop):
-        slot, left, row, column = np.int64(lines[q, 0]), np.int64(lines[q, 1]), lines[q, 2], np.int64(lines[q, 3])
-        y = min(max((np.float32(row) + half) * step - half, _ZERO), np.float32(height - 1))
-        above = min(np.int64(y), max(height - 2, 0))
-        below, part = min(above + 1, height - 1), y - np.float32(above)
-        b = np.float32(offset[0] + offset[2] * row)
-        slope = np.float32(offset[1])
-        while left > 0:
-            x = (np.float32(column) + half) * step - half
-            before = np.int64(np.floor(x))
-            # pixels up to the next centre of a block: the gain is linear along them
-            number = min(left, (before + 1) * side + side // 2 - column)
-            i0, i1 = min(max(before, 0), width - 1), min(before + 1, width - 1)
-            at = (_ONE - part) * gain[above, i0] + part * gain[below, i0]
-            change = (_ONE - part) * gain[above, i1] + part * gain[below, i1] - at
-            start_x = x - np.float32(before)
-            first, from_column = np.uint64(slot), np.float32(column)
-            for i in range(np.uint32(number)):
-                t = np.float32(np.int32(i))
-                a = max(at + change * (start_x + t * step), least)
-                f = reference[first + i]
-                g = f - difference[first + i] - (b + slope * (from_column + t))
-                out[first + i] = (f - g / a) / unit[first + i]
-            slot, left, column = slot + number, left - number, column + number
+        first, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
+        row, column = np.uint64(lines[q, 2]), np.uint64(lines[q, 3])
+        b, slope = np.float32(offset[0] + offset[2] * row + offset[1] * column), np.float32(offset[1])
+        for i in range(number):
+            f, unit = reference[first + i], inverse_level[first + i]
+            a = scales[row, column + i] * unit
+            c = f * unit + a * (b + slope * np.float32(np.int32(i)))
+            scale[first + i] = a
+            constant[first + i] = c
+            difference[first + i] = c - a * (f - difference[first + i])
 
 
 @compiled("out", axis=1, fastmath=FAST)

@@ -23,6 +23,7 @@ from rgbmidic._kernels.owned_pixels import interpolate_nodal
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import Assembly, rigid_functions
 from rgbmidic.correlation.blocks import BlockTable
+from rgbmidic.correlation.brightness import Brightness
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.light_bias import settled_gradient
@@ -354,10 +355,13 @@ def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
             place[:] = pixels.gather(old.scatter(row))
         return out
 
-    fields: dict[str, Any] = {name: moved(getattr(reference, name)) for name in ("values", "gradient", "pixel_weights")}
+    names = "values", "level", "inverse_level", "gradient", "pixel_weights"
+    fields: dict[str, Any] = {name: moved(getattr(reference, name)) for name in names}
     texture = reference.texture
     fields["texture"] = replace(texture, images=moved(texture.images), texture=moved(texture.texture))
-    return replace(reference, mesh=mesh, material=mesh, pixels=pixels, assembly=Assembly.from_mesh(mesh), **fields)
+    return replace(
+        reference, mesh=mesh, material=mesh, pixels=pixels, assembly=Assembly.from_mesh(mesh), gain_fits=(), **fields
+    )
 
 
 def _unsmoothing(mesh: Tri3Mesh) -> Callable[[FloatArray], FloatArray]:
@@ -437,7 +441,7 @@ def _left(reference: Reference, noise: FloatImage, field: FloatArray) -> Residua
     weights, moments = reference.pixel_weights, np.zeros((len(noise), 0, 6))
     return Residual(
         reference=reference,
-        brightness=reference.brightness_of(weights, None),
+        brightness=Brightness(constant=reference.values, scale=reference.inverse_level),
         weights=weights,
         difference=left,
         moments=moments,

@@ -379,8 +379,8 @@ def _right_sides(
             difference = known[light]
         else:
             there = reference.warp(problem.deformed, light, displacement)
-            differences(problem.deformed.coefficients[light], reference.values[light], *there, difference)
-            difference = brightness.residual(light, difference)
+            images = problem.deformed.coefficients[light], brightness.constant[light], brightness.scale[light]
+            differences(*images, *there, difference)
         gradient = reference.gradient[:, light]
         vector = assembly.vector(reference.projected(equations.weights[light], difference, gradient))
         total += vector

@@ -164,10 +164,12 @@ class Reference:
         Fraction of the variance of a block's score that the fit leaves in the residual (`unfitted_fraction`).
     values, pixel_weights : ndarray, shape (k, P), float32
         The same at the owned pixels.
-    level : ndarray, shape (k, P), float32
-        Local mean of `values`, in units of which residual and gradient are.
+    level, inverse_level : ndarray, shape (k, P), float32
+        Local mean of `values`, in units of which residual and gradient are, and one over it.
     brightness, gain_window
         ``solver.brightness``, and the standard deviation (px) of the window of the gain; None where that is one number.
+    gain_fits : tuple of GainFit
+        Of each light's gain with the `pixel_weights`; empty where they are not kept.
     gradient : ndarray, shape (2, k, P), float32
         Gradient of the texture common to the lights, as each shows it, in its `level` per px; without what is a gain.
     texture : TextureGradient
@@ -188,7 +190,9 @@ class Reference:
     weights: FloatImage
     values: FloatImage
     level: FloatImage
+    inverse_level: FloatImage
     gain_window: float | None
+    gain_fits: tuple[GainFit, ...]
     brightness: BrightnessModel
     gradient: FloatImage
     pixel_weights: FloatImage
@@ -269,7 +273,13 @@ class Reference:
             sigma = window_width(values, own, weighted, pixels, constants)
         level = _local_level(values, weighted, pixels, sigma)
         weighted *= level > DARK * level.max(axis=1, keepdims=True)
-        own = _relative_gradient(own, values, level, weighted, pixels, sigma)
+        inverse_level, fits = np.float32(1) / level, tuple[GainFit, ...]()
+        if sigma is not None:  # what a gain may be is no displacement
+            fits = tuple(GainFit.over(f, w, pixels, sigma) for f, w in zip(values, weighted, strict=True))
+            for light, fit in enumerate(fits):
+                for axis in own[:, light]:
+                    axis[:] = fit.remainder(axis, values[light])
+        own *= inverse_level
         texture = TextureGradient.of_images(own, weighted, pixels, constants.shared)
         gradient = texture.matched(pixels)
         return cls(
@@ -283,7 +293,9 @@ class Reference:
             weights=usable,
             values=values,
             level=level,
+            inverse_level=inverse_level,
             gain_window=sigma,
+            gain_fits=fits,
             brightness=brightness,
             gradient=gradient,
             pixel_weights=weighted,
@@ -293,31 +305,30 @@ class Reference:
             constants=constants,
         )
 
-    def brightness_of(self, weights: FloatImage, moments: FloatArray | None) -> Brightness:
-        """Estimate the brightness of deformed images.
+    def correct_brightness(self, difference: FloatImage, weights: FloatImage, moments: FloatArray) -> Brightness:
+        """Estimate the brightness of deformed images, and correct the difference of the grey levels by it, in place.
 
         Parameters
         ----------
+        difference : ndarray, shape (k, P), float32
+            f - g of the grey levels; becomes the residual, in units of the `level`.
         weights : ndarray, shape (k, P), float32
             Weights of the pixels that both states show.
-        moments : ndarray, shape (k, E, 6), or None
-            `Residual.moments`; None, or the model ``"none"``: gain 1 and offset 0.
+        moments : ndarray, shape (k, E, 6)
+            As of `Residual`.
         """
-        gain, offset = np.ones(len(weights)), np.zeros((len(weights), 3))
-        if moments is not None and self.brightness != "none":
-            centres = self.mesh.centres - self.pixels.bounds[1::-1]
-            gain, offset = gain_and_offset(moments, centres, self.constants)
-        whole = Brightness(
-            pixels=self.pixels,
-            values=self.values,
-            level=self.level,
-            gain=gain,
-            offset=offset,
-            least_gain=self.constants.least_gain,
-        )
-        if moments is None or self.gain_window is None:
-            return whole
-        return whole.with_windows(weights, self.gain_window)
+        whole = np.ones(len(weights)), np.zeros((len(weights), 3))
+        if self.brightness != "none":
+            whole = gain_and_offset(moments, self.mesh.centres - self.pixels.bounds[1::-1], self.constants)
+        fits: list[GainFit | None] = [None] * len(weights)
+        if self.gain_window is not None:
+            for light, (f, w) in enumerate(zip(self.values, weights, strict=True)):
+                kept = self.gain_fits[light] if self.gain_fits else None
+                if kept is None or not np.array_equal(w, kept.weights):  # some pixels are saturated, or off the frame
+                    kept = GainFit.over(f, w, self.pixels, self.gain_window)
+                fits[light] = kept
+        images = self.values, self.inverse_level, self.pixels
+        return Brightness.correcting(difference, fits, whole, *images, self.constants.least_gain)
 
     def channel_specific(self, light: int) -> FloatImage:
         """Return what a light's own gradient has beyond the one that it is matched with, (2, P).
@@ -359,7 +370,7 @@ class Reference:
         factors = filter_variance(self.prefilter) / 2 * (beyond * (1, 2, 1)).astype(np.float32)
         values, (top, left, _, _) = self.values.copy(), self.pixels.bounds
         add_second_derivatives(factors, self.images, self.pixels.lines, self.pixels.run_offsets, top, left, values)
-        return replace(self, values=values)
+        return replace(self, values=values, gain_fits=())
 
     def offset(self, deformed: Deformed) -> FloatArray:
         """Column and row of these images (2,) at which those of a deformed state begin.
@@ -503,10 +514,15 @@ def _where_they_lie(
     x, y = pixels.columns, pixels.rows
     values, weights = (np.empty((len(state.weights), inside.size), dtype=np.float32) for _ in range(2))
     gradient, shift = (np.empty((2, *many, inside.size), dtype=np.float32) for many in (values.shape[:1], ()))
-    zero, unused, moments = np.zeros_like(inside), np.empty_like(inside), np.empty((len(mesh.elements), 6))
+    one, zero, unused, moments = (
+        np.ones_like(inside),
+        np.zeros_like(inside),
+        np.empty_like(inside),
+        np.empty((len(mesh.elements), 6)),
+    )
     for light, motion in enumerate(registration.displacement(mesh.nodes + state.origin)):
         there, spline = carried(mesh, pixels, motion), state.coefficients[light]
-        differences(spline, zero, *there, values[light])
+        differences(spline, zero, one, *there, values[light])
         images = state.weights[light], state.partial[light], zero, values[light], inside
         warped_weights(*images, *there, weights[light], moments)
         interpolate_nodal(motion, mesh.elements, *pixels.positions, shift)
@@ -549,21 +565,3 @@ def _local_level(values: FloatImage, weights: FloatImage, pixels: PixelMap, sigm
             out[:] = pixels.from_blocks(window.ratios(pixels, np.stack([w * f, w])), window.step)[0]
             np.maximum(out, np.float32(DARK * out.max() or 1.0), out=out)
     return level
-
-
-def _relative_gradient(
-    gradient: FloatImage,
-    values: FloatImage,
-    level: FloatImage,
-    weights: FloatImage,
-    pixels: PixelMap,
-    sigma: float | None,
-) -> FloatImage:
-    """Gradient (2, k, P) in units of the `level`, without what is a gain of the grey levels in the window."""
-    relative = np.empty_like(gradient)
-    for light, (f, w) in enumerate(zip(values, weights, strict=True)):
-        fit = GainFit.over(f, w, pixels, sigma) if sigma is not None else None
-        for axis in range(2):
-            one = gradient[axis, light]
-            relative[axis, light] = (fit.remainder(one, f) if fit else one) / level[light]
-    return relative

@@ -36,7 +36,7 @@ class Residual:
     weights : ndarray, shape (k, P), float32
         Weights given, warped by the displacement; 0 where g is not known.
     difference : ndarray, shape (k, P), float32
-        f - g(x + u) with the brightness of g corrected, in units of the local mean of f (`Brightness.residual`).
+        f - g(x + u) with the brightness of g corrected, in units of the local mean of f (`Brightness`).
     moments : ndarray, shape (k, E, 6)
         Sums of w, w f, w g, w f f, w f g, w g g over the pixels of each element.
     """
@@ -62,17 +62,15 @@ class Residual:
         -------
         Residual
         """
-        values = reference.values
+        values, unit = reference.values, np.ones_like(reference.values[0])
         difference, weights = np.empty_like(values), np.empty_like(values)
         moments = np.empty((len(values), len(reference.mesh.elements), 6))
         for light, displacement in enumerate(displacements):
             there = reference.warp(deformed, light, displacement)
-            differences(deformed.coefficients[light], values[light], *there, difference[light])
+            differences(deformed.coefficients[light], values[light], unit, *there, difference[light])
             images = deformed.weights[light], deformed.partial[light], values[light], difference[light]
             warped_weights(*images, reference.pixel_weights[light], *there, weights[light], moments[light])
-        brightness = reference.brightness_of(weights, moments)
-        for light, one in enumerate(difference):
-            one[:] = brightness.residual(light, one)
+        brightness = reference.correct_brightness(difference, weights, moments)
         return cls(reference=reference, brightness=brightness, weights=weights, difference=difference, moments=moments)
 
     @property

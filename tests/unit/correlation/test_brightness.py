@@ -7,7 +7,7 @@ import pytest
 from textures import Affine, Texture
 
 from rgbmidic import Status, correlate
-from rgbmidic._kernels.owned_pixels import corrected_difference
+from rgbmidic._kernels.owned_pixels import correct_brightness
 from rgbmidic.correlation.brightness import GainFit, gain_and_offset
 from rgbmidic.correlation.constants import USUAL
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
@@ -48,7 +48,7 @@ def test_a_change_of_light_costs_nothing():
         # noise of 3 in both states, after a gain a: sqrt((1 + 1 / a^2) / 2) times the error
         expected = once * np.sqrt((1 + np.mean(1 / np.square(gain))) / 2)
         assert changed < 1.1 * expected
-        assert 0.8 < ratio < 1.25
+        assert 0.7 < ratio < 1.25
         assert passes <= iterations + 2
 
 
@@ -59,9 +59,9 @@ def test_a_gain_that_is_linear_in_the_window_is_found_at_every_edge(pixels):
     fit = GainFit.over(values, np.ones_like(values), pixels, 10.0)
     found = fit.gain(fit.block_sums((gain * values).astype(np.float32)))
     # the ridge holds a twentieth of the slope at an edge, and beyond the last block's centre the gain is that of it
-    np.testing.assert_allclose(pixels.from_blocks(found[None], 4)[0], gain, rtol=0.04)
+    np.testing.assert_allclose(pixels.from_blocks(found[None], 8)[0], gain, rtol=0.06)
     left = fit.remainder((gain * values).astype(np.float32), values)
-    assert np.abs(left).max() < 0.04 * 150 * gain.max()
+    assert np.abs(left).max() < 0.06 * 150 * gain.max()
 
 
 def test_an_offset_is_a_plane_whatever_some_elements_show():
@@ -79,21 +79,17 @@ def test_an_offset_is_a_plane_whatever_some_elements_show():
     np.testing.assert_array_equal(unlike[1], [[0.0, 0.0, 0.0]])
 
 
-@pytest.mark.parametrize("grid", [(1, 1), (30, 40)])
-def test_the_corrected_difference_is_that_of_the_naive_one(pixels, grid):
+def test_the_corrected_difference_is_that_of_the_naive_one(pixels):
     random = np.random.default_rng(2)
-    f, level, difference = random.uniform(50, 150, (3, pixels.columns.size)).astype(np.float32)
-    gain, offset, out = random.uniform(0.2, 2, grid).astype(np.float32), np.array([3.0, 0.1, -0.2]), np.empty_like(f)
-    corrected_difference(pixels.lines, f, level, difference, gain, offset, np.float32(0.4), 4, out)
+    f, level, before = random.uniform(50, 150, (3, pixels.columns.size)).astype(np.float32)
+    scales, offset = random.uniform(0.2, 2, pixels.bounds[2:]).astype(np.float32), np.array([3.0, 0.1, -0.2])
+    difference, constant, scale = before.copy(), np.empty_like(f), np.empty_like(f)
+    correct_brightness(pixels.lines, f, 1 / level, scales, offset, difference, constant, scale)
     top, left = pixels.bounds[:2]
     rows, columns = pixels.rows - top, pixels.columns - left
-    places = [np.clip((one + 0.5) / 4 - 0.5, 0, size - 1) for one, size in zip((rows, columns), grid, strict=True)]
-    first = [np.minimum(one.astype(int), max(size - 2, 0)) for one, size in zip(places, grid, strict=True)]
-    (i, j), (s, t) = first, (place - low for place, low in zip(places, first, strict=True))
-    below, right = np.minimum(i + 1, grid[0] - 1), np.minimum(j + 1, grid[1] - 1)
-    a = (1 - s) * ((1 - t) * gain[i, j] + t * gain[i, right]) + s * ((1 - t) * gain[below, j] + t * gain[below, right])
-    b = offset[0] + offset[1] * columns + offset[2] * rows
-    np.testing.assert_allclose(out, (f - (f - difference - b) / np.maximum(a, 0.4)) / level, rtol=2e-4, atol=2e-4)
+    a, b = scales[rows, columns], offset[0] + offset[1] * columns + offset[2] * rows
+    np.testing.assert_allclose(difference, (f - a * (f - before - b)) / level, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(constant - scale * (f - before), difference, rtol=1e-4, atol=1e-4)
 
 
 def test_weighted_sums_over_blocks_are_those_of_the_products(pixels):
