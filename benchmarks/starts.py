@@ -123,7 +123,7 @@ def search(side: int, texture: FloatImage, size: int, lights: str, motion: Motio
     deformed = Deformed.prepare(*under_lights(moved(texture, size, motion), lights, random), prefilter="binomial")
     start = find_start(reference, deformed)
     truth = motion.of(mesh.nodes, (size - 1) / 2)
-    residual = Residual.at(reference, deformed, reference.values, [truth] * len(images))
+    residual = Residual.at(reference, deformed, [truth] * len(images))
     visible = np.nan_to_num(correlation_around(residual)) >= VISIBLE
     if not visible.any():
         return None

@@ -106,6 +106,7 @@ class Competitor:
             mesh=Tri3Mesh.from_region(region, element_size),
             prefilter=SolverSettings().prefilter if settings.default else prefilter,
             registration=images.registration,
+            brightness="auto" if settings.default else "constant" if settings.brightness == "local" else "none",
         )
         return cls(method=method, lights=lights, reference=reference, threshold=limit)
 
@@ -117,8 +118,7 @@ class Competitor:
         if start is None:
             start = find_start(self.reference, deformed).displacement
         method = METHODS[self.method]
-        options = SolverSettings(brightness=method.brightness)
-        solution = solve(self.reference, deformed, start, options, Statistics() if method.default else None)
+        solution = solve(self.reference, deformed, start, SolverSettings(), Statistics() if method.default else None)
         if method.ours or not solution.measured.any():
             return solution
         fitted = linear_fit(self.reference, deformed, solution, corrected=method.brightness == "local")
@@ -142,12 +142,13 @@ def linear_fit(reference: Reference, deformed: Deformed, solution: Solution, *, 
         return np.asarray(spsolve((system + held * sp.eye(len(vector))).tocsc(), vector)).reshape(-1, 2)
 
     for _ in range(ITERATIONS):
-        residual = Residual.at(reference, deformed, reference.values, [moved] * len(lights))
+        residual = Residual.at(reference, deformed, [moved] * len(lights))
         system, vector = sp.csr_matrix((2 * len(moved),) * 2), np.zeros(2 * len(moved))
         for light in lights:
             weight, difference = residual.weights[light] * whole, residual.difference[light]
             if corrected:
-                f, g = reference.values[light], residual.warped[light]
+                f = reference.values[light] * reference.inverse_level[light]
+                g = f - difference
                 basis = np.stack([g / np.float32(g.mean()), np.ones_like(g)])
                 sums = assembly.vector(reference.projected(weight, f, basis))
                 nodal = solved(assembly.matrix(reference.blocks(weight, basis)), sums)

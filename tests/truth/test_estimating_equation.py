@@ -65,7 +65,7 @@ def minimum_from_root(first, second):
 
     def criterion(shift):
         moved = found.displacement + np.array([shift, 0])
-        residual = Residual.at(reference, deformed, reference.values, [moved] * len(first))
+        residual = Residual.at(reference, deformed, [moved] * len(first))
         return float((residual.weights * residual.difference.astype(float) ** 2).sum())
 
     place = 0.0
