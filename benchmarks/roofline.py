@@ -54,7 +54,6 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     owned, count, elements = reference.pixels.local_x.size, size * size, len(mesh.elements)
     difference, weight = np.empty((2, owned), np.float32)
     values, weights, moments = reference.values[0], reference.pixel_weights[0], np.empty((elements, 6))
-    unit = np.ones_like(values)
     coefficients = np.empty((size + 2 * PAD,) * 2, np.float32)
     there = carried(mesh, reference.pixels, motion)
     warped = deformed.weights[0], deformed.partial[0], values, difference, weights, *there, weight, moments
@@ -62,7 +61,7 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     lights, lit = np.empty_like(channels), np.empty_like(known)
     grid, needed = np.tile(np.eye(3, dtype=np.float32) + np.float32(0.1), (2, 2, 1, 1)), np.eye(3, dtype=bool)
     return [
-        ("difference", owned, 16, lambda: differences(deformed.coefficients[0], values, unit, *there, difference)),
+        ("difference", owned, 12, lambda: differences(deformed.coefficients[0], values, *there, difference)),
         ("weights and moments", owned, 16, lambda: warped_weights(*warped)),
         ("right-hand side", owned, 24, lambda: reference.projected(weights, difference, reference.gradient[:, 0])),
         ("Hessian", owned, 20, lambda: reference.blocks(weights, reference.gradient[:, 0])),

@@ -102,11 +102,11 @@ def _element_motion(displacement, elements, barycentric, origin, e):
 
 @compiled("elements", fastmath=FAST)
 def differences(
-    start, stop, coefficients, constant, scale, runs, run_offsets, origin, elements, barycentric, displacement, out
+    start, stop, coefficients, reference, runs, run_offsets, origin, elements, barycentric, displacement, out
 ):
-    """Differences ``constant - scale g(x + u)`` of one light at the owned pixels, 0 outside the deformed image.
+    """Differences ``f - g(x + u)`` of one light at the owned pixels, 0 outside the deformed image.
 
-    `coefficients` of the deformed image; `constant`, `scale` and `out` (P,) float32; `runs` (R, 4) int32, `run_offsets`
+    `coefficients` of the deformed image; `reference` and `out` (P,) float32; `runs` (R, 4) int32, `run_offsets`
     (E + 1,) and `origin` (E, 2) as in `rgbmidic.mesh.PixelMap`; `barycentric` (E, 3, 3) float64 with the shape function
     ``b[0] + b[1] x + b[2] y`` of the local position; `displacement` (N, 2) float64.
     """
@@ -134,14 +134,14 @@ def differences(
                 n = max(min(np.int64(side_by_side) + 1, width - 1 - column), 1)
                 # whole vectors, of which the last one may be too long, where memory goes on so far
                 filled = (n + _LANES - 1) // _LANES * _LANES
-                if slot + filled > constant.size or column + filled + 3 >= width + 2 * PAD:
+                if slot + filled > reference.size or column + filled + 3 >= width + 2 * PAD:
                     filled = n
                 i0, first = np.uint64(slot), np.uint64(row + PAD - 1) * across + np.uint64(column + PAD - 1)
                 for i in range(np.uint32(filled)):
                     t = np.float32(np.int32(i))
                     g = _spline(flat, first, across, i, tx + (fxx - _ONE) * t, ty + fyx * t)
                     if np.int32(i) < np.int32(n):
-                        out[i0 + i] = constant[i0 + i] - scale[i0 + i] * g
+                        out[i0 + i] = reference[i0 + i] - g
                 slot, left, x = slot + n, left - n, x + np.float32(n)
 
 

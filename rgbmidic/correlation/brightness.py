@@ -8,7 +8,6 @@ counts only the information that the unknown gain leaves.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -112,58 +111,48 @@ def _moments(sums: FloatArray, sigma: float, order: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Brightness:
-    """Brightness of the deformed images g: the residual of a pass is ``constant - scale g``.
+    """Brightness of the deformed images of a pass.
 
     Attributes
     ----------
-    constant, scale : ndarray, shape (k, P), float32
-        ``(f + b / a) / level`` and ``1 / (a level)``, with the grey levels f of the reference and their local mean.
+    pixels
+        P owned pixels of the reference.
+    values, inverse_level : ndarray, shape (k, P), float32
+        Grey levels of the reference, and one over their local mean, the unit of the residual.
+    gain : ndarray, shape (k,)
+        Of each light; 1 where it shows nothing.
+    offset : ndarray, shape (k, 3)
+        Of each light: its constant, and its slopes along the columns and rows of the rectangle around the pixels.
+    fits : tuple
+        `GainFit` of each light's local gain; None where the gain is one number.
+    least_gain
+        Least local gain over that of the light.
     """
 
-    constant: FloatImage
-    scale: FloatImage
+    pixels: PixelMap
+    values: FloatImage
+    inverse_level: FloatImage
+    gain: FloatArray
+    offset: FloatArray
+    fits: tuple[GainFit | None, ...]
+    least_gain: float
 
-    @classmethod
-    def correcting(
-        cls,
-        difference: FloatImage,
-        fits: Sequence[GainFit | None],
-        gain_and_offset: tuple[FloatArray, FloatArray],
-        values: FloatImage,
-        inverse_level: FloatImage,
-        pixels: PixelMap,
-        least_gain: float,
-    ) -> Brightness:
-        """Estimate the brightness from the `difference` f - g (k, P), which is corrected in place.
+    def correct(self, light: int, difference: FloatImage) -> None:
+        """Make a light's residual ``(f - (g - b) / a) / level`` of its difference f - g (P,), in place.
 
-        Parameters
-        ----------
-        difference : ndarray, shape (k, P), float32
-            Of the grey levels.
-        fits
-            Of each light; None: its gain is one number.
-        gain_and_offset
-            Gain (k,) and offset (k, 3) of each light, as `gain_and_offset` finds them.
-        values, inverse_level : ndarray, shape (k, P), float32
-            Grey levels f of the reference, and one over their local mean.
-        pixels
-            P owned pixels.
-        least_gain
-            Least local gain over that of the light.
+        The local gain is that of these very grey levels, so that a displacement leaves no gain behind.
         """
-        constant, scale = np.empty_like(difference), np.empty_like(difference)
-        lights = zip(fits, *gain_and_offset, values, inverse_level, difference, constant, scale, strict=True)
-        for fit, gain, offset, f, unit, one, *out in lights:
-            local, side = np.full((1, 1), gain, dtype=np.float32), max(pixels.bounds[2:])
-            if fit is not None:
-                side = fit.side
-                rows, columns = ((place + 0.5) * side - 0.5 for place in np.indices(fit.sums.shape))
-                plane = offset[0] + offset[1] * columns + offset[2] * rows
-                local = fit.gain(fit.sums - fit.block_sums(one) - plane * fit.totals)
-            grid = 1 / np.maximum(local, np.float32(least_gain * gain))
-            scales = cv2.resize(grid, (grid.shape[1] * side, grid.shape[0] * side), interpolation=cv2.INTER_LINEAR)
-            correct_brightness(pixels.lines, f, unit, scales, offset, one, *out)
-        return cls(constant=constant, scale=scale)
+        fit, gain, offset = self.fits[light], self.gain[light], self.offset[light]
+        local, side = np.full((1, 1), gain, dtype=np.float32), max(self.pixels.bounds[2:])
+        if fit is not None:
+            side = fit.side
+            rows, columns = np.ogrid[: fit.sums.shape[0], : fit.sums.shape[1]]
+            plane = offset[0] + offset[1] * ((columns + 0.5) * side - 0.5) + offset[2] * ((rows + 0.5) * side - 0.5)
+            local = fit.gain(fit.sums - fit.block_sums(difference) - plane * fit.totals)
+        grid = 1 / np.maximum(local, np.float32(self.least_gain * gain))
+        scales = cv2.resize(grid, (grid.shape[1] * side, grid.shape[0] * side), interpolation=cv2.INTER_LINEAR)
+        fields = self.values[light], self.inverse_level[light], scales
+        correct_brightness(self.pixels.lines, *fields, offset, difference)
 
 
 _ELEMENTS = 300

@@ -23,7 +23,6 @@ from rgbmidic._kernels.owned_pixels import interpolate_nodal
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import Assembly, rigid_functions
 from rgbmidic.correlation.blocks import BlockTable
-from rgbmidic.correlation.brightness import Brightness
 from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.correlation.light_bias import settled_gradient
@@ -441,7 +440,7 @@ def _left(reference: Reference, noise: FloatImage, field: FloatArray) -> Residua
     weights, moments = reference.pixel_weights, np.zeros((len(noise), 0, 6))
     return Residual(
         reference=reference,
-        brightness=Brightness(constant=reference.values, scale=reference.inverse_level),
+        brightness=reference.brightness_of(weights, np.zeros((len(noise), 1, 6))),
         weights=weights,
         difference=left,
         moments=moments,

@@ -379,8 +379,8 @@ def _right_sides(
             difference = known[light]
         else:
             there = reference.warp(problem.deformed, light, displacement)
-            images = problem.deformed.coefficients[light], brightness.constant[light], brightness.scale[light]
-            differences(*images, *there, difference)
+            differences(problem.deformed.coefficients[light], reference.values[light], *there, difference)
+            brightness.correct(light, difference)
         gradient = reference.gradient[:, light]
         vector = assembly.vector(reference.projected(equations.weights[light], difference, gradient))
         total += vector

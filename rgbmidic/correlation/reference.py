@@ -305,30 +305,39 @@ class Reference:
             constants=constants,
         )
 
-    def correct_brightness(self, difference: FloatImage, weights: FloatImage, moments: FloatArray) -> Brightness:
-        """Estimate the brightness of deformed images, and correct the difference of the grey levels by it, in place.
+    def brightness_of(self, weights: FloatImage, moments: FloatArray) -> Brightness:
+        """Estimate gain and offset of deformed images.
 
         Parameters
         ----------
-        difference : ndarray, shape (k, P), float32
-            f - g of the grey levels; becomes the residual, in units of the `level`.
         weights : ndarray, shape (k, P), float32
             Weights of the pixels that both states show.
         moments : ndarray, shape (k, E, 6)
             As of `Residual`.
+
+        Returns
+        -------
+        Brightness
         """
-        whole = np.ones(len(weights)), np.zeros((len(weights), 3))
+        gain, offset = np.ones(len(weights)), np.zeros((len(weights), 3))
         if self.brightness != "none":
-            whole = gain_and_offset(moments, self.mesh.centres - self.pixels.bounds[1::-1], self.constants)
+            gain, offset = gain_and_offset(moments, self.mesh.centres - self.pixels.bounds[1::-1], self.constants)
         fits: list[GainFit | None] = [None] * len(weights)
         if self.gain_window is not None:
             for light, (f, w) in enumerate(zip(self.values, weights, strict=True)):
-                kept = self.gain_fits[light] if self.gain_fits else None
-                if kept is None or not np.array_equal(w, kept.weights):  # some pixels are saturated, or off the frame
-                    kept = GainFit.over(f, w, self.pixels, self.gain_window)
-                fits[light] = kept
-        images = self.values, self.inverse_level, self.pixels
-        return Brightness.correcting(difference, fits, whole, *images, self.constants.least_gain)
+                fit = self.gain_fits[light] if self.gain_fits else None
+                if fit is None or not np.array_equal(w, fit.weights):  # some pixels are saturated, or off the frame
+                    fit = GainFit.over(f, w, self.pixels, self.gain_window)
+                fits[light] = fit
+        return Brightness(
+            pixels=self.pixels,
+            values=self.values,
+            inverse_level=self.inverse_level,
+            gain=gain,
+            offset=offset,
+            fits=tuple(fits),
+            least_gain=self.constants.least_gain,
+        )
 
     def channel_specific(self, light: int) -> FloatImage:
         """Return what a light's own gradient has beyond the one that it is matched with, (2, P).
@@ -522,7 +531,7 @@ def _where_they_lie(
     )
     for light, motion in enumerate(registration.displacement(mesh.nodes + state.origin)):
         there, spline = carried(mesh, pixels, motion), state.coefficients[light]
-        differences(spline, zero, one, *there, values[light])
+        differences(spline, zero, *there, values[light])
         images = state.weights[light], state.partial[light], zero, values[light], inside
         warped_weights(*images, *there, weights[light], moments)
         interpolate_nodal(motion, mesh.elements, *pixels.positions, shift)

@@ -62,15 +62,17 @@ class Residual:
         -------
         Residual
         """
-        values, unit = reference.values, np.ones_like(reference.values[0])
+        values = reference.values
         difference, weights = np.empty_like(values), np.empty_like(values)
         moments = np.empty((len(values), len(reference.mesh.elements), 6))
         for light, displacement in enumerate(displacements):
             there = reference.warp(deformed, light, displacement)
-            differences(deformed.coefficients[light], values[light], unit, *there, difference[light])
+            differences(deformed.coefficients[light], values[light], *there, difference[light])
             images = deformed.weights[light], deformed.partial[light], values[light], difference[light]
             warped_weights(*images, reference.pixel_weights[light], *there, weights[light], moments[light])
-        brightness = reference.correct_brightness(difference, weights, moments)
+        brightness = reference.brightness_of(weights, moments)
+        for light, one in enumerate(difference):
+            brightness.correct(light, one)
         return cls(reference=reference, brightness=brightness, weights=weights, difference=difference, moments=moments)
 
     @property

@@ -112,7 +112,7 @@ def test_gradients_at_the_owned_pixels_equal_the_naive_twin(outlined):
 def test_differences_equal_the_naive_twin(motion, outlined):
     case = scene(3, motion, outlined=outlined)
     out = np.full(case.reference.size, 7, dtype=np.float32)
-    kernels.differences(case.coefficients, case.reference, np.ones_like(case.reference), *moved(case), out)
+    kernels.differences(case.coefficients, case.reference, *moved(case), out)
     expected = np.nan_to_num(case.reference - naive.warp(case.coefficients, case.pixels, case.mesh, case.displacement))
     np.testing.assert_allclose(out, expected, atol=0.02)
     assert (out == 0).all() == (motion == "far outside")
@@ -121,9 +121,9 @@ def test_differences_equal_the_naive_twin(motion, outlined):
 def test_an_invalid_coefficient_reaches_the_pixels_around_it_only():
     case = scene(4, "none")
     clean, dirty = np.empty((2, case.reference.size), dtype=np.float32)
-    kernels.differences(case.coefficients, case.reference, np.ones_like(case.reference), *moved(case), clean)
+    kernels.differences(case.coefficients, case.reference, *moved(case), clean)
     case.coefficients[15 + PAD, 18 + PAD] = np.nan
-    kernels.differences(case.coefficients, case.reference, np.ones_like(case.reference), *moved(case), dirty)
+    kernels.differences(case.coefficients, case.reference, *moved(case), dirty)
     touched = np.isnan(naive.warp(case.coefficients, case.pixels, case.mesh, case.displacement))
     np.testing.assert_array_equal(np.isnan(dirty), touched)
     assert touched.any()
@@ -175,7 +175,7 @@ def compared(case, given, weight):
     """Difference, weight and moments for a deformed weight (H, W) and a reference weight (P,)."""
     difference, found = np.full((2, case.pixels.rows.size), 7, dtype=np.float32)
     moments = np.full((len(case.mesh.elements), 6), 7.0)
-    kernels.differences(case.coefficients, case.reference, np.ones_like(case.reference), *moved(case), difference)
+    kernels.differences(case.coefficients, case.reference, *moved(case), difference)
     images = given, _partial_blocks(given), case.reference, difference, weight
     kernels.warped_weights(*images, *moved(case), found, moments)
     return difference, found, moments
