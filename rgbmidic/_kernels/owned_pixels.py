@@ -70,7 +70,7 @@ def subtract_quadratic(
     coefficients of 1, x, y, x^2, x y, y^2 of the local position, in px.
     """
     for light in range(len(difference)):
-        given, gx, gy, less = difference[light], gradient_x[light], gradient_y[light], out[light]
+        residual, gx, gy, corrected = difference[light], gradient_x[light], gradient_y[light], out[light]
         for e in range(start, stop):
             u, v = polynomials[e, 0], polynomials[e, 1]
             u0, u1, u2, u3, u4, u5 = u[0], u[1], u[2], u[3], u[4], u[5]
@@ -79,7 +79,7 @@ def subtract_quadratic(
                 x, y = local_x[i], local_y[i]
                 dx = u0 + x * (u1 + u3 * x + u4 * y) + y * (u2 + u5 * y)
                 dy = v0 + x * (v1 + v3 * x + v4 * y) + y * (v2 + v5 * y)
-                less[i] = given[i] - gx[i] * dx - gy[i] * dy
+                corrected[i] = residual[i] - gx[i] * dx - gy[i] * dy
 
 
 @compiled("factors", fastmath=FAST)
@@ -96,10 +96,10 @@ def add_second_derivatives(start, stop, factors, images, lines, run_offsets, top
                 row, first = top + lines[q, 2], left + lines[q, 3]
                 if row == 0 or row == height - 1:
                     continue
-                above, here, below = images[light, row - 1], images[light, row], images[light, row + 1]
+                above, centre, below = images[light, row - 1], images[light, row], images[light, row + 1]
                 for c in range(max(first, 1), min(first + lines[q, 1], width - 1)):
-                    twice = here[c] + here[c]
-                    second = xx * (here[c - 1] - twice + here[c + 1]) + yy * (above[c] - twice + below[c])
+                    twice = centre[c] + centre[c]
+                    second = xx * (centre[c - 1] - twice + centre[c + 1]) + yy * (above[c] - twice + below[c])
                     cross = above[c - 1] - above[c + 1] - below[c - 1] + below[c + 1]
                     out[light, lines[q, 0] + c - first] += second + xy * cross
 
@@ -128,38 +128,38 @@ def weighted_block_sums(start, stop, values, weight, lines, run_offsets, offsets
 
 
 @compiled("lines", fastmath=FAST)
-def corrected_difference(start, stop, lines, reference, unit, difference, gain, offset, least, side, out):
+def corrected_difference(start, stop, lines, reference, unit, difference, gain, offset, min_gain, side, out):
     """Residual ``(f - (g - b) / a) / unit`` of one light, from the `reference` f (P,) and the `difference` f - g (P,).
 
-    The `gain` a (h, w) at the centres of blocks of `side` px is interpolated between them, and is `least` at least. The
+    The `gain` a (h, w) at the centres of blocks of `side` px is interpolated between them, and at least `min_gain`. The
     `offset` b has a constant and slopes along columns and rows. `unit` and `out` are (P,) float32.
     """
     height, width = gain.shape
     half, step = np.float32(0.5), np.float32(1.0 / side)
     for q in range(start, stop):
-        slot, left, row, column = np.int64(lines[q, 0]), np.int64(lines[q, 1]), lines[q, 2], np.int64(lines[q, 3])
+        slot, remaining, row, column = np.int64(lines[q, 0]), np.int64(lines[q, 1]), lines[q, 2], np.int64(lines[q, 3])
         y = min(max((np.float32(row) + half) * step - half, _ZERO), np.float32(height - 1))
         above = min(np.int64(y), max(height - 2, 0))
-        below, part = min(above + 1, height - 1), y - np.float32(above)
+        below, row_fraction = min(above + 1, height - 1), y - np.float32(above)
         b = np.float32(offset[0] + offset[2] * row)
         slope = np.float32(offset[1])
-        while left > 0:
+        while remaining > 0:
             x = (np.float32(column) + half) * step - half
             before = np.int64(np.floor(x))
             # pixels up to the next centre of a block: the gain is linear along them
-            number = min(left, (before + 1) * side + side // 2 - column)
+            number = min(remaining, (before + 1) * side + side // 2 - column)
             i0, i1 = min(max(before, 0), width - 1), min(before + 1, width - 1)
-            at = (_ONE - part) * gain[above, i0] + part * gain[below, i0]
-            change = (_ONE - part) * gain[above, i1] + part * gain[below, i1] - at
+            at = (_ONE - row_fraction) * gain[above, i0] + row_fraction * gain[below, i0]
+            change = (_ONE - row_fraction) * gain[above, i1] + row_fraction * gain[below, i1] - at
             start_x = x - np.float32(before)
             first, from_column = np.uint64(slot), np.float32(column)
             for i in range(np.uint32(number)):
                 t = np.float32(np.int32(i))
-                a = max(at + change * (start_x + t * step), least)
+                a = max(at + change * (start_x + t * step), min_gain)
                 f = reference[first + i]
                 g = f - difference[first + i] - (b + slope * (from_column + t))
                 out[first + i] = (f - g / a) / unit[first + i]
-            slot, left, column = slot + number, left - number, column + number
+            slot, remaining, column = slot + number, remaining - number, column + number
 
 
 @compiled("out", axis=1, fastmath=FAST)
@@ -246,18 +246,18 @@ def score_sums(
 @helper()
 def _largest(offsets):
     """Number of pixels of the largest element."""
-    most = 0
+    largest = 0
     for e in range(offsets.size - 1):
-        most = max(most, offsets[e + 1] - offsets[e])
-    return most
+        largest = max(largest, offsets[e + 1] - offsets[e])
+    return largest
 
 
 @helper()
 def _slots(lines, run_offsets, offsets, e, top, bottom):
     """First slot of an element and its number of pixels; none where it has no row from `top` to `bottom`."""
     first, last = run_offsets[e], run_offsets[e + 1] - 1
-    away = last < first or lines[first, 2] >= bottom or lines[last, 2] < top
-    return np.uint64(offsets[e]), np.uint64(0 if away else offsets[e + 1] - offsets[e])
+    is_outside = last < first or lines[first, 2] >= bottom or lines[last, 2] < top
+    return np.uint64(offsets[e]), np.uint64(0 if is_outside else offsets[e + 1] - offsets[e])
 
 
 @helper(fastmath=FAST)
