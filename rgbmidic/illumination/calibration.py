@@ -151,9 +151,10 @@ class Calibration:
             ):
                 return self
             raise CalibrationError(
-                f"the calibration was made with frames of {_size(full_shape)} px and holds what varies over them; those "
-                f"of the test have {_size(shape)} px. If the camera cropped them, state frames.crop_origin = [x, y], the "
-                "column and row of the calibrated frame at which they begin; else calibrate with frames of their size"
+                f"the calibration was made with frames of {_size(full_shape)} px and holds what varies over them; "
+                f"those of the test have {_size(shape)} px. If the camera cropped them, state "
+                "frames.crop_origin = [x, y], the column and row of the calibrated frame at which they begin; else "
+                "calibrate with frames of their size"
             )
         column, row = origin
         if full_shape is not None and (row + shape[0] > full_shape[0] or column + shape[1] > full_shape[1]):
