@@ -23,6 +23,7 @@ from rgbmidic.arguments import check_fields
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.linear import LinearChannels
 from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:  # reading a result takes no kernels
@@ -207,6 +208,7 @@ REFLECTING = 0.2
 """Reflection index from which a light counts as reflecting."""
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IlluminationImages:
     """The k illumination images of one mechanical state.
