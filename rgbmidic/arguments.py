@@ -47,7 +47,7 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
     return call
 
 
-def check_fields(one: object, error: type[RgbmidicError] = InputError) -> None:
+def check_fields(instance: object, error: type[RgbmidicError] = InputError) -> None:
     """Convert the fields of a frozen dataclass to the types of their annotations, or refuse them.
 
     Raises
@@ -55,36 +55,36 @@ def check_fields(one: object, error: type[RgbmidicError] = InputError) -> None:
     RgbmidicError
         A field is not of the type of its annotation.
     """
-    hints = type_hints(cast(Any, type(one)))
-    for entry in fields(cast(Any, one)):
-        value = getattr(one, entry.name)
-        where = f"{entry.name} of {type(one).__name__}"
-        object.__setattr__(one, entry.name, _converted(value, hints[entry.name], where, error))
+    hints = type_hints(cast(Any, type(instance)))
+    for entry in fields(cast(Any, instance)):
+        value = getattr(instance, entry.name)
+        label = f"{entry.name} of {type(instance).__name__}"
+        object.__setattr__(instance, entry.name, _converted(value, hints[entry.name], label, error))
 
 
-def _converted(value: Any, hint: Any, where: str, error: type[RgbmidicError]) -> Any:
+def _converted(value: Any, hint: Any, label: str, error: type[RgbmidicError]) -> Any:
     """Value in the type of the annotation; what is neither number, text, tuple nor array, as it is."""
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     if value is None and NoneType in kinds:
         return None
     if any(str(getattr(get_origin(kind), "__module__", "")).startswith("numpy") for kind in kinds):
-        return _array(value, where, error)
+        return _array(value, label, error)
     if kinds[0] not in _SIMPLE and get_origin(kinds[0]) not in (tuple, Literal):
         return value
     try:
-        value = convert_value(value, hint, where)
+        value = convert_value(value, hint, label)
     except ConfigurationError as wrong:
         raise error(str(wrong)) from None
     except TypeError:  # no value of a Literal can be compared with it
-        raise error(f"{where} cannot be {value!r:.80}") from None
+        raise error(f"{label} cannot be {value!r:.80}") from None
     if isinstance(value, float) and not math.isfinite(value):
-        raise error(f"{where} must be finite, not {value}")
+        raise error(f"{label} must be finite, not {value}")
     if isinstance(value, Path) and "\0" in str(value):
-        raise error(f"{where} is no name of a file: it holds a NUL")
+        raise error(f"{label} is no name of a file: it holds a NUL")
     return value
 
 
-def _array(values: Any, where: str, error: type[RgbmidicError]) -> Any:
+def _array(values: Any, label: str, error: type[RgbmidicError]) -> Any:
     """Values as an array of numbers."""
     try:
         array = np.asarray(values)
@@ -93,5 +93,5 @@ def _array(values: Any, where: str, error: type[RgbmidicError]) -> Any:
     except (TypeError, ValueError, OverflowError):
         array = np.empty(0, dtype=str)
     if array.dtype.kind not in "buif":
-        raise error(f"{where} is an array of real numbers, not {values!r:.80}")
+        raise error(f"{label} is an array of real numbers, not {values!r:.80}")
     return array

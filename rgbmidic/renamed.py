@@ -35,6 +35,7 @@ _NAMES: Mapping[str, Mapping[str, str]] = {
     },
     "Region": {"part": "crop"},
     "FiniteElementMesh": {"part": "subset"},
+    "IlluminationImages": {"placed": "with_origin"},
     "Inspection": {"hidden": "lacks_contrast", "unmeasured": "unmeasured_fraction"},
     "Result": {**_STRAIN, "strain": "nodal_strain", "strain_std": "nodal_strain_std", "each": "iterate"},
     "FrameRecord": {**_STRAIN, "of": "from_values"},

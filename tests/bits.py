@@ -15,7 +15,7 @@ def assert_same_on_threads(work):
     try:
         for number in (1, 3):
             set_threads(number)
-            with patch("rgbmidic._kernels.threads._LEAST", 0):
+            with patch("rgbmidic._kernels.threads._MIN_SHARED_SIZE", 0):
                 found.append(work())
     finally:
         set_threads(before)

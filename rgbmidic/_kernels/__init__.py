@@ -6,7 +6,7 @@ __all__ = ["are_compiled"]
 
 
 def are_compiled() -> bool:
-    """Whether kernels were compiled on this machine before: one that every solve needs is in the cache.
+    """Tell whether kernels were compiled on this machine before: one that every solve needs is in the cache.
 
     Returns
     -------

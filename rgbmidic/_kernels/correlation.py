@@ -118,19 +118,19 @@ def differences(
         high_x, high_y = np.float32(width - 1 - base_x), np.float32(height - 1 - base_y)
         (end_x, pace_x), (end_y, pace_y) = _crossing(fxx - _ONE), _crossing(fyx)
         for run in range(run_offsets[e], run_offsets[e + 1]):
-            slot, left = np.int64(runs[run, 0]), np.int64(runs[run, 1])
+            slot, remaining = np.int64(runs[run, 0]), np.int64(runs[run, 1])
             x, y = np.float32(runs[run, 2]), np.float32(runs[run, 3])
-            while left > 0:
+            while remaining > 0:
                 px = ux + fxx * x + fxy * y
                 py = uy + fyx * x + fyy * y
                 if not (px >= low_x and py >= low_y and px <= high_x and py <= high_y):
                     out[slot] = _ZERO
-                    slot, left, x = slot + 1, left - 1, x + _ONE
+                    slot, remaining, x = slot + 1, remaining - 1, x + _ONE
                     continue
                 cx, cy = np.floor(px), np.floor(py)
                 column, row = base_x + np.int64(cx), base_y + np.int64(cy)
                 tx, ty = px - cx, py - cy
-                side_by_side = min((end_x - tx) * pace_x, (end_y - ty) * pace_y, np.float32(left - 1))
+                side_by_side = min((end_x - tx) * pace_x, (end_y - ty) * pace_y, np.float32(remaining - 1))
                 n = max(min(np.int64(side_by_side) + 1, width - 1 - column), 1)
                 # whole vectors, of which the last one may be too long, where memory goes on so far
                 filled = (n + _LANES - 1) // _LANES * _LANES
@@ -142,7 +142,7 @@ def differences(
                     g = _spline(flat, first, across, i, tx + (fxx - _ONE) * t, ty + fyx * t)
                     if np.int32(i) < np.int32(n):
                         out[i0 + i] = reference[i0 + i] - g
-                slot, left, x = slot + n, left - n, x + np.float32(n)
+                slot, remaining, x = slot + n, remaining - n, x + np.float32(n)
 
 
 @helper()
@@ -211,21 +211,21 @@ def element_hessian(start, stop, gradient_x, gradient_y, weight, local_x, local_
 
 @compiled("out", axis=1, fastmath=FAST)
 def element_block_products(
-    start, stop, gradient_x, gradient_y, weight, runs, run_offsets, origin, barycentric, sign, side, apart, out,
+    start, stop, gradient_x, gradient_y, weight, runs, run_offsets, origin, barycentric, sign, side, period, out,
 ):  # fmt: skip
-    """Project one light's ``s w D`` on the shape functions, the blocks of `side` px of each place for themselves.
+    """Project one light's ``s w D`` on the shape functions, the blocks of `side` px of each phase for themselves.
 
-    `sign` (h, w) float32 holds s of each block; row and column of a block give its place modulo `apart`. `origin`
-    (E, 2) counts from the first block's first pixel. ``out`` (apart apart, E, 3, 3) receives the sums over shape
+    `sign` (h, w) float32 holds s of each block; row and column of a block give its phase modulo `period`. `origin`
+    (E, 2) counts from the first block's first pixel. ``out`` (period period, E, 3, 3) receives the sums over shape
     functions and D = (gx gx, gx gy, gy gy), added to what it holds.
     """
     for e in range(start, stop):
         for run in range(run_offsets[e], run_offsets[e + 1]):
-            slot, left, x, y = runs[run, 0], runs[run, 1], runs[run, 2], runs[run, 3]
+            slot, remaining, x, y = runs[run, 0], runs[run, 1], runs[run, 2], runs[run, 3]
             row = (origin[e, 1] + y) // side
-            while left > 0:
+            while remaining > 0:
                 block = (origin[e, 0] + x) // side
-                number = min(left, (block + 1) * side - origin[e, 0] - x)
+                number = min(remaining, (block + 1) * side - origin[e, 0] - x)
                 xx = xy = yy = turn_xx = turn_xy = turn_yy = _ZERO
                 first = np.uint64(slot)
                 for i in range(np.uint32(number)):
@@ -238,14 +238,14 @@ def element_block_products(
                     turn_xx += p * t
                     turn_xy += q * t
                     turn_yy += r * t
-                place = row % apart * apart + block % apart
+                phase = row % period * period + block % period
                 for a in range(3):
                     slope = sign[row, block] * barycentric[e, a, 1]
                     value = sign[row, block] * (barycentric[e, a, 0] + barycentric[e, a, 2] * y) + slope * x
-                    out[place, e, a, 0] += value * xx + slope * turn_xx
-                    out[place, e, a, 1] += value * xy + slope * turn_xy
-                    out[place, e, a, 2] += value * yy + slope * turn_yy
-                slot, left, x = slot + number, left - number, x + number
+                    out[phase, e, a, 0] += value * xx + slope * turn_xx
+                    out[phase, e, a, 1] += value * xy + slope * turn_xy
+                    out[phase, e, a, 2] += value * yy + slope * turn_yy
+                slot, remaining, x = slot + number, remaining - number, x + number
 
 
 @compiled("elements", fastmath=FAST)
@@ -309,7 +309,7 @@ def warped_weights(
 
 @helper()
 def _any_partial(partial, left, top, right, bottom):
-    """Whether a block is partial that holds a pixel of this rectangle, or the next one on the right or below."""
+    """Tell whether a block is partial that holds a pixel of this rectangle, or the next one on the right or below."""
     a, b = np.int64(left) // BLOCK, np.int64(top) // BLOCK
     c = min((np.int64(right) + 1) // BLOCK + 1, partial.shape[1] - 1)
     d = min((np.int64(bottom) + 1) // BLOCK + 1, partial.shape[0] - 1)

@@ -50,17 +50,17 @@ def fill_unknown(start, stop, padded, fraction, red_row, red_column, pad, out, u
                         total += w * np.sqrt(s) * padded[a, b]
                         weight += w * s
                         near += s if distance <= 2 else 0.0
-            own = fraction[_channel(i - pad, j - pad, red_row, red_column), ti, tj]
-            out[i, j] = np.sqrt(own) * total / weight if near > 0.5 else 0.0
+            pixel_fraction = fraction[_channel(i - pad, j - pad, red_row, red_column), ti, tj]
+            out[i, j] = np.sqrt(pixel_fraction) * total / weight if near > 0.5 else 0.0
             unknown[i, j] = near <= 0.5
 
 
 # contraction to fused multiply-add alone: NaN and infinity keep their meaning
 @helper(fastmath={"contract"}, forceinline=True)
-def _filtered(padded, row, left, lines, out):
+def _filtered(padded, row, first_column, lines, out):
     """Sum of the products of five rows of samples, from a place on, with the taps `lines` (25, _STRIP)."""
-    r0, r1, r2 = padded[row, left:], padded[row + 1, left:], padded[row + 2, left:]
-    r3, r4 = padded[row + 3, left:], padded[row + 4, left:]
+    r0, r1, r2 = padded[row, first_column:], padded[row + 1, first_column:], padded[row + 2, first_column:]
+    r3, r4 = padded[row + 3, first_column:], padded[row + 4, first_column:]
     for j in range(out.size):
         total = np.float32(0.0)
         for b in range(_SIZE):
@@ -84,11 +84,11 @@ def _add_row(row, lines, out):
 def _spread(taps, parity, channel, index, first, lines):
     """Write the filters of tiles, tap by tap, along the pixels from the tile `first` on."""
     for tile in range(first, min(first + lines.shape[1] // TILE, index.size)):
-        chosen = taps[index[tile], parity, channel]
+        tile_taps = taps[index[tile], parity, channel]
         for k in range(lines.shape[0]):
-            even, odd, line = chosen[k, 0], chosen[k, 1], lines[k, (tile - first) * TILE :]
+            even_tap, odd_tap, line = tile_taps[k, 0], tile_taps[k, 1], lines[k, (tile - first) * TILE :]
             for j in range(TILE // 2):
-                line[2 * j], line[2 * j + 1] = even, odd
+                line[2 * j], line[2 * j + 1] = even_tap, odd_tap
 
 
 @compiled("index", fastmath={"contract"})
@@ -121,43 +121,45 @@ def predict(start, stop, padded, index, taps, size, scale, scale_block, mean, me
     lines, channels = np.empty((size * size, strip), np.float32), np.empty((3, TILE, strip), np.float32)
     for ti in range(start, stop):
         top, bottom = ti * TILE, min((ti + 1) * TILE, rows)
-        for left in range(0, columns, strip):
-            number = min(strip, columns - left)
+        for first_column in range(0, columns, strip):
+            number = min(strip, columns - first_column)
             for c in range(3):
                 for parity in range(2):
-                    _spread(taps, parity, c, index[ti], left // TILE, lines)
+                    _spread(taps, parity, c, index[ti], first_column // TILE, lines)
                     for i in range(top + parity, bottom, 2):
-                        made = channels[c, i - top, :number]
+                        filtered = channels[c, i - top, :number]
                         if size == _SIZE:
-                            _filtered(padded, i, left, lines, made)
+                            _filtered(padded, i, first_column, lines, filtered)
                         else:
-                            made[:] = 0
+                            filtered[:] = 0
                             for k in range(_WIDE):
-                                _add_row(padded[i + k, left:], lines[k * _WIDE : (k + 1) * _WIDE], made)
-                        low, high, part = between(i, mean_block, mean.shape[1])
-                        above, below = mean[c, low, left:], mean[c, high, left:]
-                        low, high, ahead = between(i, scale_block, scale.shape[1])
-                        gain, other = scale[c, low, left:], scale[c, high, left:]
+                                _add_row(padded[i + k, first_column:], lines[k * _WIDE : (k + 1) * _WIDE], filtered)
+                        low, high, mean_fraction = between(i, mean_block, mean.shape[1])
+                        above, below = mean[c, low, first_column:], mean[c, high, first_column:]
+                        low, high, scale_fraction = between(i, scale_block, scale.shape[1])
+                        gain_above, gain_below = scale[c, low, first_column:], scale[c, high, first_column:]
                         for j in range(number):
-                            level = above[j] + part * (below[j] - above[j])
-                            made[j] = level + (gain[j] + ahead * (other[j] - gain[j])) * made[j]
+                            level = above[j] + mean_fraction * (below[j] - above[j])
+                            gain = gain_above[j] + scale_fraction * (gain_below[j] - gain_above[j])
+                            filtered[j] = level + gain * filtered[j]
             for n in range(len(out)):
                 red, green, blue = mixing[n]
                 for i in range(top, bottom):
-                    r, g, b, target = channels[0, i - top], channels[1, i - top], channels[2, i - top], out[n, i, left:]
+                    r, g, b = channels[0, i - top], channels[1, i - top], channels[2, i - top]
+                    target = out[n, i, first_column:]
                     for j in range(number):
                         target[j] = red * r[j] + green * g[j] + blue * b[j]
 
 
-@compiled("out", least=0, fastmath=FAST)
+@compiled("out", min_size=0, fastmath=FAST)
 def prediction_taps(
     start,
     stop,
-    seen,
+    light_fraction,
     spread,
     specific,
     coloured,
-    alike,
+    light_correlation,
     displacement,
     noise,
     held,
@@ -170,16 +172,16 @@ def prediction_taps(
 ):
     """Filters of the best linear prediction (simple kriging) from a square of samples, for T entries of a table.
 
-    The contrast at site s over its channel's slope is ``sum_l seen_sl (a_l + a_0 + sqrt(specific_l) e_l)`` and noise:
-    lights l show the texture displaced, with the covariance ``alike_lm C(x - y - d_l + d_m)``, a_0 is an unknown
-    constant of variance `offset`, e_l the light's own component. Predicted are the channels, green as the mean of its
-    two sites. Samples and channels are divided by their channel's `spread`.
+    The contrast at site s over its channel's slope is ``sum_l F_sl (a_l + a_0 + sqrt(specific_l) e_l)`` and noise, with
+    F the `light_fraction`: lights l show the texture displaced, with the covariance ``R_lm C(x - y - d_l + d_m)`` and
+    R the `light_correlation`, a_0 is an unknown constant of variance `offset`, e_l the light's own component. Predicted
+    are the channels, green as the mean of its two sites. Samples and channels are divided by their channel's `spread`.
 
     Parameters
     ----------
     start, stop
         Range of entries that this call does.
-    seen : (4, k) float64
+    light_fraction : (4, k) float64
         Of the sites red, green in red rows, green in blue rows, and blue.
     spread : (T, 4) float64
         Standard deviation of the sites' channels, without noise.
@@ -187,7 +189,7 @@ def prediction_taps(
         Variance of the lights' own components.
     coloured
         Fraction of them that is the channels', which have nothing in common on a coloured specimen.
-    alike : (T, k, k) float64
+    light_correlation : (T, k, k) float64
         Correlations of the lights' textures.
     displacement : (T, k, 2) float64
         d in x and y, px.
@@ -208,59 +210,59 @@ def prediction_taps(
     out : (T, 4, 3, size, size) float64
         Written.
     """
-    lights, size, count = seen.shape[1], np.uint64(sites.shape[1]), np.uint64(sites[0].size)
+    lights, size, count = light_fraction.shape[1], np.uint64(sites.shape[1]), np.uint64(sites[0].size)
     one, two, sides = np.uint64(1), np.uint64(2), np.uint64(fine.shape[0])
     reach, half = size - one, size // two
     covariance, lagged = np.empty((4, 4, fine.shape[0], fine.shape[0])), np.empty(fine.shape)
-    matrix, factor, wanted = np.empty((count, count)), np.empty((count, count)), np.empty((3, count))
+    matrix, factor, rhs = np.empty((count, count)), np.empty((count, count)), np.empty((3, count))
     per_step, last = 1 / step, texture.size - 1.001
     for entry in range(start, stop):
         for c in range(4):
             for e in range(4):
-                constant = shown = 0.0
+                constant = amplitude = 0.0
                 if (c + 1) // 2 == (e + 1) // 2:
-                    shown = coloured * (spread[entry, c] ** 2 - 1)
+                    amplitude = coloured * (spread[entry, c] ** 2 - 1)
                 for a in range(lights):
-                    shown += (1 - coloured) * seen[c, a] * seen[e, a] * specific[entry, a]
+                    amplitude += (1 - coloured) * light_fraction[c, a] * light_fraction[e, a] * specific[entry, a]
                     for b in range(lights):
-                        constant += seen[c, a] * seen[e, b] * offset
+                        constant += light_fraction[c, a] * light_fraction[e, b] * offset
                 for i in range(sides):
                     for j in range(sides):
-                        covariance[c, e, i, j] = constant + shown * fine[i, j]
+                        covariance[c, e, i, j] = constant + amplitude * fine[i, j]
         for a in range(lights):
             for b in range(lights):
                 x = displacement[entry, b, 0] - displacement[entry, a, 0] - reach
                 y = displacement[entry, b, 1] - displacement[entry, a, 1] - reach
                 for i in range(sides):
                     for j in range(sides):
-                        place = min(((x + j) ** 2 + (y + i) ** 2) * per_step, last)
-                        low = np.uint64(place)
-                        lagged[i, j] = texture[low] + (place - low) * (texture[low + one] - texture[low])
+                        position = min(((x + j) ** 2 + (y + i) ** 2) * per_step, last)
+                        low = np.uint64(position)
+                        lagged[i, j] = texture[low] + (position - low) * (texture[low + one] - texture[low])
                 for c in range(4):
                     for e in range(4):
-                        shown = seen[c, a] * seen[e, b] * alike[entry, a, b]
+                        amplitude = light_fraction[c, a] * light_fraction[e, b] * light_correlation[entry, a, b]
                         for i in range(sides):
                             for j in range(sides):
-                                covariance[c, e, i, j] += shown * lagged[i, j]
+                                covariance[c, e, i, j] += amplitude * lagged[i, j]
         for c in range(4):
             for e in range(4):
-                shown = 1 / (spread[entry, c] * spread[entry, e])
+                scale = 1 / (spread[entry, c] * spread[entry, e])
                 for i in range(sides):
                     for j in range(sides):
-                        covariance[c, e, i, j] *= shown
+                        covariance[c, e, i, j] *= scale
         for phase in range(4):
             for m in range(count):
                 row, column = m // size, m % size
                 c = sites[phase, row, column]
-                for other in range(row + one):
+                for other_row in range(row + one):
                     for n in range(size):
-                        e = sites[phase, other, n]
-                        matrix[m, other * size + n] = covariance[c, e, row + reach - other, column + reach - n]
+                        e = sites[phase, other_row, n]
+                        matrix[m, other_row * size + n] = covariance[c, e, row + reach - other_row, column + reach - n]
                 matrix[m, m] += noise[entry, (c + 1) // 2]
                 below, right = row + reach - half, column + reach - half
-                wanted[0, m] = covariance[c, 0, below, right]
-                wanted[1, m] = (covariance[c, 1, below, right] + covariance[c, 2, below, right]) / 2
-                wanted[2, m] = covariance[c, 3, below, right]
+                rhs[0, m] = covariance[c, 0, below, right]
+                rhs[1, m] = (covariance[c, 1, below, right] + covariance[c, 2, below, right]) / 2
+                rhs[2, m] = covariance[c, 3, below, right]
             middle = count // two
             matrix[middle, middle] += held
             for q in range(count):  # Cholesky, column by column
@@ -271,14 +273,14 @@ def prediction_taps(
                     for n in range(q + one, m + one):
                         matrix[m, n] -= factor[q, m] * factor[q, n]
                 for e in range(3):
-                    wanted[e, q] *= scale
+                    rhs[e, q] *= scale
                     for m in range(q + one, count):
-                        wanted[e, m] -= wanted[e, q] * factor[q, m]
+                        rhs[e, m] -= rhs[e, q] * factor[q, m]
             for e in range(3):
                 for back in range(count):
                     p = count - one - back
-                    value = wanted[e, p]
+                    value = rhs[e, p]
                     for m in range(p + one, count):
-                        value -= factor[p, m] * wanted[e, m]
-                    wanted[e, p] = value / factor[p, p]
-                    out[entry, phase, e, p // size, p % size] = wanted[e, p]
+                        value -= factor[p, m] * rhs[e, m]
+                    rhs[e, p] = value / factor[p, p]
+                    out[entry, phase, e, p // size, p % size] = rhs[e, p]

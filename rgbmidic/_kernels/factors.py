@@ -12,21 +12,21 @@ _BLOCK = 32
 
 
 @compiled(fastmath=FAST)
-def factorise(data, given_starts, given_nodes, given, before_starts, before, starts, rows, lower, inverse):
+def factorise(data, entry_starts, entry_nodes, entries, before_starts, before, starts, rows, lower, inverse):
     """Factorise a symmetric positive definite matrix, with a block of 2 x 2 for each two nodes, as ``L D L^T``.
 
     The algorithm is that of Davis (Direct Methods for Sparse Linear Systems, 2006, section 4.8). Row k of the matrix
-    has the blocks ``data[given[p]]``, (n, 2, 2) places, at the nodes ``given_nodes[p]`` up to k, p from
-    ``given_starts[k]`` to ``given_starts[k + 1]``; row k of L, whose own block is 1, has blocks at the nodes `before`
+    has the blocks ``data[entries[p]]``, (n, 2, 2) indices, at the nodes ``entry_nodes[p]`` up to k, p from
+    ``entry_starts[k]`` to ``entry_starts[k + 1]``; row k of L, whose own block is 1, has blocks at the nodes `before`
     it, and column k at `rows` after it, in their order. `lower` (R, 4) receives the latter, `inverse` (N, 3)
     entries xx, xy and yy of the inverse of each block of D.
     """
     work, filled = np.zeros((len(inverse), 4)), starts[:-1].copy()
     for k in range(len(inverse)):
-        for p in range(given_starts[k], given_starts[k + 1]):
-            i = given_nodes[p]
-            work[i, 0], work[i, 1] = data[given[p, 0, 0]], data[given[p, 0, 1]]
-            work[i, 2], work[i, 3] = data[given[p, 1, 0]], data[given[p, 1, 1]]
+        for p in range(entry_starts[k], entry_starts[k + 1]):
+            i = entry_nodes[p]
+            work[i, 0], work[i, 1] = data[entries[p, 0, 0]], data[entries[p, 0, 1]]
+            work[i, 2], work[i, 3] = data[entries[p, 1, 0]], data[entries[p, 1, 1]]
         xx, xy, yy = work[k, 0], work[k, 1], work[k, 3]
         work[k] = 0.0
         for q in range(before_starts[k], before_starts[k + 1]):
@@ -63,17 +63,17 @@ def solve_factors(start, stop, starts, rows, lower, inverse, x):
                     x[i, 0, r] -= a * x[j, 0, r] + b * x[j, 1, r]
                     x[i, 1, r] -= c * x[j, 0, r] + d * x[j, 1, r]
         for back in range(n):
-            own = np.uint64(n - 1 - back)
-            xx, xy, yy = inverse[own, 0], inverse[own, 1], inverse[own, 2]
+            node = np.uint64(n - 1 - back)
+            xx, xy, yy = inverse[node, 0], inverse[node, 1], inverse[node, 2]
             for r in range(begin, end):
-                u, v = x[own, 0, r], x[own, 1, r]
-                x[own, 0, r] = xx * u + xy * v
-                x[own, 1, r] = xy * u + yy * v
-            for p in range(starts[own], starts[own + np.uint64(1)]):
+                u, v = x[node, 0, r], x[node, 1, r]
+                x[node, 0, r] = xx * u + xy * v
+                x[node, 1, r] = xy * u + yy * v
+            for p in range(starts[node], starts[node + np.uint64(1)]):
                 i, a, b, c, d = np.uint64(rows[p]), lower[p, 0], lower[p, 1], lower[p, 2], lower[p, 3]
                 for r in range(begin, end):
-                    x[own, 0, r] -= a * x[i, 0, r] + c * x[i, 1, r]
-                    x[own, 1, r] -= b * x[i, 0, r] + d * x[i, 1, r]
+                    x[node, 0, r] -= a * x[i, 0, r] + c * x[i, 1, r]
+                    x[node, 1, r] -= b * x[i, 0, r] + d * x[i, 1, r]
 
 
 @compiled("x", axis=1, grain=_BLOCK, fastmath=FAST)

@@ -39,22 +39,24 @@ def claim_pixels(nodes, elements, owner):
 
 
 @compiled()
-def colour_nodes(starts, near, taken, colour):
-    """Give each node the first colour that no node before it has `taken` (N, C), bool, at one of those `near` both.
+def colour_nodes(starts, near, occupied, colour):
+    """Give each node the first colour that no earlier node with a neighbour in common has.
+
+    `occupied` (N, C), bool, is set where a node or one `near` it has a colour.
 
     The nodes near node n, itself with them, are ``near[starts[n]:starts[n + 1]]``; `colour` (N,) receives its colour.
     """
     for node in range(colour.size):
         begin, end = starts[node], starts[node + 1]
-        own, k = 0, begin
+        candidate, k = 0, begin
         while k < end:
-            if taken[near[k], own]:
-                own, k = own + 1, begin
+            if occupied[near[k], candidate]:
+                candidate, k = candidate + 1, begin
             else:
                 k += 1
-        colour[node] = own
+        colour[node] = candidate
         for k in range(begin, end):
-            taken[near[k], own] = True
+            occupied[near[k], candidate] = True
 
 
 _EDGE = -1e-9

@@ -70,7 +70,7 @@ def subtract_quadratic(
     coefficients of 1, x, y, x^2, x y, y^2 of the local position, in px.
     """
     for light in range(len(difference)):
-        given, gx, gy, less = difference[light], gradient_x[light], gradient_y[light], out[light]
+        residual, gx, gy, corrected = difference[light], gradient_x[light], gradient_y[light], out[light]
         for e in range(start, stop):
             u, v = polynomials[e, 0], polynomials[e, 1]
             u0, u1, u2, u3, u4, u5 = u[0], u[1], u[2], u[3], u[4], u[5]
@@ -79,7 +79,7 @@ def subtract_quadratic(
                 x, y = local_x[i], local_y[i]
                 dx = u0 + x * (u1 + u3 * x + u4 * y) + y * (u2 + u5 * y)
                 dy = v0 + x * (v1 + v3 * x + v4 * y) + y * (v2 + v5 * y)
-                less[i] = given[i] - gx[i] * dx - gy[i] * dy
+                corrected[i] = residual[i] - gx[i] * dx - gy[i] * dy
 
 
 @compiled("factors", fastmath=FAST)
@@ -96,10 +96,10 @@ def add_second_derivatives(start, stop, factors, images, lines, run_offsets, top
                 row, first = top + lines[q, 2], left + lines[q, 3]
                 if row == 0 or row == height - 1:
                     continue
-                above, here, below = images[light, row - 1], images[light, row], images[light, row + 1]
+                above, centre, below = images[light, row - 1], images[light, row], images[light, row + 1]
                 for c in range(max(first, 1), min(first + lines[q, 1], width - 1)):
-                    twice = here[c] + here[c]
-                    second = xx * (here[c - 1] - twice + here[c + 1]) + yy * (above[c] - twice + below[c])
+                    twice = centre[c] + centre[c]
+                    second = xx * (centre[c - 1] - twice + centre[c + 1]) + yy * (above[c] - twice + below[c])
                     cross = above[c - 1] - above[c + 1] - below[c - 1] + below[c + 1]
                     out[light, lines[q, 0] + c - first] += second + xy * cross
 
@@ -228,18 +228,18 @@ def score_sums(
 @helper()
 def _largest(offsets):
     """Number of pixels of the largest element."""
-    most = 0
+    largest = 0
     for e in range(offsets.size - 1):
-        most = max(most, offsets[e + 1] - offsets[e])
-    return most
+        largest = max(largest, offsets[e + 1] - offsets[e])
+    return largest
 
 
 @helper()
 def _slots(lines, run_offsets, offsets, e, top, bottom):
     """First slot of an element and its number of pixels; none where it has no row from `top` to `bottom`."""
     first, last = run_offsets[e], run_offsets[e + 1] - 1
-    away = last < first or lines[first, 2] >= bottom or lines[last, 2] < top
-    return np.uint64(offsets[e]), np.uint64(0 if away else offsets[e + 1] - offsets[e])
+    is_outside = last < first or lines[first, 2] >= bottom or lines[last, 2] < top
+    return np.uint64(offsets[e]), np.uint64(0 if is_outside else offsets[e + 1] - offsets[e])
 
 
 @helper(fastmath=FAST)

@@ -8,7 +8,7 @@ from rgbmidic._kernels.threads import compiled
 
 _EDGE = 1e-6
 """Distance (px) within which a pixel on an edge is painted by both elements: no gap through rounding in float64."""
-_EACH, _OPAQUE = np.uint32(0x010101), np.uint32(0xFF000000)
+_GREY_STEP, _OPAQUE = np.uint32(0x010101), np.uint32(0xFF000000)
 """A grey level in the three colours of a pixel, and its opacity, as the bytes of a number."""
 
 
@@ -40,7 +40,7 @@ def paint_field(start, stop, out, grey, x, y, elements, values, low, high, colou
     width, last = out.shape[1], np.float32(colours.shape[0] - 1)
     for row in range(start, stop):
         for column in range(width):
-            out[row, column] = np.uint32(grey[row, column]) * _EACH | _OPAQUE
+            out[row, column] = np.uint32(grey[row, column]) * _GREY_STEP | _OPAQUE
     scale, share = colours.shape[0] / (high - low), np.uint32(share)
     for e in range(elements.shape[0]):
         i, j, k = elements[e, 0], elements[e, 1], elements[e, 2]
@@ -70,12 +70,12 @@ def paint_field(start, stop, out, grey, x, y, elements, values, low, high, colou
             slope = np.float32(scale * (ac * (vj - vi) + bc * (vk - vi)))
             base = np.float32(scale * (vi + a0 * (vj - vi) + b0 * (vk - vi) - low))
             for column in range(first, end + 1):
-                place = base + slope * np.float32(column)
+                colour_position = base + slope * np.float32(column)
                 if nearest:
                     a, b = a0 + ac * column, b0 + bc * column
                     c = 1.0 - a - b
-                    own = vi if c >= a and c >= b else (vj if a >= b else vk)
-                    place = np.float32(scale * (own - low))
-                index = np.int32(min(max(place, np.float32(0)), last))
-                seen = (np.uint32(grey[row, column]) * share) >> np.uint32(8)
-                out[row, column] = colours[index] + seen * _EACH
+                    corner_value = vi if c >= a and c >= b else (vj if a >= b else vk)
+                    colour_position = np.float32(scale * (corner_value - low))
+                index = np.int32(min(max(colour_position, np.float32(0)), last))
+                background = (np.uint32(grey[row, column]) * share) >> np.uint32(8)
+                out[row, column] = colours[index] + background * _GREY_STEP

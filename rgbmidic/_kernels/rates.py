@@ -15,7 +15,7 @@ _NOISE = 1.2
 """What the stated noise is multiplied by where pieces are chosen: errors are .9 to 1.2 times what is stated of them
 (docs: uncertainty). A piece that by chance begins a frame too early is doubtful then: without it what is false before
 an onset was up to 8 times the stated in 400 draws, with it 5.6."""
-_PRICE, _PLACE = 3.5, 2
+_PRICE, _CUT_PARAMETERS = 3.5, 2
 """Price of a parameter in units of chi-square (Schwarz: the logarithm of the number of values, here 33), and parameters
 that the place of a piece counts for: chosen from 2.5 to 5 and 1 to 4 on signals that benchmarks/rates.py does not use.
 At a lower price rates are noisier at rest, at a higher one the jerk that begins a pulse is overlooked."""
@@ -26,7 +26,7 @@ _NONE = np.int64(-1)
 """No index; a literal would compile what it is given to once more."""
 _NEVER = 12.0
 """Log odds under those of the best cut at this place below which a start cannot come back."""
-_LEAST, _NOTHING = 3e-4, -30.0
+_MIN_PROBABILITY, _NOTHING = 3e-4, -30.0
 """Probability from which a window counts (from 1e-3 on the acceleration of a pulse is beyond 1.3 times the stated in
 11 % of its frames, not in 4 %; from 1e-4 on a swing takes 1.5 times as long), and logarithm of what adds nothing to 1.
 """
@@ -34,11 +34,11 @@ _LEAST, _NOTHING = 3e-4, -30.0
 
 @helper()
 def _add_row(corner, rotated, row, x, value, weight):
-    """Add an equation to a triangular system (Givens rotations) and return what is left of its right side."""
+    """Add an equation to a triangular system (Givens rotations) and return the residual of its right side."""
     row[0] = weight
     for j in range(HIGHEST):
         row[j + 1] = row[j] * x
-    rest = value * weight
+    residual = value * weight
     for j in range(HIGHEST + 1):
         length = np.sqrt(corner[j, j] ** 2 + row[j] ** 2)
         if length == 0.0:
@@ -46,8 +46,8 @@ def _add_row(corner, rotated, row, x, value, weight):
         c, s = corner[j, j] / length, row[j] / length
         for k in range(j, HIGHEST + 1):
             corner[j, k], row[k] = c * corner[j, k] + s * row[k], c * row[k] - s * corner[j, k]
-        rotated[j], rest = c * rotated[j] + s * rest, c * rest - s * rotated[j]
-    return rest
+        rotated[j], residual = c * rotated[j] + s * residual, c * residual - s * rotated[j]
+    return residual
 
 
 @helper()
@@ -56,29 +56,30 @@ def _pieces(t, y, w, young, starts, ends, logs, before):
 
     `before` (n + 1,) receives the log likelihood of what lies before each frame, summed over all ways to cut it.
     """
-    n, room, count, followed = t.size, young + _ROOM + 1, np.int64(0), 0
+    n, room, count, n_open = t.size, young + _ROOM + 1, np.int64(0), 0
     corner, rotated = np.zeros((room, HIGHEST + 1, HIGHEST + 1)), np.zeros((room, HIGHEST + 1))
-    rest, origin, odds, row = np.zeros(room), np.zeros(room, dtype=np.int64), np.zeros(room), np.zeros(HIGHEST + 1)
+    square_sums, origin, odds = np.zeros(room), np.zeros(room, dtype=np.int64), np.zeros(room)
+    row = np.zeros(HIGHEST + 1)
     before[:] = -np.inf
     before[0] = 0.0
     for b in range(n):
         if before[b] > -np.inf:
-            corner[followed], rotated[followed], rest[followed], origin[followed] = 0.0, 0.0, 0.0, b
-            followed += 1
+            corner[n_open], rotated[n_open], square_sums[n_open], origin[n_open] = 0.0, 0.0, 0.0, b
+            n_open += 1
         first, best = count, -np.inf
-        for i in range(followed):
+        for i in range(n_open):
             a = origin[i]
-            rest[i] += _add_row(corner[i], rotated[i], row, t[b] - t[a], y[b] - y[a], w[b]) ** 2
+            square_sums[i] += _add_row(corner[i], rotated[i], row, t[b] - t[a], y[b] - y[a], w[b]) ** 2
             odds[i] = -np.inf
             if b - a < LOWEST:
                 continue
             starts[count], ends[count], logs[count] = a, b, -np.inf
-            left = rest[i]
+            square_sum = square_sums[i]
             for d in range(HIGHEST, LOWEST - 1, -1):
                 if d <= b - a:
-                    logs[count, d - LOWEST] = -0.5 * (left / _NOISE**2 + _PRICE * (d + 1 + _PLACE))
+                    logs[count, d - LOWEST] = -0.5 * (square_sum / _NOISE**2 + _PRICE * (d + 1 + _CUT_PARAMETERS))
                     odds[i] = max(odds[i], before[a] + logs[count, d - LOWEST])
-                left += rotated[i, d] ** 2
+                square_sum += rotated[i, d] ** 2
             best = max(best, odds[i])
             count += 1
         total = 0.0
@@ -88,34 +89,34 @@ def _pieces(t, y, w, young, starts, ends, logs, before):
                 total += np.exp(term) if term > _NOTHING else 0.0
         if total > 0.0:
             before[b + 1] = best + np.log(total)
-        kept = 0
-        for i in range(followed):
+        n_kept = 0
+        for i in range(n_open):
             length = b - origin[i] + 1
             # whoever cuts here pays one price more, and fits no worse
-            never = length > HIGHEST and odds[i] < best - 0.5 * _PRICE * (LOWEST + 1 + _PLACE) - _NEVER
-            if never or (length >= young and (odds[i] < best - _FAINT or kept == _ROOM)):
+            never = length > HIGHEST and odds[i] < best - 0.5 * _PRICE * (LOWEST + 1 + _CUT_PARAMETERS) - _NEVER
+            if never or (length >= young and (odds[i] < best - _FAINT or n_kept == _ROOM)):
                 continue
-            rest[kept], origin[kept] = rest[i], origin[i]
+            square_sums[n_kept], origin[n_kept] = square_sums[i], origin[i]
             for j in range(HIGHEST + 1):  # one assignment of slices in this file takes numba 3 s more to compile
-                rotated[kept, j] = rotated[i, j]
+                rotated[n_kept, j] = rotated[i, j]
                 for k in range(HIGHEST + 1):
-                    corner[kept, j, k] = corner[i, j, k]
-            kept += 1
-        followed = kept
+                    corner[n_kept, j, k] = corner[i, j, k]
+            n_kept += 1
+        n_open = n_kept
     return count
 
 
 @helper()
 def _probabilities(n, count, starts, ends, logs, before):
     """Replace log likelihoods of pieces by their probabilities, given the whole series."""
-    high, total, after = np.full(n + 1, -np.inf), np.zeros(n + 1), 0.0
+    high, total, log_after = np.full(n + 1, -np.inf), np.zeros(n + 1), 0.0
     high[n], total[n] = 0.0, 1.0
     for p in range(count - 1, -1, -1):
         a, b = starts[p], ends[p]
         if p == count - 1 or b != ends[p + 1]:
-            after = high[b + 1] + np.log(total[b + 1]) if total[b + 1] > 0 else -np.inf
+            log_after = high[b + 1] + np.log(total[b + 1]) if total[b + 1] > 0 else -np.inf
         for k in range(logs.shape[1]):
-            term = logs[p, k] + after
+            term = logs[p, k] + log_after
             if term > high[a]:
                 total[a] = total[a] * np.exp(high[a] - term) + 1.0
                 high[a] = term
@@ -167,7 +168,7 @@ def _add_window(t, y, w, first, last, chance, times, low, high, begin, end, base
     norms, shifts, values, at, z, mixed = work
     top = _NONE
     for d in range(LOWEST, HIGHEST + 1):
-        if chance[d - LOWEST] > _LEAST and last - first >= d:
+        if chance[d - LOWEST] > _MIN_PROBABILITY and last - first >= d:
             top = np.int64(d)
     if top < 0:
         return
@@ -183,21 +184,21 @@ def _add_window(t, y, w, first, last, chance, times, low, high, begin, end, base
         group = 1 if i == begin else (2 if i == end else 0)
         mixed[:] = 0.0
         for d in range(LOWEST, top + 1):
-            if chance[d - LOWEST] <= _LEAST:
+            if chance[d - LOWEST] <= _MIN_PROBABILITY:
                 continue
             spread = 0.0
             for k in range(d + 1):
                 spread += at[1, k] ** 2
             weight = chance[d - LOWEST] / np.sqrt(spread)
             for o in range(3):
-                found = variance = 0.0
+                estimate = variance = 0.0
                 for k in range(d + 1):
-                    found += at[o, k] * z[k]
+                    estimate += at[o, k] * z[k]
                     variance += at[o, k] ** 2
                     mixed[o, k] += weight * at[o, k]
                 sums[group, i, o, 0] += weight
-                sums[group, i, o, 1] += weight * found
-                sums[group, i, o, 2] += weight * found**2
+                sums[group, i, o, 1] += weight * estimate
+                sums[group, i, o, 2] += weight * estimate**2
                 sums[group, i, o, 3] += weight * variance
         for o in range(3):
             for j in range(first, last + 1):
@@ -221,46 +222,48 @@ def _average(t, y, w, frames, times, count, starts, ends, chances, base, work, s
     reaches half as far to both sides, and next to its ends the windows there.
     """
     n = t.size
-    whole, degrees = np.zeros(HIGHEST + 1 - LOWEST), HIGHEST + 1 - LOWEST
+    window_chance, degrees = np.zeros(HIGHEST + 1 - LOWEST), HIGHEST + 1 - LOWEST
     beginning, ending, middle = np.zeros((n, degrees)), np.zeros((n, degrees)), np.zeros((times.size + 1, degrees))
     for p in range(count):
         a, b, short = starts[p], ends[p], False
         for k in range(degrees):
-            chance, reach, whole[k] = chances[p, k], _length(LOWEST + k), 0.0
-            if chance <= _LEAST:
+            chance, reach, window_chance[k] = chances[p, k], _length(LOWEST + k), 0.0
+            if chance <= _MIN_PROBABILITY:
                 continue
             if t[b] - t[a] <= reach:
-                whole[k], short = chance, True
+                window_chance[k], short = chance, True
                 continue
             beginning[a, k] += chance
             ending[b, k] += chance
         if short:
             low, high = frames[a], frames[b]
-            _add_window(t, y, w, a, b, whole, times, low, high, low, high, base, work, sums, lines)
+            _add_window(t, y, w, a, b, window_chance, times, low, high, low, high, base, work, sums, lines)
     for k in range(degrees):
         reach = _length(LOWEST + k)
-        whole[:] = 0.0
+        window_chance[:] = 0.0
         for j in range(n):
-            own, whole[k] = frames[j], beginning[j, k]
-            if whole[k] > 0:
+            frame, window_chance[k] = frames[j], beginning[j, k]
+            if window_chance[k] > 0:
                 last = np.searchsorted(t, t[j] + reach, side="right") - 1
                 high = np.searchsorted(times, t[j] + reach / 2)
-                _add_window(t, y, w, j, last, whole, times, own, high - 1, own, _NONE, base, work, sums, lines)
-                middle[high, k] += whole[k]
-            whole[k] = ending[j, k]
-            if whole[k] > 0:
+                _add_window(
+                    t, y, w, j, last, window_chance, times, frame, high - 1, frame, _NONE, base, work, sums, lines
+                )
+                middle[high, k] += window_chance[k]
+            window_chance[k] = ending[j, k]
+            if window_chance[k] > 0:
                 first = np.searchsorted(t, t[j] - reach)
                 low = np.searchsorted(times, t[j] - reach / 2, side="right")
-                _add_window(t, y, w, first, j, whole, times, low, own, _NONE, own, base, work, sums, lines)
-                middle[low, k] -= whole[k]
+                _add_window(t, y, w, first, j, window_chance, times, low, frame, _NONE, frame, base, work, sums, lines)
+                middle[low, k] -= window_chance[k]
         for i in range(times.size):
             if i:
                 middle[i, k] += middle[i - 1, k]
-            whole[k] = middle[i, k]
-            if whole[k] > _LEAST:
+            window_chance[k] = middle[i, k]
+            if window_chance[k] > _MIN_PROBABILITY:
                 first = np.searchsorted(t, times[i] - reach / 2)
                 last = np.searchsorted(t, times[i] + reach / 2, side="right") - 1
-                _add_window(t, y, w, first, last, whole, times, i, i, _NONE, _NONE, base, work, sums, lines)
+                _add_window(t, y, w, first, last, window_chance, times, i, i, _NONE, _NONE, base, work, sums, lines)
 
 
 @helper()
@@ -282,20 +285,20 @@ def _conclude(w, frames, reference, base, sums, lines, out):
             spread = max(sums[:, i, o, 2].sum() / weight - mean**2, 0.0)
             out[0, o, i], out[1, o, i] = mean, chance + spread
             for side in range(2 if o else 0):
-                part = sums[0, i, o] + sums[2 - side, i, o]
-                if part[0] > 0:
-                    mean = part[1] / part[0]
+                totals = sums[0, i, o] + sums[2 - side, i, o]
+                if totals[0] > 0:
+                    mean = totals[1] / totals[0]
                     out[0, o + 2 + 2 * side, i] = mean
-                    out[1, o + 2 + 2 * side, i] = (part[3] + part[2]) / part[0] - mean**2
+                    out[1, o + 2 + 2 * side, i] = (totals[3] + totals[2]) / totals[0] - mean**2
 
 
-@compiled("values", least=0)
-def mean_rates(start, stop, times, values, noise, common, reference, most, out):
+@compiled("values", min_size=0)
+def mean_rates(start, stop, times, values, noise, common, reference, max_frames, out):
     """Value, velocity and acceleration of series (N, T), those from before and from after each frame, and variances.
 
     `noise` (N, T) is the standard uncertainty of each value that is its own, 0 where it is not known, `common` (N, T)
     the variance that the reference adds to all of them, and `reference` (T,) the weight of each frame in the reference.
-    Windows of the lowest degree have the length 1 (`times` rise) and hold up to `most` frames. `out` (N, 2, 7, T), NaN,
+    Windows of the lowest degree are of length 1 (`times` rise) and hold `max_frames` at most. `out` (N, 2, 7, T), NaN,
     receives estimates and their variances: value, velocity, acceleration; velocity, acceleration before; those after.
     """
     size, reach = times.size, _length(HIGHEST)
@@ -303,7 +306,7 @@ def mean_rates(start, stop, times, values, noise, common, reference, most, out):
     for i in range(size):
         width = max(width, np.searchsorted(times, times[i] + 2 * reach, side="right") - i + 1)
     frames, t, y, w = np.zeros(size, dtype=np.int64), np.zeros(size), np.zeros(size), np.zeros(size)
-    young = _OLD * most
+    young = _OLD * max_frames
     room = size * (young + _ROOM + 1)
     starts, ends = np.zeros(room, dtype=np.int64), np.zeros(room, dtype=np.int64)
     logs, before = np.zeros((room, HIGHEST - LOWEST + 1)), np.zeros(size + 1)

@@ -36,7 +36,7 @@ _SQRT6 = math.sqrt(6.0)
 _ROW = (64 * TILE) ** 2 + 16
 """Length of the rows of the work arrays, which are flat: the compiler must know how far apart rows lie to vectorise."""
 # Rows of samples: spatial point, material point less the middle one, paint and slope, facet's normal, seen or not.
-_X, _Y, _Z, _MX, _MY, _MZ, _COVER, _HEIGHT, _DX, _DY, _DZ, _FX, _FY, _FZ, _SEEN = range(0, 15 * _ROW, _ROW)
+_X, _Y, _Z, _MX, _MY, _MZ, _COVER, _HEIGHT, _DX, _DY, _DZ, _FX, _FY, _FZ, _VISIBLE = range(0, 15 * _ROW, _ROW)
 
 # A rotation about (1, 1, 1): no axis of the body lies near a plane of the wrinkle lattice.
 _A, _B, _C = 0.80473785, -0.31061722, 0.50587936
@@ -77,8 +77,8 @@ def _corner(h, u, v, w, wu, wv, ww, du, dv, dw):
 @helper()
 def _fade(t):
     """Weight of the far corner along one axis, and its slope."""
-    rest = t * (t - _ONE)
-    return t * t * t * (t * (t * _SIX - _FIFTEEN) + _TEN), _THIRTY * rest * rest
+    product = t * (t - _ONE)
+    return t * t * t * (t * (t * _SIX - _FIFTEEN) + _TEN), _THIRTY * product * product
 
 
 @helper(forceinline=True)  # the loop that calls it is vectorised only without the call
@@ -106,7 +106,7 @@ def _noise(h, u, v, w, seed):
 
 
 @helper()
-def _gather(found, x, y, z, slack, body, paint, counts, seed):
+def _gather(droplets, x, y, z, slack, body, paint, counts, seed):
     """Droplets (centre on the surface less the given point, radius) that can touch a point within `slack` of it."""
     cell, reach, n = paint[0], paint[2] + slack, 0
     margin = 0.87 * cell + paint[1]
@@ -116,7 +116,7 @@ def _gather(found, x, y, z, slack, body, paint, counts, seed):
                 height, _, _, _ = _to_surface((i + 0.5) * cell, (j + 0.5) * cell, (k + 0.5) * cell, body)
                 if abs(height) <= margin:
                     h = _mix(i * _PI + j * _PJ + k * _PK ^ seed)
-                    n = _throw(found, n, i, j, k, h, x, y, z, slack, body, paint, counts)
+                    n = _throw(droplets, n, i, j, k, h, x, y, z, slack, body, paint, counts)
     return n
 
 
@@ -131,7 +131,7 @@ def _to_surface(x, y, z, body):
 
 
 @helper()
-def _throw(found, n, i, j, k, h, x, y, z, slack, body, paint, counts):
+def _throw(droplets, n, i, j, k, h, x, y, z, slack, body, paint, counts):
     """Append the droplets of one cell that lie near enough."""
     cell, widest, chance, number = paint[0], paint[2] + slack, h * _UNIT, 0
     while number < counts.size and chance >= counts[number]:
@@ -153,7 +153,7 @@ def _throw(found, n, i, j, k, h, x, y, z, slack, body, paint, counts):
         radius = paint[3] * math.exp(paint[4] * _SQRT6 * size)
         far = radius + 0.5 * paint[5] + slack
         if square <= far * far and n < MAX_CANDIDATES:
-            found[n], found[_CY + n], found[_CZ + n], found[_CR + n] = cx, cy, cz, radius
+            droplets[n], droplets[_CY + n], droplets[_CZ + n], droplets[_CR + n] = cx, cy, cz, radius
             n += 1
     return n
 
@@ -168,13 +168,13 @@ def _curve(body):
 
 
 @helper()
-def _coat(work, count, found, n, body, paint):
+def _coat(work, count, droplets, n, body, paint):
     """Cover by black paint (0 to 1) of the samples, with height and slope of the droplet on top."""
     inverse, dome = np.float32(1.0 / max(paint[5], 1e-9)), np.float32(paint[6])
     for s in range(count):
         work[_COVER + s] = work[_HEIGHT + s] = work[_DX + s] = work[_DY + s] = work[_DZ + s] = _ZERO
     for c in range(n):
-        x, y, z, radius = found[c], found[_CY + c], found[_CZ + c], found[_CR + c]
+        x, y, z, radius = droplets[c], droplets[_CY + c], droplets[_CZ + c], droplets[_CR + c]
         for s in range(count):
             dx, dy, dz = work[_MX + s] - x, work[_MY + s] - y, work[_MZ + s] - z
             inside = (radius - math.sqrt(dx * dx + dy * dy + dz * dz)) * inverse + _HALF
@@ -193,12 +193,12 @@ def _dome(work, count, x, y, z, radius, dome, body):
     inverse = _ONE / (radius * radius)
     for s in range(count):
         dx, dy, dz = work[_MX + s] - x, work[_MY + s] - y, work[_MZ + s] - z
-        rest = _ONE - (dx * dx + dy * dy + dz * dz) * inverse
-        if rest > _ZERO and dome * rest * rest > work[_HEIGHT + s]:
+        falloff = _ONE - (dx * dx + dy * dy + dz * dz) * inverse
+        if falloff > _ZERO and dome * falloff * falloff > work[_HEIGHT + s]:
             nx, ny, nz = a * work[_X + s], b * work[_Y + s], a * work[_Z + s] + c
             normal = dx * nx + dy * ny + dz * nz
-            slope = -_FOUR * dome * rest * inverse
-            work[_HEIGHT + s] = dome * rest * rest
+            slope = -_FOUR * dome * falloff * inverse
+            work[_HEIGHT + s] = dome * falloff * falloff
             work[_DX + s] = slope * (dx - normal * nx)
             work[_DY + s] = slope * (dy - normal * ny)
             work[_DZ + s] = slope * (dz - normal * nz)
@@ -257,12 +257,12 @@ def _relief(work, count, x, y, z, body, paint, seed):
 
 
 @helper()
-def _paint(work, place, count, middle, found, body, paint, counts, seed):
+def _paint(work, material_points, count, middle, droplets, body, paint, counts, seed):
     """Paint of a tile: droplets gathered once about its middle, or point by point where the tile spreads too far."""
     far = 0.0
-    x, y, z = place[middle], place[_ROW + middle], place[2 * _ROW + middle]
+    x, y, z = material_points[middle], material_points[_ROW + middle], material_points[2 * _ROW + middle]
     for s in range(count):
-        dx, dy, dz = place[s] - x, place[_ROW + s] - y, place[2 * _ROW + s] - z
+        dx, dy, dz = material_points[s] - x, material_points[_ROW + s] - y, material_points[2 * _ROW + s] - z
         square = dx * dx + dy * dy + dz * dz
         if not square <= far:
             far = square if square == square else 1e30
@@ -271,39 +271,39 @@ def _paint(work, place, count, middle, found, body, paint, counts, seed):
         step, slack = 1, 0.0
     for first in range(0, count, step):
         if step == 1:
-            x, y, z = place[first], place[_ROW + first], place[2 * _ROW + first]
-        if step > 1 or work[_SEEN + first] > _ZERO:
-            group, at = work[first:], place[first:]
+            x, y, z = material_points[first], material_points[_ROW + first], material_points[2 * _ROW + first]
+        if step > 1 or work[_VISIBLE + first] > _ZERO:
+            group, at = work[first:], material_points[first:]
             for s in range(step):
                 group[_MX + s], group[_MY + s], group[_MZ + s] = at[s] - x, at[_ROW + s] - y, at[2 * _ROW + s] - z
-            n = _gather(found, x, y, z, slack, body, paint, counts, seed)
-            _coat(group, step, found, n, body, paint)
+            n = _gather(droplets, x, y, z, slack, body, paint, counts, seed)
+            _coat(group, step, droplets, n, body, paint)
             _relief(group, step, x, y, z, body, paint, seed ^ _WRINKLES)
 
 
 @helper()
-def _locate(work, place, rows, span, samples, x0, y0, lens, frame, body, affine):
-    """Where the rays through the sub-pixels (x0 + i, y0 + r) meet the body; `_SEEN` is 1 or 0."""
+def _locate(work, material_points, rows, span, samples, x0, y0, lens, frame, body, affine):
+    """Intersect the rays through the sub-pixels (x0 + i, y0 + r) with the body; `_VISIBLE` is 1 or 0."""
     scale = 1.0 / (lens[0] * samples)
     # the surface is quadric . (x², y², z²) = 1 along the axes it curves about, or the plane z = 0
     flat = body[0] == PLATE
     ax, ay = 0.0 if flat else 1.0, 1.0 if body[0] == SPHERE else 0.0
     ox, oy, oz = frame[0], frame[1], frame[2]
-    rest = ax * (ox * ox + oz * oz) + ay * oy * oy - body[1] * body[1]
+    constant = ax * (ox * ox + oz * oz) + ay * oy * oy - body[1] * body[1]
     for r in range(rows):
         cy = (y0 + r) * scale
         rx, ry, rz = frame[4] * cy + frame[5], frame[7] * cy + frame[8], frame[10] * cy + frame[11]
-        row, at = work[r * span :], place[r * span :]
+        row, at = work[r * span :], material_points[r * span :]
         for i in range(span):
             cx = (x0 + i) * scale
             dx, dy, dz = frame[3] * cx + rx, frame[6] * cx + ry, frame[9] * cx + rz
             square = ax * (dx * dx + dz * dz) + ay * dy * dy
             half = ax * (ox * dx + oz * dz) + ay * oy * dy
-            root = half * half - square * rest
+            root = half * half - square * constant
             t = -oz / dz if flat else (-half - math.sqrt(max(root, 0.0))) / square
             x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
             row[_X + i], row[_Y + i], row[_Z + i] = x, y, z
-            row[_SEEN + i] = _ONE if (t > 0.0) & ((oz < 0.0) if flat else (root > 0.0)) else _ZERO
+            row[_VISIBLE + i] = _ONE if (t > 0.0) & ((oz < 0.0) if flat else (root > 0.0)) else _ZERO
             at[i] = affine[0] * x + affine[1] * y + affine[4]
             at[_ROW + i] = affine[2] * x + affine[3] * y + affine[5]
             at[2 * _ROW + i] = ax * z
@@ -324,7 +324,7 @@ def _exp(x):
 
 
 @helper()
-def _light(energy, left, work, rows, span, lights, j, frame, body, paint):
+def _light(energy, first_column, work, rows, span, lights, j, frame, body, paint):
     """Radiance towards the camera in units of what an ideal white, facing the light at its nominal distance, gives.
 
     Lambert plus a micro-facet lobe exp((m.h - 1)/variance) with the masking of Cook and Torrance (1982).
@@ -336,7 +336,7 @@ def _light(energy, left, work, rows, span, lights, j, frame, body, paint):
     more, glossier = np.float32(paint[12]) - albedo, np.float32(paint[15]) - gloss
     broader = np.float32(paint[16]) - variance
     for r in range(rows):
-        line, row = energy[r][left:], work[r * span :]
+        line, row = energy[r][first_column:], work[r * span :]
         for s in range(span):
             x, y, z, cover = row[_X + s], row[_Y + s], row[_Z + s], row[_COVER + s]
             lx, ly, lz, vx, vy, vz = px - x, py - y, pz - z, ox - x, oy - y, oz - z
@@ -353,10 +353,10 @@ def _light(energy, left, work, rows, span, lights, j, frame, body, paint):
             masking = min(_ONE, _FOUR * mh * min(mv, ml) / length) / mv
             shiny = (gloss + cover * glossier) * masking * _exp((mh - _ONE) / (variance + cover * broader))
             total = diffuse + (shiny if mv > _ZERO else _ZERO)
-            line[s] = power * square * total if (row[_SEEN + s] > _ZERO) & (nl > _ZERO) & (ml > _ZERO) else _ZERO
+            line[s] = power * square * total if (row[_VISIBLE + s] > _ZERO) & (nl > _ZERO) & (ml > _ZERO) else _ZERO
 
 
-@compiled("out", axis=1, grain=TILE, least=0)
+@compiled("out", axis=1, grain=TILE, min_size=0)
 def trace_rows(
     start, stop, out, first_row, taps, pad, lens, frame, body, affine, material, lights, paint, counts, seed
 ):
@@ -386,26 +386,26 @@ def trace_rows(
         Position in the body's frame and power.
     """
     samples, across, side = out.shape[2], out.shape[2] * (out.shape[3] + 2 * pad), out.shape[2] * TILE
-    work, place = np.empty(15 * _ROW, dtype=np.float32), np.empty(3 * _ROW)
-    found = np.empty(4 * MAX_CANDIDATES, dtype=np.float32)
+    work, material_points = np.empty(15 * _ROW, dtype=np.float32), np.empty(3 * _ROW)
+    droplets = np.empty(4 * MAX_CANDIDATES, dtype=np.float32)
     energy = np.empty(lights.shape[0] * side * across, dtype=np.float32).reshape(lights.shape[0], side, across)
     x0, y0 = 0.5 - samples * (0.5 + lens[1] + pad), 0.5 - samples * (0.5 + lens[2]) + first_row
     for block in range(start, stop, TILE):
         top, rows = block * samples, min(side, (stop - block) * samples)
-        for left in range(0, across, side):
-            span = min(side, across - left)
+        for first_column in range(0, across, side):
+            span = min(side, across - first_column)
             count = rows * span
-            _locate(work, place, rows, span, samples, x0 + left, y0 + top, lens, frame, body, affine)
+            _locate(work, material_points, rows, span, samples, x0 + first_column, y0 + top, lens, frame, body, affine)
             if material.size > 0:
                 for s in range(count):
-                    row, column = top + s // span, left + s % span
-                    place[s], place[_ROW + s] = material[row, column, 0], material[row, column, 1]
+                    row, column = top + s // span, first_column + s % span
+                    material_points[s], material_points[_ROW + s] = material[row, column, 0], material[row, column, 1]
             for s in range(count):  # nothing is seen beyond the body's edge
-                inside = (abs(place[s]) <= body[2]) & (abs(place[_ROW + s]) <= body[3])
-                work[_SEEN + s] = work[_SEEN + s] if inside else _ZERO
-            _paint(work, place, count, (count + span) // 2, found, body, paint, counts, seed)
+                inside = (abs(material_points[s]) <= body[2]) & (abs(material_points[_ROW + s]) <= body[3])
+                work[_VISIBLE + s] = work[_VISIBLE + s] if inside else _ZERO
+            _paint(work, material_points, count, (count + span) // 2, droplets, body, paint, counts, seed)
             for j in range(lights.shape[0]):
-                _light(energy[j], left, work, rows, span, lights, j, frame, body, paint)
+                _light(energy[j], first_column, work, rows, span, lights, j, frame, body, paint)
         for j in range(lights.shape[0]):
             for r in range(rows):
                 _decimate(out[j, block + r // samples, r % samples], energy[j, r], samples, taps)
@@ -415,24 +415,24 @@ def trace_rows(
 def _decimate(out, line, samples, taps):
     """Weighted sums of the sub-pixel samples of a row, one per pixel."""
     for c in range(out.size):
-        total, part = _ZERO, line[c * samples :]
+        total, window = _ZERO, line[c * samples :]
         for q in range(taps.size):
-            total += taps[q] * part[q]
+            total += taps[q] * window[q]
         out[c] = total
 
 
-@compiled("out", grain=_POINTS, least=0)
+@compiled("out", grain=_POINTS, min_size=0)
 def sample_paint(start, stop, out, points, body, paint, counts, seed):
     """Cover, height (mm) and slope vector of the paint at points on the body: `out` (N, 5)."""
     for first in range(start, stop, _POINTS):
         number = min(_POINTS, stop - first)
-        found = np.empty(4 * MAX_CANDIDATES, dtype=np.float32)
-        work, place = np.empty(15 * _ROW, dtype=np.float32), np.empty(3 * _ROW)
+        droplets = np.empty(4 * MAX_CANDIDATES, dtype=np.float32)
+        work, material_points = np.empty(15 * _ROW, dtype=np.float32), np.empty(3 * _ROW)
         for p in range(number):
             x, y, z = points[first + p, 0], points[first + p, 1], points[first + p, 2]
-            place[p], place[_ROW + p], place[2 * _ROW + p] = x, y, z
-            work[_X + p], work[_Y + p], work[_Z + p], work[_SEEN + p] = x, y, z, _ONE
-        _paint(work, place, number, number // 2, found, body, paint, counts, seed)
+            material_points[p], material_points[_ROW + p], material_points[2 * _ROW + p] = x, y, z
+            work[_X + p], work[_Y + p], work[_Z + p], work[_VISIBLE + p] = x, y, z, _ONE
+        _paint(work, material_points, number, number // 2, droplets, body, paint, counts, seed)
         for p in range(number):
             for column in range(5):
                 out[first + p, column] = work[_COVER + column * _ROW + p]

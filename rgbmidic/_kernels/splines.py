@@ -69,7 +69,7 @@ def _filter_rows(start, stop, image, taps, out):
     """
     n = image.shape[1]
     edge = PAD + _REACH + taps.size - 1
-    line, other = np.empty(n + 2 * edge, dtype=np.float32), np.empty(n + 2 * edge, dtype=np.float32)
+    line, buffer = np.empty(n + 2 * edge, dtype=np.float32), np.empty(n + 2 * edge, dtype=np.float32)
     for r in range(PAD + start, PAD + stop):
         row, middle = out[r, PAD:], line[edge:]
         for j in range(n):
@@ -77,13 +77,13 @@ def _filter_rows(start, stop, image, taps, out):
         for j in range(1, edge + 1):
             line[edge - j], middle[n - 1 + j] = row[_mirrored(j, n)], row[_mirrored(n - 1 + j, n)]
         for k in range(1, taps.size):
-            _symmetric(line if k == 1 else other, taps[0] if k == 1 else np.float32(1.0), line, taps[k], k, other)
+            _symmetric(line if k == 1 else buffer, taps[0] if k == 1 else np.float32(1.0), line, taps[k], k, buffer)
         if taps.size > 1:
-            line, other = other, line
+            line, buffer = buffer, line
         factor = _POLE
         for step in range(_STEPS):
-            _symmetric(line, np.float32(1.0) + factor * factor, line, factor, 1 << step, other)
-            line, other = other, line
+            _symmetric(line, np.float32(1.0) + factor * factor, line, factor, 1 << step, buffer)
+            line, buffer = buffer, line
             factor *= factor
         row, middle = out[r], line[edge - PAD :]
         for j in range(row.size):
@@ -91,11 +91,11 @@ def _filter_rows(start, stop, image, taps, out):
 
 
 @helper(fastmath=FAST)
-def _symmetric(centre, own, line, beside, step, out):
-    """``out = own * centre`` plus `beside` times what `line` has `step` before and behind, where there are both."""
+def _symmetric(centre, centre_weight, line, side_weight, step, out):
+    """``out = centre_weight * centre`` plus `side_weight` times `line` a `step` before and behind, where both are."""
     left, middle, right, target = line, centre[step:], line[2 * step :], out[step:]
     for j in range(right.size):
-        target[j] = own * middle[j] + beside * (left[j] + right[j])
+        target[j] = centre_weight * middle[j] + side_weight * (left[j] + right[j])
 
 
 @helper()
@@ -116,10 +116,14 @@ def pixel_gradient(start, stop, lines, coefficients, top, left, gradient_x, grad
     for q in range(start, stop):
         slot, number = np.uint64(lines[q, 0]), np.uint64(lines[q, 1])
         row, column = top + lines[q, 2] + PAD, left + lines[q, 3] + PAD - 1
-        above, here, below = coefficients[row - 1, column:], coefficients[row, column:], coefficients[row + 1, column:]
+        above, centre, below = (
+            coefficients[row - 1, column:],
+            coefficients[row, column:],
+            coefficients[row + 1, column:],
+        )
         for i in range(number):
             j, k = i + np.uint64(1), i + np.uint64(2)
-            along = (above[k] - above[i]) + four * (here[k] - here[i]) + (below[k] - below[i])
+            along = (above[k] - above[i]) + four * (centre[k] - centre[i]) + (below[k] - below[i])
             down = (below[i] - above[i]) + four * (below[j] - above[j]) + (below[k] - above[k])
             gradient_x[slot + i] = twelfth * along
             gradient_y[slot + i] = twelfth * down
@@ -157,7 +161,12 @@ def sample_with_gradient(start, stop, coefficients, x, y, value, gradient_x, gra
 @helper(fastmath=FAST)
 def _weights(t):
     """Return the four cubic B-spline weights at the fraction t behind the second sample, and their slopes."""
-    t2, rest = t * t, 1.0 - t
+    t2, complement = t * t, 1.0 - t
     t3 = t2 * t
-    weights = rest * rest * rest / 6, (4 - 6 * t2 + 3 * t3) / 6, (1 + 3 * t + 3 * t2 - 3 * t3) / 6, t3 / 6
-    return weights, (-rest * rest / 2, (3 * t2 - 4 * t) / 2, (1 + 2 * t - 3 * t2) / 2, t2 / 2)
+    weights = (
+        complement * complement * complement / 6,
+        (4 - 6 * t2 + 3 * t3) / 6,
+        (1 + 3 * t + 3 * t2 - 3 * t3) / 6,
+        t3 / 6,
+    )
+    return weights, (-complement * complement / 2, (3 * t2 - 4 * t) / 2, (1 + 2 * t - 3 * t2) / 2, t2 / 2)

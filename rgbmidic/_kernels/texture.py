@@ -31,11 +31,11 @@ def block_sums(start, stop, values, block, sums):
             for j in range(total.shape[1]):
                 total[n, j] = 0
         for i in range(bi * block, min((bi + 1) * block, len(values))):
-            line, value, known = values[i], total[i % 2], total[2 + i % 2]
+            line, value, count = values[i], total[i % 2], total[2 + i % 2]
             for j in range(line.size):
                 finite = np.isfinite(line[j])
                 value[j] += line[j] if finite else np.float32(0.0)
-                known[j] += np.float32(1.0) if finite else np.float32(0.0)
+                count[j] += np.float32(1.0) if finite else np.float32(0.0)
         for plane in range(8):
             line, out = total[plane // 2], sums[plane, bi]
             for b in range(out.size):
@@ -53,10 +53,10 @@ def subtract_mean(start, stop, values, mean, block, out):
     columns.
     """
     for i in range(start, stop):
-        low, high, part = between(i, block, mean.shape[1])
+        low, high, fraction = between(i, block, mean.shape[1])
         above, below, line, target = mean[i % 2, low], mean[i % 2, high], values[i], out[i]
         for j in range(line.size):
-            target[j] = line[j] - (above[j] + part * (below[j] - above[j]))
+            target[j] = line[j] - (above[j] + fraction * (below[j] - above[j]))
 
 
 @compiled("out")
@@ -70,10 +70,10 @@ def scaled_contrast(start, stop, contrast, scale, block, pad, out):
     for p in range(start, stop):
         i = abs(p - pad)
         i = min(i, 2 * (rows - 1) - i)
-        low, high, part = between(i, block, scale.shape[1])
+        low, high, fraction = between(i, block, scale.shape[1])
         above, below, line, target = scale[i % 2, low], scale[i % 2, high], contrast[i], out[p, pad:]
         for j in range(columns):
-            target[j] = line[j] * (above[j] + part * (below[j] - above[j]))
+            target[j] = line[j] * (above[j] + fraction * (below[j] - above[j]))
         for side in range(1, pad + 1):
             out[p, pad - side] = target[side]
             target[columns - 1 + side] = target[columns - 1 - side]
@@ -81,14 +81,14 @@ def scaled_contrast(start, stop, contrast, scale, block, pad, out):
 
 
 @helper(fastmath={"contract"})
-def _down(above, here, below, first, last, planes, number):
+def _down(above, centre, below, first, last, planes, number):
     """Binomial sums of three rows of a mosaic, of their even and of their odd columns."""
     ten = np.float32(10)
     for c in range(np.uint64(number)):
         j = np.uint64(2) * c
-        planes[0, c] = first * above[j] + ten * here[j] + last * below[j]
+        planes[0, c] = first * above[j] + ten * centre[j] + last * below[j]
         j += np.uint64(1)
-        planes[1, c] = first * above[j] + ten * here[j] + last * below[j]
+        planes[1, c] = first * above[j] + ten * centre[j] + last * below[j]
 
 
 @compiled("low", axis=1, fastmath={"contract"})
@@ -117,9 +117,9 @@ def low_passed_planes(start, stop, contrast, order, unmixing, low, lights):
             p1 = five * planes[1, c] + ten * planes[1, d] + planes[1, e]
             p2 = planes[2, c] + ten * planes[2, d] + five * planes[2, e]
             p3 = five * planes[3, c] + ten * planes[3, d] + planes[3, e]
-            known = np.isfinite(p0 + p1 + p2 + p3)
-            low[first, ci, d], low[second, ci, d] = p0 if known else nan, p1 if known else nan
-            low[third, ci, d], low[fourth, ci, d] = p2 if known else nan, p3 if known else nan
+            finite = np.isfinite(p0 + p1 + p2 + p3)
+            low[first, ci, d], low[second, ci, d] = p0 if finite else nan, p1 if finite else nan
+            low[third, ci, d], low[fourth, ci, d] = p2 if finite else nan, p3 if finite else nan
         for light in range(len(lights)):
             target, (a, b, c, d) = lights[light, ci], unmixing[light]
             first_line, second_line, third_line, fourth_line = low[0, ci], low[1, ci], low[2, ci], low[3, ci]
@@ -141,10 +141,10 @@ def plane_products(start, stop, planes, half, sums):
         total[:] = 0
         for i in range(bi * half, min((bi + 1) * half, height)):
             for j in range(width):
-                known = np.float32(0)
+                plane_sum = np.float32(0)
                 for n in range(count):
-                    known += planes[n, i, j]
-                finite = np.isfinite(known)
+                    plane_sum += planes[n, i, j]
+                finite = np.isfinite(plane_sum)
                 total[-1, j] += np.float32(1) if finite else np.float32(0)
                 for n in range(count):
                     value[n, j] = planes[n, i, j] if finite else np.float32(0)
@@ -174,26 +174,28 @@ def register_planes(start, stop, planes, displacement, weights, out):
     height, width = planes.shape[1:]
     lines = np.empty((CELLS + 7, width), np.float32)
     wx, wy = np.empty((8, width), np.float32), np.empty((8, width), np.float32)
-    left, top = np.empty(displacement.shape[3], np.int64), np.empty(displacement.shape[3], np.int64)
+    column_shift, row_shift = np.empty(displacement.shape[3], np.int64), np.empty(displacement.shape[3], np.int64)
     steps = weights.shape[1]
     out[:, start:stop] = np.nan
     for bi in range(start // CELLS, -(-stop // CELLS)):
         for light in range(len(planes)):
             for bj in range(-(-width // CELLS)):
                 x, y = displacement[light, 0, bi, bj], displacement[light, 1, bi, bj]
-                left[bj], top[bj] = int(np.floor(x)), int(np.floor(y))
+                column_shift[bj], row_shift[bj] = int(np.floor(x)), int(np.floor(y))
                 # a place just before a sample is rounded to it
-                at_x = min(int((x - left[bj]) * steps), steps - 1)
-                at_y = min(int((y - top[bj]) * steps), steps - 1)
+                at_x = min(int((x - column_shift[bj]) * steps), steps - 1)
+                at_y = min(int((y - row_shift[bj]) * steps), steps - 1)
                 for k in range(8):
                     for j in range(bj * CELLS, min((bj + 1) * CELLS, width)):
                         wx[k, j], wy[k, j] = weights[k, at_x], weights[k, at_y]
             first = 0
             while first < width:  # a run of blocks whose places lie between the same samples
                 bj = last = first // CELLS
-                while last * CELLS < width and left[last] == left[bj] and top[last] == top[bj]:
+                while (
+                    last * CELLS < width and column_shift[last] == column_shift[bj] and row_shift[last] == row_shift[bj]
+                ):
                     last += 1
-                i0, j0 = bi * CELLS + top[bj] - 3, left[bj] - 3
+                i0, j0 = bi * CELLS + row_shift[bj] - 3, column_shift[bj] - 3
                 begin, end = max(first, -j0), min(min(last * CELLS, width), width - j0 - 7)
                 if i0 >= 0 and i0 + CELLS + 7 <= height:
                     for i in range(CELLS + 7):
@@ -230,27 +232,27 @@ def displacement_scores(start, stop, planes, slope, half, sums):
         total[:] = 0
         first, last = max(bi * half, 1), min((bi + 1) * half, height - 1)
         for i in range(first - 1, last + 1):
-            low, high, part = between(i, half, slope.shape[1])
+            low, high, row_fraction = between(i, half, slope.shape[1])
             for light in range(count):
                 above, below, line = slope[light, low], slope[light, high], planes[light, i]
                 target = texture[light, i - first + 1]
                 for j in range(width):
-                    target[j] = line[j] / (above[j] + part * (below[j] - above[j]))
+                    target[j] = line[j] / (above[j] + row_fraction * (below[j] - above[j]))
         for light in range(count):
             along_x, along_y, square = total[light]
             for i in range(last - first + 2):
                 target = mean[i]
                 target[:] = 0
-                for other in range(count):
-                    if other != light:
-                        line = texture[other, i]
+                for other_light in range(count):
+                    if other_light != light:
+                        line = texture[other_light, i]
                         for j in range(width):
                             target[j] += fraction * line[j]
             for i in range(1, last - first + 1):
-                own, above, here, below = texture[light, i], mean[i - 1], mean[i], mean[i + 1]
+                light_row, above, centre, below = texture[light, i], mean[i - 1], mean[i], mean[i + 1]
                 for j in range(1, width - 1):
-                    r = own[j] - here[j]
-                    gx = np.float32(0.5) * (here[j + 1] - here[j - 1])
+                    r = light_row[j] - centre[j]
+                    gx = np.float32(0.5) * (centre[j + 1] - centre[j - 1])
                     gy = np.float32(0.5) * (below[j] - above[j])
                     finite = np.isfinite(r + gx + gy)
                     along_x[j] -= r * gx if finite else zero
@@ -277,15 +279,15 @@ def lag_products(contrast, red_row, red_column, lags, step, sums, counts):
         di, dj = lags[n, 0], lags[n, 1]
         for ci in range(0, rows // 2, step):
             for i in range(2 * ci, 2 * ci + 2):
-                other = i + di
-                if other >= rows:
+                other_row = i + di
+                if other_row >= rows:
                     continue
-                own = 0 if i % 2 == red_row else 2
-                own_other = 0 if other % 2 == red_row else 2
+                row_colour = 0 if i % 2 == red_row else 2
+                other_colour = 0 if other_row % 2 == red_row else 2
                 for j in range(max(0, -dj), min(columns, columns - dj)):
-                    a = own if (j % 2 == red_column) == (own == 0) else 1
-                    b = own_other if ((j + dj) % 2 == red_column) == (own_other == 0) else 1
-                    product = contrast[i, j] * contrast[other, j + dj]
+                    a = row_colour if (j % 2 == red_column) == (row_colour == 0) else 1
+                    b = other_colour if ((j + dj) % 2 == red_column) == (other_colour == 0) else 1
+                    product = contrast[i, j] * contrast[other_row, j + dj]
                     if np.isfinite(product):
                         kind = a if a == b else 2 + a + b
                         sums[n, kind] += product

@@ -27,7 +27,7 @@ T = TypeVar("T")
 FAST = {"reassoc", "contract", "arcp", "nsz"}
 """Freedom of a kernel's floating-point arithmetic: it keeps the meaning of NaN and inf."""
 _VARIABLE = "RGBMIDIC_THREADS"
-_chosen: list[int] = []
+_requested_threads: list[int] = []
 _limits: list[Any] = []
 _lock = threading.Lock()
 
@@ -38,8 +38,10 @@ def machine() -> str:
     import scipy.linalg  # noqa: F401 which has a library of its own
     from llvmlite.binding import get_host_cpu_name
 
-    found = [one for one in ThreadpoolController().info() if one["user_api"] == "blas"]
-    libraries = {f"{one['internal_api']} {one['version']} {one.get('architecture', '')}".strip() for one in found}
+    blas = [library for library in ThreadpoolController().info() if library["user_api"] == "blas"]
+    libraries = {
+        f"{library['internal_api']} {library['version']} {library.get('architecture', '')}".strip() for library in blas
+    }
     return ", ".join([str(get_host_cpu_name()), *sorted(libraries)])
 
 
@@ -54,7 +56,7 @@ def threads() -> int:
     InputError
         RGBMIDIC_THREADS is not a whole number from 1.
     """
-    return _chosen[-1] if _chosen else _default()
+    return _requested_threads[-1] if _requested_threads else _default()
 
 
 def set_threads(number: int) -> None:
@@ -67,7 +69,7 @@ def set_threads(number: int) -> None:
     """
     if number < 1:
         raise InputError(f"the number of threads must be at least 1; given is {number}")
-    _chosen[:] = [number]
+    _requested_threads[:] = [number]
 
 
 @cache
@@ -84,7 +86,7 @@ def keep_memory() -> None:
             mallopt(parameter, value)
 
 
-_LEAST = 1 << 16
+_MIN_SHARED_SIZE = 1 << 16
 """Entries of a kernel's largest array under which one thread does it all: at some 3 ns each it takes .2 ms, and another
 thread .05 to .1 ms to begin and to report (measured)."""
 
@@ -106,7 +108,7 @@ def aside(function: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Fu
 @cache
 def _pool(process: int, name: str = "kernels") -> ThreadPoolExecutor:
     """Return the pool of a process: a forked one inherits no threads and makes its own, as many as are needed."""
-    return ThreadPoolExecutor(max(_default(), *_chosen, 1), thread_name_prefix=f"rgbmidic-{name}")
+    return ThreadPoolExecutor(max(_default(), *_requested_threads, 1), thread_name_prefix=f"rgbmidic-{name}")
 
 
 @contextmanager
@@ -135,12 +137,12 @@ def _blas() -> ThreadpoolController:
 
 @cache
 def _default() -> int:
-    given = os.environ.get(_VARIABLE)
-    if given is None:
+    setting = os.environ.get(_VARIABLE)
+    if setting is None:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if not given.isdecimal() or int(given) < 1:
-        raise InputError(f"{_VARIABLE} must be a whole number from 1; given is {given!r}")
-    return int(given)
+    if not setting.isdecimal() or int(setting) < 1:
+        raise InputError(f"{_VARIABLE} must be a whole number from 1; given is {setting!r}")
+    return int(setting)
 
 
 class Kernel:
@@ -158,12 +160,12 @@ class Kernel:
         *,
         axis: int = 0,
         grain: int = 1,
-        least: int | None = None,
+        min_size: int | None = None,
         **options: Any,
     ) -> None:
         update_wrapper(self, function)
         self._names = function.__code__.co_varnames[2 : function.__code__.co_argcount]
-        self.over, self._axis, self._grain, self._least, self._options = over, axis, grain, least, options
+        self.over, self._axis, self._grain, self._min_size, self._options = over, axis, grain, min_size, options
 
     @cached_property
     def dispatcher(self) -> Any:
@@ -172,9 +174,9 @@ class Kernel:
 
         from rgbmidic._kernels.cache import KernelCache
 
-        made = njit(**self._options)(self.__wrapped__)
-        made._cache = KernelCache(self.__wrapped__)
-        return made
+        kernel = njit(**self._options)(self.__wrapped__)
+        kernel._cache = KernelCache(self.__wrapped__)
+        return kernel
 
     @property
     def _numba_type_(self) -> Any:  # what numba asks of a global of a function that it compiles
@@ -188,19 +190,21 @@ class Kernel:
         if self.over is None:
             return self.dispatcher(*arguments)
         keep_memory()
-        items, most = arguments[self._names.index(self.over)].shape[self._axis], threads()
+        items, n_threads = arguments[self._names.index(self.over)].shape[self._axis], threads()
         kernel = self.dispatcher  # the first call imports numba, before threads begin
         grains = -(-items // self._grain)
         largest = max(getattr(argument, "size", 0) for argument in arguments)
-        parts = min(most, grains) if largest >= (_LEAST if self._least is None else self._least) else 1
-        if parts <= 1:
+        n_ranges = (
+            min(n_threads, grains) if largest >= (_MIN_SHARED_SIZE if self._min_size is None else self._min_size) else 1
+        )
+        if n_ranges <= 1:
             return kernel(0, items, *arguments)
-        edges = [min(grains * part // parts * self._grain, items) for part in range(parts + 1)]
+        edges = [min(grains * index // n_ranges * self._grain, items) for index in range(n_ranges + 1)]
         pool = _pool(os.getpid())
-        others = [pool.submit(kernel, *edge, *arguments) for edge in pairwise(edges[1:])]
+        futures = [pool.submit(kernel, *edge, *arguments) for edge in pairwise(edges[1:])]
         kernel(0, edges[1], *arguments)
-        for other in others:
-            other.result()
+        for future in futures:
+            future.result()
         return None
 
 
@@ -211,7 +215,7 @@ def compiled(over: str | None = None, **options: Any) -> Callable[[Callable[...,
     ----------
     over
         Name of the argument that has one entry per item that threads share; None: it is no such kernel.
-    axis, grain, least
+    axis, grain, min_size
         Axis of the items; ranges start at multiples of the grain, so that what is vectorised or gathered in blocks of
         so many items stays the same on any number of threads; entries of its largest array from which threads share
         it, some 65,000 if not stated.

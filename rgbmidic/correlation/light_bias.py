@@ -3,9 +3,9 @@
 A light's residual at the solution, projected on its gradient in a window, is its own displacement from the solution.
 Noise makes some thousandths of a pixel of it; more is a reflection that does not follow the surface, or follows it with
 the droplets' flanks. The solution is the mean of the lights by their precision, so it holds some of each light's bias.
-Where lights agree with each other (`rgbmidic.illumination.displacement.agreement`) the others' part is taken off the
-solution. What is left of the disagreement is its uncertainty, as of the weighted mean of measurements whose biases are
-independent; of two lights that disagree nobody knows which is right, and half their distance is uncertain.
+Where lights agree with each other (`rgbmidic.illumination.displacement.consensus_weights`) the others' part is taken
+off the solution. What is left of the disagreement is its uncertainty, as of the weighted mean of measurements whose
+biases are independent; of two lights that disagree nobody knows which is right, and half their distance is uncertain.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rgbmidic.correlation.blocks import BlockTable
 from rgbmidic.correlation.equations import Equations
 from rgbmidic.correlation.reference import Reference
 from rgbmidic.correlation.residual import Residual
-from rgbmidic.illumination.displacement import agreement
+from rgbmidic.illumination.displacement import consensus_weights
 from rgbmidic.typing import FloatArray, FloatImage
 
 
@@ -66,7 +66,7 @@ def light_bias(table: BlockTable, equations: Equations) -> tuple[FloatArray, Flo
     beyond *= gain[:, None]
     displacement = displacement + beyond
     precision = information / np.maximum(information.sum(axis=0), 1e-30)
-    believed, agree = agreement(displacement, variance, precision)
+    believed, agree = consensus_weights(displacement, variance, precision)
     part = precision + agree * (believed - precision)
     mean = (part[:, None] * displacement).sum(axis=0)
     variance += 2 * chance * gain  # twice: its scatter is taken about the local displacement itself

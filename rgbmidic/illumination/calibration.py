@@ -108,13 +108,13 @@ class Calibration:
     @property
     def kinds(self) -> tuple[FrameKind, ...]:
         """The kinds of frames that it may be of, by all that it holds: one, or more where that leaves it open."""
-        known = len(self.camera_noise.planes) if self.camera_noise else 0
-        seen = len(self.crosstalk.matrix) if self.crosstalk else 0
-        stated = {self.kind, "bayer" if self.cfa else None} - {None}
+        n_planes = len(self.camera_noise.planes) if self.camera_noise else 0
+        n_channels = len(self.crosstalk.matrix) if self.crosstalk else 0
+        stated_kinds = {self.kind, "bayer" if self.cfa else None} - {None}
         return tuple(
             kind
             for kind, (planes, channels) in _KINDS.items()
-            if stated <= {kind} and known in (0, planes) and seen in (0, channels)
+            if stated_kinds <= {kind} and n_planes in (0, planes) and n_channels in (0, channels)
         )
 
     def cropped(self, origin: tuple[int, int] | None, shape: tuple[int, int]) -> Calibration:
@@ -137,25 +137,30 @@ class Calibration:
             They reach beyond the calibrated frame; or no origin is stated, they have another size, and the calibration
             depends on the place.
         """
-        crosstalk, registration, whole = self.crosstalk, self.registration, self.shape
+        crosstalk, registration, full_shape = self.crosstalk, self.registration, self.shape
         field = crosstalk.field if crosstalk else None
-        if whole is None and field is not None:  # older files hold the shape of the captures only in what varies
-            whole = field.shape
-        elif whole is None and registration is not None:
-            whole = round(2 * registration.centre[1] + 1), round(2 * registration.centre[0] + 1)
+        if full_shape is None and field is not None:  # older files hold the shape of the captures only in what varies
+            full_shape = field.shape
+        elif full_shape is None and registration is not None:
+            full_shape = round(2 * registration.centre[1] + 1), round(2 * registration.centre[0] + 1)
         if origin is None:
-            if whole is None or whole == shape or not (field or (registration and registration.depends_on_place)):
+            if (
+                full_shape is None
+                or full_shape == shape
+                or not (field or (registration and registration.depends_on_place))
+            ):
                 return self
             raise CalibrationError(
-                f"the calibration was made with frames of {_size(whole)} px and holds what varies over them; those of "
-                f"the test have {_size(shape)} px. If the camera cropped them, state frames.crop_origin = [x, y], the "
-                "column and row of the calibrated frame at which they begin; else calibrate with frames of their size"
+                f"the calibration was made with frames of {_size(full_shape)} px and holds what varies over them; "
+                f"those of the test have {_size(shape)} px. If the camera cropped them, state "
+                "frames.crop_origin = [x, y], the column and row of the calibrated frame at which they begin; else "
+                "calibrate with frames of their size"
             )
         column, row = origin
-        if whole is not None and (row + shape[0] > whole[0] or column + shape[1] > whole[1]):
+        if full_shape is not None and (row + shape[0] > full_shape[0] or column + shape[1] > full_shape[1]):
             raise CalibrationError(
                 f"frames of {_size(shape)} px that begin at frames.crop_origin = {list(origin)} reach beyond the "
-                f"calibrated frame of {_size(whole)} px"
+                f"calibrated frame of {_size(full_shape)} px"
             )
         return replace(
             self,
@@ -210,7 +215,7 @@ class Calibration:
         ValueError
             A section is damaged.
         """
-        known = {"schema", "schema_version", "crosstalk", "noise", "registration", "camera", "provenance"}
+        known_keys = {"schema", "schema_version", "crosstalk", "noise", "registration", "camera", "provenance"}
         camera, noise = read_table(document, "camera"), read_table(document, "noise")
         if (cfa := camera.get("cfa")) not in (None, *BAYER_PATTERNS):
             raise ValueError(f"camera.cfa is {cfa!r}; allowed are {', '.join(BAYER_PATTERNS)}")
@@ -224,7 +229,7 @@ class Calibration:
             camera_noise=_read(CameraNoise, noise, "planes"),
             registration=_read(Registration, document, "registration"),
             provenance=read_table(document, "provenance"),
-            extra={key: value for key, value in document.items() if key not in known},
+            extra={key: value for key, value in document.items() if key not in known_keys},
         )
 
     def to_document(self) -> dict[str, Any]:
@@ -257,7 +262,7 @@ class Calibration:
         dict
         """
         document = self.to_document()
-        kept = {
+        figure_names = {
             "lights",
             "matrix",
             "std",
@@ -268,15 +273,15 @@ class Calibration:
             "parameters",
         }
         figures: dict[str, Any] = {
-            section: {key: value for key, value in document[section].items() if key in kept}
+            section: {key: value for key, value in document[section].items() if key in figure_names}
             for section in ("crosstalk", "noise", "registration")
             if section in document
         }
         origins = {}
-        for name, made in self.provenance.items():
-            if isinstance(made, Mapping):
-                date, files = made.get("date", "at an unknown time"), len(made.get("inputs", ()))
-                origins[name] = {"date": date, "files": files, "warnings": list(made.get("warnings", ()))}
+        for name, record in self.provenance.items():
+            if isinstance(record, Mapping):
+                date, files = record.get("date", "at an unknown time"), len(record.get("inputs", ()))
+                origins[name] = {"date": date, "files": files, "warnings": list(record.get("warnings", ()))}
         return {**figures, "provenance": origins}
 
     def write(self, path: Path | str) -> None:
@@ -353,11 +358,11 @@ class TargetLights:
         CalibrationError
             The photograph does not fit the calibration.
         """
-        registration, whole = self.calibration.registration, self.calibration.shape
+        registration, full_shape = self.calibration.registration, self.calibration.shape
         if shape is not None:
-            if self.crop_origin is None and whole is not None and shape != whole:
+            if self.crop_origin is None and full_shape is not None and shape != full_shape:
                 raise CalibrationError(
-                    f"{self.calibration.name} was made with frames of {_size(whole)} px, the photograph has "
+                    f"{self.calibration.name} was made with frames of {_size(full_shape)} px, the photograph has "
                     f"{_size(shape)} px: state --crop-origin, where it begins in the calibrated frame"
                 )
             registration = self.calibration.cropped(self.crop_origin, shape).registration
@@ -371,13 +376,13 @@ def _size(shape: tuple[int, int]) -> str:
     return f"{shape[1]} x {shape[0]}"
 
 
-def read_document(path: Path | str, what: str, schema: str, version: int) -> dict[str, Any]:
+def read_document(path: Path | str, description: str, schema: str, version: int) -> dict[str, Any]:
     """Read the document of a JSON file that ``rgbmidic-calibrate`` wrote.
 
     Raises
     ------
     CalibrationError
-        The file is missing, not JSON, or of another schema or version; `what` it should be is named.
+        The file is missing, not JSON, or of another schema or version; the message names the `description` of the file.
     """
     try:
         text = require_regular_file(Path(path)).read_text(encoding="utf-8")
@@ -389,11 +394,11 @@ def read_document(path: Path | str, what: str, schema: str, version: int) -> dic
             parse_int=lambda text: int(text) if _number(text) else 0,
         )
     except FileNotFoundError:
-        raise CalibrationError(f"{what} not found: {path}") from None
+        raise CalibrationError(f"{description} not found: {path}") from None
     except (OSError, ValueError, RecursionError) as error:
-        raise CalibrationError(f"{path} is not a readable {what}: {error}") from None
+        raise CalibrationError(f"{path} is not a readable {description}: {error}") from None
     if not isinstance(document, dict) or document.get("schema") != schema:
-        raise CalibrationError(f'{path} is not a {what}: its "schema" is not "{schema}"')
+        raise CalibrationError(f'{path} is not a {description}: its "schema" is not "{schema}"')
     if document.get("schema_version") != version:
         raise CalibrationError(
             f"{path} has schema version {document.get('schema_version')!r}; this version of rgbmidic reads {version}. "

@@ -33,7 +33,7 @@ MEAN_BLOCK = 4
 """Side of the blocks (px) of the local means."""
 MEAN_WIDTH, MOMENT_WIDTH = 8.0, 14.0
 """Standard deviation (px) of the windows over which means and moments are taken: several speckles wide."""
-LEAST = 0.001
+MIN_SPECIFIC = 0.001
 """Least channel-specific variance: how well two colours can agree."""
 _BETWEEN = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 EQUALLY_APART = 0.2
@@ -50,7 +50,7 @@ class Moments:
         Local mean of each kind of site on a grid of `MEAN_BLOCK` px.
     contrast : (H, W) float32
         Samples minus their site's local mean; NaN where not known.
-    own, shared : (3, h, w) float64
+    variance, covariance : (3, h, w) float64
         Local moments of the low-passed planes on a grid of `BLOCK` px, as they would be with the lights in register and
         one kind of green: red², green², blue² without camera noise, and red green, red blue, green blue.
     greens : (h, w) float64
@@ -65,8 +65,8 @@ class Moments:
 
     mean: FloatImage
     contrast: FloatImage
-    own: FloatArray
-    shared: FloatArray
+    variance: FloatArray
+    covariance: FloatArray
     greens: FloatArray
     noise: FloatArray
     red: tuple[int, int]
@@ -80,7 +80,7 @@ class Moments:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ColourFactors:
-    """How each channel sees the common texture, on a grid of `BLOCK` px.
+    """The slopes of channels and lights on the common texture, and what they show beside it, on a grid of `BLOCK` px.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class ColourFactors:
         Variance of the camera noise, relative to alpha_c².
     light_slope, light_specific : (k, h, w) float64
         The same of the lights.
-    seen : (4, k) float64
+    light_fraction : (4, k) float64
         Fraction of each light in the slope of each site's channel, over the frame.
     """
 
@@ -101,7 +101,7 @@ class ColourFactors:
     noise: FloatArray
     light_slope: FloatArray
     light_specific: FloatArray
-    seen: FloatArray
+    light_fraction: FloatArray
 
     @property
     def spread(self) -> FloatArray:
@@ -137,7 +137,7 @@ def gather_moments(
     """
     mean = local_means(values, red)
     contrast = np.empty_like(values)
-    kernels.subtract_mean(values, of_mosaic(mean, MEAN_BLOCK, values.shape[1], red), MEAN_BLOCK, contrast)
+    kernels.subtract_mean(values, interleave_bayer(mean, MEAN_BLOCK, values.shape[1], red), MEAN_BLOCK, contrast)
     height, width = (-(-side // BLOCK) for side in values.shape)
     to_lights = np.asarray(np.linalg.pinv(model.sites), dtype=np.float64)
     half = (values.shape[0] // 2, values.shape[1] // 2)
@@ -147,7 +147,7 @@ def gather_moments(
     moments = _channel_moments(by_site)
     if not model.in_register:
         by_light = _transformed(to_lights, by_site)
-        apart = _transformed(model.sites, by_light)
+        unregistered = _transformed(model.sites, by_light)
         if model.displacement.any():
             registered = np.empty_like(lights)
             kernels.register_planes(lights, model.displacement / 2, lanczos_weights(), registered)
@@ -155,20 +155,20 @@ def gather_moments(
             if texture is not None:
                 by_light /= model.registered_energy(texture)
         rows = model.matrix[list(CHANNEL)]
-        moments += _channel_moments(_transformed(rows, by_light) - apart)
+        moments += _channel_moments(_transformed(rows, by_light) - unregistered)
     level = [cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in channel_means(mean)]
-    variance = np.zeros((3, height, width))
+    noise_variance = np.zeros((3, height, width))
     if noise is not None:
-        variance = np.asarray(noise.variance(np.stack(level).astype(np.float64)))
+        noise_variance = np.asarray(noise.variance(np.stack(level).astype(np.float64)))
     # where nothing is seen but noise, a third of it stands for the contrast that there may be
-    floor = np.maximum(variance * (WHITE_ENERGY / 3), 1e-6 * moments[:3].max() + 1e-12)
+    floor = np.maximum(noise_variance * (WHITE_ENERGY / 3), 1e-6 * moments[:3].max() + 1e-12)
     return Moments(
         mean=mean,
         contrast=contrast,
-        own=np.maximum(moments[:3] - variance * WHITE_ENERGY, floor),
-        shared=moments[3:6],
+        variance=np.maximum(moments[:3] - noise_variance * WHITE_ENERGY, floor),
+        covariance=moments[3:6],
         greens=moments[6],
-        noise=variance,
+        noise=noise_variance,
         red=red,
         lights=lights,
     )
@@ -192,19 +192,19 @@ def _second_moments(planes: FloatImage, grid: tuple[int, int]) -> FloatArray:
     return np.asarray(moments[np.maximum(pairs, pairs.T)])
 
 
-def enlarged(grid: npt.NDArray[np.floating], block: int, shape: tuple[int, ...], step: int = 1) -> FloatImage:
+def upsample(grid: npt.NDArray[np.floating], block: int, shape: tuple[int, ...], step: int = 1) -> FloatImage:
     """Interpolate a grid (n, h, w) of blocks to every `step`-th pixel of a frame of `shape` (H, W)."""
-    wide = widened(grid, block, shape[1])[:, :, ::step]
-    place = np.clip((np.arange(0, shape[0], step) + 0.5) / block - 0.5, 0, grid.shape[1] - 1)
-    low = place.astype(np.intp)
-    part = (place - low).astype(np.float32)[:, None]
+    wide = upsample_rows(grid, block, shape[1])[:, :, ::step]
+    position = np.clip((np.arange(0, shape[0], step) + 0.5) / block - 0.5, 0, grid.shape[1] - 1)
+    low = position.astype(np.intp)
+    fraction = (position - low).astype(np.float32)[:, None]
     above, below = wide[:, low], wide[:, np.minimum(low + 1, grid.shape[1] - 1)]
     below -= above
-    below *= part
+    below *= fraction
     return np.asarray(np.add(above, below, out=below))
 
 
-def widened(grid: npt.NDArray[np.floating], block: int, columns: int) -> FloatImage:
+def upsample_rows(grid: npt.NDArray[np.floating], block: int, columns: int) -> FloatImage:
     """Interpolate the rows of a grid (n, h, w) of blocks to the columns of a frame, (n, h, W)."""
     out = np.empty((*grid.shape[:2], columns), dtype=np.float32)
     for layer, wide in zip(grid, out, strict=True):
@@ -213,12 +213,12 @@ def widened(grid: npt.NDArray[np.floating], block: int, columns: int) -> FloatIm
     return out
 
 
-def of_mosaic(grid: npt.NDArray[np.floating], block: int, columns: int, red: tuple[int, int]) -> FloatImage:
+def interleave_bayer(grid: npt.NDArray[np.floating], block: int, columns: int, red: tuple[int, int]) -> FloatImage:
     """Interpolate a grid (4, h, w) of the sites to the columns of a mosaic, for its even and odd rows, (2, h, W).
 
     At each column it is the grid of the site there. A grid (3, h, w) is of the channels.
     """
-    wide = widened(grid, block, columns)
+    wide = upsample_rows(grid, block, columns)
     out = np.empty((2, *wide.shape[1:]), dtype=np.float32)
     for site, plane in enumerate(_planes(red)):
         row, column = divmod(plane, 2)
@@ -234,8 +234,8 @@ def local_means(values: FloatImage, red: tuple[int, int]) -> FloatImage:
     means = _smooth(sums[:4][order], sums[4:][order], MEAN_WIDTH / MEAN_BLOCK)
     for plane, mean in zip(order, means, strict=True):  # from the middle of a site's samples to that of the block
         row, column = np.array(divmod(plane, 2)) - 0.5
-        there = np.array([[1, 0, -column / MEAN_BLOCK], [0, 1, -row / MEAN_BLOCK]])
-        mean[:] = cv2.warpAffine(mean, there, mean.shape[::-1], flags=_BETWEEN, borderMode=cv2.BORDER_REPLICATE)
+        shift = np.array([[1, 0, -column / MEAN_BLOCK], [0, 1, -row / MEAN_BLOCK]])
+        mean[:] = cv2.warpAffine(mean, shift, mean.shape[::-1], flags=_BETWEEN, borderMode=cv2.BORDER_REPLICATE)
     return means
 
 
@@ -271,8 +271,8 @@ def _smooth(sums: FloatImage, counts: FloatImage, sigma: float) -> FloatImage:
 
     weights = np.broadcast_to([smooth(number) for number in counts], sums.shape)
     out, enough = np.empty_like(sums), weights > 1e-3 * np.maximum(counts.max(axis=(1, 2), keepdims=True), 1)
-    for total, weight, known, target in zip(sums, weights, enough, out, strict=True):
-        np.divide(smooth(total), weight, out=target, where=known)
+    for total, weight, has_entries, target in zip(sums, weights, enough, out, strict=True):
+        np.divide(smooth(total), weight, out=target, where=has_entries)
     if not enough.all():
         overall = sums.sum(axis=(1, 2)) / np.maximum(counts.sum(axis=(1, 2)), 1)
         np.copyto(out, overall[:, None, None], where=~enough)
@@ -281,12 +281,12 @@ def _smooth(sums: FloatImage, counts: FloatImage, sigma: float) -> FloatImage:
 
 def learn_texture(moments: Moments, model: MosaicModel, *, samples: int = 80_000) -> TextureModel:
     """Learn the texture of a specimen from one mosaic; about `samples` pixels are looked at."""
-    root = np.sqrt(moments.own)
-    padded = scaled(moments, (1 / root).astype(np.float32), pad=0)
-    local = np.stack([moments.shared[n] / (root[a] * root[b]) for n, (a, b) in enumerate(PAIRS)])
+    root = np.sqrt(moments.variance)
+    padded = normalise_contrast(moments, (1 / root).astype(np.float32), pad=0)
+    local = np.stack([moments.covariance[n] / (root[a] * root[b]) for n, (a, b) in enumerate(PAIRS)])
     # red and blue, diagonal neighbours as the two greens, lack 1.85 to 1.95 times as much; the best pair of each place
     # is free of reflections, and of the specimen's colour where it is the greens
-    greens = moments.greens / moments.own[1]
+    greens = moments.greens / moments.variance[1]
     lacking = np.min([1 - local[0], (1 - local[1]) / 1.9, 1 - local[2], (1 - greens) / 1.9], axis=0)
     # whole blocks, of some 64 px at least
     extent = float(np.ptp(model.displacement, axis=(2, 3)).max())
@@ -304,7 +304,7 @@ def learn_texture(moments: Moments, model: MosaicModel, *, samples: int = 80_000
         counts=counts,
         correlations=np.array(correlations),
         displacement=np.array(displacement),
-        seen=channel_means(model.seen(_light_levels(moments, model))),
+        light_fraction=channel_means(model.light_fraction(_light_levels(moments, model))),
     )
     return fit_texture(products, 1 - float(np.median(lacking)))
 
@@ -315,11 +315,11 @@ def _light_levels(moments: Moments, model: MosaicModel) -> FloatArray:
     return np.asarray(np.maximum(levels, FAINTEST * levels.max()))
 
 
-def scaled(moments: Moments, scale: FloatImage, *, pad: int, width: int | None = None) -> FloatImage:
+def normalise_contrast(moments: Moments, scale: FloatImage, *, pad: int, width: int | None = None) -> FloatImage:
     """Return contrast times `scale` (3, h, w), mirrored by `pad` px; `width` asks for more columns, which are 0."""
     rows, columns = moments.contrast.shape
     out = np.empty((rows + 2 * pad, max(columns, width or 0) + 2 * pad), dtype=np.float32)
-    kernels.scaled_contrast(moments.contrast, of_mosaic(scale, BLOCK, columns, moments.red), BLOCK, pad, out)
+    kernels.scaled_contrast(moments.contrast, interleave_bayer(scale, BLOCK, columns, moments.red), BLOCK, pad, out)
     return out
 
 
@@ -342,31 +342,31 @@ def colour_factors(moments: Moments, texture: TextureModel, model: MosaicModel) 
     """
     crosstalk, band = model.matrix, texture.band
     energy = np.array([band.adjacent, band.diagonal, band.adjacent])[:, None, None]
-    own = moments.own / band.own
-    sparkle = np.zeros_like(own)
+    channel_variance = moments.variance / band.same
+    sparkle = np.zeros_like(channel_variance)
     # own moment beyond the common one, relative to it, that the aliasing of the coarse colour lattices may cause
     allowed = 0.05 * (1 - texture.specific)
-    least_shared = 1e-4 * own.min(axis=0)
+    least_shared = 1e-4 * channel_variance.min(axis=0)
     to_lights, to_pairs = np.linalg.pinv(crosstalk**2), np.stack([crosstalk[a] * crosstalk[b] for a, b in PAIRS])
     for _ in range(2):  # the correction is small and settles at once
         # moments of two channels that come from the sparkle of lights, given each channel's own
         leaked = np.tensordot(to_pairs, np.maximum(np.tensordot(to_lights, sparkle, axes=1), 0), axes=1)
-        red_green, red_blue, green_blue = np.maximum((moments.shared - leaked) / energy, least_shared)
+        red_green, red_blue, green_blue = np.maximum((moments.covariance - leaked) / energy, least_shared)
         square = np.stack(
             [red_green * red_blue / green_blue, red_green * green_blue / red_blue, red_blue * green_blue / red_green]
         )
-        square = np.minimum(square, own)
-        excess = own / square
-        least = excess.min(axis=0)
+        square = np.minimum(square, channel_variance)
+        excess = channel_variance / square
+        min_excess = excess.min(axis=0)
         # at least one channel is free of reflections at each place, unless it shows too much of its own for that
-        specific = excess - least + np.maximum(least - 1 - allowed, 0)
-        sparkle = specific * square * band.own
+        specific = excess - min_excess + np.maximum(min_excess - 1 - allowed, 0)
+        sparkle = specific * square * band.same
     # as if all of it were sparkle: a specimen's colour lies within the band and is trusted too little, the safe side;
     # the window cannot tell .003 from none
-    variance = np.maximum(specific * (band.own / WHITE_ENERGY) - 0.003, 0)
+    variance = np.maximum(specific * (band.same / WHITE_ENERGY) - 0.003, 0)
     lights = np.maximum(np.tensordot(to_lights, variance * square, axes=1), 0)
     # every channel sees at least what its crosstalk lets through of the lights that sparkle
-    variance = np.maximum(variance, np.tensordot(crosstalk**2, lights, axes=1) / square) + LEAST
+    variance = np.maximum(variance, np.tensordot(crosstalk**2, lights, axes=1) / square) + MIN_SPECIFIC
     slope = np.sqrt(square)
     light_slope = np.tensordot(np.linalg.pinv(crosstalk), slope, axes=1)
     least_slope = np.maximum(light_slope, FAINTEST * light_slope.max(axis=0))
@@ -375,6 +375,6 @@ def colour_factors(moments: Moments, texture: TextureModel, model: MosaicModel) 
         specific=variance,
         noise=moments.noise / square,
         light_slope=light_slope,
-        light_specific=lights / least_slope**2 + LEAST,
-        seen=model.seen(np.median(least_slope, axis=(1, 2))),
+        light_specific=lights / least_slope**2 + MIN_SPECIFIC,
+        light_fraction=model.light_fraction(np.median(least_slope, axis=(1, 2))),
     )

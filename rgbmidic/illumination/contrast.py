@@ -31,7 +31,7 @@ class ContrastConstants:
     shade
         Fraction of the brightness of the brightest tenth below which an image is dark. Chosen: the background of the
         DIC Challenge's open-hole specimen has 0.1; the parts of a specimen that are lit less keep their contrast.
-    hidden
+    max_hidden_fraction
         Fraction of the region that no light shows from which a warning is given; chosen.
     """
 
@@ -39,7 +39,7 @@ class ContrastConstants:
     speckles: float = 2.5
     blind: float = 0.5
     shade: float = 0.25
-    hidden: float = 0.01
+    max_hidden_fraction: float = 0.01
 
 
 CONTRAST = ContrastConstants()
@@ -58,13 +58,13 @@ class LocalContrast:
         Local mean, DN.
     contrast : ndarray, shape (k, H, W), float32
         Local standard deviation in units of that mean, 0 where the light is dark or unknown.
-    lit : ndarray, shape (k, H, W), bool
+    bright : ndarray, shape (k, H, W), bool
         Where the paint around is as bright as in the rest of the image.
     """
 
     level: FloatImage
     contrast: FloatImage
-    lit: BoolArray
+    bright: BoolArray
 
     @classmethod
     def of(
@@ -79,34 +79,36 @@ class LocalContrast:
         size = CONTRAST.speckles * np.median(sizes) if sizes else 0.0
         window = float(np.clip(size, *CONTRAST.contrast_widths))
         level, contrast = np.zeros((2, *images.values.shape), dtype=np.float32)
-        lit = np.zeros(images.values.shape, dtype=bool)
+        is_bright = np.zeros(images.values.shape, dtype=bool)
         closing = np.ones((round(window), round(window)), dtype=np.uint8)  # wider than dark speckle
-        for image, mean, relative, bright in zip(images.values, level, contrast, lit, strict=True):
+        for image, mean, relative, bright in zip(images.values, level, contrast, is_bright, strict=True):
             filled = np.nan_to_num(image, nan=images.full_scale)  # what is not known is saturated
             paint = cv2.morphologyEx(filled, cv2.MORPH_CLOSE, closing)
             bright[:] = paint >= CONTRAST.shade * np.quantile(paint[inside], 0.9)
             core = cv2.erode((~bright).astype(np.uint8), closing) > 0  # without the blurred rim of what is lit
-            for part, sampled in ((bright, bright), (~bright, core)):
-                if not part.any():
+            for region, sampled in ((bright, bright), (~bright, core)):
+                if not region.any():
                     continue
                 values = np.where(sampled, image, np.float32(np.nan))
-                mean[part] = np.nan_to_num(local_mean(values, window))[part]
+                mean[region] = np.nan_to_num(local_mean(values, window))[region]
                 square = local_mean(values**2, window)
-                seen = part & np.isfinite(image) & (mean > DARK * images.full_scale)
-                variance = square[seen] - mean[seen] ** 2
+                usable = region & np.isfinite(image) & (mean > DARK * images.full_scale)
+                variance = square[usable] - mean[usable] ** 2
                 if sampled is core and noise is None:
                     steps = np.diff(values, axis=1, append=np.float32(np.nan))
-                    variance -= local_mean(steps**2, window)[seen] / 2
+                    variance -= local_mean(steps**2, window)[usable] / 2
                 elif sampled is core and noise is not None:
-                    variance -= noise.variance(mean[seen])
-                relative[seen] = np.sqrt(np.maximum(variance, 0)) / mean[seen]
-        return cls(level=level, contrast=contrast, lit=lit)
+                    variance -= noise.variance(mean[usable])
+                relative[usable] = np.sqrt(np.maximum(variance, 0)) / mean[usable]
+        return cls(level=level, contrast=contrast, bright=is_bright)
 
-    def hidden(self, inside: BoolArray) -> BoolArray:
-        """Where (H, W) no light has half the contrast that is usual in the lit part of the region."""
-        best, lit = self.contrast.max(axis=0), inside & self.lit.any(axis=0)
-        return np.asarray(best < CONTRAST.blind * np.quantile(best[lit if lit.any() else inside], 0.9))
+    def low_contrast(self, inside: BoolArray) -> BoolArray:
+        """Return a mask (H, W) of pixels where no light has half the contrast usual in the lit part of `inside`."""
+        best, bright_region = self.contrast.max(axis=0), inside & self.bright.any(axis=0)
+        return np.asarray(
+            best < CONTRAST.blind * np.quantile(best[bright_region if bright_region.any() else inside], 0.9)
+        )
 
     def background(self, inside: BoolArray) -> BoolArray:
-        """Where (H, W) there is neither texture nor light: nothing can be measured."""
-        return np.asarray(self.hidden(inside) & ~self.lit.any(axis=0))
+        """Return the mask (H, W) of pixels with neither texture nor light: nothing can be measured."""
+        return np.asarray(self.low_contrast(inside) & ~self.bright.any(axis=0))

@@ -65,7 +65,7 @@ def legendre_products(points: npt.ArrayLike, shape: tuple[int, int], order: int)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CrosstalkField:
-    """How the crosstalk matrix departs from its mean over the field.
+    """The polynomial by which the crosstalk matrix departs from its mean over the field.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class CrosstalkField:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Crosstalk:
-    """How strongly each camera channel sees each light.
+    """The matrix of how strongly each camera channel sees each light.
 
     Attributes
     ----------
@@ -378,10 +378,10 @@ class Sensitivities:
         """
         import colour
 
-        known = colour.MSDS_CAMERA_SENSITIVITIES
-        if name not in known:
-            raise InputError(f"unknown camera {name!r}; colour-science has {', '.join(sorted(known))}")
-        camera = known[name]
+        cameras = colour.MSDS_CAMERA_SENSITIVITIES
+        if name not in cameras:
+            raise InputError(f"unknown camera {name!r}; colour-science has {', '.join(sorted(cameras))}")
+        camera = cameras[name]
         return cls(wavelengths=camera.wavelengths, values=np.maximum(camera.values.T, 0))
 
     @classmethod
@@ -519,14 +519,14 @@ def unmix(channels: LinearChannels, crosstalk: Crosstalk, *, negligible: float =
         np.ascontiguousarray(channels.valid, dtype=bool),
         grid,
         step,
-        needed(crosstalk.unmixing, negligible),
+        required_channels(crosstalk.unmixing, negligible),
         values,
         valid,
     )
     return IlluminationImages(values=values, valid=valid, names=crosstalk.lights, full_scale=channels.full_scale)
 
 
-def needed(matrix: FloatArray, negligible: float = NEGLIGIBLE) -> BoolArray:
+def required_channels(matrix: FloatArray, negligible: float = NEGLIGIBLE) -> BoolArray:
     """Find the channels that must be valid for each light that ``matrix @ channels`` gives.
 
     Parameters
@@ -567,8 +567,8 @@ def align(images: IlluminationImages) -> IlluminationImages:
         bspline_coefficients(fill_holes(image), spline)
         near_hole = cv2.dilate(np.isnan(image).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         for top in range(0, height, rows):
-            part = values[light, top : top + rows]
-            y, x = np.mgrid[top : top + len(part), :width].reshape(2, -1).astype(np.float64)
+            strip = values[light, top : top + rows]
+            y, x = np.mgrid[top : top + len(strip), :width].reshape(2, -1).astype(np.float64)
             shift = registration.displacement(np.stack([x, y], axis=1) + images.origin)[light].T
             if np.abs(shift).max() > 0.002:  # px: a fifth of the noise floor of DIC in good images, .01 px
                 x, y = x + shift[0], y + shift[1]
@@ -577,5 +577,5 @@ def align(images: IlluminationImages) -> IlluminationImages:
                 inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
                 row, column = (np.round(np.where(inside, at, 0)).astype(np.intp) for at in (y, x))
                 usable = inside & ~near_hole[row, column]
-                part[:] = np.where(usable, sampled[0], np.float32(np.nan)).reshape(part.shape)
+                strip[:] = np.where(usable, sampled[0], np.float32(np.nan)).reshape(strip.shape)
     return replace(images, values=values, valid=np.isfinite(values), registration=None)

@@ -35,14 +35,14 @@ from rgbmidic.illumination.colour_factors import (
     ColourFactors,
     Moments,
     colour_factors,
-    enlarged,
     gather_moments,
     learn_texture,
     local_means,
-    scaled,
-    widened,
+    normalise_contrast,
+    upsample,
+    upsample_rows,
 )
-from rgbmidic.illumination.crosstalk import Crosstalk, needed
+from rgbmidic.illumination.crosstalk import Crosstalk, required_channels
 from rgbmidic.illumination.displacement import LightDisplacement, light_displacement
 from rgbmidic.illumination.images import Registration
 from rgbmidic.illumination.linear import LinearChannels, LinearMosaic
@@ -69,8 +69,8 @@ def malvar_demosaic(mosaic: LinearMosaic) -> LinearChannels:
     IEEE ICASSP 2004, figure 2.
     """
     values = np.empty((3, *mosaic.values.shape), dtype=np.float32)
-    known = np.where(mosaic.saturated, np.float32(np.nan), mosaic.values)
-    padded = cv2.copyMakeBorder(known, PAD, PAD, PAD, PAD, cv2.BORDER_REFLECT_101)
+    samples = np.where(mosaic.saturated, np.float32(np.nan), mosaic.values)
+    padded = cv2.copyMakeBorder(samples, PAD, PAD, PAD, PAD, cv2.BORDER_REFLECT_101)
     malvar(padded, *red_position(mosaic.cfa), values)
     return LinearChannels(values=values, valid=np.isfinite(values), full_scale=mosaic.full_scale)
 
@@ -82,9 +82,9 @@ def normalised_demosaic(mosaic: LinearMosaic) -> LinearChannels:
     beat. A channel in a reflection has less contrast and leaves a pattern.
     """
     values = np.where(mosaic.saturated, np.float32(np.nan), mosaic.values)
-    level = enlarged(channel_means(local_means(values, red_position(mosaic.cfa))), MEAN_BLOCK, values.shape)
-    own = np.take_along_axis(level, sampled_channels(mosaic.cfa, values.shape)[None], axis=0)[0]
-    out = level * np.divide(values, own, out=np.full_like(values, np.nan), where=own > 0)
+    level = upsample(channel_means(local_means(values, red_position(mosaic.cfa))), MEAN_BLOCK, values.shape)
+    sampled_level = np.take_along_axis(level, sampled_channels(mosaic.cfa, values.shape)[None], axis=0)[0]
+    out = level * np.divide(values, sampled_level, out=np.full_like(values, np.nan), where=sampled_level > 0)
     return LinearChannels(values=out, valid=np.isfinite(out), full_scale=mosaic.full_scale)
 
 
@@ -167,36 +167,36 @@ def reconstruct(
         )
     if mosaic.saturated.any():
         values = np.where(mosaic.saturated, np.float32(np.nan), values)
-    model, learnt = MosaicModel.of(crosstalk, registration, values.shape), texture
+    model, fitted_texture = MosaicModel.of(crosstalk, registration, values.shape), texture
     gather = partial(gather_moments, values, red_position(mosaic.cfa), mosaic.noise, model)
     moments = gather(texture)
-    if learnt is None:
-        learnt = learn_texture(moments, model)
+    if fitted_texture is None:
+        fitted_texture = learn_texture(moments, model)
         if model.displacement.any():  # what the lattices cannot see of displaced lights follows from a first texture
-            learnt = learn_texture(gather(learnt), model)
-            moments = gather(learnt)
-    factors = colour_factors(moments, learnt, model)
-    displacement = light_displacement(moments, factors, learnt, model)
+            fitted_texture = learn_texture(gather(fitted_texture), model)
+            moments = gather(fitted_texture)
+    factors = colour_factors(moments, fitted_texture, model)
+    displacement = light_displacement(moments, factors, fitted_texture, model)
     glints = displacement.significant
-    if learnt.specific >= COLOURED:
+    if fitted_texture.specific >= COLOURED:
         # a coloured specimen has no texture in common that could tell how the channels see the lights
         model = MosaicModel.of(None, None, values.shape)
-        factors = colour_factors(moments, learnt, model)
+        factors = colour_factors(moments, fitted_texture, model)
         displacement, glints = displacement.without_glints, np.zeros_like(glints)
     frame = _Frame(mosaic=mosaic, model=model, moments=moments, factors=factors, glints=_per_tile(glints))
-    if texture is None and learnt.specific < COLOURED:
-        learnt = replace(learnt, common=frame.shows_common_texture(learnt))
+    if texture is None and fitted_texture.specific < COLOURED:
+        fitted_texture = replace(fitted_texture, common=frame.shows_common_texture(fitted_texture))
     mixing = np.eye(3) if mixing is None else mixing
-    if learnt.common:
-        channels = frame.predicted(learnt, mixing, tables)
+    if fitted_texture.common:
+        channels = frame.predicted(fitted_texture, mixing, tables)
     else:
         by_channel = malvar_demosaic(mosaic)
         out = np.tensordot(mixing, by_channel.values, axes=1).astype(np.float32)
-        valid = np.stack([by_channel.valid[matters].all(axis=0) for matters in needed(mixing)])
+        valid = np.stack([by_channel.valid[matters].all(axis=0) for matters in required_channels(mixing)])
         channels = LinearChannels(values=out, valid=valid, full_scale=mosaic.full_scale)
     return Reconstruction(
         channels=channels,
-        texture=learnt,
+        texture=fitted_texture,
         factors=factors,
         mean=moments.channel_mean,
         displacement=displacement,
@@ -225,35 +225,37 @@ class _Frame:
         if self.mosaic.saturated.any():
             source, unknown = padded.copy(), np.zeros(padded.shape, dtype=bool)
             fill_unknown(source, _per_tile(1 / (1 + self.factors.specific)), *self.moments.red, pad, padded, unknown)
-            known = _validity(self.mosaic.saturated, unknown[pad : pad + rows, pad : pad + columns], self.mosaic.cfa)
-            valid = np.stack([known[matters].all(axis=0) for matters in needed(mixing)])
-        scale = widened(self.factors.spread, BLOCK, columns)
-        mean = widened(self.moments.channel_mean, MEAN_BLOCK, columns)
+            channel_valid = _validity(
+                self.mosaic.saturated, unknown[pad : pad + rows, pad : pad + columns], self.mosaic.cfa
+            )
+            valid = np.stack([channel_valid[matters].all(axis=0) for matters in required_channels(mixing)])
+        scale = upsample_rows(self.factors.spread, BLOCK, columns)
+        mean = upsample_rows(self.moments.channel_mean, MEAN_BLOCK, columns)
         predict(padded, index, taps, size, scale, BLOCK, mean, MEAN_BLOCK, mixing.astype(np.float32), out)
         return LinearChannels(values=out, valid=valid, full_scale=self.mosaic.full_scale)
 
     def shows_common_texture(self, texture: TextureModel) -> bool:
-        """Whether samples are predicted no worse from what was found to be common than if each light had half its own.
+        """Tell whether samples are predicted no worse by the common texture found than if each light had half its own.
 
         By leaving each sample out in turn (Rasmussen and Williams, Gaussian processes, 2006, section 5.4.2).
         """
-        found = self.factors.light_specific
-        half = self._left_out_error(texture, np.maximum(found, 1.0))
-        return self._left_out_error(texture, found) <= CONTRADICTED * half
+        specific = self.factors.light_specific
+        half = self._left_out_error(texture, np.maximum(specific, 1.0))
+        return self._left_out_error(texture, specific) <= CONTRADICTED * half
 
     def _left_out_error(self, texture: TextureModel, specific: FloatArray) -> float:
         """Mean square error of samples that are left out, each over its channel's variance."""
         index, taps, size = self._filters(texture, specific, left_out=True)
         padded, pad, (rows, columns) = self._contrast(index.shape[1], size), size // 2, self.mosaic.values.shape
-        ones, zeros = (np.full((3, 1, columns), level, np.float32) for level in (1, 0))
+        unit_scale, zero_mean = (np.full((3, 1, columns), level, np.float32) for level in (1, 0))
         out = np.empty((3, rows, columns), dtype=np.float32)
-        predict(padded, index, taps, size, ones, rows, zeros, rows, np.eye(3, dtype=np.float32), out)
+        predict(padded, index, taps, size, unit_scale, rows, zero_mean, rows, np.eye(3, dtype=np.float32), out)
         site = sampled_channels(self.mosaic.cfa, (rows, columns))
         sample = padded[pad : pad + rows, pad : pad + columns]
         difference = np.take_along_axis(out, site[None], axis=0)[0] - sample
         finite = np.isfinite(difference)
-        squares = ([(part[finite & (site == c)] ** 2).sum() for c in range(3)] for part in (difference, sample))
-        return float(sum(error / max(whole, 1e-12) for error, whole in zip(*squares, strict=True)))
+        squares = ([(plane[finite & (site == c)] ** 2).sum() for c in range(3)] for plane in (difference, sample))
+        return float(sum(error / max(signal, 1e-12) for error, signal in zip(*squares, strict=True)))
 
     def _filters(
         self,
@@ -268,7 +270,7 @@ class _Frame:
             _per_tile(self.factors.noise),
             texture,
             self.mosaic.cfa,
-            seen=self.factors.seen,
+            light_fraction=self.factors.light_fraction,
             displacement=_per_tile(self.model.displacement),
             glints=self.glints,
             tables=tables,
@@ -278,7 +280,7 @@ class _Frame:
     def _contrast(self, tiles: int, size: int) -> FloatImage:
         """Return the samples' contrast over its spread, padded for filters of a side; NaN where saturated."""
         spread = self.factors.spread.astype(np.float32)
-        return scaled(self.moments, np.float32(1) / spread, pad=size // 2, width=tiles * TILE)
+        return normalise_contrast(self.moments, np.float32(1) / spread, pad=size // 2, width=tiles * TILE)
 
 
 def _per_tile(grid: FloatArray) -> FloatArray:
@@ -286,8 +288,8 @@ def _per_tile(grid: FloatArray) -> FloatArray:
     ratio = TILE // BLOCK
     missing = [*[(0, 0)] * (grid.ndim - 2), *((0, -side % ratio) for side in grid.shape[-2:])]
     padded = np.pad(grid, missing, mode="edge") if np.any(missing) else grid
-    parts = [padded[..., row::ratio, column::ratio] for row, column in np.ndindex(ratio, ratio)]
-    return np.asarray(sum(parts) / ratio**2)
+    sublattices = [padded[..., row::ratio, column::ratio] for row, column in np.ndindex(ratio, ratio)]
+    return np.asarray(sum(sublattices) / ratio**2)
 
 
 def _validity(saturated: BoolArray, unknown: BoolArray, cfa: str) -> BoolArray:
@@ -295,5 +297,5 @@ def _validity(saturated: BoolArray, unknown: BoolArray, cfa: str) -> BoolArray:
     site = sampled_channels(cfa, saturated.shape)
     near = np.ones((3, 3), np.uint8)
     wide = cv2.dilate(unknown.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
-    own = [cv2.dilate((saturated & (site == c)).astype(np.uint8), near).astype(bool) for c in range(3)]
-    return np.stack([~(mask | wide) for mask in own])
+    near_saturated = [cv2.dilate((saturated & (site == c)).astype(np.uint8), near).astype(bool) for c in range(3)]
+    return np.stack([~(mask | wide) for mask in near_saturated])

@@ -6,8 +6,8 @@ The difference of each light's low-passed plane from the mean of the others, all
 they show the texture, is regressed on the gradient of that mean. What is smooth over the whole field is not glints but
 lateral colour beyond the registration (`LightDisplacement.lateral`).
 
-Which of several lights shows the texture where it is, is a question of agreement (`agreement`): a light counts by its
-precision and by the precision of the others that show it at the same place.
+Which of several lights shows the texture where it is, is a question of agreement (`consensus_weights`): a light counts
+by its precision and by the precision of the others that show it at the same place.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from rgbmidic._kernels.texture import CELLS, displacement_scores
-from rgbmidic.illumination.colour_factors import ColourFactors, Moments, widened
+from rgbmidic.illumination.colour_factors import ColourFactors, Moments, upsample_rows
 from rgbmidic.illumination.images import frame_geometry, registration_basis
 from rgbmidic.illumination.mosaic_model import BLOCK, FAINTEST, MosaicModel
 from rgbmidic.illumination.texture import TextureModel
@@ -97,15 +97,15 @@ class LightDisplacement:
         return fields
 
 
-def agreement(
+def consensus_weights(
     displacement: FloatArray,
     variance: FloatArray,
     precision: FloatArray,
     *,
     harmless: float = 0.03,
-    alone: float = 0.1,
+    consistency_floor: float = 0.1,
 ) -> tuple[FloatArray, FloatArray]:
-    """How far lights are to be believed about a place, and how far those that are agree with another one.
+    """Weigh the lights by their precision and their agreement, and return how consistent those with weight are.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def agreement(
     harmless
         Distance (px) of two lights at which each counts half for the other. Half and twice of it change the error of
         raised droplets by 2 % at most (benchmarks/reflections.py).
-    alone
+    consistency_floor
         What a light with which no other agrees counts: the square of it is its weight against lights that agree.
 
     Returns
@@ -126,19 +126,19 @@ def agreement(
     tuple of ndarray, shape (k, h, w) and (h, w)
         Weights of the lights, their sum 1; the weighted mean, 0 to 1, of how far each agrees with its nearest.
     """
-    believed = precision / np.maximum(precision.sum(axis=0), 1e-30)
-    alike, nearest = np.zeros_like(believed), np.zeros_like(believed)
-    lights = range(len(believed))
+    precision_fraction = precision / np.maximum(precision.sum(axis=0), 1e-30)
+    consistency, nearest = np.zeros_like(precision_fraction), np.zeros_like(precision_fraction)
+    lights = range(len(precision_fraction))
     for light in lights:
-        for other in lights:
-            if other != light:
-                apart = ((displacement[light] - displacement[other]) ** 2).sum(axis=0)
-                beyond = np.maximum(apart - 2 * (variance[light] + variance[other]), 0)
-                near = 1 / (1 + beyond / harmless**2)
-                alike[light] += believed[other] * near
+        for other_light in lights:
+            if other_light != light:
+                square_distance = ((displacement[light] - displacement[other_light]) ** 2).sum(axis=0)
+                excess = np.maximum(square_distance - 2 * (variance[light] + variance[other_light]), 0)
+                near = 1 / (1 + excess / harmless**2)
+                consistency[light] += precision_fraction[other_light] * near
                 nearest[light] = np.maximum(nearest[light], near)
-        alike[light] /= np.maximum(1 - believed[light], 1e-6)
-    weights = believed * (alone + alike) ** 2
+        consistency[light] /= np.maximum(1 - precision_fraction[light], 1e-6)
+    weights = precision_fraction * (consistency_floor + consistency) ** 2
     weights /= np.maximum(weights.sum(axis=0), 1e-30)
     return weights, (weights * nearest).sum(axis=0)
 
@@ -162,22 +162,24 @@ def light_displacement(
     count, width = len(moments.lights), moments.lights.shape[2]
     # the binomial weights of a plane sum to 256
     slope = 256 * np.maximum(factors.light_slope, FAINTEST * factors.light_slope.max())
-    scale = widened(slope, CELLS, width)
+    scale = upsample_rows(slope, CELLS, width)
     sums = np.empty((count, 3, *slope.shape[1:]), dtype=np.float32)
     displacement_scores(moments.lights, scale, CELLS, sums)
     blocks = window / BLOCK
-    around = np.array([[_window_sums(grid, blocks) for grid in one] for one in sums], dtype=np.float64)
-    information = around[:, 2:] + 1e-12
-    found = around[:, :2] / information
+    window_sums = np.array(
+        [[_window_sums(grid, blocks) for grid in light_sums] for light_sums in sums], dtype=np.float64
+    )
+    information = window_sums[:, 2:] + 1e-12
+    estimate = window_sums[:, :2] / information
     # by the scatter of the blocks' scores, which are nearly independent
-    scatter = ((sums[:, :2] - found * sums[:, 2:]) ** 2).mean(axis=1).astype(np.float32)
+    scatter = ((sums[:, :2] - estimate * sums[:, 2:]) ** 2).mean(axis=1).astype(np.float32)
     chance = np.array([_window_sums(grid, blocks / np.sqrt(2)) for grid in scatter]) / (4 * np.pi * blocks**2)
     # cells of 2 px; a light against the mean of all, not of the others
     unit = 2 / texture.gradient_gain * (count - 1) / count
     std = unit * np.sqrt(np.maximum(chance, 1e-12)) / information[:, 0]
-    found = unit * found - _at_rest(moments.red, factors, texture, model)[:, :, None, None]
+    estimate = unit * estimate - _at_rest(moments.red, factors, texture, model)[:, :, None, None]
     # a single light lies at the mean of all, exactly
-    return LightDisplacement(values=found - found.mean(axis=0), std=np.maximum(std, LEAST_STD))
+    return LightDisplacement(values=estimate - estimate.mean(axis=0), std=np.maximum(std, LEAST_STD))
 
 
 def _window_sums(grid: FloatImage, sigma: float) -> FloatImage:

@@ -75,8 +75,8 @@ class _Samples:
     @property
     def middle(self) -> tuple[slice, ...]:
         """At most 288 x 288 samples in the middle, from even ones on: 4 planes of them are looked at in 30 ms."""
-        most = 288
-        return tuple(slice(max(side - most, 0) // 4 * 2, (side + most) // 2) for side in self.stored.shape[1:])
+        max_side = 288
+        return tuple(slice(max(side - max_side, 0) // 4 * 2, (side + max_side) // 2) for side in self.stored.shape[1:])
 
 
 def check_state(
@@ -120,15 +120,17 @@ def check_state(
     if unknown := set(accept) - set(get_args(FrameCheck)):
         raise ConfigurationError(f"accept takes {', '.join(get_args(FrameCheck))}, not {', '.join(sorted(unknown))}")
     pairs = zip_longest(state, repeat or ())
-    found = tuple(check for frame, again in pairs for check in contradictions(frame, calibration, inside, again))
-    if wrong := refused(found, accept):
+    checks = tuple(
+        check for frame, repeat_frame in pairs for check in contradictions(frame, calibration, inside, repeat_frame)
+    )
+    if wrong := refused(checks, accept):
         names = ", ".join(dict.fromkeys(f'"{check.name}"' for check in wrong))
         raise FrameError(
             f"{name} is not what was calibrated: {'; '.join(check.text for check in wrong)}. Take the calibration of "
             "this camera and these lights; if all this is meant to be, accept it: calibration.accept = "
             f"[{names}] (rgbmidic inspect: --accept)"
         )
-    return found
+    return checks
 
 
 def contradictions(
@@ -159,9 +161,9 @@ def contradictions(
     samples = _Samples.of(frame, calibration, inside, window)
     if min(samples.stored.shape[1:]) < 2 * BLOCK:
         return []
-    again = None if repeat is None else _Samples.of(repeat, calibration, inside, window)
+    repeat_samples = None if repeat is None else _Samples.of(repeat, calibration, inside, window)
     full_scale = frame.white_level - float(frame.black_level.mean())
-    checks = list(_levels(samples, again, calibration.unevenness, full_scale))
+    checks = list(_levels(samples, repeat_samples, calibration.unevenness, full_scale))
     if len(samples.names) == 4:
         checks += _greens(samples)
     if len(samples.names) > 1:
@@ -172,7 +174,9 @@ def contradictions(
     return reported(checks)
 
 
-def _levels(samples: _Samples, again: _Samples | None, calibrated: float | None, full_scale: float) -> Iterator[Check]:
+def _levels(
+    samples: _Samples, repeat_samples: _Samples | None, calibrated: float | None, full_scale: float
+) -> Iterator[Check]:
     """Check the histogram of the grey levels for levels that are missing or doubled, and where none are, the noise.
 
     From 1000 levels of the full scale on, that is 10 bit, photon noise exceeds `SMOOTHED` where a sensor is
@@ -185,18 +189,18 @@ def _levels(samples: _Samples, again: _Samples | None, calibrated: float | None,
     if full_scale < 1000 * step and samples.noise[0] is None:  # noise may be too little to smooth the histogram
         return
     planes = zip(samples.stored, samples.usable, samples.noise, samples.black.tolist(), strict=True)
-    each = [unevenness(stored[usable], noise, black, step) for stored, usable, noise, black in planes]
-    uneven = float(np.nanmax([0.0, *each]))
+    by_plane = [unevenness(stored[usable], noise, black, step) for stored, usable, noise, black in planes]
+    uneven = float(np.nanmax([0.0, *by_plane]))
     # some cameras have tables of their own, which their captures show too
     if uneven > limit and calibrated is not None and calibrated <= limit:
         text = (
-            f"grey levels of {samples.names[int(np.nanargmax(each))]} are missing or doubled (relative variance of "
+            f"grey levels of {samples.names[int(np.nanargmax(by_plane))]} are missing or doubled (relative variance of "
             f"their histogram {uneven:.2g}, in the captures of the calibration {calibrated:.2g}): a gain, white "
             "balance, gamma or 8-bit table was applied to stored samples"
         )
         yield Check("levels", text, uneven, limit)
     if uneven <= limit:  # the count of small differences wants samples that take any whole value
-        yield from _noise(samples, again, step)
+        yield from _noise(samples, repeat_samples, step)
 
 
 def saturation_pile(samples: npt.NDArray[np.integer[Any]], white: float) -> float | None:
@@ -253,19 +257,19 @@ def unevenness(
     if count.size < 30:
         return float("nan")
     count[: np.flatnonzero(count)[0] + 1] = 0  # what is clipped at the bottom
-    around = np.convolve(count, np.full(WINDOW, 1 / WINDOW), mode="same")
-    known = around >= 8
+    smooth_count = np.convolve(count, np.full(WINDOW, 1 / WINDOW), mode="same")
+    usable = smooth_count >= 8
     if noise is not None:
-        known &= noise.variance(step * np.arange(count.size) - black) >= (SMOOTHED * step) ** 2
-    if known.sum() < 30:
+        usable &= noise.variance(step * np.arange(count.size) - black) >= (SMOOTHED * step) ** 2
+    if usable.sum() < 30:
         return float("nan")
     middle = np.linalg.pinv(np.vander(np.arange(WINDOW) - WINDOW // 2, 3))[-1]  # of the parabola through a window
-    kept = 1 - middle[WINDOW // 2]  # of the variance of counting, by the residual of the parabola
-    square = (count - np.convolve(count, middle, mode="same"))[known] ** 2 / kept
-    chance = SIGNIFICANCE * np.sqrt(2 * known.sum())
-    if (square / around[known]).sum() - known.sum() < chance:
+    residual_fraction = 1 - middle[WINDOW // 2]  # of the variance of counting, by the residual of the parabola
+    square = (count - np.convolve(count, middle, mode="same"))[usable] ** 2 / residual_fraction
+    chance = SIGNIFICANCE * np.sqrt(2 * usable.sum())
+    if (square / smooth_count[usable]).sum() - usable.sum() < chance:
         return 0.0
-    return float((square.sum() - around[known].sum()) / (around[known] ** 2).sum())
+    return float((square.sum() - smooth_count[usable].sum()) / (smooth_count[usable] ** 2).sum())
 
 
 def _noise(samples: _Samples, repeat: _Samples | None, step: int) -> Iterator[Check]:
@@ -292,8 +296,9 @@ def _noise(samples: _Samples, repeat: _Samples | None, step: int) -> Iterator[Ch
             square[:, :-4, 2:-2] + square[:, 4:, 2:-2] + square[:, 2:-2, :-4] + square[:, 2:-2, 4:]
         )
     if repeat:
-        again, _, more, clear = _differences(repeat)
-        difference, variance, usable = difference - again, variance + more, usable & clear
+        repeat_difference, _, repeat_variance, repeat_usable = _differences(repeat)
+        difference, variance = difference - repeat_difference, variance + repeat_variance
+        usable = usable & repeat_usable
     usable &= np.isfinite(flatness).all(axis=0)
     if usable.sum() < 1000:
         return
@@ -302,20 +307,20 @@ def _noise(samples: _Samples, repeat: _Samples | None, step: int) -> Iterator[Ch
     # of every colour and of all, at every grey level and at all
     counts = np.concatenate([counts, counts.sum(axis=0, keepdims=True)])
     counts = np.concatenate([counts, counts.sum(axis=1, keepdims=True)], axis=1)
-    count, expected, chance, level, deviation, places = np.moveaxis(counts, -1, 0)
+    count, expected, chance, level, deviation, n_differences = np.moveaxis(counts, -1, 0)
     shared = 1.5  # variance of the count over that of independent differences: neighbours share two samples of four
-    beyond = (count - expected) / (SIGNIFICANCE * np.sqrt(shared * np.maximum(chance, 1e-9)))
-    ratio = np.divide(count, expected, out=np.ones_like(count), where=(beyond > 1) | ((beyond < -1) & bool(repeat)))
+    score = (count - expected) / (SIGNIFICANCE * np.sqrt(shared * np.maximum(chance, 1e-9)))
+    ratio = np.divide(count, expected, out=np.ones_like(count), where=(score > 1) | ((score < -1) & bool(repeat)))
     for excess, limit, motion in ((ratio, 1.25, ""), (1 / ratio, np.inf, ", motion between the two frames")):
         at = np.unravel_index(excess.argmax(), excess.shape)
         if excess[at] <= 1:
             continue
         name = [*samples.names, "all colours"][at[0]]
-        calibrated = deviation[at] / places[at] / np.sqrt(2 if repeat else 1)
+        calibrated = deviation[at] / n_differences[at] / np.sqrt(2 if repeat else 1)
         text = (
-            f"the noise of {name} at {level[at] / places[at]:.0f} DN above black is {calibrated / ratio[at]:.2g} DN"
-            f"{'' if repeat else ' or less'}, the calibration states {calibrated:.2g} DN (another camera or gain, "
-            f"gamma, noise reduction, interpolated samples, black level{motion}?)"
+            f"the noise of {name} at {level[at] / n_differences[at]:.0f} DN above black is "
+            f"{calibrated / ratio[at]:.2g} DN{'' if repeat else ' or less'}, the calibration states {calibrated:.2g} "
+            f"DN (another camera or gain, gamma, noise reduction, interpolated samples, black level{motion}?)"
         )
         yield Check("noise", text, float(excess[at]), limit, doubtful=1.12)
 
@@ -346,8 +351,8 @@ def _small_differences(plane: npt.NDArray[Any], step: int) -> FloatArray:
         near = np.abs(difference[inside]) < limit
         columns = (near, expected, expected * (1 - expected), mean[inside], deviation / 2, np.ones(inside.size))
         for index, fraction in enumerate(_FLATTEST):
-            few = int(inside.size * fraction / max(_FLATTEST))
-            out[level, index] = [column[:few].sum() for column in columns]
+            n_flattest = int(inside.size * fraction / max(_FLATTEST))
+            out[level, index] = [column[:n_flattest].sum() for column in columns]
     return out
 
 
@@ -360,13 +365,13 @@ def _differences(samples: _Samples) -> tuple[npt.NDArray[Any], ...]:
     x, usable = samples.values[:, *samples.middle], np.logical_and.reduce(samples.usable[:, *samples.middle])
     a, b, c, d = x[:, :-1, :-1], x[:, :-1, 1:], x[:, 1:, :-1], x[:, 1:, 1:]
     mean = (a + b + c + d) / 4
-    whole = usable[:-1, :-1] & usable[:-1, 1:] & usable[1:, :-1] & usable[1:, 1:]
+    complete = usable[:-1, :-1] & usable[:-1, 1:] & usable[1:, :-1] & usable[1:, 1:]
     variance = np.empty_like(mean)
     for plane, model in enumerate(filter(None, samples.noise)):
         exact = 4 * model.variance(mean[plane])
-        whole &= exact > 4 * 4 * model.read_noise**2
+        complete &= exact > 4 * 4 * model.read_noise**2
         variance[plane] = exact
-    return a - b - c + d, mean, variance, whole
+    return a - b - c + d, mean, variance, complete
 
 
 def _block_means(values: npt.NDArray[np.float32], side: int) -> FloatArray:
@@ -393,12 +398,12 @@ def _greens(samples: _Samples) -> Iterator[Check]:
     if clear.sum() < 36:  # a rms of 36 is known to 12 %
         return
     red, first, second, blue = (np.log(mean[clear]) for mean in means)
-    greens, others = (float(np.sqrt((pair**2).mean())) for pair in (first - second, red - blue))
+    greens, red_blue = (float(np.sqrt((pair**2).mean())) for pair in (first - second, red - blue))
     text = (
         f"the two greens of the pattern differ by {greens:.1%} (rms of blocks of {2 * BLOCK} px), red and blue by "
-        f"{others:.1%}: the pattern or its phase is not that of the calibration"
+        f"{red_blue:.1%}: the pattern or its phase is not that of the calibration"
     )
-    yield Check("greens", text, greens, max(0.03, 1.5 * others))
+    yield Check("greens", text, greens, max(0.03, 1.5 * red_blue))
 
 
 def _lights(samples: _Samples, crosstalk: Crosstalk, full_scale: float, origin: tuple[int, int]) -> Iterator[Check]:
@@ -417,20 +422,20 @@ def _lights(samples: _Samples, crosstalk: Crosstalk, full_scale: float, origin: 
     mean = _block_means(channels, side)
     texture = channels[0] + channels[1] + channels[2]
     spread = _block_means(channels * texture, side) - mean * _block_means(texture[None], side)
-    own = _block_means(channels**2, side) - mean**2
-    common = float(np.median((spread.sum(axis=0) / np.maximum(own.sum(axis=0), 1e-9))[usable]))  # 1 to 3
+    channel_variance = _block_means(channels**2, side) - mean**2
+    common = float(np.median((spread.sum(axis=0) / np.maximum(channel_variance.sum(axis=0), 1e-9))[usable]))  # 1 to 3
     y, x = (BLOCK * (np.arange(count) + 0.5) for count in usable.shape)
     unmixing = crosstalk.unmixing_at(np.stack(np.meshgrid(x, y), axis=-1) + origin)
-    level, slope = (np.einsum("yxkc,cyx->kyx", unmixing, part) for part in (mean, spread))
+    level, slope = (np.einsum("yxkc,cyx->kyx", unmixing, channel_blocks) for channel_blocks in (mean, spread))
     contrast = slope / np.maximum(level, negligible)
     best = contrast.max(axis=0)
     for name, light, relative in zip(crosstalk.lights, level, contrast, strict=True):
         limit = 0.01
         negative = float((light < -negligible)[usable].mean())
         mirrored = float((relative < -0.1 * best)[usable].mean()) if common > 1.6 else 0.0
-        what = f"negative on {negative:.0%}" if negative > limit else f"mirrored (dark for bright) on {mirrored:.0%}"
+        defect = f"negative on {negative:.0%}" if negative > limit else f"mirrored (dark for bright) on {mirrored:.0%}"
         text = (
-            f"light {name} is {what} of the region after unmixing: crosstalk, pattern or black level of the "
+            f"light {name} is {defect} of the region after unmixing: crosstalk, pattern or black level of the "
             "calibration are not those of this frame"
         )
         yield Check("lights", text, max(negative, mirrored), limit)
@@ -459,7 +464,7 @@ def _red_and_blue(samples: _Samples, crosstalk: Crosstalk) -> Iterator[Check]:
     red, *greens, blue = means[:, clear]
     first, last = greens[0], greens[-1]
     channels = np.array([red.mean(), (first.mean() + last.mean()) / 2, blue.mean()])
-    stated, exchanged = (crosstalk.unmixing @ one for one in (channels, channels[::-1]))
+    direct_levels, exchanged_levels = (crosstalk.unmixing @ levels for levels in (channels, channels[::-1]))
     text = (
         "{} than if red and blue were exchanged, as where the window of the sensor (offset, crop, region of interest) "
         "begins one row and one column beside that of the calibration: compare their offsets, or state the pattern "
@@ -467,36 +472,45 @@ def _red_and_blue(samples: _Samples, crosstalk: Crosstalk) -> Iterator[Check]:
     )
     better = 0.0
 
-    def fits_better(asked: float, other: float, scatter: float) -> float:
-        """By how much the squared departure `other` is less than that `asked`; 0 where neither fits."""
-        return float((asked**2 - other**2) / scatter**2) if abs(other) < 3 * scatter or abs(asked) < abs(other) else 0.0
+    def fits_better(direct: float, swapped: float, scatter: float) -> float:
+        """Return by how much the squared departure `swapped` is less than `direct`; 0 where neither fits."""
+        return (
+            float((direct**2 - swapped**2) / scatter**2)
+            if abs(swapped) < 3 * scatter or abs(direct) < abs(swapped)
+            else 0.0
+        )
 
     if mosaic and crosstalk.green_difference is not None:
         sign = 1.0 if samples.red_row == 0 else -1.0
         relative = sign * (first - last) / channels[1]
-        std = 0.0 if crosstalk.green_difference_std is None else crosstalk.green_difference_std @ np.abs(stated)
+        std = 0.0 if crosstalk.green_difference_std is None else crosstalk.green_difference_std @ np.abs(direct_levels)
         scatter = np.sqrt(relative.var() / relative.size + (std / channels[1]) ** 2 + _GREENS**2)
-        asked, other = (crosstalk.green_difference @ one / channels[1] for one in (stated, exchanged))
-        better = fits_better(relative.mean() - asked, relative.mean() + other, scatter)
-        found = f"the greens in rows with red exceed those in rows with blue by {relative.mean():.2%}, calibrated "
-        yield Check(
-            "greens", text.format(f"{found}are {asked:.2%}: less probable"), max(better, 0.0), 36.0, doubtful=9.0
+        direct, swapped = (
+            crosstalk.green_difference @ levels / channels[1] for levels in (direct_levels, exchanged_levels)
         )
-    if crosstalk.light_levels is None or better < -9 or min(*stated, *exchanged) <= 0 or len(lights) != 3:
+        better = fits_better(relative.mean() - direct, relative.mean() + swapped, scatter)
+        observation = (
+            f"the greens in rows with red exceed those in rows with blue by {relative.mean():.2%}, calibrated "
+        )
+        yield Check(
+            "greens", text.format(f"{observation}are {direct:.2%}: less probable"), max(better, 0.0), 36.0, doubtful=9.0
+        )
+    if crosstalk.light_levels is None or better < -9 or min(*direct_levels, *exchanged_levels) <= 0 or len(lights) != 3:
         return
     order = np.argmax(crosstalk.matrix, axis=0)
     ends = int(np.argmin(order)), int(np.argmax(order))
     if (order[ends[0]], order[ends[1]]) != (0, 2):
         return
-    calibrated, asked, other = (
-        np.log(one[ends[0]] / one[ends[1]]) for one in (crosstalk.light_levels, stated, exchanged)
+    calibrated, direct, swapped = (
+        np.log(levels[ends[0]] / levels[ends[1]])
+        for levels in (crosstalk.light_levels, direct_levels, exchanged_levels)
     )
-    better = fits_better(asked - calibrated, other - calibrated, _LIGHT_LEVELS)
-    found = (
-        f"light {lights[ends[0]]} is {np.exp(asked):.2g} times as strong as light {lights[ends[1]]}, in the captures "
+    better = fits_better(direct - calibrated, swapped - calibrated, _LIGHT_LEVELS)
+    observation = (
+        f"light {lights[ends[0]]} is {np.exp(direct):.2g} times as strong as light {lights[ends[1]]}, in the captures "
         f"of the calibration {np.exp(calibrated):.2g} times: less probable"
     )
-    yield warning(text.format(found), max(better, 0.0), above=9.0)
+    yield warning(text.format(observation), max(better, 0.0), above=9.0)
 
 
 def _interpolated(samples: _Samples) -> Iterator[Check]:
@@ -538,6 +552,10 @@ def _curvature(x: npt.NDArray[np.float32], usable: BoolArray) -> tuple[FloatArra
         return None
     second = np.where(clear, x[:, :-2] - 2 * x[:, 1:-1] + x[:, 2:], 0)
     first = np.where(clear, x[:, 2:] - x[:, :-2], 0)
-    places = [[(second[p::2, q::2] ** 2).sum() / clear[p::2, q::2].sum() for q in (1, 0)] for p in (0, 1)]
+    mean_squares = [[(second[p::2, q::2] ** 2).sum() / clear[p::2, q::2].sum() for q in (1, 0)] for p in (0, 1)]
     energy = float((second**2).sum()), float((first**2).sum())
-    return (np.array(places), energy[0] / energy[1]) if min(places[0] + places[1]) > 0 and energy[1] > 0 else None
+    return (
+        (np.array(mean_squares), energy[0] / energy[1])
+        if min(mean_squares[0] + mean_squares[1]) > 0 and energy[1] > 0
+        else None
+    )

@@ -23,6 +23,7 @@ from rgbmidic.arguments import check_fields
 from rgbmidic.errors import CalibrationError, InputError
 from rgbmidic.illumination.linear import LinearChannels
 from rgbmidic.illumination.texture import TextureModel
+from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 if TYPE_CHECKING:  # reading a result takes no kernels
@@ -49,9 +50,9 @@ def registration_basis(points: npt.ArrayLike, centre: tuple[float, float], radiu
     """Return the displacement (M, 2, 5) at points (x, y) of shape (M, 2) per unit of each of the `PARAMETERS`."""
     arm = np.asarray(points, dtype=np.float64) - np.asarray(centre)
     x, y = arm.T
-    one, none = np.ones_like(x), np.zeros_like(x)
+    unit, zero = np.ones_like(x), np.zeros_like(x)
     growth = (x**2 + y**2) / radius**2
-    return np.stack([[one, none, -y, x, growth * x], [none, one, x, y, growth * y]]).transpose(2, 0, 1)
+    return np.stack([[unit, zero, -y, x, growth * x], [zero, unit, x, y, growth * y]]).transpose(2, 0, 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,7 +111,7 @@ class Registration:
 
     @property
     def depends_on_place(self) -> bool:
-        """Whether any light is more than shifted."""
+        """Tell whether any light is more than shifted."""
         return bool(self.parameters[:, 2:].any())
 
     def cropped(self, origin: tuple[int, int]) -> Registration:
@@ -177,24 +178,24 @@ class Registration:
             )
         index = [self.lights.index(name) for name in dict.fromkeys(lights)]
         parameters = self.parameters[index].mean(axis=0)
-        apart = self.parameters[index] - parameters
-        covariance = apart.T @ apart / (len(index) * (len(index) + 1))
+        deviations = self.parameters[index] - parameters
+        covariance = deviations.T @ deviations / (len(index) * (len(index) + 1))
         if self.covariance is not None:
             covariance = covariance + self.covariance[index].mean(axis=0)
-        seen = _checked(points)
-        origin = seen
+        position = _checked(points)
+        origin = position
         for _ in range(10):  # each gains a factor of the magnification, some thousandths
             basis = registration_basis(origin, self.centre, self.radius)
-            origin = seen - basis @ parameters
+            origin = position - basis @ parameters
         variances, axes = np.linalg.eigh(covariance)
         return origin, basis @ (axes * np.sqrt(np.maximum(variances, 0)))
 
 
 def _checked(points: npt.ArrayLike) -> FloatArray:
-    place = np.asarray(points, dtype=np.float64)
-    if place.ndim != 2 or place.shape[1] != 2:
-        raise InputError(f"points have shape (M, 2), not {place.shape}")
-    return place
+    position = np.asarray(points, dtype=np.float64)
+    if position.ndim != 2 or position.shape[1] != 2:
+        raise InputError(f"points have shape (M, 2), not {position.shape}")
+    return position
 
 
 def frame_geometry(shape: tuple[int, int]) -> tuple[tuple[float, float], float]:
@@ -207,6 +208,7 @@ REFLECTING = 0.2
 """Reflection index from which a light counts as reflecting."""
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IlluminationImages:
     """The k illumination images of one mechanical state.
@@ -299,7 +301,7 @@ class IlluminationImages:
             full_scale=frames[0].full_scale,
         )
 
-    def placed(self, origin: tuple[int, int]) -> IlluminationImages:
+    def with_origin(self, origin: tuple[int, int]) -> IlluminationImages:
         """Return the images as those of a part of the frame that begins at the pixel `origin` (column, row).
 
         Parameters
@@ -311,8 +313,10 @@ class IlluminationImages:
         -------
         IlluminationImages
         """
-        known = self.registration
-        return replace(self, origin=origin, registration=known and known.cropped((-origin[0], -origin[1])))
+        registration = self.registration
+        return replace(
+            self, origin=origin, registration=registration and registration.cropped((-origin[0], -origin[1]))
+        )
 
     def reflection_index(self, step: int = 1, within: tuple[slice, slice] | None = None) -> FloatImage | None:
         """Return the fraction of a light that is not diffuse, from a single frame.
@@ -330,7 +334,7 @@ class IlluminationImages:
             0 where a light's contrast is that of the light with the most contrast there, towards 1 in its reflection;
             None where the separation does not give it.
         """
-        from rgbmidic.illumination.colour_factors import enlarged  # reading a result takes no kernels
+        from rgbmidic.illumination.colour_factors import upsample  # reading a result takes no kernels
         from rgbmidic.illumination.mosaic_model import BLOCK
 
         if self.reflection is None:
@@ -338,7 +342,7 @@ class IlluminationImages:
         rows, columns = within or (slice(0, self.shape[0]), slice(0, self.shape[1]))
         grid = self.reflection[:, rows.start // BLOCK : -(-rows.stop // BLOCK)]
         shape = rows.stop - rows.start, columns.stop - columns.start
-        return enlarged(grid[..., columns.start // BLOCK : -(-columns.stop // BLOCK)], BLOCK, shape, step)
+        return upsample(grid[..., columns.start // BLOCK : -(-columns.stop // BLOCK)], BLOCK, shape, step)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -395,10 +399,10 @@ def _half_blur(image: FloatImage, sigma: float) -> FloatImage:
     """Return the Gaussian mean of each two rows, from an image of half the size."""
     height, width = image.shape
     odd = height % 2, width % 2
-    even = cv2.copyMakeBorder(image, 0, odd[0], 0, odd[1], cv2.BORDER_REPLICATE) if any(odd) else image
-    half = cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    padded = cv2.copyMakeBorder(image, 0, odd[0], 0, odd[1], cv2.BORDER_REPLICATE) if any(odd) else image
+    half = cv2.resize(padded, (padded.shape[1] // 2, padded.shape[0] // 2), interpolation=cv2.INTER_AREA)
     blurred = _gaussian(np.asarray(half), np.sqrt(sigma**2 - _RESIZED) / 2)
-    wide = cv2.resize(blurred, (even.shape[1], len(half)), interpolation=cv2.INTER_LINEAR)
+    wide = cv2.resize(blurred, (padded.shape[1], len(half)), interpolation=cv2.INTER_LINEAR)
     return np.ascontiguousarray(wide[:, :width])
 
 

@@ -38,7 +38,7 @@ def channel_means(sites: npt.NDArray[Number]) -> npt.NDArray[Number]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MosaicModel:
-    """How the sites see the lights, and where each light shows the texture.
+    """The response of the sites to the lights, and the displacement at which each light shows the texture.
 
     Attributes
     ----------
@@ -82,8 +82,8 @@ class MosaicModel:
                     f"the registration is of {len(registration.lights)} lights, the crosstalk of {sites.shape[1]}"
                 )
             y, x = np.mgrid[:rows, :columns].reshape(2, -1) * BLOCK + (BLOCK - 1) / 2
-            places = registration.displacement(np.stack([x, y], axis=1)).reshape(-1, rows, columns, 2)
-            displacement = np.moveaxis(places - places.mean(axis=0), 3, 1)
+            positions = registration.displacement(np.stack([x, y], axis=1)).reshape(-1, rows, columns, 2)
+            displacement = np.moveaxis(positions - positions.mean(axis=0), 3, 1)
         return cls(sites=sites, displacement=displacement)
 
     @property
@@ -93,10 +93,10 @@ class MosaicModel:
 
     @property
     def in_register(self) -> bool:
-        """Whether all lights show the texture at one place, and the greens are alike."""
+        """Tell whether all lights show the texture at one place, and the greens are alike."""
         return not self.displacement.any() and np.array_equal(self.sites[1], self.sites[2])
 
-    def seen(self, contrast: FloatArray) -> FloatArray:
+    def light_fraction(self, contrast: FloatArray) -> FloatArray:
         """Return the fraction (4, k) of each light in the slope of each site's channel on the texture.
 
         Parameters
@@ -120,18 +120,23 @@ class MosaicModel:
         fractions = np.linalg.pinv(self.sites) * self.sites.T  # of a light's plane, what each site contributes
         count, rows, columns = len(fractions), *self.displacement.shape[2:]
         size = -(-columns // _COARSE), -(-rows // _COARSE)
-        coarse = [[cv2.resize(d, size, interpolation=cv2.INTER_AREA) for d in one] for one in self.displacement]
+        coarse = [
+            [cv2.resize(d, size, interpolation=cv2.INTER_AREA) for d in light_displacement]
+            for light_displacement in self.displacement
+        ]
         entry = np.round(np.mod(coarse, 2) / DISPLACEMENTS[1]).astype(np.intp)
         lines, weights = registered_lines(texture.widths), np.asarray(texture.weights)
         # whether two sites lie in different columns, and rows, of the cell
         kinds = [[(int(s % 2 != t % 2), int(s // 2 != t // 2)) for t in range(4)] for s in range(4)]
         energy = np.empty((count, count, rows, columns))
         for a, b in zip(*np.triu_indices(count), strict=True):
-            fraction, met, rest = np.zeros((2, 2)), np.zeros(size[::-1]), 0.0
+            fraction, registered, energy_at_rest = np.zeros((2, 2)), np.zeros(size[::-1]), 0.0
             np.add.at(fraction, tuple(np.moveaxis(np.array(kinds), 2, 0)), np.outer(fractions[a], fractions[b]))
-            for (x, y), part in np.ndenumerate(fraction):
-                parts = lines[x][:, entry[a, 0], entry[b, 0]] * lines[y][:, entry[a, 1], entry[b, 1]]
-                met += part * (np.tensordot(weights, parts, axes=1) + texture.offset)
-                rest += part * float(weights @ (lines[x][:, 0, 0] * lines[y][:, 0, 0]) + texture.offset)
-            energy[a, b] = energy[b, a] = cv2.resize(met / rest, (columns, rows), interpolation=cv2.INTER_LINEAR)
+            for (x, y), weight in np.ndenumerate(fraction):
+                products = lines[x][:, entry[a, 0], entry[b, 0]] * lines[y][:, entry[a, 1], entry[b, 1]]
+                registered += weight * (np.tensordot(weights, products, axes=1) + texture.offset)
+                energy_at_rest += weight * float(weights @ (lines[x][:, 0, 0] * lines[y][:, 0, 0]) + texture.offset)
+            energy[a, b] = energy[b, a] = cv2.resize(
+                registered / energy_at_rest, (columns, rows), interpolation=cv2.INTER_LINEAR
+            )
         return energy

@@ -57,7 +57,13 @@ class FilterTables:
         return FilterTables, ()
 
     def find(
-        self, codes: npt.NDArray[np.int16], texture: TextureModel, cfa: str, seen: FloatArray, *, left_out: bool
+        self,
+        codes: npt.NDArray[np.int16],
+        texture: TextureModel,
+        cfa: str,
+        light_fraction: FloatArray,
+        *,
+        left_out: bool,
     ) -> tuple[npt.NDArray[np.int32], FloatImage, int]:
         """Return the row of the table for each of T codes, the table (M, 2, 3, size², 2), and the square's side."""
         # a colour left to itself has only every other sample, so it needs to look farther
@@ -66,16 +72,18 @@ class FilterTables:
             codes.view([("", codes.dtype)] * codes.shape[1]).ravel(), return_index=True, return_inverse=True
         )
         names = [key.tobytes() for key in keys]
-        table = texture, cfa, seen.tobytes(), left_out
+        table = texture, cfa, light_fraction.tobytes(), left_out
         with self._lock:
             rows, taps = self._tables.get(table, ({}, np.empty((0, 2, 3, size * size, 2), dtype=np.float32)))
             missing = [n for n, name in enumerate(names) if name not in rows]
             if len(rows) + len(missing) > MOST_FILTERS:
                 rows, taps, missing = {}, taps[:0], list(range(len(names)))
             if missing:
-                made = _filters(codes[first[missing]], texture, cfa, seen, size, LEFT_OUT if left_out else 0.0)
+                new_taps = _filters(
+                    codes[first[missing]], texture, cfa, light_fraction, size, LEFT_OUT if left_out else 0.0
+                )
                 rows = rows | {names[n]: len(taps) + position for position, n in enumerate(missing)}
-                taps = np.concatenate([taps, made])
+                taps = np.concatenate([taps, new_taps])
                 if len(self._tables) >= 4 and table not in self._tables:
                     self._tables.clear()
                 self._tables[table] = rows, taps
@@ -88,7 +96,7 @@ def prediction_filters(
     texture: TextureModel,
     cfa: str,
     *,
-    seen: FloatArray,
+    light_fraction: FloatArray,
     displacement: FloatArray,
     glints: FloatArray,
     tables: FilterTables | None = None,
@@ -106,8 +114,8 @@ def prediction_filters(
         Autocorrelation of the common texture, and of the light-specific component.
     cfa
         Bayer pattern.
-    seen : (4, k)
-        Fraction of each light in the slope of each site's channel (`MosaicModel.seen`).
+    light_fraction : (4, k)
+        Fraction of each light in the slope of each site's channel (`MosaicModel.light_fraction`).
     displacement : (k, 2, h, w)
         Place (x, y) at which each light shows the texture, px, by the lens.
     glints : (k, 2, h, w)
@@ -129,32 +137,32 @@ def prediction_filters(
     tiles = specific.shape[1:]
     level = np.log2(np.clip(specific, 2.0**SMALLEST, 2.0**LARGEST))
     half_octave = 2 * np.log2(np.maximum(noise, LEAST_NOISE))
-    steps = [(part / STEP).reshape(-1, *tiles) for part in (displacement + glints, glints)]
+    steps = [(field / STEP).reshape(-1, *tiles) for field in (displacement + glints, glints)]
     codes = np.concatenate([level, half_octave, *steps]).reshape(-1, tiles[0] * tiles[1]).T
     rounded = np.ascontiguousarray(np.round(codes), dtype=np.int16)
-    index, taps, size = (tables or FilterTables()).find(rounded, texture, cfa, seen, left_out=left_out)
+    index, taps, size = (tables or FilterTables()).find(rounded, texture, cfa, light_fraction, left_out=left_out)
     return index.reshape(tiles), taps, size
 
 
 def _filters(
-    codes: npt.NDArray[np.int16], texture: TextureModel, cfa: str, seen: FloatArray, size: int, held: float
+    codes: npt.NDArray[np.int16], texture: TextureModel, cfa: str, light_fraction: FloatArray, size: int, held: float
 ) -> FloatImage:
     """Make the filters (T, 2, 3, size², 2) of T codes."""
-    lights = seen.shape[1]
-    level, half_octave, place, glint = np.split(codes.astype(np.float64), np.cumsum([lights, 3, 2 * lights]), axis=1)
+    lights = light_fraction.shape[1]
+    level, half_octave, position, glint = np.split(codes.astype(np.float64), np.cumsum([lights, 3, 2 * lights]), axis=1)
     variance = np.exp2(level)
-    spread = np.sqrt(1 + variance @ (channel_means(seen) ** 2).T)
+    spread = np.sqrt(1 + variance @ (channel_means(light_fraction) ** 2).T)
     glints = STEP * glint.reshape(-1, lights, 2)
     offset, phases = np.arange(size) - size // 2, list(np.ndindex(2, 2))
     cell = _site_kinds(cfa)
     taps = np.empty((len(codes), 4, 3, size, size))
     prediction_taps(
-        np.ascontiguousarray(seen, dtype=np.float64),
+        np.ascontiguousarray(light_fraction, dtype=np.float64),
         np.ascontiguousarray(spread[:, CHANNEL]),
         variance,
         texture.specific,
         np.exp(-DISSIMILAR * ((glints[:, :, None] - glints[:, None]) ** 2).sum(axis=3)),
-        np.ascontiguousarray(STEP * place).reshape(-1, lights, 2),
+        np.ascontiguousarray(STEP * position).reshape(-1, lights, 2),
         np.exp2(half_octave / 2) / spread**2,
         held,
         *_covariances(texture, size),

@@ -89,7 +89,7 @@ def _separated(
         raise InputError("the calibration has no crosstalk, which colour frames need (rgbmidic-calibrate crosstalk)")
     if isinstance(linear, LinearChannels):
         return unmix(linear, crosstalk)
-    method = _chosen(method, linear)
+    method = _resolve_method(method, linear)
     if crosstalk.matrix.shape[0] != 3:
         rows = crosstalk.matrix.shape[0]
         raise InputError(f"a Bayer mosaic has 3 camera channels; the crosstalk matrix has {rows} rows")
@@ -134,8 +134,8 @@ def demosaic(
     linear = linearise(mosaic) if isinstance(mosaic, Mosaic) else mosaic
     if not isinstance(linear, LinearMosaic):
         raise InputError(f"demosaicing takes a LinearMosaic, not {type(linear).__name__}")
-    if (chosen := _chosen(method, linear)) != DEFAULT_METHOD:
-        return _BY_CHANNEL[chosen](linear)
+    if (method_name := _resolve_method(method, linear)) != DEFAULT_METHOD:
+        return _BY_CHANNEL[method_name](linear)
     return reconstruct(linear, crosstalk, texture=texture).channels
 
 
@@ -147,20 +147,30 @@ def reconstructed_lights(model: Reconstruction, crosstalk: Crosstalk, *, unmixed
     """
     height, width = model.factors.slope.shape[1:]
     level = np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in model.mean])
-    slope, light = (np.tensordot(crosstalk.unmixing, seen, axes=1) for seen in (model.factors.slope, level))
+    slope, light = (
+        np.tensordot(crosstalk.unmixing, channel_values, axes=1) for channel_values in (model.factors.slope, level)
+    )
     contrast = np.divide(slope, light, out=np.zeros_like(slope), where=light > 1e-3 * light.max())
     best = contrast.max(axis=0)
     relative = np.divide(contrast, best, out=np.ones_like(contrast), where=best > 0)
-    found = {"reflection": 1 - np.clip(relative, 0, 1), "displacement": model.displacement, "texture": model.texture}
+    diagnostics = {
+        "reflection": 1 - np.clip(relative, 0, 1),
+        "displacement": model.displacement,
+        "texture": model.texture,
+    }
     channels = model.channels
     if not unmixed:
-        return replace(unmix(channels, crosstalk), **found)
+        return replace(unmix(channels, crosstalk), **diagnostics)
     return IlluminationImages(
-        values=channels.values, valid=channels.valid, names=crosstalk.lights, full_scale=channels.full_scale, **found
+        values=channels.values,
+        valid=channels.valid,
+        names=crosstalk.lights,
+        full_scale=channels.full_scale,
+        **diagnostics,
     )
 
 
-def _chosen(method: str, mosaic: LinearMosaic) -> str:
+def _resolve_method(method: str, mosaic: LinearMosaic) -> str:
     """The method meant, "auto" resolved."""
     if method == "auto":
         return DEFAULT_METHOD if min(mosaic.values.shape) >= SMALLEST_FRAME else "malvar"
@@ -175,11 +185,11 @@ which are not separated any more."""
 
 
 class LightSeparation(Protocol):
-    """From what the camera recorded of one state to one image per light: `Separation`, or a function of one's own.
+    """A function that turns what the camera recorded of one state into one image per light, such as `Separation`.
 
     It may also have
 
-    - ``learnt(images)``: the separation of all other frames, which knows the images of the reference's first frame;
+    - ``learnt(images)``: the separation of all other frames, which has the images of the reference's first frame;
     - ``describe()``: a text that says what it does; another text is another test, which `resume` refuses.
     """
 
@@ -210,7 +220,7 @@ class WindowedSeparation(LightSeparation, Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Separation:
-    """From what the camera recorded of one state to one image per light: linearise, demosaic, unmix.
+    """A separation that linearises, demosaics and unmixes what the camera recorded into one image per light.
 
     The images stay where they are: the solve reads each where its registration says that it lies.
 
@@ -239,22 +249,24 @@ class Separation:
         ConfigurationError
             Colour frames without a calibrated crosstalk, or settings that contradict the calibration.
         """
-        known = self.calibration or Calibration()
-        linear = [linearise(frame, known.noise) for frame in frames]
-        if all(isinstance(one, LinearChannels) and len(one.values) == 1 for one in linear):
-            names = known.registration.lights if known.registration else ()
-            images = IlluminationImages.in_succession([one for one in linear if isinstance(one, LinearChannels)], names)
+        calibration = self.calibration or Calibration()
+        linear = [linearise(frame, calibration.noise) for frame in frames]
+        if all(isinstance(channels, LinearChannels) and len(channels.values) == 1 for channels in linear):
+            names = calibration.registration.lights if calibration.registration else ()
+            images = IlluminationImages.in_succession(
+                [channels for channels in linear if isinstance(channels, LinearChannels)], names
+            )
         elif len(linear) > 1:
             raise ConfigurationError("frames.path names several series, which is for monochrome frames only")
-        elif known.crosstalk is None:
-            what = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
+        elif calibration.crosstalk is None:
+            problem = "calibration.file is missing" if self.calibration is None else "calibration.file has no crosstalk"
             raise ConfigurationError(
-                f"{what}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk; of one white light, "
-                'state frames.kind = "monochrome"'
+                f"{problem}: colour frames need the crosstalk matrix of rgbmidic-calibrate crosstalk; of one white "
+                'light, state frames.kind = "monochrome"'
             )
         else:
-            images = _separated(linear[0], known, self.demosaic, self.texture, self.tables)
-        return replace(images, registration=known.registration)
+            images = _separated(linear[0], calibration, self.demosaic, self.texture, self.tables)
+        return replace(images, registration=calibration.registration)
 
     def within(self, window: Window) -> Separation:
         """The separation of a part of the frames.
@@ -302,12 +314,12 @@ def light_images(separation: LightSeparation, state: RawState, window: Window) -
         separation = separation.within(window)
     images = separation(state)
     if not isinstance(images, IlluminationImages) or images.shape != state[0].values.shape[-2:]:
-        told = f"of shape {images.values.shape}" if isinstance(images, IlluminationImages) else ""
+        description = f"of shape {images.values.shape}" if isinstance(images, IlluminationImages) else ""
         raise InputError(
             f"the separation must give IlluminationImages of the size of the frame {state[0].values.shape[-2:]}; it "
-            f"gives {type(images).__name__} {told}".rstrip()
+            f"gives {type(images).__name__} {description}".rstrip()
         )
-    return images if window.is_whole else images.placed(window.origin)
+    return images if window.is_whole else images.with_origin(window.origin)
 
 
 def reference_images(
@@ -324,12 +336,12 @@ def reference_images(
     RgbmidicError
         As `light_images`.
     """
-    others = iter(states)
-    mean = light_images(separation, next(others), window)
+    remaining = iter(states)
+    mean = light_images(separation, next(remaining), window)
     if (learn := getattr(separation, "learnt", None)) is not None:
         separation = learn(mean)
     total, valid, count = mean.values.astype(np.float64), mean.valid, 1
-    for images in (light_images(separation, state, window) for state in others):
+    for images in (light_images(separation, state, window) for state in remaining):
         if images.values.shape != total.shape:
             raise FrameError(f"the reference frames have different shapes: {total.shape}, {images.values.shape}")
         total, valid, count = total + images.values, valid & images.valid, count + 1

@@ -40,7 +40,7 @@ class BandEnergy(NamedTuple):
 
     Attributes
     ----------
-    own
+    same
         Of a plane with itself.
     adjacent
         Of planes that are neighbours along a row or column: red and green, blue and green.
@@ -48,7 +48,7 @@ class BandEnergy(NamedTuple):
         Of planes that are diagonal neighbours: red and blue.
     """
 
-    own: float
+    same: float
     adjacent: float
     diagonal: float
 
@@ -125,10 +125,10 @@ class TextureModel:
     def gradient_gain(self) -> float:
         """Slope of a low-passed plane by regression on its central difference over two cells, both per cell."""
         weights = np.asarray(self.weights)
-        ends, whole = (
+        ends, span = (
             weights @ _plane_moments(self.widths, d) + self.offset for d in (np.array([1.9, 2.1]), [0.0, 4.0])
         )
-        return float(-20 * (ends[1] - ends[0]) / (whole[0] - whole[1]))
+        return float(-20 * (ends[1] - ends[0]) / (span[0] - span[1]))
 
     @cached_property
     def plane_displacement(self) -> float:
@@ -137,9 +137,9 @@ class TextureModel:
         That of odd ones shows it with the other sign: each has three of the six weights of the binomial.
         """
         weights = np.asarray(self.weights)
-        apart = _line(self.widths, 0, 1, [2.0, -2.0]) * (_line(self.widths, 0, 0) + _line(self.widths, 1, 1))[:, None]
+        moments = _line(self.widths, 0, 1, [2.0, -2.0]) * (_line(self.widths, 0, 0) + _line(self.widths, 1, 1))[:, None]
         near, far = weights @ _plane_moments(self.widths, np.array([1.9, 2.1]))
-        ahead, behind = weights @ apart / 2
+        ahead, behind = weights @ moments / 2
         return float((ahead - behind) / (20 * (near - far)))
 
     @cached_property
@@ -150,22 +150,22 @@ class TextureModel:
 
 def _line(widths: tuple[float, ...], p: int, q: int, distance: npt.ArrayLike = 0.0) -> FloatArray:
     """Second moments (M, ...) along one axis of planes of parity p and q, `distance` px apart: Gaussians factorise."""
-    apart = _OFFSETS[p::2, None] - _OFFSETS[q::2] + np.asarray(distance, dtype=np.float64)[..., None, None]
-    gaussians = np.exp(-0.5 * (apart / np.asarray(widths).reshape(-1, *[1] * apart.ndim)) ** 2)
+    distances = _OFFSETS[p::2, None] - _OFFSETS[q::2] + np.asarray(distance, dtype=np.float64)[..., None, None]
+    gaussians = np.exp(-0.5 * (distances / np.asarray(widths).reshape(-1, *[1] * distances.ndim)) ** 2)
     return np.asarray(_BINOMIAL[p::2] @ gaussians @ _BINOMIAL[q::2])
 
 
 @lru_cache(maxsize=64)
 def _band_energies(widths: tuple[float, ...]) -> FloatArray:
     """Return the moments (M, 3) own, adjacent and diagonal of the low-passed planes for Gaussian autocorrelations."""
-    same, other = (_line(widths, 0, 0) + _line(widths, 1, 1)) / 2, _line(widths, 0, 1)
-    return np.stack([same * same, same * other, other * other], axis=1)
+    same, opposite = (_line(widths, 0, 0) + _line(widths, 1, 1)) / 2, _line(widths, 0, 1)
+    return np.stack([same * same, same * opposite, opposite * opposite], axis=1)
 
 
 def _plane_moments(widths: tuple[float, ...], distance: npt.ArrayLike) -> FloatArray:
     """Return the moments (M, D) of a plane with itself some px farther along one axis."""
-    at_rest, apart = ((_line(widths, 0, 0, d) + _line(widths, 1, 1, d)) / 2 for d in ([0.0], distance))
-    return np.asarray(at_rest * apart)
+    at_rest, displaced = ((_line(widths, 0, 0, d) + _line(widths, 1, 1, d)) / 2 for d in ([0.0], distance))
+    return np.asarray(at_rest * displaced)
 
 
 DISPLACEMENTS = np.linspace(0, 2, 41)
@@ -230,7 +230,7 @@ class LagProducts:
         Mean correlation of the low-passed planes with the lights in register, red-green, red-blue, green-blue.
     displacement : ndarray, shape (n, k, 2)
         Place (x, y) at which each light shows the texture, px.
-    seen : ndarray, shape (3, k)
+    light_fraction : ndarray, shape (3, k)
         Fraction of each light in the slope of each channel.
     """
 
@@ -238,7 +238,7 @@ class LagProducts:
     counts: FloatArray
     correlations: FloatArray
     displacement: FloatArray
-    seen: FloatArray
+    light_fraction: FloatArray
 
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -280,7 +280,7 @@ def fit_texture(products: LagProducts, agreement: float) -> TextureModel:
         unit = np.broadcast_to(energies[:, kind], (met.sum(), len(WIDTHS)))
         product = products.sums[..., 3 + pair][met] / weight[met]
         rows.append((_gaussians(products, pair)[met], product, unit, weight[met], np.nonzero(met)[1]))
-    gaussians, product, unit, weight, lag = (np.concatenate(part) for part in zip(*rows, strict=True))
+    gaussians, product, unit, weight, lag = (np.concatenate(column) for column in zip(*rows, strict=True))
     importance = np.sqrt(weight / np.bincount(lag, weight)[lag]) / (1 + distance[lag])
     # what a lattice cannot see is hardly in the products: the fit would extrapolate it to distance 0
     finest, coarsest = (energies[:, 1] / energies[:, 0])[[0, -1]]
@@ -295,10 +295,10 @@ def _gaussians(products: LagProducts, pair: int) -> FloatArray:
     first, second = PAIRS[pair]
     total = np.zeros((*products.sums.shape[:2], len(WIDTHS)))
     for a, b in np.ndindex(products.displacement.shape[1], products.displacement.shape[1]):
-        apart = (products.displacement[:, a] - products.displacement[:, b])[:, None]
-        fraction = products.seen[first, a] * products.seen[second, b] / 2
+        offset = (products.displacement[:, a] - products.displacement[:, b])[:, None]
+        fraction = products.light_fraction[first, a] * products.light_fraction[second, b] / 2
         for sign in (1, -1):  # a lag begins at either of the two
-            square = ((LAGS[:, ::-1] + sign * apart) ** 2).sum(axis=2)
+            square = ((LAGS[:, ::-1] + sign * offset) ** 2).sum(axis=2)
             total += fraction * np.exp(-0.5 * square[..., None] / WIDTHS**2)
     return total
 
@@ -320,7 +320,7 @@ def _mixture(
     """
     if band is None:
         system = np.column_stack([gaussians, -np.ones(product.size)]) * importance[:, None]
-        wanted = product * importance
+        target = product * importance
     else:
         unit, fine = band
         system = np.column_stack([gaussians - product[:, None] * unit, product - 1]) * importance[:, None]
@@ -329,18 +329,18 @@ def _mixture(
         # products) of .05; the true one is -0.02 to -0.15
         small_offset = np.append(np.zeros(len(widths)), 0.05)
         system = np.vstack([system, 1e3 * sum_to_one, 1e3 * fine, small_offset])
-        wanted = np.concatenate([np.zeros(product.size), [1e3, 0.0, 0.0]])
+        target = np.concatenate([np.zeros(product.size), [1e3, 0.0, 0.0]])
     from scipy.optimize import nnls  # half a second to import
 
-    solution = nnls(system, wanted)[0]
+    solution = nnls(system, target)[0]
     total = solution[:-1].sum() - solution[-1]
     if not total > 0.1 * solution[:-1].sum():
         return TextureModel.of_speckle(4.0)
-    kept = solution[:-1] > 0
-    weights = solution[:-1][kept] / total
+    positive = solution[:-1] > 0
+    weights = solution[:-1][positive] / total
     model = TextureModel(
         weights=tuple(weights.tolist()),
-        widths=tuple(widths[kept].tolist()),
+        widths=tuple(widths[positive].tolist()),
         offset=min(float(1 - weights.sum()), 0.0),
         specific=specific,
         correlation=correlation,
@@ -351,14 +351,14 @@ def _mixture(
 
 def _coarse_fraction(model: TextureModel, sums: FloatArray, counts: FloatArray, correlations: FloatArray) -> float:
     """Return the fraction of the channel-specific component as coarse as the speckle, from products 2 px apart."""
-    apart = np.abs(LAGS)
-    two = (apart.max(axis=1) == 2) & (apart.min(axis=1) == 0) & (counts[:, :3] > 0).all(axis=1)
+    distance = np.abs(LAGS)
+    two = (distance.max(axis=1) == 2) & (distance.min(axis=1) == 0) & (counts[:, :3] > 0).all(axis=1)
     band = model.band
     measured = (sums[two, :3].sum(axis=0) / counts[two, :3].sum(axis=0)).mean()
-    common = np.clip(correlations / (np.array([band.adjacent, band.diagonal, band.adjacent]) / band.own), 0, 1).mean()
+    common = np.clip(correlations / (np.array([band.adjacent, band.diagonal, band.adjacent]) / band.same), 0, 1).mean()
     # what of the channel-specific fraction is still seen two pixels away, shrunk to 0 where that fraction is nearly
     # nothing: under .02 products do not show whether it is coarse
-    coarse = measured / max(float(model(2.0)) / band.own, 1e-3) - common
+    coarse = measured / max(float(model(2.0)) / band.same, 1e-3) - common
     return float(np.clip(coarse * (1 - common) / ((1 - common) ** 2 + 0.02**2), 0, 1))
 
 
@@ -390,9 +390,9 @@ def speckle_diameter(picture: FloatArray, *, background: float = 20.0) -> float 
     reach = min(int(2 * background), *(side - 1 for side in texture.shape))
     lag = np.arange(-reach, reach + 1)
     pairs = np.multiply.outer(*(1 - np.abs(lag) / side for side in texture.shape))
-    mean, away = np.fft.irfft2(power)[np.ix_(lag, lag)] / pairs, np.hypot(lag[:, None], lag)
-    ring = away.round().astype(int).ravel()
-    product, distance = (np.bincount(ring, part.ravel()) / np.bincount(ring) for part in (mean, away))
+    mean, radius = np.fft.irfft2(power)[np.ix_(lag, lag)] / pairs, np.hypot(lag[:, None], lag)
+    ring = radius.round().astype(int).ravel()
+    product, distance = (np.bincount(ring, values.ravel()) / np.bincount(ring) for values in (mean, radius))
     if not (len(product) > 2 and product[0] > 0):
         return None
     if product[1] > product[2] > 0:  # at 0 a Gaussian through the next two, without the peak of white noise there

@@ -409,7 +409,7 @@ def _check_reference(plan: Plan, state: RawState, noise: NoiseModel | None) -> N
     for doubt in suitability.separation_doubts(images, region):
         logger.warning("the reference (%s): %s", name, doubt.text)
     dark = suitability.background_fraction(images, region, plan.speckle, noise)
-    if dark > CONTRAST.hidden:
+    if dark > CONTRAST.max_hidden_fraction:
         logger.warning(f"the region holds dark background ({dark:.1%}) in the reference: draw it inside the specimen")
     levels = suitability.light_levels(images, region).items()
     off = [f"{light} ({level:.1%})" for light, level in levels if level < DARK]

@@ -11,10 +11,12 @@ import pytest
 from results import make_result
 
 from rgbmidic import frames, mesh, renamed, report, results
+from rgbmidic.illumination import IlluminationImages
 from rgbmidic.lab import inspection
 from rgbmidic.results import comparison, simulation
 
 CLASSES = {
+    "IlluminationImages": IlluminationImages,
     **vars(frames),
     **vars(mesh),
     **vars(inspection),

@@ -236,7 +236,7 @@ def inspect_frame(
         reflection_index=index,
         saturated=np.logical_or.reduce([channel.saturated for channel in channels]),
         region=region.mask,
-        lacks_contrast=contrasts.hidden(region.mask),
+        lacks_contrast=contrasts.low_contrast(region.mask),
         background=contrasts.background(region.mask),
         texture=state.texture,
         noise=noise,

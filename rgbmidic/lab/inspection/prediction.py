@@ -24,7 +24,7 @@ from scipy.ndimage import median_filter
 from rgbmidic._kernels.splines import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic.correlation.images import apply_prefilter
 from rgbmidic.illumination.calibration import Calibration
-from rgbmidic.illumination.colour_factors import LEAST, MEAN_BLOCK, enlarged
+from rgbmidic.illumination.colour_factors import MEAN_BLOCK, MIN_SPECIFIC, upsample
 from rgbmidic.illumination.contrast import LocalContrast
 from rgbmidic.illumination.crosstalk import Crosstalk, unmix
 from rgbmidic.illumination.demosaicing import Reconstruction, reconstruct
@@ -245,16 +245,16 @@ def _draw_sites(model: Reconstruction, strength: FloatArray, random: np.random.G
     """
     factors, texture, sites = model.factors, model.texture, model.model
     shape = model.channels.values.shape[1:]
-    displacement = enlarged(sites.displacement.reshape(-1, *sites.displacement.shape[2:]), BLOCK, shape)
+    displacement = upsample(sites.displacement.reshape(-1, *sites.displacement.shape[2:]), BLOCK, shape)
     margin = int(np.ceil(np.abs(displacement).max())) + 2
     common = gaussian_field(texture, (shape[0] + 2 * margin, shape[1] + 2 * margin), random)
     sparkle = TextureModel(weights=(1.0,), widths=(float(np.sqrt(2 * SPARKLE_VARIANCE)),))
     # by the median around: variances are cut off at zero, so that a mean would be too large
     size = 1, CONSTANTS.median_window, CONSTANTS.median_window
-    typical = median_filter(factors.light_specific - LEAST, size=size, mode="reflect")
-    deviation = np.sqrt(enlarged(np.maximum(typical, 0), BLOCK, shape))
-    slope = enlarged(_smooth_blocks(factors.light_slope, BLOCK), BLOCK, shape)
-    mean = enlarged(_smooth_blocks(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
+    typical = median_filter(factors.light_specific - MIN_SPECIFIC, size=size, mode="reflect")
+    deviation = np.sqrt(upsample(np.maximum(typical, 0), BLOCK, shape))
+    slope = upsample(_smooth_blocks(factors.light_slope, BLOCK), BLOCK, shape)
+    mean = upsample(_smooth_blocks(model.mean, MEAN_BLOCK), MEAN_BLOCK, shape)
     response = sites.sites * strength
     # each green sees the lights' means in its own proportion
     response_beyond = (response - sites.matrix[list(CHANNEL)]) @ np.linalg.pinv(sites.matrix)

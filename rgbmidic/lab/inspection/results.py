@@ -294,11 +294,11 @@ def _region_checks(inspection: Inspection) -> Iterator[Check]:
     if len(inspection.lights) > 1:
         subject, cause = "no light shows", "all lights reflect or saturate there"
     reasons = []
-    if dark_fraction > CONTRAST.hidden:
+    if dark_fraction > CONTRAST.max_hidden_fraction:
         reasons.append(f"it holds dark background ({dark_fraction:.1%}), draw it inside the specimen")
-    if hidden_fraction - dark_fraction > CONTRAST.hidden or not reasons:
+    if hidden_fraction - dark_fraction > CONTRAST.max_hidden_fraction or not reasons:
         reasons.append(f"{cause}, or there is no paint")
     text = f"{subject} the texture on {hidden_fraction:.1%} of the region: {'; '.join(reasons)}"
-    yield Check("hidden", text, hidden_fraction, CONTRAST.hidden)
+    yield Check("hidden", text, hidden_fraction, CONTRAST.max_hidden_fraction)
     lost_text = f"{inspection.unmeasured_fraction:.1%} of the nodes will not be measured"
     yield Check("not measured", lost_text, inspection.unmeasured_fraction)

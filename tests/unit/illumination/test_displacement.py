@@ -6,9 +6,9 @@ import pytest
 from scipy.ndimage import shift
 
 from rgbmidic._kernels.texture import displacement_scores
-from rgbmidic.illumination.colour_factors import enlarged, widened
+from rgbmidic.illumination.colour_factors import upsample, upsample_rows
 from rgbmidic.illumination.crosstalk import Crosstalk
-from rgbmidic.illumination.displacement import LightDisplacement, agreement
+from rgbmidic.illumination.displacement import LightDisplacement, consensus_weights
 from rgbmidic.illumination.separation import separate
 
 SHAPE = (192, 192)
@@ -72,15 +72,15 @@ def test_displaced_lights_do_not_pull_the_others():
 def test_a_light_counts_by_its_precision_and_by_those_that_agree():
     place = np.array([[0.0, 0.0], [0.15, 0.0], [0.0, 0.01]])[:, :, None, None]
     chance, even = np.full((3, 1, 1), 1e-6), np.ones((3, 1, 1))
-    weights, agree = (part[..., 0, 0] for part in agreement(place, chance, even))
+    weights, agree = (part[..., 0, 0] for part in consensus_weights(place, chance, even))
     np.testing.assert_allclose(weights.sum(), 1)
     assert weights[1] < 0.04
     assert agree > 0.85
     # by chance as far apart: all count alike
-    weights, _ = agreement(place, np.full((3, 1, 1), 0.02), even)
+    weights, _ = consensus_weights(place, np.full((3, 1, 1), 0.02), even)
     np.testing.assert_allclose(weights.ravel(), 1 / 3)
     # of two nobody knows which is right
-    weights, agree = agreement(place[:2], chance[:2], np.array([3.0, 1.0])[:, None, None])
+    weights, agree = consensus_weights(place[:2], chance[:2], np.array([3.0, 1.0])[:, None, None])
     np.testing.assert_allclose(weights.ravel(), [0.75, 0.25])
     assert agree.item() < 0.05
 
@@ -99,8 +99,8 @@ def test_scores_are_those_written_out():
     planes[1, 5, 7] = np.nan
     slope = rng.uniform(1, 2, (3, 3, 5)).astype(np.float32)
     sums = np.empty((3, 3, 3, 5), dtype=np.float32)
-    displacement_scores(planes, widened(slope, half, 18), half, sums)
-    texture = planes / enlarged(slope, half, (11, 18))
+    displacement_scores(planes, upsample_rows(slope, half, 18), half, sums)
+    texture = planes / upsample(slope, half, (11, 18))
     expected = np.zeros_like(sums)
     for light, i, j in np.ndindex(3, 9, 16):
         others = np.delete(texture, light, axis=0).mean(axis=0)

@@ -108,9 +108,9 @@ def test_band_energy_is_that_of_a_rendered_texture():
     moments = gather_moments(field.astype(np.float32), (0, 0), None, MosaicModel.of(None, None, field.shape))
     band = TextureModel(weights=(1.0,), widths=(width,)).band
     # the local mean takes some of the coarse texture away
-    assert moments.own.mean() == pytest.approx(band.own, rel=0.15)
-    ratios = moments.shared.mean(axis=(1, 2)) / moments.own.mean()
-    np.testing.assert_allclose(ratios, np.array([band.adjacent, band.diagonal, band.adjacent]) / band.own, atol=0.004)
+    assert moments.variance.mean() == pytest.approx(band.same, rel=0.15)
+    ratios = moments.covariance.mean(axis=(1, 2)) / moments.variance.mean()
+    np.testing.assert_allclose(ratios, np.array([band.adjacent, band.diagonal, band.adjacent]) / band.same, atol=0.004)
 
 
 def test_slopes_follow_the_lights(mat):
@@ -139,7 +139,11 @@ def test_camera_noise_is_not_taken_for_a_reflection(mat):
 
 
 NOISE = np.full((3, 1, 1), 1e-4)
-STILL = {"seen": np.eye(3)[list(CHANNEL)], "displacement": np.zeros((3, 2, 1, 1)), "glints": np.zeros((3, 2, 1, 1))}
+STILL = {
+    "light_fraction": np.eye(3)[list(CHANNEL)],
+    "displacement": np.zeros((3, 2, 1, 1)),
+    "glints": np.zeros((3, 2, 1, 1)),
+}
 """Each channel sees a light of its own, which is not displaced."""
 
 
@@ -178,7 +182,7 @@ def test_filters_are_the_best_prediction_of_what_crosstalk_shows_of_lights(by_le
         np.full((3, 1, 1), noise),
         texture,
         "RGGB",
-        seen=seen,
+        light_fraction=seen,
         displacement=grid[0],
         glints=grid[1],
         left_out=left_out,
@@ -227,7 +231,7 @@ def test_filters_that_are_kept_are_those_made_anew():
                 np.full((3, 4, 5), 1e-3),
                 texture,
                 "GRBG",
-                seen=STILL["seen"],
+                light_fraction=STILL["light_fraction"],
                 displacement=still,
                 glints=still,
                 tables=where,

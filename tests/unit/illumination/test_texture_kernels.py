@@ -6,7 +6,7 @@ import pytest
 
 from rgbmidic._kernels import demosaicing as kriging
 from rgbmidic._kernels import texture
-from rgbmidic.illumination.colour_factors import _channel_moments, _planes, of_mosaic, widened
+from rgbmidic.illumination.colour_factors import _channel_moments, _planes, interleave_bayer, upsample_rows
 from rgbmidic.illumination.demosaicing import red_position
 from rgbmidic.illumination.texture import lanczos_weights
 from rgbmidic.settings import BAYER_PATTERNS
@@ -36,10 +36,10 @@ def test_sums_means_and_scaling(cfa, shape):
     np.testing.assert_allclose(sums[:4], expected[0], rtol=1e-5, atol=1e-3)
     np.testing.assert_array_equal(sums[4:], expected[1])
     mean, out = grid_for(shape, 4), np.empty_like(values)
-    texture.subtract_mean(values, of_mosaic(mean, 4, shape[1], red), 4, out)
+    texture.subtract_mean(values, interleave_bayer(mean, 4, shape[1], red), 4, out)
     np.testing.assert_allclose(out, naive_texture.subtract_mean(values, mean, cfa, 4), rtol=1e-5, atol=1e-4)
     scale, padded = grid_for(shape, 8), np.empty((shape[0] + 4, shape[1] + 4 + 7), dtype=np.float32)
-    texture.scaled_contrast(values, of_mosaic(scale, 8, shape[1], red), 8, 2, padded)
+    texture.scaled_contrast(values, interleave_bayer(scale, 8, shape[1], red), 8, 2, padded)
     expected = naive_texture.scaled_contrast(values, scale, cfa, 8, 2, padded.shape[1])
     np.testing.assert_allclose(padded, expected, rtol=1e-5, atol=1e-3)
 
@@ -108,7 +108,7 @@ def test_prediction_with_different_filters_per_tile(size):
     padded = rng.normal(size=(shape[0] + 2 * pad, tiles[1] * kriging.TILE + 2 * pad)).astype(np.float32)
     scale, mean, out = grid_for(shape, 8), grid_for(shape, 4), np.empty((2, *shape), dtype=np.float32)
     mixing = rng.normal(size=(2, 3)).astype(np.float32)
-    wide = widened(scale, 8, shape[1]), 8, widened(mean, 4, shape[1]), 4
+    wide = upsample_rows(scale, 8, shape[1]), 8, upsample_rows(mean, 4, shape[1]), 4
     kriging.predict(padded, index, taps, size, *wide, mixing, out)
     channels = naive_texture.predict(padded, index, taps, size, scale, 8, mean, 4, shape, kriging.TILE)
     np.testing.assert_allclose(out, np.tensordot(mixing, channels, axes=1), rtol=1e-4, atol=3e-4)

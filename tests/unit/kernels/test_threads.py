@@ -57,7 +57,7 @@ def shared(dispatcher, **options):
 def test_every_item_is_done_once_in_whole_grains(count, grain, number):
     set_threads(number)
     kernel, items = Counted(), np.zeros((2, count))
-    shared(kernel, axis=1, grain=grain, least=0)(None, items)
+    shared(kernel, axis=1, grain=grain, min_size=0)(None, items)
     assert (items == 1).all()
     assert len(kernel.ranges) == max(1, min(number, -(-count // grain)))
     assert all(start % grain == 0 for start, _ in kernel.ranges)
@@ -67,7 +67,7 @@ def test_every_item_is_done_once_in_whole_grains(count, grain, number):
 def test_one_thread_does_alone_what_is_small(other, parts):
     set_threads(2)
     kernel = Counted()
-    shared(kernel, axis=1, least=100)(other, np.zeros((2, 8)))
+    shared(kernel, axis=1, min_size=100)(other, np.zeros((2, 8)))
     assert len(kernel.ranges) == parts
 
 
@@ -85,7 +85,7 @@ def test_a_failure_in_any_thread_is_told():
 
     set_threads(3)
     with pytest.raises(ValueError, match="the last one"):
-        shared(Failing(), least=0)(None, np.zeros(9))
+        shared(Failing(), min_size=0)(None, np.zeros(9))
 
 
 def test_many_threads_may_call_at_once():
