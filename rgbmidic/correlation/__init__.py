@@ -8,7 +8,7 @@ from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status, fill
 from rgbmidic.correlation.solve import solve
-from rgbmidic.correlation.start import Start, find_start, track
+from rgbmidic.correlation.start import TrackingState, find_initial_guess, track
 
 __all__ = [
     "Deformed",
@@ -20,11 +20,11 @@ __all__ = [
     "Residual",
     "Solution",
     "SolverConstants",
-    "Start",
     "Status",
+    "TrackingState",
     "discretisation_error",
     "fill",
-    "find_start",
+    "find_initial_guess",
     "solve",
     "track",
     "unresolved_strain",

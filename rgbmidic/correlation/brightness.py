@@ -61,8 +61,10 @@ class GainFit:
         xx, yy = xx + spread, yy + spread
         cofactors = np.stack([xx * yy - xy * xy, xy * y - x * yy, x * xy - xx * y])
         determinant = (cofactors * (total, x, y)).sum(axis=0)
-        least = 1e-6 * float(determinant.max(initial=0.0)) + 1e-300
-        coefficients = np.where(determinant > least, cofactors / np.maximum(determinant, least), 0.0)
+        min_determinant = 1e-6 * float(determinant.max(initial=0.0)) + 1e-300
+        coefficients = np.where(
+            determinant > min_determinant, cofactors / np.maximum(determinant, min_determinant), 0.0
+        )
         return cls(pixels=pixels, weights=weights, sigma=sigma, sums=sums, coefficients=coefficients)
 
     def block_sums(self, field: FloatImage) -> FloatArray:
@@ -134,7 +136,7 @@ class Brightness:
         """Return the brightness with a gain that varies over windows of `sigma` px, for weights (k, P)."""
         lights = zip(self.values, weights, strict=True)
         fits = tuple(GainFit.over(f, w, self.pixels, sigma) for f, w in lights)
-        rows, columns = ((place + 0.5) * _STEP - 0.5 for place in np.indices(fits[0].sums.shape))
+        rows, columns = ((index + 0.5) * _STEP - 0.5 for index in np.indices(fits[0].sums.shape))
         totals = self.pixels.block_sums(weights, _STEP)
         planes = (b[0] + b[1] * columns + b[2] * rows for b in self.offset)
         offset_sums = tuple(plane * total for plane, total in zip(planes, totals, strict=True))
@@ -155,9 +157,9 @@ class Brightness:
         if self.fits:
             fit = self.fits[light]
             gain = fit.gain(fit.sums - fit.block_sums(difference) - self.offset_sums[light])
-        least = np.float32(self.least_gain * self.gain[light])
+        min_gain = np.float32(self.least_gain * self.gain[light])
         images = self.values[light], self.level[light], difference
-        corrected_difference(self.pixels.lines, *images, gain, self.offset[light], least, _STEP, out)
+        corrected_difference(self.pixels.lines, *images, gain, self.offset[light], min_gain, _STEP, out)
         return out
 
 
@@ -182,11 +184,13 @@ def gain_and_offset(
         total, f, g, ff, fg, gg = sums.T
         total = np.maximum(total, 1e-30)
         ff, fg, gg = ff - f * f / total, fg - f * g / total, gg - g * g / total
-        alike = (ff > 0) & (gg > 0) & (fg > constants.lit * np.sqrt(np.maximum(ff * gg, 0)))
-        if alike.any():
-            gain = np.sqrt(gg[alike] / ff[alike])
+        is_correlated = (ff > 0) & (gg > 0) & (fg > constants.min_gain_correlation * np.sqrt(np.maximum(ff * gg, 0)))
+        if is_correlated.any():
+            gain = np.sqrt(gg[is_correlated] / ff[is_correlated])
             gains[light] = np.median(gain)
-            offsets[light] = _offset_plane(centres[alike], (g[alike] - gain * f[alike]) / total[alike])
+            offsets[light] = _offset_plane(
+                centres[is_correlated], (g[is_correlated] - gain * f[is_correlated]) / total[is_correlated]
+            )
     return gains, offsets
 
 
@@ -237,9 +241,9 @@ def window_width(
         for f, gx, gy, w in zip(values, *gradient, weights, strict=True):
             fields = np.stack([w * f, w * f * f, w * (gx * gx + gy * gy), w])
             mean, square, slope = window.ratios(pixels, fields).astype(np.float64)
-            if (seen := slope > 0).any():
+            if (textured := slope > 0).any():
                 variance = np.maximum(square - mean * mean, 0)
-                lengths.append(float(np.sqrt(np.median(variance[seen] / slope[seen]))))
+                lengths.append(float(np.sqrt(np.median(variance[textured] / slope[textured]))))
         length = float(np.median(lengths)) if lengths else 0.0
-        sigma = max(constants.window_of_gain * length, constants.least_window)
+        sigma = max(constants.gain_window_factor * length, constants.min_gain_window)
     return sigma
