@@ -63,7 +63,9 @@ class Deformed:
 
     def __post_init__(self) -> None:
         """Count the blocks with a weight other than 1."""
-        object.__setattr__(self, "partial", np.stack([_count_nonuniform_blocks(weight) for weight in self.weights]))
+        object.__setattr__(
+            self, "nonuniform_weight_blocks", np.stack([_count_nonuniform_blocks(weight) for weight in self.weights])
+        )
 
     def contains(self, points: FloatArray) -> BoolArray:
         """Find the points that lie on pixels of the images.

@@ -216,7 +216,7 @@ class Search:
     def _keypoints(
         self, images: FloatImage, weights: FloatImage, window: tuple[slice, slice], reduction: int, max_count: int
     ) -> Keypoints | None:
-        """Find the `max_count` strongest keypoints in a window of a state's picture, where a weight is not 0, if any."""
+        """Find the `max_count` strongest keypoints in a window of a state's picture, where a weight is not 0."""
         if min(side.stop - side.start for side in window) // reduction < 2 * self.normalise:
             return None
         picture, weight_sum = self._picture(images, weights, window, reduction)
