@@ -9,6 +9,7 @@ from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status, fill
 from rgbmidic.correlation.solve import solve
 from rgbmidic.correlation.start import TrackingState, find_initial_guess, track
+from rgbmidic.renamed import refuse_old_names
 
 __all__ = [
     "Deformed",
@@ -30,3 +31,5 @@ __all__ = [
     "unresolved_strain",
     "with_one_sided_error",
 ]
+
+__getattr__ = refuse_old_names(__name__)

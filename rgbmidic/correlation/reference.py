@@ -35,11 +35,13 @@ from rgbmidic.correlation.texture import TextureGradient
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import DARK, Registration
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
 _WARP = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Deformed:
     """The k images of a deformed state, ready to be interpolated.
@@ -144,6 +146,7 @@ class Deformed:
         )
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reference:
     """The reference state: its mesh and its images; everything a frame needs and no frame changes.

@@ -20,9 +20,11 @@ from rgbmidic._kernels.owned_pixels import subtract_quadratic
 from rgbmidic.correlation.brightness import Brightness
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Residual:
     """Both states at the owned pixels of the reference.
@@ -138,6 +140,7 @@ class Residual:
         return replace(self, difference=out)
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Precision:
     """Precision of the lights, from their residuals.
