@@ -392,7 +392,7 @@ def _unsmoothing(mesh: Tri3Mesh) -> Callable[[FloatArray], FloatArray]:
 
 
 def _simulate_noise(refined: _RefinedMesh, reference: Reference) -> _NoiseStatistics:
-    """Find what noise does from random scores with the covariance of the Hessian, and from images of noise."""
+    """Simulate noise on both meshes from random scores with the covariance of the Hessian, and from images of noise."""
     mesh, fine, count, random = refined.mesh, refined.fine, len(refined.mesh.nodes), np.random.default_rng(0)
     finer, coarse = (
         Equations.build(state, state.pixel_weights, np.zeros((state.assembly.size, 0)), np.zeros_like(state.mesh.nodes))

@@ -226,7 +226,7 @@ def one_sided_error(mesh: Tri3Mesh, active: BoolArray, displacement: FloatArray,
     """
     fits = _boundary_fits(mesh, active.tobytes())
     u, v = fields = tuple(zip(np.nan_to_num(displacement).T, np.nan_to_num(std**2).T, strict=True))
-    half_x, half_y = (with_data(field, field.data / 2) for field in (fits.slope_x, fits.slope_y))
+    half_x, half_y = (with_data(slope, slope.data / 2) for slope in (fits.slope_x, fits.slope_y))
     single_terms = ((fits.value, u), (fits.value, v), (fits.slope_x, u), (fits.slope_y, v))
     squares = [_square_and_noise(fits.mean, *terms) for terms in (*zip(single_terms), ((half_y, u), (half_x, v)))]
     square, noise = np.stack(squares, axis=-1)
