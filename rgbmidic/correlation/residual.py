@@ -308,7 +308,7 @@ twice of it results differ by 5e-6 px at most (measured)."""
 
 
 def interpolate_motion(points: FloatArray, motion: FloatArray, mesh: Tri3Mesh, scale: float) -> FloatArray:
-    """Interpolate motion (P, 2) of points (P, 2) at the nodes (N, 2): one affine field, and what a local one adds to it.
+    """Interpolate motion (P, 2) of points (P, 2) at the nodes (N, 2): one affine field, and what a local one adds.
 
     Both are robust fits, with Cauchy weights of `scale` px. Around a node it is that of the nearest `_FITTED_PAIRS`
     points, around the nodes at a crack of those on their own side.
