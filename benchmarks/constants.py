@@ -18,7 +18,7 @@ import numpy as np
 from textures import Affine, Texture
 
 from rgbmidic import Region, Solution, SolverSettings, Tri3Mesh
-from rgbmidic.correlation import Deformed, Reference, SolverConstants, Start, track
+from rgbmidic.correlation import Deformed, Reference, SolverConstants, TrackingState, track
 from rgbmidic.correlation.images import SlidingWindow, as_light_stack
 from rgbmidic.correlation.start import Search
 from rgbmidic.settings import ELEMENT_SIZE
@@ -30,8 +30,9 @@ from .tables import Row, table
 SHAPE, REGION = (200, 240), (15, 15, 222, 182)
 VARIED = {
     "solver": (
-        *("smoothness", "longest_step", "patience", "anchor", "even", "score_range", "prior", "gain_smoothness"),
-        *("worse", "one_sided", "noisy", "begun", "wandering", "swinging", "settled"),
+        *("smoothness", "longest_step", "patience", "anchor", "information_smoothing", "score_range", "prior_blocks"),
+        *("outlier_factor", "min_isotropy", "max_noise_fraction", "min_initial_zncc", "divergence_step"),
+        *("gain_window_factor", "max_oscillating_fraction", "weight_tolerance"),
     ),
     "window": ("sigma",),
     "search": ("normalise", "flat", "grey", "voters", "tolerance", "context"),
@@ -42,7 +43,7 @@ QUICK = ("least_variance", "sigma")
 """One of each part."""
 NOTHING = {"displacement/stated": 1e-3, "stated [%]": 0.01}
 """What is as good as no change: the last iteration of a solve may move the nodes by so much."""
-COARSE = {"smoothness": 10, "anchor": 10, "settled": 100, "voters": 10, "tolerance": 100}
+COARSE = {"smoothness": 10, "anchor": 10, "weight_tolerance": 100, "voters": 10, "tolerance": 100}
 """Constants of which only the order of magnitude counts, and factors."""
 
 
@@ -72,7 +73,7 @@ class Method:
         reference = Reference.prepare(f, region, weights, mesh=mesh, prefilter=prefilter, constants=self.solver)
         deformed = Deformed.prepare(g, None, prefilter=prefilter)
         statistics = replace(self.statistics, window=self.window)
-        return track(reference, deformed, Start(displacement=None), settings, statistics, self.search)
+        return track(reference, deformed, TrackingState(displacement=None), settings, statistics, self.search)
 
 
 @cache

@@ -157,14 +157,14 @@ def write_raw_test(folder: Path, frames: int, states: FloatArray, registration: 
 def raw_frame(folder: Path) -> Callable[[], Points]:
     """Measures the second frame of a raw series, whose reference is prepared, as a run does."""
     from rgbmidic import read_test
-    from rgbmidic.correlation import Start
+    from rgbmidic.correlation import TrackingState
     from rgbmidic.pipeline import Plan, measure_frame
 
     plan = Plan.from_settings(read_test(folder / "TEST.toml"))
     nodes = plan.reference.mesh.nodes
 
     def measure() -> Points:
-        found = measure_frame(plan, 1, Start(displacement=np.zeros_like(nodes)))
+        found = measure_frame(plan, 1, TrackingState(displacement=np.zeros_like(nodes)))
         return nodes + plan.window.origin, np.stack([found.u, found.v], axis=1)
 
     return measure

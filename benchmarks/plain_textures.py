@@ -201,7 +201,9 @@ def _unfitted(image: FloatArray, region: tuple[int, int, int, int], size: float)
     """Fraction of the noise's score that the fit leaves in the residual."""
     place = Region.from_rectangle(region, image.shape)
     mesh = Tri3Mesh.from_region(place, size)
-    return float(Reference.prepare(image[None].astype(np.float32), place, mesh=mesh, prefilter="binomial").unfitted)
+    return float(
+        Reference.prepare(image[None].astype(np.float32), place, mesh=mesh, prefilter="binomial").residual_leverage
+    )
 
 
 def _speckle(size: int, width: float) -> FloatArray:

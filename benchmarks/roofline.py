@@ -16,7 +16,7 @@ from rgbmidic._kernels.correlation import differences, warped_weights
 from rgbmidic._kernels.illumination import unmix
 from rgbmidic._kernels.splines import PAD, bspline_coefficients
 from rgbmidic.correlation import Deformed, Reference
-from rgbmidic.correlation.reference import carried
+from rgbmidic.correlation.reference import warp_arguments
 from rgbmidic.mesh import Region, Tri3Mesh
 
 from .tables import table
@@ -55,8 +55,17 @@ def cases(size: int) -> list[tuple[str, int, int, Callable[[], object]]]:
     difference, weight = np.empty((2, owned), np.float32)
     values, weights, moments = reference.values[0], reference.pixel_weights[0], np.empty((elements, 6))
     coefficients = np.empty((size + 2 * PAD,) * 2, np.float32)
-    there = carried(mesh, reference.pixels, motion)
-    warped = deformed.weights[0], deformed.partial[0], values, difference, weights, *there, weight, moments
+    there = warp_arguments(mesh, reference.pixels, motion)
+    warped = (
+        deformed.weights[0],
+        deformed.nonuniform_weight_blocks[0],
+        values,
+        difference,
+        weights,
+        *there,
+        weight,
+        moments,
+    )
     channels, known = random.uniform(0, 200, (3, size, size)).astype(np.float32), np.ones((3, size, size), dtype=bool)
     lights, lit = np.empty_like(channels), np.empty_like(known)
     grid, needed = np.tile(np.eye(3, dtype=np.float32) + np.float32(0.1), (2, 2, 1, 1)), np.eye(3, dtype=bool)

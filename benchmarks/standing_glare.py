@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from rgbmidic._kernels.splines import PAD, bspline_coefficients, sample_with_gradient
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.start import Start, track
+from rgbmidic.correlation.start import TrackingState, track
 from rgbmidic.frames import Mosaic, Window, cfa_channels
 from rgbmidic.illumination.calibration import Calibration
 from rgbmidic.illumination.crosstalk import Crosstalk
@@ -181,11 +181,11 @@ def _measured(plate: HoledPlate, moving: int | None) -> Row:
     )
     mesh = Tri3Mesh.from_region(region, ELEMENT_SIZE)
     reference = Reference.prepare(images.values, region, mesh=mesh, prefilter=solver.prefilter)
-    start, errors, stated = Start(displacement=np.zeros_like(mesh.nodes)), [], []
+    start, errors, stated = TrackingState(displacement=np.zeros_like(mesh.nodes)), [], []
     for number in range(plate.rest, len(frames)):
         ready = separation(frames[number]).values
         found = track(reference, Deformed.prepare(ready, prefilter=solver.prefilter), start, solver, Statistics())
-        start = start.after(mesh, found.displacement, found.measured)
+        start = start.extrapolate(mesh, found.displacement, found.measured)
         errors.append(found.displacement - plate.displacement(mesh.nodes, number))
         stated.append(found.displacement_std)
     error = np.abs(np.concatenate(errors))

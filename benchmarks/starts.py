@@ -19,7 +19,7 @@ from rgbmidic import Region, Tri3Mesh
 from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.correlation.nodes import correlation_around
 from rgbmidic.correlation.residual import Residual
-from rgbmidic.correlation.start import find_start
+from rgbmidic.correlation.start import find_initial_guess
 from rgbmidic.typing import FloatArray, FloatImage
 
 from .tables import Row, table
@@ -121,7 +121,7 @@ def search(side: int, texture: FloatImage, size: int, lights: str, motion: Motio
     mesh = Tri3Mesh.from_region(region, 25)
     reference = Reference.prepare(images, region, weights, mesh=mesh, prefilter="binomial")
     deformed = Deformed.prepare(*under_lights(moved(texture, size, motion), lights, random), prefilter="binomial")
-    start = find_start(reference, deformed)
+    start = find_initial_guess(reference, deformed)
     truth = motion.of(mesh.nodes, (size - 1) / 2)
     residual = Residual.at(reference, deformed, [truth] * len(images))
     visible = np.nan_to_num(correlation_around(residual)) >= VISIBLE

@@ -17,6 +17,7 @@ _NAMES: Mapping[str, Mapping[str, str]] = {
         "optional": "import_optional",
         "disk_faults": "convert_disk_errors",
     },
+    "rgbmidic.correlation": {"Start": "TrackingState", "find_start": "find_initial_guess"},
     "rgbmidic.typing": {"Progress": "ProgressCallback"},
     "rgbmidic.results": {"Quantity": "ResultQuantity", "shared_part": "common_variance_fraction"},
     "rgbmidic.results.comparison": {"QUANTITIES": "COMPARED_QUANTITIES", "WAYS": "VARIANTS"},
@@ -24,6 +25,10 @@ _NAMES: Mapping[str, Mapping[str, str]] = {
     "rgbmidic.report": {"Movie": "FieldMovie"},
     "rgbmidic.frames": {"Movie": "MovieSource", "known_formats": "frame_formats"},
     "rgbmidic.settings": {"regular": "require_regular_file", "plain": "to_plain"},
+    "Deformed": {"pictures": "images_on_first_light", "partial": "nonuniform_weight_blocks"},
+    "Reference": {"unfitted": "residual_leverage"},
+    "Residual": {"without": "subtract_curvature"},
+    "Precision": {"bend": "loss_curvature"},
     "FrameSource": {"stated": "user_metadata"},
     "Window": {"whole": "of_frame", "around": "around_points", "part_of": "slices_in"},
     "Tri3Mesh": {

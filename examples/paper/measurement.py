@@ -19,7 +19,7 @@ from scipy.sparse.linalg import spsolve
 
 from bench import Bench, Topography
 from rgbmidic import Region, Solution, Tri3Mesh
-from rgbmidic.correlation import Deformed, Reference, Residual, find_start, solve
+from rgbmidic.correlation import Deformed, Reference, Residual, find_initial_guess, solve
 from rgbmidic.errors import InputError
 from rgbmidic.fields import at_nodes, at_pixels, high_pass
 from rgbmidic.illumination import IlluminationImages
@@ -116,7 +116,7 @@ class Competitor:
         values, weights = _seen(self.method, self.lights, self.threshold, images)
         deformed = Deformed.prepare(values, weights, prefilter=self.reference.prefilter)
         if start is None:
-            start = find_start(self.reference, deformed).displacement
+            start = find_initial_guess(self.reference, deformed).displacement
         method = METHODS[self.method]
         solution = solve(self.reference, deformed, start, SolverSettings(), Statistics() if method.default else None)
         if method.ours or not solution.measured.any():

@@ -8,7 +8,8 @@ from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual
 from rgbmidic.correlation.solution import NodeStatus, Solution, Status, fill
 from rgbmidic.correlation.solve import solve
-from rgbmidic.correlation.start import Start, find_start, track
+from rgbmidic.correlation.start import TrackingState, find_initial_guess, track
+from rgbmidic.renamed import refuse_old_names
 
 __all__ = [
     "Deformed",
@@ -20,13 +21,15 @@ __all__ = [
     "Residual",
     "Solution",
     "SolverConstants",
-    "Start",
     "Status",
+    "TrackingState",
     "discretisation_error",
     "fill",
-    "find_start",
+    "find_initial_guess",
     "solve",
     "track",
     "unresolved_strain",
     "with_one_sided_error",
 ]
+
+__getattr__ = refuse_old_names(__name__)

@@ -37,7 +37,7 @@ class Assembly:
     ----------
     entries : csc_matrix, shape (nonzeros, 27 E)
         Sums element blocks into the data of the assembled matrix.
-    unknowns, own : ndarray, shape (6 E,), (9 E,)
+    unknowns, node_entries : ndarray, shape (6 E,), (9 E,)
         Number of each entry of element vectors, and of three values at the corners, in those of the nodes.
     smoothness : csc_matrix, shape (2 N, 2 N)
         Graph Laplacian of the mesh for u and v, rows summing to zero, unit mean diagonal; in the structure of the
@@ -52,7 +52,7 @@ class Assembly:
 
     entries: sp.csc_matrix
     unknowns: npt.NDArray[np.int64]
-    own: npt.NDArray[np.int64]
+    node_entries: npt.NDArray[np.int64]
     smoothness: sp.csc_matrix
     diagonal: FloatArray
     nodal_area: FloatArray
@@ -82,7 +82,7 @@ class Assembly:
         return cls(
             entries=sp.csc_matrix((np.ones(rows.size), rows, starts), shape=(slots.size, starts.size - 1)),
             unknowns=(2 * corners[..., None] + component).ravel(),
-            own=(3 * corners[..., None] + np.arange(3)).ravel(),
+            node_entries=(3 * corners[..., None] + np.arange(3)).ravel(),
             smoothness=sp.csc_matrix((smooth, indices, indptr), shape=(2 * count, 2 * count)),
             diagonal=diagonal,
             nodal_area=mesh.to_nodes(mesh.areas / 3),
@@ -109,14 +109,16 @@ class Assembly:
         """Entries xx, xy, yy (3, N) of the nodes' own blocks in that matrix."""
         return np.ascontiguousarray(self.at_nodes(np.einsum("eaad->ead", blocks)).T)
 
-    def at_nodes(self, parts: FloatArray) -> FloatArray:
+    def at_nodes(self, corner_values: FloatArray) -> FloatArray:
         """Sum three values at the corners of the elements (E, 3, 3) at the nodes, (N, 3)."""
-        sums = np.bincount(self.own, weights=parts.ravel(), minlength=self.size // 2 * 3)
+        sums = np.bincount(self.node_entries, weights=corner_values.ravel(), minlength=self.size // 2 * 3)
         return np.asarray(sums, dtype=np.float64).reshape(-1, 3)
 
-    def vector(self, parts: FloatArray) -> FloatArray:
+    def vector(self, corner_values: FloatArray) -> FloatArray:
         """Assemble element vectors (E, 3, 2) into a vector (2 N,)."""
-        return np.asarray(np.bincount(self.unknowns, weights=parts.ravel(), minlength=self.size), dtype=np.float64)
+        return np.asarray(
+            np.bincount(self.unknowns, weights=corner_values.ravel(), minlength=self.size), dtype=np.float64
+        )
 
 
 _RIGID_FUNCTIONS = {"none": 0, "translation": 2, "translation+rotation": 3}
@@ -138,24 +140,24 @@ class RigidMotions:
 
     Attributes
     ----------
-    follows : ndarray, shape (2 N, K)
+    response : ndarray, shape (2 N, K)
         X: the displacement follows a unit of each coefficient by its negative.
-    moves : ndarray, shape (k, 2 N, K)
+    relative_modes : ndarray, shape (k, 2 N, K)
         D: what each light moves by then.
-    pull : ndarray, shape (2 N, K)
+    coupling : ndarray, shape (2 N, K)
         ``B + H X``: what a displacement takes from the right-hand sides of the coefficients.
     inverse : ndarray, shape (K, K)
         Of the Schur complement without smoothness, in the directions that the images show, else 0.
-    hidden : ndarray, shape (k,), bool
+    unobservable : ndarray, shape (k,), bool
         Lights with a weight whose rigid motion the images do not show: they share no texture with the first light,
         directly or through others.
     """
 
-    follows: FloatArray
-    moves: FloatArray
-    pull: FloatArray
+    response: FloatArray
+    relative_modes: FloatArray
+    coupling: FloatArray
     inverse: FloatArray
-    hidden: BoolArray
+    unobservable: BoolArray
 
     @classmethod
     def eliminate(
@@ -188,36 +190,41 @@ class RigidMotions:
             Of the solve.
         """
         lights, count = len(per_light), functions.shape[1]
-        each = np.zeros((lights, lights - 1, len(functions), count))
-        each[np.arange(1, lights), np.arange(lights - 1)] = functions
-        own = each.transpose(0, 2, 1, 3).reshape(lights, len(functions), -1)
-        border = np.sum([assembly.matrix(blocks) @ part for blocks, part in zip(per_light, own, strict=True)], axis=0)
-        follows = solve(border)
-        moves, held = own - follows, hold @ follows
+        unit_modes = np.zeros((lights, lights - 1, len(functions), count))
+        unit_modes[np.arange(1, lights), np.arange(lights - 1)] = functions
+        modes = unit_modes.transpose(0, 2, 1, 3).reshape(lights, len(functions), -1)
+        border = np.sum(
+            [assembly.matrix(blocks) @ mode for blocks, mode in zip(per_light, modes, strict=True)],
+            axis=0,
+        )
+        response = solve(border)
+        relative_modes, held = modes - response, hold @ response
 
-        def energy(chosen: BoolArray) -> FloatArray:
+        def energy(elements: BoolArray) -> FloatArray:
             """``sum D_j^T M_j D_j`` over the chosen elements (E,)."""
-            hessians = (assembly.matrix(blocks * chosen[:, None, None, None]) for blocks in per_light)
-            return np.asarray(sum(part.T @ (hessian @ part) for hessian, part in zip(hessians, moves, strict=True)))
+            hessians = (assembly.matrix(blocks * elements[:, None, None, None]) for blocks in per_light)
+            return np.asarray(
+                sum(motion.T @ (hessian @ motion) for hessian, motion in zip(hessians, relative_modes, strict=True))
+            )
 
         everywhere = energy(np.ones_like(textured))
-        alone = np.einsum("jnc,nc->c", own, border)  # diagonal of C
-        unit = np.sqrt(np.where(alone > 0, alone, 1.0))
+        border_diagonal = np.einsum("jnc,nc->c", modes, border)  # diagonal of C
+        unit = np.sqrt(np.where(border_diagonal > 0, border_diagonal, 1.0))
         scale = unit[:, None] * unit
-        whole = (everywhere + follows.T @ held) / scale
+        total_energy = (everywhere + response.T @ held) / scale
         # a complement under it is rounding (1e-13), or the hold of a constant between two bodies (1e-9)
         rounding = 1e-9
-        shown, directions = eigh(energy(textured) / scale, whole + rounding * np.eye(len(unit)))
-        known = directions[:, shown > constants.shown] / unit[:, None]
-        unknown = directions[:, shown <= constants.shown] * (alone > 0)[:, None]
+        observability, directions = eigh(energy(textured) / scale, total_energy + rounding * np.eye(len(unit)))
+        observable = directions[:, observability > constants.min_observability] / unit[:, None]
+        unknown = directions[:, observability <= constants.min_observability] * (border_diagonal > 0)[:, None]
         unknown = unknown / np.maximum(np.linalg.norm(unknown, axis=0), 1e-300)
-        part = (unknown**2).sum(axis=1).reshape(lights - 1, count).sum(axis=1)
+        participation = (unknown**2).sum(axis=1).reshape(lights - 1, count).sum(axis=1)
         return cls(
-            follows=follows,
-            moves=moves,
-            pull=border + held,
-            inverse=known @ np.linalg.inv(known.T @ everywhere @ known) @ known.T,
-            hidden=np.append(False, part > constants.named),
+            response=response,
+            relative_modes=relative_modes,
+            coupling=border + held,
+            inverse=observable @ np.linalg.inv(observable.T @ everywhere @ observable) @ observable.T,
+            unobservable=np.append(False, participation > constants.min_participation),
         )
 
     def increment(self, free: FloatArray, held_side: FloatArray, rigid_side: FloatArray) -> FloatArray:
@@ -235,15 +242,18 @@ class RigidMotions:
         rigid_side : ndarray, shape (K,)
             Right-hand side of the coefficients.
         """
-        return np.asarray(self.inverse @ (rigid_side - self.pull.T @ free + self.follows.T @ held_side))
+        return np.asarray(self.inverse @ (rigid_side - self.coupling.T @ free + self.response.T @ held_side))
 
 
 def block_side(pixels: PixelMap, element: float, constants: SolverConstants) -> int:
     """Side (px) of the blocks for elements of side `element` (px); a small region has a few of them across."""
-    return max(constants.block, min(round(constants.of_element * element), min(pixels.bounds[2:]) // constants.across))
+    return max(
+        constants.min_block_side,
+        min(round(constants.block_side_per_element * element), min(pixels.bounds[2:]) // constants.min_blocks_across),
+    )
 
 
-def unfitted_fraction(
+def mean_residual_leverage(
     mesh: Tri3Mesh,
     pixels: PixelMap,
     assembly: Assembly,
@@ -278,16 +288,16 @@ def unfitted_fraction(
     """
     side = block_side(pixels, mesh.size, constants)
     rows, columns = pixels.grid(side)
-    apart = int(np.clip(np.ceil(2 * np.sqrt(constants.projected / (rows * columns))), 2, 4))
+    stride = int(np.clip(np.ceil(2 * np.sqrt(constants.projected_blocks / (rows * columns))), 2, 4))
     sign = np.random.default_rng(0).choice(np.array([-1, 1], dtype=np.float32), (rows, columns))
-    top, left, _, _ = pixels.bounds
-    place = pixels.runs, pixels.run_offsets, pixels.origin - (left, top), pixels.barycentric
-    hessian, products = np.zeros((len(pixels.origin), 3, 3, 3)), np.zeros((apart**2, len(pixels.origin), 3, 3))
-    own = np.empty_like(hessian)
+    first_row, first_column, _, _ = pixels.bounds
+    pixel_geometry = pixels.runs, pixels.run_offsets, pixels.origin - (first_column, first_row), pixels.barycentric
+    hessian, products = np.zeros((len(pixels.origin), 3, 3, 3)), np.zeros((stride**2, len(pixels.origin), 3, 3))
+    light_hessian = np.empty_like(hessian)
     for gx, gy, weight in zip(*images[0], images[1], strict=True):
-        element_hessian(gx, gy, weight, *pixels.positions, own)
-        hessian += own
-        element_block_products(gx, gy, weight, *place, sign, side, apart, products)
+        element_hessian(gx, gy, weight, *pixels.positions, light_hessian)
+        hessian += light_hessian
+        element_block_products(gx, gy, weight, *pixel_geometry, sign, side, stride, products)
     total = float(hessian[..., (0, 2)].sum())
     if not total:
         return 1.0
@@ -301,27 +311,33 @@ def unfitted_fraction(
         inner = ~mesh.on_boundary | mesh.on_boundary.all()
         unit = np.zeros((len(mesh.nodes), 2, 2))
         unit[:, [0, 1], [0, 1]] = inner[:, None] * np.random.default_rng(0).choice([-1.0, 1.0], mesh.nodes.shape)
-        moved = solve(unit.reshape(-1, 2)).T
-        fitted = solutions.reshape(-1, apart**2, 2).sum(axis=1).T
-        sign = sign[(pixels.rows - top) // side, (pixels.columns - left) // side]
-        each = mesh, pixels, images, prefilter
-        passed = [(_passed(*each, fitted[a], (sign * (1 - a), sign * a)), _passed(*each, moved[a])) for a in (0, 1)]
+        nodal_noise = solve(unit.reshape(-1, 2)).T
+        fitted = solutions.reshape(-1, stride**2, 2).sum(axis=1).T
+        sign = sign[(pixels.rows - first_row) // side, (pixels.columns - first_column) // side]
+        shared_arguments = mesh, pixels, images, prefilter
+        passed = [
+            (
+                _passed(*shared_arguments, fitted[a], (sign * (1 - a), sign * a)),
+                _passed(*shared_arguments, nodal_noise[a]),
+            )
+            for a in (0, 1)
+        ]
         ratio = float(np.sqrt(np.prod([residual / motion for residual, motion in passed])))
     if not mesh.is_graded:
         fraction = 1 - float((sides * solutions).sum()) / total
-        return ratio * fraction if fraction > constants.least_unfitted else float("nan")
+        return ratio * fraction if fraction > constants.min_residual_leverage else float("nan")
     fitted = (sides * solutions).reshape(len(mesh.nodes), -1).sum(axis=1)
-    parts = np.ascontiguousarray(hessian[..., (0, 2)].sum(axis=(2, 3)).ravel())
-    whole = np.bincount(mesh.elements.ravel(), weights=parts, minlength=len(mesh.nodes))
+    element_texture = np.ascontiguousarray(hessian[..., (0, 2)].sum(axis=(2, 3)).ravel())
+    nodal_texture = np.bincount(mesh.elements.ravel(), weights=element_texture, minlength=len(mesh.nodes))
     limits = np.array([side * rows, side * columns]) - 1
-    row, column = (np.clip(mesh.nodes[:, ::-1] - (top, left), 0, limits) // side).astype(int).T
-    here = (np.bincount(row * columns + column, values, rows * columns) for values in (fitted, whole))
-    around = [window_sums(grid.reshape(rows, columns), constants.score_range / side) for grid in here]
-    centre = mesh.centres[:, ::-1] - (top, left)
+    row, column = (np.clip(mesh.nodes[:, ::-1] - (first_row, first_column), 0, limits) // side).astype(int).T
+    block_grids = (np.bincount(row * columns + column, values, rows * columns) for values in (fitted, nodal_texture))
+    smoothed_grids = [window_sums(grid.reshape(rows, columns), constants.score_range / side) for grid in block_grids]
+    centre = mesh.centres[:, ::-1] - (first_row, first_column)
     row, column = (np.clip(centre, 0, limits) // side).astype(int).T
-    known = np.maximum(around[1][row, column], np.finfo(float).tiny)
-    local = 1 - around[0][row, column] / known
-    return np.where(local > constants.least_unfitted, ratio * local, np.nan)
+    local_texture = np.maximum(smoothed_grids[1][row, column], np.finfo(float).tiny)
+    local = 1 - smoothed_grids[0][row, column] / local_texture
+    return np.where(local > constants.min_residual_leverage, ratio * local, np.nan)
 
 
 def _passed(

@@ -50,8 +50,8 @@ class BlockTable:
         pixels, sums = reference.pixels, []
         for fields in rows:
             out = np.empty((len(fields), *pixels.grid(side)), dtype=np.float32)
-            both = (*fields, *fields[:2])[:6]
-            score_sums(*both, pixels.lines, pixels.run_offsets, pixels.offsets, side, out)
+            columns = (*fields, *fields[:2])[:6]
+            score_sums(*columns, pixels.lines, pixels.run_offsets, pixels.offsets, side, out)
             sums.append(out)
         return cls(sums=np.array(sums, dtype=np.float64), side=side, reference=reference)
 
@@ -60,7 +60,7 @@ class BlockTable:
         """Sum each light for itself, with the weights (k, P) of the solve."""
         reference = residual.reference
         lights = (
-            (one[None] for one in light)
+            (values[None] for values in light)
             for light in zip(residual.difference, weights, *reference.gradient, strict=True)
         )
         return cls.of(reference, side, map(tuple, lights))
@@ -75,8 +75,8 @@ class BlockTable:
 
     def at(self, grids: AnyArray, points: FloatArray) -> FloatArray:
         """Interpolate grids (n, h, w) at points (M, 2) in px, (n, M)."""
-        place = (points[:, ::-1] - self.reference.pixels.bounds[:2]).T / self.side - 0.5
-        return np.stack([map_coordinates(grid, place, order=1, mode="nearest") for grid in grids])
+        coordinates = (points[:, ::-1] - self.reference.pixels.bounds[:2]).T / self.side - 0.5
+        return np.stack([map_coordinates(grid, coordinates, order=1, mode="nearest") for grid in grids])
 
     def displacement(self, range_: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Displacement of each light from the solution in a window of so many px (standard deviation).
@@ -90,13 +90,13 @@ class BlockTable:
         information : ndarray, shape (k, h, w)
             Mean over the window, of each direction.
         """
-        score, own = self.sums[:, :2], self.sums[:, 2] / 2
-        information = np.maximum(self._mean(own, range_), 1e-30)
+        score, axis_information = self.sums[:, :2], self.sums[:, 2] / 2
+        information = np.maximum(self._mean(axis_information, range_), 1e-30)
         displacement = self._mean(score, range_) / information[:, None]
         blocks = 4 * np.pi * (range_ / self.side) ** 2  # that a window holds
-        square = ((score - displacement * own[:, None]) ** 2).mean(axis=1)
-        around = self._mean(square, self.reference.constants.bias_range)
-        return displacement, around / information**2 / blocks, information
+        square = ((score - displacement * axis_information[:, None]) ** 2).mean(axis=1)
+        mean_square = self._mean(square, self.reference.constants.bias_range)
+        return displacement, mean_square / information**2 / blocks, information
 
     def _mean(self, grids: FloatArray, range_: float) -> FloatArray:
         """Mean of grids (..., h, w) over a window of a standard deviation of so many px."""
@@ -110,29 +110,34 @@ class BlockTable:
         stated uncertainty has the variance 1.
         """
         constants = self.reference.constants
-        prior = constants.prior * self.side**2
+        prior = constants.prior_blocks * self.side**2
         window = 4 * np.pi * (constants.score_range / self.side) ** 2
-        found = []
+        effects = []
         for score, count in zip(self._relative(self.sums[:, :2]), self.sums[:, 3], strict=True):
-            (x, y), typical, around = score, _typical_square(score, count), self.around(count)
+            (x, y), typical, pixel_count = score, _typical_square(score, count), self.windowed_sums(count)
             # an estimate from n blocks has 2 n degrees of freedom; the mean of its inverse is n / (n - 1) times too
             # large; of one block, less one, a quarter: the variance is hardly known, and stated 4 times larger
-            number = np.minimum(window * around, count.sum()) / self.side**2
-            few = number / np.maximum(number - 1, 0.25)
+            number = np.minimum(window * pixel_count, count.sum()) / self.side**2
+            small_sample_factor = number / np.maximum(number - 1, 0.25)
             products = (x * x, typical), (x * y, 0.0), (y * y, typical)
-            found.append([(self.around(one) + prior * mean) / (around + prior) * few for one, mean in products])
-        return np.array(found)
+            effects.append(
+                [
+                    (self.windowed_sums(square) + prior * mean) / (pixel_count + prior) * small_sample_factor
+                    for square, mean in products
+                ]
+            )
+        return np.array(effects)
 
     def correlation(self) -> FloatArray:
         """Correlation of the scores of each two lights over the blocks around that both see, (k, k, h, w)."""
         scores, counts, lights = self._relative(self.sums[:, :2]), self.sums[:, 3], range(len(self.sums))
-        prior = self.reference.constants.prior * self.side**2
-        typical = [2 * prior * _typical_square(one, count) for one, count in zip(scores, counts, strict=True)]
+        prior = self.reference.constants.prior_blocks * self.side**2
+        typical = [2 * prior * _typical_square(score, count) for score, count in zip(scores, counts, strict=True)]
         out = np.zeros((len(scores), *counts.shape))
         for a, b in product(lights, lights):
-            both = (counts[a] > 0) & (counts[b] > 0)
+            common = (counts[a] > 0) & (counts[b] > 0)
             along, *squares = (
-                self.around(both * (scores[i] * scores[j]).sum(axis=0)) for i, j in ((a, b), (a, a), (b, b))
+                self.windowed_sums(common * (scores[i] * scores[j]).sum(axis=0)) for i, j in ((a, b), (a, a), (b, b))
             )
             scale = np.sqrt((squares[0] + typical[a]) * (squares[1] + typical[b]))
             np.divide(along, scale, out=out[a, b], where=scale > 0)
@@ -146,16 +151,16 @@ class BlockTable:
         reference, deformed = self.at(self.sums[0, 4:], points)
         return np.asarray(np.divide(deformed, reference, out=np.ones_like(deformed), where=reference > 0))
 
-    def around(self, grid: AnyArray) -> AnyArray:
+    def windowed_sums(self, grid: AnyArray) -> AnyArray:
         """Sums of a grid over the window in which scores are averaged, up to a factor."""
         return window_sums(grid, self.reference.constants.score_range / self.side)
 
     def typical_ratio(self, scores: FloatArray) -> float:
         """Typical square of other scores (2, h, w) of all lights together over that of the table's."""
-        other, own = (
-            _typical_square(self._relative(one[None])[0], self.sums[0, 3]) for one in (scores, self.sums[0, :2])
+        numerator, denominator = (
+            _typical_square(self._relative(values[None])[0], self.sums[0, 3]) for values in (scores, self.sums[0, :2])
         )
-        return other / own if own > 0 else 0.0
+        return numerator / denominator if denominator > 0 else 0.0
 
     def _relative(self, scores: FloatArray) -> FloatArray:
         """Scores (k, 2, h, w) over the root of the information around them.
@@ -163,10 +168,10 @@ class BlockTable:
         A light's precision changes a hundredfold at the edge of a reflection, the scores' variance with it: what is
         smooth, and averaged, is its ratio to the information.
         """
-        even, out = self.reference.constants.even, np.zeros_like(scores)
-        for (information, count), score, one in zip(self.sums[:, 2:4], scores, out, strict=True):
-            level = window_sums(information, even) / np.maximum(window_sums(count, even), 1e-6)
-            np.divide(score, np.sqrt(level), out=one, where=(level > 0) & (count > 0))
+        smoothing, out = self.reference.constants.information_smoothing, np.zeros_like(scores)
+        for (information, count), score, relative in zip(self.sums[:, 2:4], scores, out, strict=True):
+            level = window_sums(information, smoothing) / np.maximum(window_sums(count, smoothing), 1e-6)
+            np.divide(score, np.sqrt(level), out=relative, where=(level > 0) & (count > 0))
         return out
 
 
@@ -176,6 +181,6 @@ def _typical_square(score: FloatArray, count: FloatArray) -> float:
     A median, so that what does not match has no part in it: ``x^2 + y^2`` of two independent Gaussian scores is
     distributed exponentially, with a median of 2 ln 2 variances.
     """
-    whole = count >= 0.5 * count.max(initial=0.0)
-    square = (score**2).sum(axis=0)[whole] / np.maximum(count[whole], 1.0)
+    is_full = count >= 0.5 * count.max(initial=0.0)
+    square = (score**2).sum(axis=0)[is_full] / np.maximum(count[is_full], 1.0)
     return float(np.median(square)) / (2 * np.log(2)) if square.size else 0.0

@@ -69,8 +69,10 @@ class GainFit:
         xx, yy = xx + spread, yy + spread
         cofactors = np.stack([xx * yy - xy * xy, xy * y - x * yy, x * xy - xx * y])
         determinant = (cofactors * (total, x, y)).sum(axis=0)
-        least = 1e-6 * float(determinant.max(initial=0.0)) + 1e-300
-        coefficients = np.where(determinant > least, cofactors / np.maximum(determinant, least), 0.0)
+        min_determinant = 1e-6 * float(determinant.max(initial=0.0)) + 1e-300
+        coefficients = np.where(
+            determinant > min_determinant, cofactors / np.maximum(determinant, min_determinant), 0.0
+        )
         return cls(
             pixels=pixels, weights=weights, sigma=sigma, side=side, sums=sums, totals=totals, coefficients=coefficients
         )
@@ -180,12 +182,12 @@ def gain_and_offset(
         total, f, g, ff, fg, gg = sums.T
         total = np.maximum(total, 1e-30)
         ff, fg, gg = ff - f * f / total, fg - f * g / total, gg - g * g / total
-        alike = (ff > 0) & (gg > 0) & (fg > constants.lit * np.sqrt(np.maximum(ff * gg, 0)))
-        if alike.any():
-            some = np.flatnonzero(alike)[:: 1 + int(alike.sum()) // _ELEMENTS]
-            gain = np.sqrt(gg[some] / ff[some])
+        is_correlated = (ff > 0) & (gg > 0) & (fg > constants.min_gain_correlation * np.sqrt(np.maximum(ff * gg, 0)))
+        if is_correlated.any():
+            sample = np.flatnonzero(is_correlated)[:: 1 + int(is_correlated.sum()) // _ELEMENTS]
+            gain = np.sqrt(gg[sample] / ff[sample])
             gains[light] = np.median(gain)
-            offsets[light] = _offset_plane(centres[some], (g[some] - gain * f[some]) / total[some])
+            offsets[light] = _offset_plane(centres[sample], (g[sample] - gain * f[sample]) / total[sample])
     return gains, offsets
 
 
@@ -236,9 +238,9 @@ def window_width(
         for f, gx, gy, w in zip(values, *gradient, weights, strict=True):
             fields = np.stack([w * f, w * f * f, w * (gx * gx + gy * gy), w])
             mean, square, slope = window.ratios(pixels, fields).astype(np.float64)
-            if (seen := slope > 0).any():
+            if (textured := slope > 0).any():
                 variance = np.maximum(square - mean * mean, 0)
-                lengths.append(float(np.sqrt(np.median(variance[seen] / slope[seen]))))
+                lengths.append(float(np.sqrt(np.median(variance[textured] / slope[textured]))))
         length = float(np.median(lengths)) if lengths else 0.0
-        sigma = max(constants.window_of_gain * length, constants.least_window)
+        sigma = max(constants.gain_window_factor * length, constants.min_gain_window)
     return sigma

@@ -23,9 +23,9 @@ from rgbmidic._kernels.owned_pixels import interpolate_nodal
 from rgbmidic._kernels.threads import one_blas_thread
 from rgbmidic.correlation.assembly import Assembly, rigid_functions
 from rgbmidic.correlation.blocks import BlockTable
-from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, stepped
+from rgbmidic.correlation.equations import Equations, Estimate, Problem, compare, gauss_newton_step
 from rgbmidic.correlation.images import apply_prefilter
-from rgbmidic.correlation.light_bias import settled_gradient
+from rgbmidic.correlation.light_bias import with_consistent_gradient
 from rgbmidic.correlation.one_sided_fit import one_sided_error, with_one_sided_error
 from rgbmidic.correlation.recovery import Recovery, at_free_boundary, nodal_slopes
 from rgbmidic.correlation.reference import Deformed, Reference
@@ -54,12 +54,13 @@ class DiscretisationConstants:
         where waves are long, next to nothing at 3 elements: 4/3 to 1.1 for strain (derived). For displacement 1.07, and
         more for what is lost with differences taken for noise; chosen on the DIC Challenge star.
     unsmoothed
-        Inverse second moment of the rows of TRI3's mass matrix over h^2/3: what `_Halves.unsmooth` overstates.
-    sure
+        Inverse second moment of the rows of TRI3's mass matrix over h^2/3: what `_RefinedMesh.unsmooth` overstates.
+    significance
         Standard deviations of the mean square of noise alone by which the difference, of displacement (2) and of strain
-        (3), and what is `_Halves.beyond` (3) must exceed it. Strain's difference has 3 to 4 times the noise of strain,
-        so that what passes by chance would be a multiple of it. Chosen: affine fields come out 15 % larger at most.
-    sure_at_edge
+        (3), and the `_RefinedMesh.smoothing_loss` (3) must exceed it. Strain's difference has 3 to 4 times the noise of
+        strain, so that what passes by chance would be a multiple of it. Chosen: affine fields come out 15 % larger at
+        most.
+    significance_at_edge
         The same at the boundary, where the difference has 10 to 16 times the noise of strain.
     uneven
         Variance of the same over that with equal weights: a robust loss weighs pixels unevenly (measured on affine
@@ -77,8 +78,8 @@ class DiscretisationConstants:
     spread: int = 4
     of_difference: float = 1.25
     unsmoothed: float = 0.72
-    sure: tuple[float, ...] = (1.2, 1.2, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0)
-    sure_at_edge: tuple[float, ...] = (3.6, 3.6, 12.0, 12.0, 12.0, 2.0, 2.0, 2.0)
+    significance: tuple[float, ...] = (1.2, 1.2, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0)
+    significance_at_edge: tuple[float, ...] = (3.6, 3.6, 12.0, 12.0, 12.0, 2.0, 2.0, 2.0)
     uneven: tuple[float, ...] = (1.15, 1.15, 1.4, 1.4, 1.4, 1.4, 1.4, 1.4)
     chance: float = 0.8
     held: float = 1e-6
@@ -117,20 +118,20 @@ def discretisation_error(
     mesh, measured = reference.mesh, solution.measured
     if not measured.any() or mesh.size < SMALLEST_HALVED:
         return with_one_sided_error(mesh, solution)
-    halves, draws = _halves(reference)
+    refined, noise_statistics = _refined_mesh(reference)
     with one_blas_thread():
-        values, variance, deformation = _finer_field(halves, deformed, solution, options, method)
+        values, variance, deformation = _finer_field(refined, deformed, solution, options, method)
         std = np.concatenate([solution.displacement_std, solution.strain_std], axis=1)
-        noise = np.sqrt(draws.own_variance * np.column_stack([variance, variance, variance.mean(axis=1)]))
+        noise = np.sqrt(noise_statistics.field_variance * np.column_stack([variance, variance, variance.mean(axis=1)]))
         turned = np.sqrt(np.einsum("nij,nj->ni", deformation**2, noise[:, :2] ** 2))
         noise[:, :4] *= np.tile(turned / np.maximum(noise[:, :2], 1e-300), 2)  # slopes of u have its direction
         less = noise < _CONSTANTS.chance * std
-        own = np.concatenate([solution.displacement, solution.strain], axis=1)
-        used = np.asarray(measured[mesh.elements].all(axis=1))
-        difference = np.concatenate([own - values, halves.beyond(own)], axis=1)
-        error = halves.error(draws, difference, np.where(less, noise, std))
+        coarse = np.concatenate([solution.displacement, solution.strain], axis=1)
+        active = np.asarray(measured[mesh.elements].all(axis=1))
+        difference = np.concatenate([coarse - values, refined.smoothing_loss(coarse)], axis=1)
+        error = refined.error(noise_statistics, difference, np.where(less, noise, std))
         std = np.where(less, noise / np.sqrt(_CONSTANTS.chance), std)
-        error = np.fmax(error, one_sided_error(mesh, used, solution.displacement, std[:, :2]))
+        error = np.fmax(error, one_sided_error(mesh, active, solution.displacement, std[:, :2]))
     return replace(
         solution,
         displacement_std=std[:, :2],
@@ -142,7 +143,11 @@ def discretisation_error(
 
 
 def _finer_field(
-    halves: _Halves, deformed: Deformed, solution: Solution, options: SolverSettings, method: PrecisionMethod | None
+    refined: _RefinedMesh,
+    deformed: Deformed,
+    solution: Solution,
+    options: SolverSettings,
+    method: PrecisionMethod | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Take Gauss-Newton steps on the halved mesh from the recovered field.
 
@@ -153,34 +158,34 @@ def _finer_field(
         of the scores in x and y of the reference that it leaves, (N, 2), as `_score_variance`; and the deformation
         gradient (N, 2, 2) that carries these axes.
     """
-    mesh, fine, count = halves.mesh, halves.fine, len(halves.mesh.nodes)
-    used = np.asarray(solution.measured[mesh.elements].all(axis=1))
-    start = halves.interpolated(solution.displacement[mesh.nearest_nodes(solution.measured)[1]], used)
+    mesh, fine, count = refined.mesh, refined.fine, len(refined.mesh.nodes)
+    active = np.asarray(solution.measured[mesh.elements].all(axis=1))
+    start = refined.interpolated(solution.displacement[mesh.nearest_nodes(solution.measured)[1]], active)
     fine, functions = fine.filtered_as(start), rigid_functions(mesh.nodes, options.rigid).reshape(count, -1)
-    functions = halves.prolonged(functions).reshape(2 * len(start), -1)
+    functions = refined.prolonged(functions).reshape(2 * len(start), -1)
     problem = Problem(reference=fine, deformed=deformed, options=options, method=method, functions=functions)
     estimate = Estimate(displacement=start, rigid=np.nan_to_num(solution.rigid))
     first = compare(problem, estimate)
-    children = np.repeat(used, len(_CHILDREN))
-    given = first.weights * np.repeat(children, np.diff(fine.pixels.offsets))
-    weights, _ = _weighed(method, first, given)
-    fine = settled_gradient(first, weights)
+    children = np.repeat(active, len(_CHILDREN))
+    prior_weights = first.weights * np.repeat(children, np.diff(fine.pixels.offsets))
+    weights, _ = _precision_weights(method, first, prior_weights)
+    fine = with_consistent_gradient(first, weights)
     problem, first = replace(problem, reference=fine), replace(first, reference=fine)
-    without, noise = np.zeros((start.size, 0)), None if method is None else given  # without rigid functions
+    without, noise = np.zeros((start.size, 0)), None if method is None else prior_weights  # without rigid functions
     equations = Equations.build(fine, weights, without, start, noise)
-    estimate = stepped(problem, equations, first.brightness, estimate, first.difference)
+    estimate = gauss_newton_step(problem, equations, first.brightness, estimate, first.difference)
     last = compare(problem, estimate)
-    weights, loss = _weighed(method, last, given)
+    weights, loss = _precision_weights(method, last, prior_weights)
     equations = Equations.build(fine, weights, without, start, noise)
     # a robust loss bends less than the weights of one residual state: with these alone noise is followed too little
-    rest = loss * equations.solve(_right_side(fine, equations.weights, last.difference)).reshape(-1, 2)
-    last = replace(last, difference=_left(fine, last.difference, rest).difference)
-    found = estimate.displacement + equations.turned(rest)
-    recovery = halves.recovery(children & equations.textured[fine.mesh.elements].all(axis=1), equations)
-    straight = halves.straightened(last, equations, recovery, found)
+    correction = loss * equations.solve(_right_side(fine, equations.weights, last.difference)).reshape(-1, 2)
+    last = replace(last, difference=_noise_residual(fine, last.difference, correction).difference)
+    fitted = estimate.displacement + equations.turned(correction)
+    recovery = refined.recovery(children & equations.textured[fine.mesh.elements].all(axis=1), equations)
+    straight = refined.without_curvature(last, equations, recovery, fitted)
     variance = _score_variance(straight, equations.weights) * loss**2
-    known = (equations.textured & ~fine.mesh.adjacent_nodes(~equations.textured))[:count]
-    return np.where(known[:, None], recovery.field(*found.T), np.nan), variance[:count], equations.deformation[:count]
+    valid = (equations.textured & ~fine.mesh.adjacent_nodes(~equations.textured))[:count]
+    return np.where(valid[:, None], recovery.field(*fitted.T), np.nan), variance[:count], equations.deformation[:count]
 
 
 def _right_side(reference: Reference, weights: FloatImage, difference: FloatImage) -> FloatArray:
@@ -189,14 +194,14 @@ def _right_side(reference: Reference, weights: FloatImage, difference: FloatImag
     return reference.assembly.vector(np.sum([reference.projected(*light) for light in lights], axis=0))
 
 
-def _weighed(
-    method: PrecisionMethod | None, residual: Residual, given: FloatImage
+def _precision_weights(
+    method: PrecisionMethod | None, residual: Residual, prior_weights: FloatImage
 ) -> tuple[FloatImage, FloatArray | float]:
     """Weights by the residual's precision, and the factor (N, 1) by which the robust loss bends less."""
     precision = None if method is None else method.precision(residual)
     if precision is None:
-        return given, 1.0
-    weights = given * precision.factor
+        return prior_weights, 1.0
+    weights = prior_weights * precision.factor
     return weights, precision.robust_loss(residual.reference, weights)[:, None]
 
 
@@ -204,33 +209,33 @@ def _score_variance(residual: Residual, weights: FloatImage) -> FloatArray:
     """Variance of the scores in x and y (N, 2) over the square of their information, per pixel, around each node."""
     table, mesh = BlockTable.of_all(residual, weights), residual.reference.mesh
     x, y, information, count = table.sums[0, :4]
-    xx, yy, information, count = map(table.around, (x * x, y * y, information, count))
+    xx, yy, information, count = map(table.windowed_sums, (x * x, y * y, information, count))
     scale = np.divide(count, information**2, out=np.zeros_like(count), where=information > 0)
     return table.at(np.stack([xx * scale, yy * scale]), mesh.nodes).T
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Draws:
-    """What noise alone does, by draws of it: nothing else about it is assumed.
+class _NoiseStatistics:
+    """Effect of noise on both fields, from draws of it: nothing else about it is assumed.
 
     Attributes
     ----------
     variance : ndarray, shape (N, 8)
-        Variance of the difference of both fields (5), and of what is `_Halves.beyond` the coarse one (3), over that of
-        the coarse one.
+        Variance of the difference of both fields (5), and of the `_RefinedMesh.smoothing_loss` of the coarse one (3),
+        over that of the coarse one.
     scatter : ndarray, shape (N, 8)
         Relative standard deviation of their mean square over a window.
-    own_variance : ndarray, shape (N, 5)
+    field_variance : ndarray, shape (N, 5)
         Variance of u, v, exx, eyy, exy over that of the scores in their direction which the finer mesh leaves.
     """
 
     variance: FloatArray
     scatter: FloatArray
-    own_variance: FloatArray
+    field_variance: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Halves:
+class _RefinedMesh:
     """The mesh of a reference with each element in four, and what follows for all its frames.
 
     Attributes
@@ -241,7 +246,7 @@ class _Halves:
         Its nodes `at_free_boundary`.
     fine
         The reference on the finer mesh: its first nodes are those of `mesh`, each other is between two `neighbours`.
-    around : csr_matrix, shape (N, N)
+    neighbour_mean : csr_matrix, shape (N, N)
         Mean over each node and those beside it, boundary and interior apart.
     unsmooth
         Takes strain (N, C) to ``(M^-1 L - 1) s``, 0 at the boundary: what recovered slopes of a smooth field have lost.
@@ -250,7 +255,7 @@ class _Halves:
     mesh: Tri3Mesh
     at_edge: BoolArray
     fine: Reference
-    around: sp.csr_matrix
+    neighbour_mean: sp.csr_matrix
     unsmooth: Callable[[FloatArray], FloatArray]
 
     def prolonged(self, nodal: FloatArray) -> FloatArray:
@@ -259,60 +264,67 @@ class _Halves:
 
     def restricted(self, sums: FloatArray) -> FloatArray:
         """Sum right-hand sides (2 M, R) of the finer mesh to those (2 N, R) of the coarse one."""
-        parts, count = sums.reshape(-1, 2, *sums.shape[1:]), len(self.mesh.nodes)
-        total = parts[:count].copy()
+        components, count = sums.reshape(-1, 2, *sums.shape[1:]), len(self.mesh.nodes)
+        total = components[:count].copy()
         for end in self.mesh.neighbours.T:
-            np.add.at(total, end, parts[count:] / 2)
+            np.add.at(total, end, components[count:] / 2)
         return total.reshape(2 * count, *sums.shape[1:])
 
-    def interpolated(self, nodal: FloatArray, used: BoolArray) -> FloatArray:
+    def interpolated(self, nodal: FloatArray, active: BoolArray) -> FloatArray:
         """Interpolate a displacement (N, 2) at the nodes of the finer mesh, as everywhere between nodes."""
         ends = self.mesh.neighbours
-        slopes = np.stack([one @ nodal for one in nodal_slopes(self.mesh, used)], axis=-1)[ends]
+        slopes = np.stack([operator @ nodal for operator in nodal_slopes(self.mesh, active)], axis=-1)[ends]
         arm = self.mesh.nodes[ends[:, 1]] - self.mesh.nodes[ends[:, 0]]
         sag = np.einsum("ncd,nd->nc", slopes[:, 1] - slopes[:, 0], arm) / 8
         return np.concatenate([nodal, nodal[ends].mean(axis=1) - sag])
 
-    def recovery(self, used: BoolArray, equations: Equations) -> Recovery:
+    def recovery(self, active: BoolArray, equations: Equations) -> Recovery:
         """Recover the field on the finer mesh, at the nodes of the coarse one."""
-        return Recovery.over(self.fine.material, used, equations.information(self.fine), len(self.mesh.nodes))
+        return Recovery.over(self.fine.material, active, equations.information(self.fine), len(self.mesh.nodes))
 
-    def straightened(self, residual: Residual, equations: Equations, recovery: Recovery, found: FloatArray) -> Residual:
-        """Take out what the recovered field (its fit on the finer mesh is `found`) has over that fit."""
-        return residual.without(*(equations.turned_back(self.prolonged(part)) for part in recovery.bend(found)))
+    def without_curvature(
+        self, residual: Residual, equations: Equations, recovery: Recovery, fitted: FloatArray
+    ) -> Residual:
+        """Take out what the recovered field (its fit on the finer mesh is `fitted`) has over that fit."""
+        return residual.subtract_curvature(
+            *(equations.turned_back(self.prolonged(nodal)) for nodal in recovery.offset_and_curvature(fitted))
+        )
 
     def averaged(self, values: FloatArray) -> FloatArray:
         """Mean (N, C) over a window of some 1.5 elements; NaN takes no part."""
-        known = np.isfinite(values)
-        total, number = np.where(known, values, 0), known.astype(np.float64)
+        valid = np.isfinite(values)
+        total, number = np.where(valid, values, 0), valid.astype(np.float64)
         for _ in range(_CONSTANTS.spread):
-            total, number = self.around @ total, self.around @ number
+            total, number = self.neighbour_mean @ total, self.neighbour_mean @ number
         return np.asarray(np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0))
 
-    def beyond(self, field: FloatArray) -> FloatArray:
-        """What the strain of a field (N, ..., 5) has lost by smoothing, (N, ..., 3); NaN at the boundary."""
+    def smoothing_loss(self, field: FloatArray) -> FloatArray:
+        """Return what the strain of a field (N, ..., 5) has lost by smoothing, (N, ..., 3); NaN at the boundary."""
         strain = np.ascontiguousarray(field[..., 2:])
         out = self.unsmooth(np.nan_to_num(strain.reshape(len(strain), -1))).reshape(strain.shape)
         out[self.at_edge] = np.nan
         return out
 
-    def error(self, draws: _Draws, difference: FloatArray, std: FloatArray) -> FloatArray:
-        """Error (N, 5) from the difference of the two fields and what is `beyond` (N, 8), and noise (N, 5)."""
+    def error(self, noise_statistics: _NoiseStatistics, difference: FloatArray, std: FloatArray) -> FloatArray:
+        """Error (N, 5) from the difference of the two fields and what is `smoothing_loss` (N, 8), and noise (N, 5)."""
         constants = _CONSTANTS
-        noise = np.array(constants.uneven) * draws.variance * np.column_stack([std, std[:, 2:]]) ** 2
-        sure = np.where(self.at_edge[:, None], constants.sure_at_edge, constants.sure) * draws.scatter
-        square = self._excess(difference, noise, sure)
+        noise = np.array(constants.uneven) * noise_statistics.variance * np.column_stack([std, std[:, 2:]]) ** 2
+        significance = (
+            np.where(self.at_edge[:, None], constants.significance_at_edge, constants.significance)
+            * noise_statistics.scatter
+        )
+        square = self._excess(difference, noise, significance)
         square[:, :5] *= constants.of_difference**2
         square[:, 2:5] = np.fmax(square[:, 2:5], constants.unsmoothed**2 * square[:, 5:])
         return np.asarray(np.sqrt(square[:, :5]))
 
-    def _excess(self, values: FloatArray, variance: FloatArray, sure: FloatArray) -> FloatArray:
+    def _excess(self, values: FloatArray, variance: FloatArray, significance: FloatArray) -> FloatArray:
         """Mean square around each node beyond the noise, 0 where it may be noise; nodes count by their precision."""
-        known = np.isfinite(values) & (variance > 0)
-        weight = np.divide(1, variance, out=np.full_like(variance, np.nan), where=known)
+        valid = np.isfinite(values) & (variance > 0)
+        weight = np.divide(1, variance, out=np.full_like(variance, np.nan), where=valid)
         noise = 1 / self.averaged(weight)
-        square = noise * self.averaged(weight * np.where(known, values, 0) ** 2)
-        return np.where(square > noise * (1 + sure), square - noise, np.where(np.isnan(square), np.nan, 0))
+        square = noise * self.averaged(weight * np.where(valid, values, 0) ** 2)
+        return np.where(square > noise * (1 + significance), square - noise, np.where(np.isnan(square), np.nan, 0))
 
 
 _CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
@@ -320,11 +332,11 @@ _CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 
 
 @lru_cache(maxsize=1)
-def _halves(reference: Reference) -> tuple[_Halves, _Draws]:
+def _refined_mesh(reference: Reference) -> tuple[_RefinedMesh, _NoiseStatistics]:
     """Halve the elements of a reference, and find what noise does; the last result is kept."""
     mesh, count = reference.mesh, len(reference.mesh.nodes)
-    place = np.unique(edge_keys(mesh.elements[:, EDGES].reshape(-1, 2), count), return_inverse=True)[1]
-    six = np.concatenate([mesh.elements, count + place.reshape(-1, 3)], axis=1)
+    edge_index = np.unique(edge_keys(mesh.elements[:, EDGES].reshape(-1, 2), count), return_inverse=True)[1]
+    six = np.concatenate([mesh.elements, count + edge_index.reshape(-1, 3)], axis=1)
     nodes = np.concatenate([mesh.nodes, mesh.nodes[mesh.neighbours].mean(axis=1)])
     fine_mesh = Tri3Mesh(nodes=nodes, elements=six[:, _CHILDREN].reshape(-1, 3))
     edge = at_free_boundary(mesh)
@@ -332,14 +344,14 @@ def _halves(reference: Reference) -> tuple[_Halves, _Draws]:
     itself = np.arange(count)
     row, column = np.concatenate([i, j, itself]), np.concatenate([j, i, itself])
     number = np.bincount(row, minlength=count)
-    halves = _Halves(
+    refined = _RefinedMesh(
         mesh=mesh,
         at_edge=edge,
         fine=_on_mesh(reference, fine_mesh),
-        around=sp.csr_matrix((1 / number[row], (row, column)), shape=(count, count)),
+        neighbour_mean=sp.csr_matrix((1 / number[row], (row, column)), shape=(count, count)),
         unsmooth=_unsmoothing(mesh),
     )
-    return halves, _drawn(halves, reference)
+    return refined, _simulate_noise(refined, reference)
 
 
 def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
@@ -348,23 +360,23 @@ def _on_mesh(reference: Reference, mesh: Tri3Mesh) -> Reference:
     region = Region.from_mask(old.scatter(np.ones(old.local_x.size, dtype=np.float32)) > 0)
     pixels = PixelMap.from_mesh(mesh, region)
 
-    def moved(values: FloatImage) -> FloatImage:
+    def resample(values: FloatImage) -> FloatImage:
         out = np.empty((*values.shape[:-1], pixels.local_x.size), dtype=np.float32)
-        for row, place in zip(values.reshape(-1, values.shape[-1]), out.reshape(-1, out.shape[-1]), strict=True):
-            place[:] = pixels.gather(old.scatter(row))
+        for row, target in zip(values.reshape(-1, values.shape[-1]), out.reshape(-1, out.shape[-1]), strict=True):
+            target[:] = pixels.gather(old.scatter(row))
         return out
 
     names = "values", "level", "inverse_level", "gradient", "pixel_weights"
-    fields: dict[str, Any] = {name: moved(getattr(reference, name)) for name in names}
+    fields: dict[str, Any] = {name: resample(getattr(reference, name)) for name in names}
     texture = reference.texture
-    fields["texture"] = replace(texture, images=moved(texture.images), texture=moved(texture.texture))
+    fields["texture"] = replace(texture, images=resample(texture.images), texture=resample(texture.texture))
     return replace(
         reference, mesh=mesh, material=mesh, pixels=pixels, assembly=Assembly.from_mesh(mesh), gain_fits=(), **fields
     )
 
 
 def _unsmoothing(mesh: Tri3Mesh) -> Callable[[FloatArray], FloatArray]:
-    """See `_Halves.unsmooth`."""
+    """See `_RefinedMesh.unsmooth`."""
     mass, edge = mesh.mass_matrix.tocsr(), mesh.on_boundary
     lumped = np.asarray(mass.sum(axis=1)).ravel()
     inner, outer = np.flatnonzero(~edge), np.flatnonzero(edge)
@@ -380,44 +392,46 @@ def _unsmoothing(mesh: Tri3Mesh) -> Callable[[FloatArray], FloatArray]:
     return unsmooth
 
 
-def _drawn(halves: _Halves, reference: Reference) -> _Draws:
-    """Find what noise does from random scores with the covariance of the Hessian, and from images of noise."""
-    mesh, fine, count, random = halves.mesh, halves.fine, len(halves.mesh.nodes), np.random.default_rng(0)
+def _simulate_noise(refined: _RefinedMesh, reference: Reference) -> _NoiseStatistics:
+    """Simulate noise on both meshes from random scores with the covariance of the Hessian, and from images of noise."""
+    mesh, fine, count, random = refined.mesh, refined.fine, len(refined.mesh.nodes), np.random.default_rng(0)
     finer, coarse = (
-        Equations.build(one, one.pixel_weights, np.zeros((one.assembly.size, 0)), np.zeros_like(one.mesh.nodes))
-        for one in (fine, reference)
+        Equations.build(state, state.pixel_weights, np.zeros((state.assembly.size, 0)), np.zeros_like(state.mesh.nodes))
+        for state in (fine, reference)
     )
     everywhere = np.ones(len(mesh.elements), dtype=bool)
     recovery = Recovery.over(reference.material, everywhere, coarse.information(reference))
-    fine_recovery = halves.recovery(np.repeat(everywhere, len(_CHILDREN)), finer)
-    drawn = _scores(finer, random)
-    right = np.stack([fine.assembly.vector(one) for one in drawn], axis=1)
-    found = coarse.solve(halves.restricted(right))
-    fields = recovery.field(found[::2], found[1::2])
-    found = finer.solve(right)
-    difference = fields - fine_recovery.field(found[::2], found[1::2])
-    squares = np.concatenate([difference, halves.beyond(fields)], axis=2) ** 2
-    means = halves.averaged(squares.reshape(count, -1)).reshape(squares.shape)
+    fine_recovery = refined.recovery(np.repeat(everywhere, len(_CHILDREN)), finer)
+    scores = _scores(finer, random)
+    right = np.stack([fine.assembly.vector(score) for score in scores], axis=1)
+    solution = coarse.solve(refined.restricted(right))
+    fields = recovery.field(solution[::2], solution[1::2])
+    solution = finer.solve(right)
+    difference = fields - fine_recovery.field(solution[::2], solution[1::2])
+    squares = np.concatenate([difference, refined.smoothing_loss(fields)], axis=2) ** 2
+    means = refined.averaged(squares.reshape(count, -1)).reshape(squares.shape)
     typical = means.mean(axis=1)
     per_node = (fields**2).mean(axis=1)
-    own = halves.averaged(per_node)
+    node_variance = refined.averaged(per_node)
     # a node that scatters more than its neighbours, by more than draws may, is not averaged with them
-    per_node = np.maximum(own, per_node / (1 + 2 * np.sqrt(2 / _CONSTANTS.draws)))
-    scatter = np.sqrt(halves.averaged(means.var(axis=1) / typical**2))
-    left, energy = np.zeros((count, 2)), 0.0
+    per_node = np.maximum(node_variance, per_node / (1 + 2 * np.sqrt(2 / _CONSTANTS.draws)))
+    scatter = np.sqrt(refined.averaged(means.var(axis=1) / typical**2))
+    residual_variance, energy = np.zeros((count, 2)), 0.0
     for _ in range(_CONSTANTS.noises):
         white = random.standard_normal((len(fine.values), *fine.pixels.shape), dtype=np.float32)
         noise = fine.pixels.gather(np.stack([apply_prefilter(image, fine.prefilter) for image in white]))
         side = _right_side(fine, fine.pixel_weights, noise)
-        found = finer.solve(side).reshape(-1, 2)
-        residual = halves.straightened(_left(fine, noise, found), finer, fine_recovery, found)
-        left += _score_variance(residual, fine.pixel_weights)[:count] / _CONSTANTS.noises
+        solution = finer.solve(side).reshape(-1, 2)
+        residual = refined.without_curvature(_noise_residual(fine, noise, solution), finer, fine_recovery, solution)
+        residual_variance += _score_variance(residual, fine.pixel_weights)[:count] / _CONSTANTS.noises
         energy += float(side @ side) / float((right**2).sum()) * _CONSTANTS.draws / _CONSTANTS.noises
     if not mesh.is_graded:
-        left[:] = left.mean(axis=0)
-    own_variance = energy * per_node / np.column_stack([left, left, left.mean(axis=1)])
-    variance = typical / np.concatenate([own, own[:, 2:]], axis=1)
-    return _Draws(variance=variance, scatter=scatter, own_variance=own_variance)
+        residual_variance[:] = residual_variance.mean(axis=0)
+    field_variance = (
+        energy * per_node / np.column_stack([residual_variance, residual_variance, residual_variance.mean(axis=1)])
+    )
+    variance = typical / np.concatenate([node_variance, node_variance[:, 2:]], axis=1)
+    return _NoiseStatistics(variance=variance, scatter=scatter, field_variance=field_variance)
 
 
 def _scores(equations: Equations, random: np.random.Generator) -> FloatArray:
@@ -428,20 +442,20 @@ def _scores(equations: Equations, random: np.random.Generator) -> FloatArray:
         for b in range(2):
             covariance[:, a::2, b::2] = blocks[..., a + b]
     covariance += _CONSTANTS.held * np.trace(covariance.mean(axis=0)) * np.eye(6)
-    drawn = np.linalg.cholesky(covariance) @ random.standard_normal((len(blocks), 6, _CONSTANTS.draws))
-    return np.moveaxis(drawn, 2, 0).reshape(_CONSTANTS.draws, -1, 3, 2)
+    scores = np.linalg.cholesky(covariance) @ random.standard_normal((len(blocks), 6, _CONSTANTS.draws))
+    return np.moveaxis(scores, 2, 0).reshape(_CONSTANTS.draws, -1, 3, 2)
 
 
-def _left(reference: Reference, noise: FloatImage, field: FloatArray) -> Residual:
+def _noise_residual(reference: Reference, noise: FloatImage, field: FloatArray) -> Residual:
     """Residual that a displacement (N, 2) leaves of noise (k, P)."""
-    shown = np.empty((2, noise.shape[1]), dtype=np.float32)
-    interpolate_nodal(field, reference.mesh.elements, *reference.pixels.positions, shown)
-    left = noise - reference.gradient[0] * shown[0] - reference.gradient[1] * shown[1]
+    motion = np.empty((2, noise.shape[1]), dtype=np.float32)
+    interpolate_nodal(field, reference.mesh.elements, *reference.pixels.positions, motion)
+    difference = noise - reference.gradient[0] * motion[0] - reference.gradient[1] * motion[1]
     weights, moments = reference.pixel_weights, np.zeros((len(noise), 0, 6))
     return Residual(
         reference=reference,
         brightness=reference.brightness_of(weights, np.zeros((len(noise), 1, 6))),
         weights=weights,
-        difference=left,
+        difference=difference,
         moments=moments,
     )

@@ -32,11 +32,11 @@ class Elimination:
 
     Attributes
     ----------
-    place : ndarray, shape (N,)
+    order : ndarray, shape (N,)
         When each node is eliminated. All else counts the nodes so.
-    own : ndarray, shape (N, 2)
+    diagonal_slots : ndarray, shape (N, 2)
         Places of the entries xx and yy of each node's own block in the matrix' data.
-    given : tuple of ndarray
+    matrix_rows : tuple of ndarray
         Rows of the lower half of the matrix: where each starts, nodes, and places (n, 2, 2) in the matrix' data.
     lower : csc_matrix, shape (N, N)
         Blocks of the lower factor under its diagonal.
@@ -44,9 +44,9 @@ class Elimination:
         The same by rows.
     """
 
-    place: Index
-    own: Index
-    given: tuple[Index, Index, Index]
+    order: Index
+    diagonal_slots: Index
+    matrix_rows: tuple[Index, Index, Index]
     lower: sp.csc_matrix
     before: sp.csr_matrix
 
@@ -68,19 +68,25 @@ class Elimination:
         values = np.where(row == column, edges[column] + 1.0, -1.0)
         graph = sp.csc_matrix((values, row, np.concatenate([[0], np.cumsum(edges)])), shape=(edges.size,) * 2)
         factors = splu(graph, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        whole, place = factors.L, factors.perm_c
-        whole.sort_indices()
-        below = np.ones(whole.nnz, dtype=bool)
-        below[whole.indptr[:-1]] = False  # the diagonal is the first of each column
-        rows, starts = whole.indices[below], np.concatenate([[0], np.cumsum(np.diff(whole.indptr) - 1)])
-        lower = sp.csc_matrix((np.ones(rows.size, dtype=bool), rows, starts), shape=whole.shape)
-        half = np.flatnonzero(place[column] <= place[row])
-        half = half[np.argsort(place[row[half]], kind="stable")]
-        own = np.empty((edges.size, 2), dtype=np.int64)
-        own[place[row[row == column]]] = slots[row == column][:, [0, 1], [0, 1]]
-        given_starts = np.searchsorted(place[row[half]], np.arange(edges.size + 1))
-        given = given_starts, place[column[half]], np.ascontiguousarray(slots[half])
-        return cls(place=place, own=own, given=given, lower=lower, before=sp.csr_matrix(lower))
+        factor, order = factors.L, factors.perm_c
+        factor.sort_indices()
+        below = np.ones(factor.nnz, dtype=bool)
+        below[factor.indptr[:-1]] = False  # the diagonal is the first of each column
+        rows, starts = factor.indices[below], np.concatenate([[0], np.cumsum(np.diff(factor.indptr) - 1)])
+        lower = sp.csc_matrix((np.ones(rows.size, dtype=bool), rows, starts), shape=factor.shape)
+        half = np.flatnonzero(order[column] <= order[row])
+        half = half[np.argsort(order[row[half]], kind="stable")]
+        diagonal_slots = np.empty((edges.size, 2), dtype=np.int64)
+        diagonal_slots[order[row[row == column]]] = slots[row == column][:, [0, 1], [0, 1]]
+        row_starts = np.searchsorted(order[row[half]], np.arange(edges.size + 1))
+        matrix_rows = row_starts, order[column[half]], np.ascontiguousarray(slots[half])
+        return cls(
+            order=order,
+            diagonal_slots=diagonal_slots,
+            matrix_rows=matrix_rows,
+            lower=lower,
+            before=sp.csr_matrix(lower),
+        )
 
     def factorise(self, data: FloatArray) -> Callable[[FloatArray], FloatArray]:
         """Factorise a positive definite matrix given by its data.
@@ -95,18 +101,18 @@ class Elimination:
         LinAlgError
             The matrix is not positive definite, or singular in double precision.
         """
-        lower, inverse = np.empty((self.lower.nnz, 4)), np.empty((self.place.size, 3))
+        lower, inverse = np.empty((self.lower.nnz, 4)), np.empty((self.order.size, 3))
         structure = self.lower.indptr, self.lower.indices
-        factorise(data, *self.given, self.before.indptr, self.before.indices, *structure, lower, inverse)
+        factorise(data, *self.matrix_rows, self.before.indptr, self.before.indices, *structure, lower, inverse)
         xx, xy, yy = inverse.T
-        growth = (xx + yy) * data[self.own].sum(axis=1)
+        growth = (xx + yy) * data[self.diagonal_slots].sum(axis=1)
         if not ((xx > 0) & (xx * yy > xy * xy) & (growth < _SINGULAR)).all():
             raise np.linalg.LinAlgError("the matrix is singular, or not positive definite")
 
         def solve(right_sides: FloatArray) -> FloatArray:
-            solution = np.empty((self.place.size, 2, right_sides[0].size))
-            solution[self.place] = right_sides.reshape(solution.shape)
+            solution = np.empty((self.order.size, 2, right_sides[0].size))
+            solution[self.order] = right_sides.reshape(solution.shape)
             solve_factors(*structure, lower, inverse, solution)
-            return solution[self.place].reshape(right_sides.shape)
+            return solution[self.order].reshape(right_sides.shape)
 
         return solve

@@ -76,7 +76,7 @@ class Equations:
         weights: FloatImage,
         functions: FloatArray,
         displacement: FloatArray,
-        given: FloatImage | None = None,
+        prior_weights: FloatImage | None = None,
     ) -> Equations:
         """Assemble and factorise the equations for given weights.
 
@@ -90,7 +90,7 @@ class Equations:
             Rigid functions.
         displacement : ndarray, shape (N, 2)
             Around which the equations are linearised, px.
-        given : ndarray, shape (k, P), float32, optional
+        prior_weights : ndarray, shape (k, P), float32, optional
             The weights without the precision of the lights, where it is part of `weights`.
 
         Raises
@@ -101,22 +101,22 @@ class Equations:
         assembly, constants = reference.assembly, reference.constants
         per_light = reference.hessians(weights)
         blocks = np.sum(per_light, axis=0)
-        own = assembly.node_blocks(blocks)
-        least = constants.seen if given is None else constants.informed
-        observability = _observability(own, assembly.nodal_area, least, constants)
-        if given is not None:
-            texture = assembly.node_blocks(np.sum(reference.hessians(given), axis=0))
-            seen = _observability(texture, assembly.nodal_area, constants.seen, constants)
-            observability = np.minimum(observability, seen)
-        diagonal, textured = (own[0] + own[2]) / 2, observability > 1
+        node_blocks = assembly.node_blocks(blocks)
+        min_fraction = constants.min_texture if prior_weights is None else constants.min_information
+        observability = _observability(node_blocks, assembly.nodal_area, min_fraction, constants)
+        if prior_weights is not None:
+            texture = assembly.node_blocks(np.sum(reference.hessians(prior_weights), axis=0))
+            texture_observability = _observability(texture, assembly.nodal_area, constants.min_texture, constants)
+            observability = np.minimum(observability, texture_observability)
+        diagonal, textured = (node_blocks[0] + node_blocks[2]) / 2, observability > 1
         scale = float(np.median(diagonal[textured]) if textured.any() else diagonal.max(initial=0.0)) or 1.0
-        held = scale * (constants.smoothness * assembly.smoothness.data + constants.constant * assembly.diagonal)
+        held = scale * (constants.smoothness * assembly.smoothness.data + constants.ridge * assembly.diagonal)
         solve = assembly.factorise(assembly.matrix(blocks, held))
         hold = with_data(assembly.smoothness, held)
-        around = _gradient_around(reference.mesh, blocks)
+        mean_gradient = _mean_gradient(reference.mesh, blocks)
 
         def gradient(displacement: FloatArray) -> FloatArray:
-            nodal = around(displacement).reshape(-1, 2)
+            nodal = mean_gradient(displacement).reshape(-1, 2)
             # nodes without data have that of the others, carried along as a displacement is
             return np.asarray(nodal - solve(hold @ nodal)).reshape(-1, 2, 2)
 
@@ -127,14 +127,14 @@ class Equations:
         total = light.sum(axis=1, keepdims=True)
         rigid = None
         if functions.shape[1] and len(per_light) > 1:
-            shown = np.asarray(textured[reference.mesh.elements].all(axis=1))
-            rigid = RigidMotions.eliminate(assembly, per_light, functions, hold, solve, shown, constants)
+            textured_elements = np.asarray(textured[reference.mesh.elements].all(axis=1))
+            rigid = RigidMotions.eliminate(assembly, per_light, functions, hold, solve, textured_elements, constants)
         return cls(
             weights=weights,
             deformation=deformation,
             functions=functions,
             blocks=blocks,
-            node_blocks=own,
+            node_blocks=node_blocks,
             smoothness=constants.smoothness * scale,
             gradient=gradient,
             solve=solve,
@@ -174,7 +174,7 @@ class Equations:
         motion, rigid = self.solve(right_side), np.zeros(0)
         if self.rigid is not None:
             rigid = self.rigid.increment(motion, held_side, rigid_side)
-            motion = motion - self.rigid.follows @ rigid
+            motion = motion - self.rigid.response @ rigid
         return self.turned(motion.reshape(-1, 2)), rigid
 
     def held_side(self, reference: Reference, displacement: FloatArray) -> FloatArray:
@@ -196,18 +196,18 @@ class Equations:
         return _turned_back(self.deformation, vectors)
 
 
-def _gradient_around(mesh: Tri3Mesh, blocks: FloatArray) -> Callable[[FloatArray], FloatArray]:
+def _mean_gradient(mesh: Tri3Mesh, blocks: FloatArray) -> Callable[[FloatArray], FloatArray]:
     """Return what averages the gradient of a displacement (N, 2) over the elements around each node, (N, 2, 2).
 
     Elements count by what they show: one that is half on another body, and left out, turns in a way of its own.
     """
     texture = np.einsum("eaad->ed", blocks)[:, [0, 2]].sum(axis=1)
-    shown = texture + 1e-6 * (texture.mean() or 1.0)  # where nothing is shown all count alike
-    around = mesh.to_nodes(shown)
+    texture_weight = texture + 1e-6 * (texture.mean() or 1.0)  # where nothing is shown all count alike
+    nodal_weight = mesh.to_nodes(texture_weight)
 
     def average(displacement: FloatArray) -> FloatArray:
-        parts = shown * mesh.element_gradient(displacement).reshape(-1, 4).T
-        return np.stack([mesh.to_nodes(part) / around for part in parts], axis=1).reshape(-1, 2, 2)
+        components = texture_weight * mesh.element_gradient(displacement).reshape(-1, 4).T
+        return np.stack([mesh.to_nodes(component) / nodal_weight for component in components], axis=1).reshape(-1, 2, 2)
 
     return average
 
@@ -216,7 +216,7 @@ def _deformation(gradient: FloatArray, constants: SolverConstants) -> FloatArray
     """Deformation gradient (N, 2, 2), I + grad u; where that is nearly singular its rotation, the polar factor."""
     deformation = np.eye(2) + gradient
     square = np.maximum((deformation**2).sum(axis=(1, 2)), 1)
-    flat = np.linalg.det(deformation) < constants.flattened * square
+    flat = np.linalg.det(deformation) < constants.min_area_ratio * square
     angle = np.arctan2(gradient[:, 1, 0] - gradient[:, 0, 1], 2 + gradient[:, 0, 0] + gradient[:, 1, 1])
     cos, sin = np.cos(angle), np.sin(angle)
     rotation = np.stack([cos, -sin, sin, cos], axis=1).reshape(-1, 2, 2)
@@ -227,23 +227,25 @@ def _turned_back(deformation: FloatArray, vectors: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nij,nj...->ni...", np.linalg.inv(deformation), vectors))
 
 
-def _observability(own: FloatArray, area: FloatArray, least: float, constants: SolverConstants) -> FloatArray:
-    """Texture that the nodes see in their worse direction, over a fraction `least` of the median, (N,).
+def _observability(
+    node_blocks: FloatArray, area: FloatArray, min_fraction: float, constants: SolverConstants
+) -> FloatArray:
+    """Texture that the nodes see in their worse direction, over a fraction `min_fraction` of the median, (N,).
 
     It is the smaller eigenvalue of a node's own 2 x 2 block.
     """
-    xx, xy, yy = own
+    xx, xy, yy = node_blocks
     half = (xx + yy) / 2
     smallest = half - np.hypot((xx - yy) / 2, xy)
     smallest[smallest < constants.rounding * half] = 0  # texture in one direction only
     density = smallest / area
-    typical = np.median(density[density > constants.silent * density.max()]) if density.max() > 0 else 0.0
-    return np.asarray(density / (least * typical) if typical > 0 else np.zeros_like(density))
+    typical = np.median(density[density > constants.texture_floor * density.max()]) if density.max() > 0 else 0.0
+    return np.asarray(density / (min_fraction * typical) if typical > 0 else np.zeros_like(density))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
-    """What is solved: two states, the options, the method of weighting, and the rigid functions (2 N, m)."""
+    """A problem to solve: two states, the options, the method of weighting, and the rigid functions (2 N, m)."""
 
     reference: Reference
     deformed: Deformed
@@ -320,36 +322,36 @@ def iterate(
     UnsolvableError
         The iteration diverged.
     """
-    known: FloatImage | None = residual.difference
-    constants, left = problem.constants, problem.options.max_iterations - len(estimate.increments)
+    difference: FloatImage | None = residual.difference
+    constants, remaining = problem.constants, problem.options.max_iterations - len(estimate.increments)
     relaxation, motion = 1.0, np.zeros_like(estimate.displacement)
-    for turn in range(min(constants.pass_iterations, left)):
+    for turn in range(min(constants.max_pass_iterations, remaining)):
         before, last = estimate.displacement, motion
-        estimate = stepped(problem, equations, residual.brightness, estimate, known, relaxation)
-        known, motion = None, estimate.displacement - before
+        estimate = gauss_newton_step(problem, equations, residual.brightness, estimate, difference, relaxation)
+        difference, motion = None, estimate.displacement - before
         # where the deformed images have more contrast than the reference, all nodes swing about the solution (Aitken)
         swing = float((motion * last).sum()) / max(float((last * last).sum()), 1e-30)
-        relaxation /= 1 - swing if swing < -constants.swing else 1
+        relaxation /= 1 - swing if swing < -constants.max_overshoot else 1
         if not np.isfinite(estimate.displacement).all():
             raise UnsolvableError("the iteration diverged", estimate)
         # a few nodes that wander where nothing matches must not keep the others waiting
-        moved = estimate.increments[-1][equations.textured]
-        most = turn >= constants.patience and np.quantile(moved, 0.9) <= tolerance
-        if estimate.longest <= tolerance or most:
+        steps = estimate.increments[-1][equations.textured]
+        nearly_converged = turn >= constants.patience and np.quantile(steps, 0.9) <= tolerance
+        if estimate.longest <= tolerance or nearly_converged:
             break
     return estimate
 
 
-def stepped(
+def gauss_newton_step(
     problem: Problem,
     equations: Equations,
     brightness: Brightness,
     estimate: Estimate,
-    known: FloatImage | None,
+    difference: FloatImage | None,
     relaxation: float = 1.0,
 ) -> Estimate:
-    """One Gauss-Newton iteration; `known` is the difference (k, P) of the states at the estimate, if it is."""
-    steps = equations.increment(*_right_sides(problem, equations, brightness, estimate, known))
+    """One Gauss-Newton iteration; `difference` is the difference (k, P) of the states at the estimate, if it is."""
+    steps = equations.increment(*_right_sides(problem, equations, brightness, estimate, difference))
     motion, shifts = (relaxation * step for step in steps)
     length = np.hypot(*motion.T)
     longest = float(length[equations.textured].max())
@@ -368,18 +370,22 @@ def stepped(
 
 
 def _right_sides(
-    problem: Problem, equations: Equations, brightness: Brightness, estimate: Estimate, known: FloatImage | None
+    problem: Problem,
+    equations: Equations,
+    brightness: Brightness,
+    estimate: Estimate,
+    estimate_difference: FloatImage | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sum the right-hand sides of nodes (2 N,), the smoothness' part of it, and of rigid functions ((k - 1) m,)."""
     reference, assembly = problem.reference, problem.reference.assembly
     held = equations.held_side(reference, estimate.displacement)
     total, rigid, difference = held.copy(), [], np.empty_like(reference.values[0])
     for light, displacement in enumerate(_light_displacements(problem, estimate)):
-        if known is not None:
-            difference = known[light]
+        if estimate_difference is not None:
+            difference = estimate_difference[light]
         else:
-            there = reference.warp(problem.deformed, light, displacement)
-            differences(problem.deformed.coefficients[light], reference.values[light], *there, difference)
+            warp_arguments = reference.warp(problem.deformed, light, displacement)
+            differences(problem.deformed.coefficients[light], reference.values[light], *warp_arguments, difference)
             brightness.correct(light, difference)
         gradient = reference.gradient[:, light]
         vector = assembly.vector(reference.projected(equations.weights[light], difference, gradient))

@@ -26,12 +26,12 @@ PREFILTERS: dict[str, FloatArray] = {
 """One-dimensional prefilters, applied along both axes; ``"gaussian"`` has a standard deviation of 1 px."""
 
 
-def unmasked(given: npt.ArrayLike) -> AnyArray:
+def unmasked(array: npt.ArrayLike) -> AnyArray:
     """Return an array whose masked entries are NaN: as floats where there are any, else of the dtype given."""
-    if isinstance(given, np.ma.MaskedArray) and np.ma.is_masked(given):
-        values: Any = given if given.dtype.kind in "fc" else given.astype(np.float64)
+    if isinstance(array, np.ma.MaskedArray) and np.ma.is_masked(array):
+        values: Any = array if array.dtype.kind in "fc" else array.astype(np.float64)
         return np.asarray(np.ma.filled(values, np.nan))
-    return np.asarray(given)
+    return np.asarray(array)
 
 
 def as_light_stack(images: npt.ArrayLike, name: str) -> FloatImage:
@@ -109,7 +109,7 @@ def spline_coefficients(images: FloatImage, prefilter: str = "none") -> FloatIma
 def spline_values(coefficients: FloatImage) -> FloatImage:
     """Evaluate the images (k, H, W) at the pixels from the coefficients of their splines."""
     mean = np.array([1, 4, 1], dtype=np.float32) / 6
-    return np.stack([cv2.sepFilter2D(one, -1, mean, mean)[PAD:-PAD, PAD:-PAD] for one in coefficients])
+    return np.stack([cv2.sepFilter2D(spline, -1, mean, mean)[PAD:-PAD, PAD:-PAD] for spline in coefficients])
 
 
 def window_sums(grid: AnyArray, sigma: float) -> AnyArray:
@@ -155,8 +155,8 @@ class SlidingWindow:
     def _means(self, totals: FloatImage, weights: FloatImage) -> FloatImage:
         """Divide sums (n, h, w) by those of their weights (n, h, w) or (1, h, w), both blurred."""
         sigma = self.sigma / self.step
-        means, around = (np.stack([window_sums(grid, sigma) for grid in grids]) for grids in (totals, weights))
-        means /= np.maximum(around, np.float32(1e-6), out=around)
+        means, weight_means = (np.stack([window_sums(grid, sigma) for grid in grids]) for grids in (totals, weights))
+        means /= np.maximum(weight_means, np.float32(1e-6), out=weight_means)
         return np.asarray(means, dtype=np.float32)
 
 

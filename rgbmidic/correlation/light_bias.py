@@ -22,23 +22,24 @@ from rgbmidic.illumination.displacement import consensus_weights
 from rgbmidic.typing import FloatArray, FloatImage
 
 
-def settled_gradient(residual: Residual, weights: FloatImage) -> Reference:
+def with_consistent_gradient(residual: Residual, weights: FloatImage) -> Reference:
     """Return the reference with the gradients for the rest of a solve, from the residual at a solution.
 
     A light is matched with the mean of all lights only as far as what it alone shows follows the solution.
     """
     reference = residual.reference
     texture, constants = reference.texture, reference.constants
-    if len(weights) < 3 or not texture.together.any():
+    if len(weights) < 3 or not texture.mean_fraction.any():
         return reference
     gradients = map(reference.channel_specific, range(len(weights)))
     rows = (
-        (r[None], w[None], *own[:, None]) for r, w, own in zip(residual.difference, weights, gradients, strict=True)
+        (r[None], w[None], *specific[:, None])
+        for r, w, specific in zip(residual.difference, weights, gradients, strict=True)
     )
-    table = BlockTable.of(reference, constants.block, rows)
+    table = BlockTable.of(reference, constants.min_block_side, rows)
     displacement, variance, _ = table.displacement(constants.bias_range)
-    beyond = np.maximum((displacement**2).sum(axis=1) - 2 * variance, 0)
-    consistency = 1 / (1 + beyond / constants.follows**2)
+    excess = np.maximum((displacement**2).sum(axis=1) - 2 * variance, 0)
+    consistency = 1 / (1 + excess / constants.half_weight_displacement**2)
     return replace(reference, gradient=texture.matched(reference.pixels, consistency, table.side))
 
 
@@ -61,19 +62,19 @@ def light_bias(table: BlockTable, equations: Equations) -> tuple[FloatArray, Flo
         return np.zeros_like(nodes), np.zeros((len(nodes), 5))
     displacement, variance, information = table.displacement(reach)
     local, chance, _ = table.displacement(constants.local_bias_range)
-    beyond = local - displacement
-    gain = np.maximum(1 - constants.local_bias * chance / np.maximum((beyond**2).sum(axis=1), 1e-30), 0)
-    beyond *= gain[:, None]
-    displacement = displacement + beyond
+    local_change = local - displacement
+    gain = np.maximum(1 - constants.local_bias_threshold * chance / np.maximum((local_change**2).sum(axis=1), 1e-30), 0)
+    local_change *= gain[:, None]
+    displacement = displacement + local_change
     precision = information / np.maximum(information.sum(axis=0), 1e-30)
-    believed, agree = consensus_weights(displacement, variance, precision)
-    part = precision + agree * (believed - precision)
-    mean = (part[:, None] * displacement).sum(axis=0)
+    consensus, consistency = consensus_weights(displacement, variance, precision)
+    fractions = precision + consistency * (consensus - precision)
+    mean = (fractions[:, None] * displacement).sum(axis=0)
     variance += 2 * chance * gain  # twice: its scatter is taken about the local displacement itself
-    apart = np.maximum((displacement - mean) ** 2 - variance[:, None], 0)
-    left = count / (count - 1) * (part[:, None] ** 2 * apart).sum(axis=0)
-    left += ((part - precision)[:, None] * beyond).sum(axis=0) ** 2
+    scatter = np.maximum((displacement - mean) ** 2 - variance[:, None], 0)
+    residual_variance = count / (count - 1) * (fractions[:, None] ** 2 * scatter).sum(axis=0)
+    residual_variance += ((fractions - precision)[:, None] * local_change).sum(axis=0) ** 2
     off = mean - (precision[:, None] * displacement).sum(axis=0)
-    bias, square = table.at(np.concatenate([off, left]), nodes).T.reshape(-1, 2, 2).swapaxes(0, 1)
+    bias, square = table.at(np.concatenate([off, residual_variance]), nodes).T.reshape(-1, 2, 2).swapaxes(0, 1)
     x, y = np.sqrt(np.einsum("nij,nj->ni", equations.deformation**2, square)).T
     return equations.turned(bias), np.stack([x, y, x / reach, y / reach, np.hypot(x, y) / (2 * reach)], axis=1)

@@ -1,7 +1,7 @@
 """Which elements match, and which nodes count as measured.
 
 The matching criterion of an element is the zero-mean correlation coefficient of all lights at the displacement found.
-A node counts as measured unless one of an ordered table of rules applies to it (`judge`).
+A node counts as measured unless one of an ordered table of rules applies to it (`classify_nodes`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
-def judge(
+def classify_nodes(
     equations: Equations,
     residual: Residual,
     matched: BoolArray,
@@ -53,9 +53,9 @@ def judge(
         # the texture runs in one direction only: what lies along it cannot be measured
         (one_sided, NodeStatus.NOT_SEEN),
         # its displacement is uncertain by half a pixel or more, or nobody knows by how much
-        (~(std.max(axis=1) <= residual.reference.constants.lost), NodeStatus.DECORRELATED),
+        (~(std.max(axis=1) <= residual.reference.constants.max_std), NodeStatus.DECORRELATED),
     )
-    status = [np.uint8(one) for _, one in rules]
+    status = [np.uint8(code) for _, code in rules]
     return np.select([applies for applies, _ in rules], status, np.uint8(NodeStatus.MEASURED))
 
 
@@ -64,14 +64,14 @@ def one_sided_texture(equations: Equations, residual: Residual) -> BoolArray:
     (xx, xy, yy), constants = equations.node_blocks, residual.reference.constants
     half, difference = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     weak = half - difference
-    one_sided = np.asarray(equations.textured & (weak < constants.one_sided * (half + difference)))
+    one_sided = np.asarray(equations.textured & (weak < constants.min_isotropy * (half + difference)))
     if not one_sided.any():
         return one_sided
     angle = np.arctan2(2 * xy, xx - yy) / 2 + np.pi / 2  # of the weaker direction
     x, y = np.cos(angle), np.sin(angle)
     noise_xx, noise_xy, noise_yy = _noise_blocks(residual, equations.weights, one_sided)
     along = noise_xx * x * x + 2 * noise_xy * x * y + noise_yy * y * y
-    return np.asarray(one_sided & (along > constants.noisy * weak))
+    return np.asarray(one_sided & (along > constants.max_noise_fraction * weak))
 
 
 def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> FloatArray:
@@ -82,25 +82,25 @@ def _noise_blocks(residual: Residual, weights: FloatImage, nodes: BoolArray) -> 
     reference, pixels = residual.reference, residual.reference.pixels
     mesh = reference.mesh
     elements = np.asarray(nodes[mesh.elements].any(axis=1))
-    around, column, row = pixels.element_pixels(elements)
+    pixel_index, column, row = pixels.element_pixels(elements)
     beside, columns_beside, rows_beside = pixels.element_pixels(
         np.asarray(mesh.adjacent_nodes(nodes)[mesh.elements].any(axis=1))
     )
     offsets = np.concatenate([[0], np.cumsum(np.diff(pixels.offsets)[elements])])
-    place = pixels.local_x[around], pixels.local_y[around], offsets, pixels.barycentric[elements]
-    own, total = np.zeros((int(elements.sum()), 3, 3, 3)), np.zeros((elements.size, 3, 3, 3))
+    geometry = pixels.local_x[pixel_index], pixels.local_y[pixel_index], offsets, pixels.barycentric[elements]
+    light_blocks, total = np.zeros((int(elements.sum()), 3, 3, 3)), np.zeros((elements.size, 3, 3, 3))
     image = np.zeros([side + 1 for side in pixels.shape], dtype=np.float32)
     for weight, difference in zip(weights, residual.difference, strict=True):
         image[rows_beside, columns_beside] = difference[beside] / np.float32(np.sqrt(2))
-        here = image[row, column]
-        slopes = image[row, column + 1] - here, image[row + 1, column] - here
-        element_hessian(*slopes, weight[around], *place, own)
-        total[elements] += own
+        centre = image[row, column]
+        slopes = image[row, column + 1] - centre, image[row + 1, column] - centre
+        element_hessian(*slopes, weight[pixel_index], *geometry, light_blocks)
+        total[elements] += light_blocks
     return reference.assembly.node_blocks(total)
 
 
 def matching_elements(
-    residual: Residual, displacement: FloatArray, precision: Precision | None = None, *, least: float | None = None
+    residual: Residual, displacement: FloatArray, precision: Precision | None = None, *, min_zncc: float | None = None
 ) -> BoolArray:
     """Find the elements that are whole and match: zero-mean correlation coefficient of all lights together.
 
@@ -114,7 +114,7 @@ def matching_elements(
         That displacement, px.
     precision
         Of the lights, by which they count in an element; None: all alike.
-    least
+    min_zncc
         Coefficient from which an element matches; None judges it by what the elements around reach.
 
     Returns
@@ -123,24 +123,24 @@ def matching_elements(
     """
     mesh, constants = residual.reference.mesh, residual.reference.constants
     fg, ff, gg = _centred_products(residual, precision)
-    own = correlation(fg, ff, gg)
+    element_zncc = correlation(fg, ff, gg)
     # a few speckles can match by chance; those of all elements around a node hardly
-    around = correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
-    coefficient = np.minimum(own, np.sort(around[mesh.elements], axis=1)[:, 1])
-    whole = ~torn_elements(mesh, displacement, constants)
-    if least is not None:
-        return np.asarray(whole & (coefficient >= least))
-    poor, good = constants.matched if precision is None else constants.matched_precise
+    nodal_zncc = correlation(mesh.to_nodes(fg), mesh.to_nodes(ff), mesh.to_nodes(gg))
+    coefficient = np.minimum(element_zncc, np.sort(nodal_zncc[mesh.elements], axis=1)[:, 1])
+    intact = ~torn_elements(mesh, displacement, constants)
+    if min_zncc is not None:
+        return np.asarray(intact & (coefficient >= min_zncc))
+    poor, good = constants.zncc_bounds if precision is None else constants.zncc_bounds_precise
     matched = np.asarray(coefficient >= good)
     between = ~matched & (coefficient >= poor)
     typical, textured = 1.0, ff > 0
     if textured.any() and between.any():
         centre = mesh.centres
-        ranks = [*range(1, min(constants.around, int(textured.sum())) + 1)]
+        ranks = [*range(1, min(constants.neighbour_count, int(textured.sum())) + 1)]
         nearest = cKDTree(centre[textured]).query(centre[between], k=ranks)[1]
         typical = np.median(coefficient[textured][nearest], axis=1)
-    matched[between] = coefficient[between] >= 1 - constants.worse * (1 - typical)
-    return matched & whole
+    matched[between] = coefficient[between] >= 1 - constants.outlier_factor * (1 - typical)
+    return matched & intact
 
 
 def torn_elements(mesh: Tri3Mesh, displacement: FloatArray, constants: SolverConstants = USUAL) -> BoolArray:
@@ -150,12 +150,14 @@ def torn_elements(mesh: Tri3Mesh, displacement: FloatArray, constants: SolverCon
     """
     deformation = np.eye(2) + mesh.element_gradient(displacement)
     stretch = np.swapaxes(deformation, 1, 2) @ deformation - np.eye(2)
-    torn = np.asarray(np.linalg.norm(stretch, axis=(1, 2)) > constants.torn)
+    torn = np.asarray(np.linalg.norm(stretch, axis=(1, 2)) > constants.max_relative_stretch)
     if torn.any():
         centre = mesh.centres
-        around = cKDTree(centre).query(centre[torn], k=[*range(1, min(constants.around, len(centre)) + 1)])[1]
-        beyond = stretch[torn] - np.median(stretch[around], axis=1)
-        torn[torn] = np.linalg.norm(beyond, axis=(1, 2)) > constants.torn
+        neighbours = cKDTree(centre).query(
+            centre[torn], k=[*range(1, min(constants.neighbour_count, len(centre)) + 1)]
+        )[1]
+        excess = stretch[torn] - np.median(stretch[neighbours], axis=1)
+        torn[torn] = np.linalg.norm(excess, axis=(1, 2)) > constants.max_relative_stretch
     return torn
 
 
@@ -165,7 +167,7 @@ def correlation_around(residual: Residual) -> FloatArray:
     It is NaN where the states show no texture together.
     """
     mesh = residual.reference.mesh
-    fg, ff, gg = (mesh.to_nodes(part) for part in _centred_products(residual, None))
+    fg, ff, gg = (mesh.to_nodes(products) for products in _centred_products(residual, None))
     return np.where(ff > 1e-9 * ff.max(initial=0.0), correlation(fg, ff, gg), np.nan)
 
 
@@ -185,10 +187,10 @@ def misfit(mesh: Tri3Mesh, squares: FloatArray, measured: BoolArray) -> FloatArr
     -------
     ndarray, shape (N,)
     """
-    square, _, count = (mesh.to_nodes(part) for part in squares.sum(axis=0).T)
-    around = square / np.maximum(count, 1.0)
-    typical = float(np.median(around[measured])) if measured.any() else 0.0
-    return np.sqrt(around / typical) if typical > 0 else np.ones_like(around)
+    square, _, count = (mesh.to_nodes(sums) for sums in squares.sum(axis=0).T)
+    mean_square = square / np.maximum(count, 1.0)
+    typical = float(np.median(mean_square[measured])) if measured.any() else 0.0
+    return np.sqrt(mean_square / typical) if typical > 0 else np.ones_like(mean_square)
 
 
 def _centred_products(residual: Residual, precision: Precision | None) -> FloatArray:
@@ -198,7 +200,7 @@ def _centred_products(residual: Residual, precision: Precision | None) -> FloatA
     """
     products = np.array(residual.centred_products())
     if precision is not None and len(residual.weights) > 1:
-        mean = residual.reference.sums(precision.factor, precision.bend)[..., 0]
+        mean = residual.reference.sums(precision.factor, precision.loss_curvature)[..., 0]
         products *= mean / np.maximum(mean.max(axis=0), 1e-300)
     return np.asarray(products.sum(axis=1))
 

@@ -49,13 +49,13 @@ class OneSidedConstants:
         of 0.08 to 0.3 of its diameter).
     departure_noise
         Variance of the noise of `_BoundaryFits.departure` over that of independent nodes: 0.34 to 0.56 (derived).
-    sure
+    significance
         Mean square over that by noise from which it is not taken for noise: in affine fields the uncertainty of strain
         is then 1.03 times as large, at the rim of a hole 1.1 times at most (measured).
     unresolved
         Errors of displacement and of strain over their noise from which strain is called unresolved: with less a hole
         at rest is called so by chance (measured: 1 of 10 frames with 1 and 4).
-    few
+    min_nodes
         Number of nodes of which less are not spoken of. Chosen.
     """
 
@@ -65,9 +65,9 @@ class OneSidedConstants:
     angle: float = 0.52
     departure: tuple[tuple[float, float], ...] = ((0.0, 0.0), (0.27, 0.8), (2.1, 7.5))
     departure_noise: float = 0.5
-    sure: float = 2.5
+    significance: float = 2.5
     unresolved: tuple[float, float] = (1.3, 4.0)
-    few: int = 3
+    min_nodes: int = 3
 
 
 _CONSTANTS = OneSidedConstants()
@@ -76,40 +76,40 @@ _CONSTANTS = OneSidedConstants()
 @lru_cache(maxsize=2)
 def cubic_fit_offset(mesh: Tri3Mesh) -> FloatArray:
     """Evaluate at each node n the best linear fit of x^3, x^2 y, x y^2, y^3 about n, (N, 4) in cubic px."""
-    point, weight = (part / 2 for part in np.polynomial.legendre.leggauss(3))
-    first, second = (part.ravel() for part in np.meshgrid(point + 0.5, point + 0.5, indexing="ij"))
+    point, weight = (values / 2 for values in np.polynomial.legendre.leggauss(3))
+    first, second = (values.ravel() for values in np.meshgrid(point + 0.5, point + 0.5, indexing="ij"))
     barycentric = np.stack([1 - first, first * (1 - second), first * second], axis=1)  # conical product, degree 4
     weights = 2 * np.outer(weight, weight).ravel() * first
     nodes = mesh.nodes - mesh.nodes.mean(axis=0)
     x, y = np.einsum("qc,ecd->deq", barycentric, nodes[mesh.elements])
     cubics = np.stack([x**3, x * x * y, x * y * y, y**3])
-    parts = np.einsum("q,qc,teq,e->tec", weights, barycentric, cubics, mesh.areas).reshape(4, -1)
-    right = np.stack([np.bincount(mesh.elements.ravel(), part, len(nodes)) for part in parts], axis=1)
+    moments = np.einsum("q,qc,teq,e->tec", weights, barycentric, cubics, mesh.areas).reshape(4, -1)
+    right = np.stack([np.bincount(mesh.elements.ravel(), values, len(nodes)) for values in moments], axis=1)
     fitted = splu(mesh.mass_matrix.tocsc()).solve(right)
     x, y = nodes.T
-    return np.asarray(fitted - _moved(x, y, mesh.linear_fit_offset, np.zeros((len(nodes), 4))))
+    return np.asarray(fitted - _fitted_cubics(x, y, mesh.linear_fit_offset, np.zeros((len(nodes), 4))))
 
 
-def _moved(x: FloatArray, y: FloatArray, quadratic: FloatArray, cubic: FloatArray) -> FloatArray:
+def _fitted_cubics(x: FloatArray, y: FloatArray, quadratic: FloatArray, cubic: FloatArray) -> FloatArray:
     """Evaluate the best linear fit of cubics about a point from which a node is (x, y) away, there: (..., 4).
 
     `quadratic` (..., 3) and `cubic` (..., 4) are what it has at the node of quadratics (`Tri3Mesh.linear_fit_offset`)
     and of cubics about it.
     """
     xx, xy, yy = np.moveaxis(quadratic, -1, 0) * np.reshape([2, 1, 2], (3, *[1] * x.ndim))
-    moved = x**3 + 3 * x * xx, x * x * y + 2 * x * xy + y * xx, x * y * y + 2 * y * xy + x * yy, y**3 + 3 * y * yy
-    return np.stack(moved, axis=-1) + cubic
+    terms = x**3 + 3 * x * xx, x * x * y + 2 * x * xy + y * xx, x * y * y + 2 * y * xy + x * yy, y**3 + 3 * y * yy
+    return np.stack(terms, axis=-1) + cubic
 
 
-def _of_cubics(mesh: Tri3Mesh, operator: sp.csr_matrix, nodes: BoolArray) -> FloatArray:
+def _recovered_cubics(mesh: Tri3Mesh, operator: sp.csr_matrix, nodes: BoolArray) -> FloatArray:
     """Apply the rows of some `nodes` (N,) of a recovery's operator (N, N) to cubics about each, (N, 4)."""
     row = np.repeat(np.arange(len(nodes)), np.diff(operator.indptr))
-    chosen = nodes[row]
-    row, column = row[chosen], operator.indices[chosen]
+    selected = nodes[row]
+    row, column = row[selected], operator.indices[selected]
     x, y = (mesh.nodes[column] - mesh.nodes[row]).T
-    fitted = _moved(x, y, mesh.linear_fit_offset[column], cubic_fit_offset(mesh)[column])
-    parts = (operator.data[chosen, None] * fitted).T
-    return np.stack([np.bincount(row, part, len(nodes)) for part in parts], axis=1)
+    fitted = _fitted_cubics(x, y, mesh.linear_fit_offset[column], cubic_fit_offset(mesh)[column])
+    products = (operator.data[selected, None] * fitted).T
+    return np.stack([np.bincount(row, values, len(nodes)) for values in products], axis=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -141,9 +141,9 @@ class _BoundaryFits:
 
 
 @lru_cache(maxsize=2)  # of a mesh with data everywhere, and of the last frame
-def _boundary_fits(mesh: Tri3Mesh, used: bytes) -> _BoundaryFits:
-    """Fit cubics to the nodes up to three edges of `used` elements away."""
-    elements, count = np.frombuffer(used, dtype=bool), len(mesh.nodes)
+def _boundary_fits(mesh: Tri3Mesh, active: bytes) -> _BoundaryFits:
+    """Fit cubics to the nodes up to three edges of `active` elements away."""
+    elements, count = np.frombuffer(active, dtype=bool), len(mesh.nodes)
     corners = mesh.elements[elements]
     ends = np.repeat(corners, 3, axis=1).ravel(), np.tile(corners, 3).ravel()
     beside = sp.csr_matrix((np.ones(len(ends[0]), dtype=bool), ends), shape=(count, count))
@@ -154,37 +154,39 @@ def _boundary_fits(mesh: Tri3Mesh, used: bytes) -> _BoundaryFits:
     nodes, reach = nodes[enough], reach[enough]
     number, size = np.diff(reach.indptr), mesh.sizes[nodes, None]
     has_node = np.arange(number.max(initial=1)) < number[:, None]
-    other = np.repeat(nodes[:, None], has_node.shape[1], axis=1)
-    other[has_node] = reach.indices
-    x, y = ((axis[other] - axis[nodes, None]) / size for axis in mesh.nodes.T)
+    neighbours = np.repeat(nodes[:, None], has_node.shape[1], axis=1)
+    neighbours[has_node] = reach.indices
+    x, y = ((axis[neighbours] - axis[nodes, None]) / size for axis in mesh.nodes.T)
     basis = np.stack([x**i * y**j for i, j in _POWERS], axis=1)
     angle = angle_fraction(mesh, elements)[nodes, None]
     weight = np.where(has_node, np.exp(-(x**2 + y**2) * angle / (2 * _CONSTANTS.width**2)), 0)[:, None]
     departure = np.where(
-        edge[nodes, None] & (angle > _CONSTANTS.angle), _fits(weight, basis)[:, 0] - (other == nodes[:, None]), 0
+        edge[nodes, None] & (angle > _CONSTANTS.angle), _fits(weight, basis)[:, 0] - (neighbours == nodes[:, None]), 0
     )
-    recovery, chosen = Recovery.over(mesh, elements, np.ones(count)), np.zeros((2, count), dtype=bool)
-    chosen[0, reach.indices] = chosen[1, nodes] = True
+    recovery, required = Recovery.over(mesh, elements, np.ones(count)), np.zeros((2, count), dtype=bool)
+    required[0, reach.indices] = required[1, nodes] = True
     missed = [
-        _of_cubics(mesh, one, chosen[min(order, 1)])
-        for order, one in enumerate((recovery.value, recovery.slope_x, recovery.slope_y))
+        _recovered_cubics(mesh, operator, required[min(order, 1)])
+        for order, operator in enumerate((recovery.value, recovery.slope_x, recovery.slope_y))
     ]
-    basis[:, 6:] += np.moveaxis(missed[0][other], -1, 1) / size[:, None] ** 3
+    basis[:, 6:] += np.moveaxis(missed[0][neighbours], -1, 1) / size[:, None] ** 3
     third = _fits(weight, basis)[:, 6:] / size[:, None] ** 3
-    places = np.repeat(nodes, number), reach.indices
-    parts = *(np.einsum("nt,ntw->nw", one[nodes], third) for one in missed), departure
-    *operators, departing = (sp.csr_matrix((part[has_node], places), shape=(count, count)) for part in parts)
+    indices = np.repeat(nodes, number), reach.indices
+    coefficients = *(np.einsum("nt,ntw->nw", operator[nodes], third) for operator in missed), departure
+    *operators, departing = (
+        sp.csr_matrix((values[has_node], indices), shape=(count, count)) for values in coefficients
+    )
     departing.eliminate_zeros()
     level = np.zeros(count, dtype=np.intp)
     level[nodes] = 1 + edge[nodes]
     rows, columns = sp.csr_matrix(beside @ beside).nonzero()
-    alike = (level[rows] == level[columns]) & (level[rows] > 0)
+    same_level = (level[rows] == level[columns]) & (level[rows] > 0)
     departs = (level[rows] > 0) & (np.diff(departing.indptr) > 0)[columns]
     concave_mean = _mean(rows[departs], columns[departs], count)
     return _BoundaryFits(
         **dict(zip(("value", "slope_x", "slope_y"), operators, strict=True)),
         departure=departing,
-        mean=_mean(rows[alike], columns[alike], count),
+        mean=_mean(rows[same_level], columns[same_level], count),
         concave_mean=sp.csr_matrix(concave_mean @ concave_mean),
         factors=np.array(_CONSTANTS.departure)[level],
     )
@@ -204,14 +206,14 @@ def _fits(weight: FloatArray, basis: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(normal, weighted))
 
 
-def one_sided_error(mesh: Tri3Mesh, used: BoolArray, displacement: FloatArray, std: FloatArray) -> FloatArray:
+def one_sided_error(mesh: Tri3Mesh, active: BoolArray, displacement: FloatArray, std: FloatArray) -> FloatArray:
     """Estimate what a recovered field misses at the nodes of `at_free_boundary` and at those beside them.
 
     Parameters
     ----------
     mesh
         N nodes, E elements.
-    used : ndarray, shape (E,), bool
+    active : ndarray, shape (E,), bool
         Elements over which nodes are reached, up to three edges away.
     displacement, std : ndarray, shape (N, 2)
         u and v, and their standard uncertainty by noise; NaN at nodes without data.
@@ -222,15 +224,17 @@ def one_sided_error(mesh: Tri3Mesh, used: BoolArray, displacement: FloatArray, s
         Error of u, v, exx, eyy, exy as a standard deviation: the root of a mean square over some elements
         along the boundary, beyond noise. 0 at other nodes.
     """
-    fits = _boundary_fits(mesh, used.tobytes())
+    fits = _boundary_fits(mesh, active.tobytes())
     u, v = fields = tuple(zip(np.nan_to_num(displacement).T, np.nan_to_num(std**2).T, strict=True))
-    half_x, half_y = (with_data(one, one.data / 2) for one in (fits.slope_x, fits.slope_y))
-    alone = ((fits.value, u), (fits.value, v), (fits.slope_x, u), (fits.slope_y, v))
-    parts = [_square_and_noise(fits.mean, *terms) for terms in (*zip(alone), ((half_y, u), (half_x, v)))]
-    square, noise = np.stack(parts, axis=-1)
-    smooth = _CONSTANTS.factor * _beyond(square, _CONSTANTS.noise * noise)
-    square, noise = np.stack([_square_and_noise(fits.concave_mean, (fits.departure, one)) for one in fields], axis=-1)
-    rough = _beyond(square, _CONSTANTS.departure_noise * noise)
+    half_x, half_y = (with_data(slope, slope.data / 2) for slope in (fits.slope_x, fits.slope_y))
+    single_terms = ((fits.value, u), (fits.value, v), (fits.slope_x, u), (fits.slope_y, v))
+    squares = [_square_and_noise(fits.mean, *terms) for terms in (*zip(single_terms), ((half_y, u), (half_x, v)))]
+    square, noise = np.stack(squares, axis=-1)
+    smooth = _CONSTANTS.factor * _excess_rms(square, _CONSTANTS.noise * noise)
+    square, noise = np.stack(
+        [_square_and_noise(fits.concave_mean, (fits.departure, field)) for field in fields], axis=-1
+    )
+    rough = _excess_rms(square, _CONSTANTS.departure_noise * noise)
     slopes = np.hypot(*rough.T)[:, None] * [np.sqrt(0.5), np.sqrt(0.5), 0.5] / mesh.sizes[:, None]
     of_values, of_slopes = fits.factors.T[:, :, None]
     return np.asarray(np.maximum(smooth, np.column_stack([of_values * rough, of_slopes * slopes])))
@@ -243,15 +247,15 @@ def _square_and_noise(mean: sp.csr_matrix, *terms: tuple[sp.csr_matrix, tuple[Fl
     return np.stack([mean @ total**2, mean @ noise])
 
 
-def _beyond(square: FloatArray, noise: FloatArray) -> FloatArray:
+def _excess_rms(square: FloatArray, noise: FloatArray) -> FloatArray:
     """Root of what a mean square has beyond noise, 0 where it may be noise."""
-    return np.sqrt(np.where(square > _CONSTANTS.sure * noise, square - noise, 0))
+    return np.sqrt(np.where(square > _CONSTANTS.significance * noise, square - noise, 0))
 
 
 def with_one_sided_error(mesh: Tri3Mesh, solution: Solution) -> Solution:
     """Add what the recovery misses near free boundaries to the stated uncertainty of a solution on a mesh."""
-    used = np.asarray(solution.measured[mesh.elements].all(axis=1))
-    error = one_sided_error(mesh, used, solution.displacement, solution.displacement_std)
+    active = np.asarray(solution.measured[mesh.elements].all(axis=1))
+    error = one_sided_error(mesh, active, solution.displacement, solution.displacement_std)
     return replace(
         solution,
         displacement_std=np.hypot(solution.displacement_std, error[:, :2]),
@@ -275,17 +279,17 @@ def unresolved_strain(mesh: Tri3Mesh, solution: Solution, with_error: Solution) 
     str
         The error is rounded to 1, 2 or 5 of its decade, so that the frames of a test have few texts.
     """
-    before, noise = (np.column_stack([one.displacement_std, one.strain_std]) for one in (solution, with_error))
+    before, noise = (np.column_stack([result.displacement_std, result.strain_std]) for result in (solution, with_error))
     missed = np.column_stack([with_error.displacement_error, with_error.strain_error])
     if not np.isfinite(missed).any():
         noise, missed = before, np.sqrt(np.maximum(noise**2 - before**2, 0))
     is_large = missed > np.repeat(_CONSTANTS.unresolved, [2, 3]) * noise
     unresolved = at_free_boundary(mesh) & is_large[:, :2].any(axis=1) & is_large[:, 2:].any(axis=1)
-    if unresolved.sum() < _CONSTANTS.few:
+    if unresolved.sum() < _CONSTANTS.min_nodes:
         return ""
-    most = np.where(is_large[unresolved, 2:], missed[unresolved, 2:], 0).max() * (1 + 1e-9)
-    decade = 10 ** np.floor(np.log10(most))
-    largest = decade * max(step for step in (1, 2, 5) if step * decade <= most)
+    max_error = np.where(is_large[unresolved, 2:], missed[unresolved, 2:], 0).max() * (1 + 1e-9)
+    decade = 10 ** np.floor(np.log10(max_error))
+    largest = decade * max(step for step in (1, 2, 5) if step * decade <= max_error)
     return (
         f"the strain at edges of the region is not resolved: it may be off by {largest:.1g} or more, over "
         f"{_CONSTANTS.unresolved[1]:g} times its noise; its uncertainty holds that, smaller elements or mesh.refine "

@@ -39,7 +39,7 @@ def functional_std(
     solve: Callable[[FloatArray], FloatArray],
     right_side_covariance: sp.csc_matrix,
     mesh: Tri3Mesh,
-    asked: Sequence[tuple[Functional, BoolArray]],
+    quantities: Sequence[tuple[Functional, BoolArray]],
 ) -> FloatArray:
     """Evaluate the standard uncertainty of quantities that are linear in the displacements around each node.
 
@@ -51,7 +51,7 @@ def functional_std(
         S, shape (2 N, 2 N).
     mesh
         N nodes.
-    asked
+    quantities
         F quantities, row n of whose matrices is zero but for n and its neighbours; and of each the nodes (N,) whose
         uncertainty is asked for. It must not touch a node that is hardly seen: such a column reaches far and would
         corrupt those of its colour.
@@ -62,20 +62,22 @@ def functional_std(
     """
     count, (colour, nearest) = len(mesh.nodes), mesh.colouring
     colours = len(nearest)
-    columns = np.zeros((count, 2, len(asked), colours))
-    for i, (functional, nodes) in enumerate(asked):
+    columns = np.zeros((count, 2, len(quantities), colours))
+    for i, (functional, nodes) in enumerate(quantities):
         for axis, matrix in enumerate(functional):
             if matrix is not None:
                 row = np.repeat(np.arange(count), np.diff(matrix.indptr))
-                place = matrix.indices * np.int64(colours) + colour[row]
-                sums = np.bincount(place, weights=matrix.data * nodes[row], minlength=count * colours)
+                slot = matrix.indices * np.int64(colours) + colour[row]
+                sums = np.bincount(slot, weights=matrix.data * nodes[row], minlength=count * colours)
                 columns[:, axis, i] = sums.reshape(count, colours)
     solved = solve(columns.reshape(2 * count, -1))
-    energy = np.empty((count, len(asked), colours))
+    energy = np.empty((count, len(quantities), colours))
     covariance = right_side_covariance  # symmetric: its columns are its rows
     node_energies(covariance.data, covariance.indices, covariance.indptr, solved, energy.reshape(count, -1))
     owner = nearest.T.ravel()
-    variance = [np.bincount(owner, weights=energy[:, i].ravel(), minlength=count)[:count] for i in range(len(asked))]
+    variance = [
+        np.bincount(owner, weights=energy[:, i].ravel(), minlength=count)[:count] for i in range(len(quantities))
+    ]
     return np.sqrt(np.maximum(np.stack(variance, axis=1), 0))
 
 
@@ -99,10 +101,10 @@ class Recovery:
     offset: FloatArray
 
     @classmethod
-    def over(cls, mesh: Tri3Mesh, used: BoolArray, information: FloatArray, first: int | None = None) -> Recovery:
-        """Over the elements `used` (E,) of a mesh; `information` (N,) and `first` as in `quadratic_fit`."""
+    def over(cls, mesh: Tri3Mesh, active: BoolArray, information: FloatArray, first: int | None = None) -> Recovery:
+        """Over the elements `active` (E,) of a mesh; `information` (N,) and `first` as in `quadratic_fit`."""
         offset = mesh.linear_fit_offset
-        operators = quadratic_fit(mesh, used, information=information, offset=offset, first=first)
+        operators = quadratic_fit(mesh, active, information=information, offset=offset, first=first)
         value, slope_x, slope_y, *curvature = operators
         return cls(value=value, slope_x=slope_x, slope_y=slope_y, curvature=tuple(curvature), offset=offset)
 
@@ -117,7 +119,7 @@ class Recovery:
         shear = (self.slope_y @ u + self.slope_x @ v) / 2
         return np.stack([self.value @ u, self.value @ v, self.slope_x @ u, self.slope_y @ v, shear], axis=-1)
 
-    def bend(self, fitted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def offset_and_curvature(self, fitted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what the linear fit has at the nodes beyond the field (N, 2), and its second derivatives (N, 2, 3)."""
         second = np.stack([operator @ fitted for operator in self.curvature], axis=-1)
         return np.einsum("nt,nct->nc", self.offset[: len(second)], second), second
@@ -131,7 +133,7 @@ TERMS = ("value", "x", "y", "xx", "xy", "yy")
 
 def quadratic_fit(
     mesh: Tri3Mesh,
-    used: BoolArray,
+    active: BoolArray,
     *,
     information: FloatArray | None = None,
     offset: FloatArray | None = None,
@@ -139,14 +141,14 @@ def quadratic_fit(
 ) -> tuple[sp.csr_matrix, ...]:
     """Linear operators (N, N), one for each of `TERMS`, from nodal values to those of the polynomial at each node.
 
-    The polynomial is fitted to the nodes within two edges, reached over `used` elements only: not across a crack or a
+    The polynomial is fitted to the nodes within two edges, reached over `active` elements only: not across a crack or a
     hole. Quadratic fields are reproduced, at edges too; what too few nodes determine is 0.
 
     Parameters
     ----------
     mesh
         N nodes, E elements.
-    used : ndarray, shape (E,), bool
+    active : ndarray, shape (E,), bool
         Elements over which nodes are reached.
     information : ndarray, shape (N,), optional
         How well each node is known (inverse variance, any unit): one that is known badly counts little elsewhere.
@@ -160,26 +162,34 @@ def quadratic_fit(
     tuple of csr_matrix, shape (N, N) or (`first`, N)
         In the order of `TERMS`, per px and square px.
     """
-    other, known, weight, structure = _window(mesh, used.tobytes())
-    basis = _basis(mesh, used.tobytes(), None if offset is None else offset.tobytes())
+    neighbours, entries, weight, structure = _window(mesh, active.tobytes())
+    basis = _basis(mesh, active.tobytes(), None if offset is None else offset.tobytes())
     if first is not None:
-        other, weight, basis, structure = other[:first], weight[:first], basis[:first], structure[:first]
-        known = known[: structure.nnz]
+        neighbours, weight, basis, structure = neighbours[:first], weight[:first], basis[:first], structure[:first]
+        entries = entries[: structure.nnz]
     if information is not None:
-        own, theirs = np.broadcast_to(information[: len(other), None], other.shape), information[other]
-        weight = weight * np.divide(theirs, own + theirs, out=np.full(other.shape, 0.5), where=own + theirs > 0)
+        node_information, neighbour_information = (
+            np.broadcast_to(information[: len(neighbours), None], neighbours.shape),
+            information[neighbours],
+        )
+        weight = weight * np.divide(
+            neighbour_information,
+            node_information + neighbour_information,
+            out=np.full(neighbours.shape, 0.5),
+            where=node_information + neighbour_information > 0,
+        )
     weighted = weight[:, None] * basis
     normal = weighted @ basis.transpose(0, 2, 1)
     # slopes and curvatures are held at 0 where too few nodes determine them: the second derivatives of waves of 5 to 6
     # elements, crack tips among them, change by 2e-5 of the largest at most (measured)
     normal[:, range(1, 6), range(1, 6)] += [1e-9, 1e-9, 1e-6, 1e-6, 1e-6]
     fits = (
-        np.linalg.inv(normal) / (mesh.sizes[: len(other), None] ** np.array([0, 1, 1, 2, 2, 2]))[:, :, None]
+        np.linalg.inv(normal) / (mesh.sizes[: len(neighbours), None] ** np.array([0, 1, 1, 2, 2, 2]))[:, :, None]
     ) @ weighted
-    return tuple(with_data(structure, fits[:, term].ravel()[known]) for term in range(6))
+    return tuple(with_data(structure, fits[:, term].ravel()[entries]) for term in range(6))
 
 
-def nodal_slopes(mesh: Tri3Mesh, used: BoolArray) -> tuple[sp.csr_matrix, sp.csr_matrix]:
+def nodal_slopes(mesh: Tri3Mesh, active: BoolArray) -> tuple[sp.csr_matrix, sp.csr_matrix]:
     """Linear operators (N, N) from nodal values to the slopes along x and y with which the field is interpolated.
 
     The slope at a node is the mean, by the areas of the elements between, of what the quadratics of the nodes beside it
@@ -191,30 +201,31 @@ def nodal_slopes(mesh: Tri3Mesh, used: BoolArray) -> tuple[sp.csr_matrix, sp.csr
     ----------
     mesh
         N nodes, E elements.
-    used : ndarray, shape (E,), bool
+    active : ndarray, shape (E,), bool
         Elements over which nodes are reached.
 
     Returns
     -------
     tuple of csr_matrix, shape (N, N)
     """
-    _, x, y, xx, xy, yy = quadratic_fit(mesh, used)
-    count, corners = len(mesh.nodes), mesh.elements[used]
+    _, x, y, xx, xy, yy = quadratic_fit(mesh, active)
+    count, corners = len(mesh.nodes), mesh.elements[active]
     pairs = np.concatenate([corners[:, [a, b]] for a in range(3) for b in range(3) if a != b])
-    around = sp.csr_matrix((np.tile(mesh.areas[used], 6), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    row = np.repeat(np.arange(count), np.diff(around.indptr))
-    around.data /= np.bincount(row, weights=around.data, minlength=count)[row]
-    to_x, to_y = (with_data(around, around.data * (axis[row] - axis[around.indices])) for axis in mesh.nodes.T)
-    own = np.where(at_free_boundary(mesh, used), 0.5, 0.0)
-    theirs = around @ x + to_x @ xx + to_y @ xy, around @ y + to_x @ xy + to_y @ yy
+    average = sp.csr_matrix((np.tile(mesh.areas[active], 6), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    row = np.repeat(np.arange(count), np.diff(average.indptr))
+    average.data /= np.bincount(row, weights=average.data, minlength=count)[row]
+    to_x, to_y = (with_data(average, average.data * (axis[row] - axis[average.indices])) for axis in mesh.nodes.T)
+    node_fraction = np.where(at_free_boundary(mesh, active), 0.5, 0.0)
+    neighbour_slopes = average @ x + to_x @ xx + to_y @ xy, average @ y + to_x @ xy + to_y @ yy
     along_x, along_y = (
-        sp.csr_matrix(sp.diags(1 - own) @ mean + sp.diags(own) @ one) for mean, one in zip(theirs, (x, y), strict=True)
+        sp.csr_matrix(sp.diags(1 - node_fraction) @ mean + sp.diags(node_fraction) @ slope)
+        for mean, slope in zip(neighbour_slopes, (x, y), strict=True)
     )
     return along_x, along_y
 
 
 @lru_cache(maxsize=2)  # of a mesh and of its halves
-def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, Index, FloatArray, sp.csr_matrix]:
+def _window(mesh: Tri3Mesh, active: bytes) -> tuple[Index, Index, FloatArray, sp.csr_matrix]:
     """Return the nodes that the polynomial of each node is fitted to.
 
     The last result is kept, for most frames use all elements.
@@ -225,38 +236,38 @@ def _window(mesh: Tri3Mesh, used: bytes) -> tuple[Index, Index, FloatArray, sp.c
         The nodes around each, itself where a row has fewer, (N, W); the places of those that are no such filling; their
         weights (N, W); and the matrix of these nodes.
     """
-    elements = np.frombuffer(used, dtype=bool)
+    elements = np.frombuffer(active, dtype=bool)
     surrounded = angle_fraction(mesh, elements)
     is_tip = mesh.on_boundary & (surrounded > 0.8)  # of a crack that opens by less than 70 degrees
     reach = _reached(mesh, elements, ~is_tip)
     number = np.diff(reach.indptr)
-    known = np.arange(number.max()) < number[:, None]
-    other = np.repeat(np.arange(number.size)[:, None], known.shape[1], axis=1)
-    other[known] = reach.indices
-    square = sum((axis[other] - axis[:, None]) ** 2 for axis in mesh.nodes.T) / mesh.sizes[:, None] ** 2
+    is_entry = np.arange(number.max()) < number[:, None]
+    neighbours = np.repeat(np.arange(number.size)[:, None], is_entry.shape[1], axis=1)
+    neighbours[is_entry] = reach.indices
+    square = sum((axis[neighbours] - axis[:, None]) ** 2 for axis in mesh.nodes.T) / mesh.sizes[:, None] ** 2
     # Standard deviation of the weights around an inner node, in sides of an element. Waves of 3, 4 and 6 elements then
     # have .95 to 1.02, .99 to 1.01 and 1.00 of their height at the nodes, at a third less noise than the linear fit's;
     # with .45 1.05 and with .7 .86 of it at 3 elements (regular and outlined meshes, waves along the mesh and at 45
     # degrees). At an edge the window holds as much of the mesh as inside: with .58 everywhere corners scattered 2 times
     # as much as the linear fit's, and waves at an edge were seen no better.
     width = 0.58
-    weight = np.where(known, np.exp(-square * surrounded[:, None] / (2 * width**2)), 0.0)
-    return other, np.flatnonzero(known), weight, reach
+    weight = np.where(is_entry, np.exp(-square * surrounded[:, None] / (2 * width**2)), 0.0)
+    return neighbours, np.flatnonzero(is_entry), weight, reach
 
 
-def angle_fraction(mesh: Tri3Mesh, used: BoolArray) -> FloatArray:
-    """Return the fraction (N,) of the full angle around each node that `used` elements fill; 1 where there are none."""
+def angle_fraction(mesh: Tri3Mesh, active: BoolArray) -> FloatArray:
+    """Return the fraction (N,) of the full angle around each node in `active` elements; 1 where there are none."""
     corners = mesh.nodes[mesh.elements]
     ahead, back = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     across = ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0]
-    angle = np.arctan2(across, (ahead * back).sum(axis=-1)) * used[:, None]
+    angle = np.arctan2(across, (ahead * back).sum(axis=-1)) * active[:, None]
     fraction = np.bincount(mesh.elements.ravel(), weights=angle.ravel(), minlength=len(mesh.nodes)) / (2 * np.pi)
     return np.asarray(np.where(fraction > 0, fraction, 1.0))
 
 
-def at_free_boundary(mesh: Tri3Mesh, used: BoolArray | None = None) -> BoolArray:
-    """Nodes (N,) on the boundary of `used` elements (E,), and those within a quarter of an element of it."""
-    elements, areas = (mesh.elements, mesh.areas) if used is None else (mesh.elements[used], mesh.areas[used])
+def at_free_boundary(mesh: Tri3Mesh, active: BoolArray | None = None) -> BoolArray:
+    """Nodes (N,) on the boundary of `active` elements (E,), and those within a quarter of an element of it."""
+    elements, areas = (mesh.elements, mesh.areas) if active is None else (mesh.elements[active], mesh.areas[active])
     sides = elements[:, EDGES]
     keys = edge_keys(sides.reshape(-1, 2), len(mesh.nodes))
     _, index, count = np.unique(keys, return_inverse=True, return_counts=True)
@@ -264,31 +275,31 @@ def at_free_boundary(mesh: Tri3Mesh, used: BoolArray | None = None) -> BoolArray
     length = np.linalg.norm(np.diff(mesh.nodes[sides], axis=2)[:, :, 0], axis=2)
     opposite = np.roll(elements, 1, axis=1)  # edge a joins the corners a and a + 1
     is_near = 2 * areas[:, None] / length < mesh.sizes[opposite] / 4
-    found = np.zeros(len(mesh.nodes), dtype=bool)
-    found[sides[is_free]] = True
-    found[opposite[is_near & is_free]] = True
-    return found
+    at_boundary = np.zeros(len(mesh.nodes), dtype=bool)
+    at_boundary[sides[is_free]] = True
+    at_boundary[opposite[is_near & is_free]] = True
+    return at_boundary
 
 
 @lru_cache(maxsize=4)  # with and without the offset
-def _basis(mesh: Tri3Mesh, used: bytes, offset: bytes | None) -> FloatArray:
+def _basis(mesh: Tri3Mesh, active: bytes, offset: bytes | None) -> FloatArray:
     """Evaluate 1, x, y, xx/2, xy, yy/2 about each node at those around it, in sides of an element: (N, 6, W)."""
-    other = _window(mesh, used)[0]
+    neighbours = _window(mesh, active)[0]
     sizes = mesh.sizes[:, None]
-    x, y = ((axis[other] - axis[:, None]) / sizes for axis in mesh.nodes.T)
+    x, y = ((axis[neighbours] - axis[:, None]) / sizes for axis in mesh.nodes.T)
     basis = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=1)
     if offset is not None:
-        for term, beyond in enumerate(np.frombuffer(offset).reshape(-1, 3).T):
-            basis[:, 3 + term] += beyond[other] / sizes**2
+        for term, excess in enumerate(np.frombuffer(offset).reshape(-1, 3).T):
+            basis[:, 3 + term] += excess[neighbours] / sizes**2
     return basis
 
 
-def _reached(mesh: Tri3Mesh, used: BoolArray, passable: BoolArray) -> sp.csr_matrix:
-    """Return the nodes at most two edges of `used` elements away from each, itself included, as the entries of its row.
+def _reached(mesh: Tri3Mesh, active: BoolArray, passable: BoolArray) -> sp.csr_matrix:
+    """Return the nodes up to two edges of `active` elements away from each and itself, as the entries of its row.
 
     A way leads through `passable` nodes (N,) only: not round the tip of a crack to its other side.
     """
-    corners, itself = mesh.elements[used], np.arange(len(mesh.nodes))
+    corners, itself = mesh.elements[active], np.arange(len(mesh.nodes))
     rows = np.concatenate([np.repeat(corners, 3, axis=1).ravel(), itself])
     columns = np.concatenate([np.tile(corners, 3).ravel(), itself])
     beside = sp.csr_matrix((np.ones(rows.size, dtype=bool), (rows, columns)), shape=(itself.size, itself.size))

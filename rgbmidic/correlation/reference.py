@@ -20,7 +20,7 @@ from rgbmidic._kernels.correlation import (
 from rgbmidic._kernels.owned_pixels import add_second_derivatives, interpolate_nodal
 from rgbmidic._kernels.splines import pixel_gradient, sample_with_gradient
 from rgbmidic._kernels.threads import aside
-from rgbmidic.correlation.assembly import Assembly, unfitted_fraction
+from rgbmidic.correlation.assembly import Assembly, mean_residual_leverage
 from rgbmidic.correlation.brightness import Brightness, BrightnessModel, GainFit, gain_and_offset, window_width
 from rgbmidic.correlation.constants import USUAL, SolverConstants
 from rgbmidic.correlation.images import (
@@ -35,11 +35,13 @@ from rgbmidic.correlation.texture import TextureGradient
 from rgbmidic.errors import InputError
 from rgbmidic.illumination.images import DARK, Registration
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
+from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import AnyArray, BoolArray, FloatArray, FloatImage
 
 _WARP = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Deformed:
     """The k images of a deformed state, ready to be interpolated.
@@ -50,7 +52,7 @@ class Deformed:
         Cubic B-spline coefficients of the images, holes filled and prefiltered.
     weights : ndarray, shape (k, H, W), float32
         0 where a pixel is excluded or must not be interpolated.
-    partial : ndarray, shape (k, h + 1, w + 1), int32
+    nonuniform_weight_blocks : ndarray, shape (k, h + 1, w + 1), int32
         Number of blocks of `BLOCK` px, above and to the left, with a weight other than 1.
     origin : tuple of int
         Column and row of the frame at which the images begin.
@@ -59,11 +61,13 @@ class Deformed:
     coefficients: FloatImage
     weights: FloatImage
     origin: tuple[int, int] = (0, 0)
-    partial: npt.NDArray[np.int32] = field(init=False)
+    nonuniform_weight_blocks: npt.NDArray[np.int32] = field(init=False)
 
     def __post_init__(self) -> None:
         """Count the blocks with a weight other than 1."""
-        object.__setattr__(self, "partial", np.stack([_partial_blocks(weight) for weight in self.weights]))
+        object.__setattr__(
+            self, "nonuniform_weight_blocks", np.stack([_count_nonuniform_blocks(weight) for weight in self.weights])
+        )
 
     def contains(self, points: FloatArray) -> BoolArray:
         """Find the points that lie on pixels of the images.
@@ -80,7 +84,7 @@ class Deformed:
         limits = np.array(self.weights.shape[:0:-1]) - 0.5
         return np.asarray(((points >= -0.5) & (points <= limits)).all(axis=1))
 
-    def pictures(self, registration: Registration | None = None) -> tuple[FloatImage, FloatImage]:
+    def images_on_first_light(self, registration: Registration | None = None) -> tuple[FloatImage, FloatImage]:
         """Return the images, holes filled and prefiltered, and the weights, both (k, H, W) on the first light's pixels.
 
         The others follow by the affine motion nearest to their registration: good enough to look at and search in.
@@ -99,9 +103,9 @@ class Deformed:
             weights = weights.copy()
             corners = np.array([[0, 0], [values.shape[2], 0], [0, values.shape[1]]], dtype=np.float32)
             for light, shift in enumerate(registration.displacement(corners + self.origin)):
-                there = cv2.getAffineTransform(corners, (corners + shift).astype(np.float32))
+                transform = cv2.getAffineTransform(corners, (corners + shift).astype(np.float32))
                 for image in (values[light], weights[light]):
-                    image[:] = cv2.warpAffine(image, there, image.shape[::-1], flags=_WARP)
+                    image[:] = cv2.warpAffine(image, transform, image.shape[::-1], flags=_WARP)
         return values, weights
 
     @classmethod
@@ -142,6 +146,7 @@ class Deformed:
         )
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reference:
     """The reference state: its mesh and its images; everything a frame needs and no frame changes.
@@ -160,8 +165,8 @@ class Reference:
     registration : Registration or None
         Where in its own image, of this state and of the deformed ones, a light shows what the first one shows at a
         pixel of the frame: there it is read; None: at the same pixel.
-    unfitted : float, or ndarray of shape (E,) on a graded mesh
-        Fraction of the variance of a block's score that the fit leaves in the residual (`unfitted_fraction`).
+    residual_leverage : float, or ndarray of shape (E,) on a graded mesh
+        Fraction of the variance of a block's score that the fit leaves in the residual (`mean_residual_leverage`).
     values, pixel_weights : ndarray, shape (k, P), float32
         The same at the owned pixels.
     level, inverse_level : ndarray, shape (k, P), float32
@@ -185,7 +190,7 @@ class Reference:
     assembly: Assembly
     material: Tri3Mesh
     origin: tuple[int, int]
-    unfitted: float | FloatArray
+    residual_leverage: float | FloatArray
     images: FloatImage
     weights: FloatImage
     values: FloatImage
@@ -257,30 +262,36 @@ class Reference:
         if region.rectangle is None:  # what lies beyond an outline may be another body, or a hole
             inside *= usable_pixels(region.mask, prefilter)
         if len(cracks := mesh.crack_edges):  # what lies beyond a crack moves otherwise
-            inside *= usable_pixels(~drawn(mesh.nodes[cracks], region.mask.shape), prefilter)
+            inside *= usable_pixels(~rasterise_lines(mesh.nodes[cracks], region.mask.shape), prefilter)
         mapped, assembly, material = aside(PixelMap.from_mesh, mesh, region), Assembly.from_mesh(mesh), material or mesh
         # what each frame needs of it, found while the pixels are
         _ = material.linear_fit_offset, material.colouring
-        pixels, (ready, usable) = mapped.result(), state.pictures(registration)
+        pixels, (prepared_images, usable) = mapped.result(), state.images_on_first_light(registration)
         usable = usable * inside
         if registration is None:
-            values, weighted, own = pixels.gather(ready), pixels.gather(usable), _gradient(state.coefficients, pixels)
+            values, weighted, light_gradient = (
+                pixels.gather(prepared_images),
+                pixels.gather(usable),
+                _gradient(state.coefficients, pixels),
+            )
         else:
-            values, weighted, own = _where_they_lie(state, mesh, pixels, pixels.gather(inside), registration)
+            values, weighted, light_gradient = _sample_registered_lights(
+                state, mesh, pixels, pixels.gather(inside), registration
+            )
         del state  # before what needs most memory
         sigma = brightness if isinstance(brightness, int | float) else None
         if brightness == "auto":
-            sigma = window_width(values, own, weighted, pixels, constants)
+            sigma = window_width(values, light_gradient, weighted, pixels, constants)
         level = _local_level(values, weighted, pixels, sigma)
         weighted *= level > DARK * level.max(axis=1, keepdims=True)
         inverse_level, fits = np.float32(1) / level, tuple[GainFit, ...]()
         if sigma is not None:  # what a gain may be is no displacement
             fits = tuple(GainFit.over(f, w, pixels, sigma) for f, w in zip(values, weighted, strict=True))
             for light, fit in enumerate(fits):
-                for axis in own[:, light]:
+                for axis in light_gradient[:, light]:
                     axis[:] = fit.remainder(axis, values[light])
-        own *= inverse_level
-        texture = TextureGradient.of_images(own, weighted, pixels, constants.shared)
+        light_gradient *= inverse_level
+        texture = TextureGradient.of_images(light_gradient, weighted, pixels, constants.gradient_correlation_bounds)
         gradient = texture.matched(pixels)
         return cls(
             mesh=mesh,
@@ -288,8 +299,10 @@ class Reference:
             assembly=assembly,
             material=material,
             origin=origin,
-            unfitted=unfitted_fraction(mesh, pixels, assembly, (gradient, weighted), prefilter, constants),
-            images=ready,
+            residual_leverage=mean_residual_leverage(
+                mesh, pixels, assembly, (gradient, weighted), prefilter, constants
+            ),
+            images=prepared_images,
             weights=usable,
             values=values,
             level=level,
@@ -373,12 +386,14 @@ class Reference:
         (xx, xy), (yx, yy) = np.moveaxis(np.eye(2) + self.mesh.element_gradient(displacement), 0, -1)
         inverse = np.stack([xy**2 + yy**2, -(xx * xy + yx * yy), xx**2 + yx**2], axis=1)
         inverse /= np.maximum((xx * yy - xy * yx) ** 2, 1e-9)[:, None]
-        beyond = np.clip(inverse - (1, 0, 1), -1, self.constants.most_filtered)
-        if np.sqrt((beyond**2).mean()) < self.constants.strained:
+        stretch_change = np.clip(inverse - (1, 0, 1), -1, self.constants.max_stretch_change)
+        if np.sqrt((stretch_change**2).mean()) < self.constants.min_stretch_change:
             return self
-        factors = filter_variance(self.prefilter) / 2 * (beyond * (1, 2, 1)).astype(np.float32)
-        values, (top, left, _, _) = self.values.copy(), self.pixels.bounds
-        add_second_derivatives(factors, self.images, self.pixels.lines, self.pixels.run_offsets, top, left, values)
+        factors = filter_variance(self.prefilter) / 2 * (stretch_change * (1, 2, 1)).astype(np.float32)
+        values, (first_row, first_column, _, _) = self.values.copy(), self.pixels.bounds
+        add_second_derivatives(
+            factors, self.images, self.pixels.lines, self.pixels.run_offsets, first_row, first_column, values
+        )
         return replace(self, values=values, gain_fits=())
 
     def offset(self, deformed: Deformed) -> FloatArray:
@@ -397,7 +412,7 @@ class Reference:
         return np.subtract(deformed.origin, self.origin).astype(np.float64)
 
     def warp(self, deformed: Deformed, light: int, displacement: FloatArray) -> tuple[AnyArray, ...]:
-        """Where a light's deformed image shows the pixels, for a displacement; see `carried`.
+        """Return where a light's deformed image shows the pixels, for a displacement; see `warp_arguments`.
 
         A light's registration is part of it, as linear in each element as the displacement, here and in the reference's
         own grey levels: what the elements do not follow of it cancels.
@@ -418,7 +433,7 @@ class Reference:
         motion = displacement - self.offset(deformed)
         if self.registration is not None:
             motion = motion + self.registration.displacement(self.mesh.nodes + displacement + self.origin, light)
-        return carried(self.mesh, self.pixels, motion)
+        return warp_arguments(self.mesh, self.pixels, motion)
 
     def blocks(self, weight: FloatImage, gradient: Iterable[FloatImage]) -> FloatArray:
         """Element blocks (E, 3, 3, 3) of ``sum w D phi_a phi_b``, D = (gx gx, gx gy, gy gy), for fields (P,).
@@ -470,9 +485,9 @@ class Reference:
         ndarray, shape (E, 3, 2)
             By element, corner and axis.
         """
-        parts = np.empty((len(self.mesh.elements), 3, 2))
-        element_vector(weight, difference, *gradient, *self.pixels.positions, parts)
-        return parts
+        vectors = np.empty((len(self.mesh.elements), 3, 2))
+        element_vector(weight, difference, *gradient, *self.pixels.positions, vectors)
+        return vectors
 
     def sums(self, values: FloatImage, factor: FloatImage) -> FloatArray:
         """Sum fields (n, P) over each element, and their products with a `factor` (P,); shape (n, E, 2).
@@ -494,26 +509,26 @@ class Reference:
         return out
 
 
-def carried(mesh: Tri3Mesh, pixels: PixelMap, motion: FloatArray) -> tuple[AnyArray, ...]:
+def warp_arguments(mesh: Tri3Mesh, pixels: PixelMap, motion: FloatArray) -> tuple[AnyArray, ...]:
     """Runs of pixels, elements, shape functions and a motion (N, 2) of the nodes, for the kernels that follow it."""
     return pixels.runs, pixels.run_offsets, pixels.origin, mesh.elements, pixels.barycentric, motion
 
 
 def _usable_weights(images: FloatImage, weights: FloatImage | None, prefilter: str) -> FloatImage:
     """Return the weight (k, H, W) of each pixel, 0 where it or its neighbourhood is invalid."""
-    given = np.ones_like(images) if weights is None else weights
+    initial_weights = np.ones_like(images) if weights is None else weights
     usable, reach = np.zeros_like(images), usable_reach(prefilter)
-    for image, weight, out in zip(images, given, usable, strict=True):
+    for image, weight, out in zip(images, initial_weights, usable, strict=True):
         if weight.min() > 0 and np.isfinite(image.sum()):  # NaN and infinity spread to it
             out[reach:-reach, reach:-reach] = weight[reach:-reach, reach:-reach]
         else:
-            known = np.isfinite(image)
-            known &= weight > 0
-            cv2.copyTo(weight, usable_pixels(known, prefilter).view(np.uint8), out)
+            valid = np.isfinite(image)
+            valid &= weight > 0
+            cv2.copyTo(weight, usable_pixels(valid, prefilter).view(np.uint8), out)
     return usable
 
 
-def _where_they_lie(
+def _sample_registered_lights(
     state: Deformed, mesh: Tri3Mesh, pixels: PixelMap, inside: FloatImage, registration: Registration
 ) -> tuple[FloatImage, FloatImage, FloatImage]:
     """Grey levels and weights (k, P), gradient (2, k, P) of lights at what the first one shows at the owned pixels.
@@ -522,24 +537,21 @@ def _where_they_lie(
     """
     x, y = pixels.columns, pixels.rows
     values, weights = (np.empty((len(state.weights), inside.size), dtype=np.float32) for _ in range(2))
-    gradient, shift = (np.empty((2, *many, inside.size), dtype=np.float32) for many in (values.shape[:1], ()))
-    one, zero, unused, moments = (
-        np.ones_like(inside),
-        np.zeros_like(inside),
-        np.empty_like(inside),
-        np.empty((len(mesh.elements), 6)),
+    gradient, shift = (
+        np.empty((2, *leading_shape, inside.size), dtype=np.float32) for leading_shape in (values.shape[:1], ())
     )
+    zero, unused, moments = np.zeros_like(inside), np.empty_like(inside), np.empty((len(mesh.elements), 6))
     for light, motion in enumerate(registration.displacement(mesh.nodes + state.origin)):
-        there, spline = carried(mesh, pixels, motion), state.coefficients[light]
-        differences(spline, zero, *there, values[light])
-        images = state.weights[light], state.partial[light], zero, values[light], inside
-        warped_weights(*images, *there, weights[light], moments)
+        warp, spline = warp_arguments(mesh, pixels, motion), state.coefficients[light]
+        differences(spline, zero, *warp, values[light])
+        images = state.weights[light], state.nonuniform_weight_blocks[light], zero, values[light], inside
+        warped_weights(*images, *warp, weights[light], moments)
         interpolate_nodal(motion, mesh.elements, *pixels.positions, shift)
         sample_with_gradient(spline, x + shift[0], y + shift[1], unused, *gradient[:, light])
     return np.negative(values, out=values), weights, gradient
 
 
-def _partial_blocks(weight: FloatImage) -> npt.NDArray[np.int32]:
+def _count_nonuniform_blocks(weight: FloatImage) -> npt.NDArray[np.int32]:
     """See `Deformed.partial`, for one weight (H, W)."""
     below, right = (-side % BLOCK for side in weight.shape)
     partial = np.pad(weight != 1, ((0, below), (0, right))) if below or right else weight != 1
@@ -547,7 +559,7 @@ def _partial_blocks(weight: FloatImage) -> npt.NDArray[np.int32]:
     return np.asarray(cv2.integral((np.bitwise_or.reduce(rows, axis=1) != 0).view(np.uint8)), dtype=np.int32)
 
 
-def drawn(lines: FloatArray, shape: tuple[int, ...]) -> BoolArray:
+def rasterise_lines(lines: FloatArray, shape: tuple[int, ...]) -> BoolArray:
     """Pixels (H, W) under lines with the ends (C, 2, 2) in px."""
     image = np.zeros(shape, dtype=np.uint8)
     shift = 8  # fixed-point bits of OpenCV's coordinates

@@ -15,10 +15,10 @@ from rgbmidic._kernels.mesh import claim_pixels
 from rgbmidic.correlation.assembly import rigid_functions
 from rgbmidic.correlation.images import usable_reach
 from rgbmidic.correlation.nodes import correlation
-from rgbmidic.correlation.reference import Deformed, Reference, drawn
+from rgbmidic.correlation.reference import Deformed, Reference, rasterise_lines
 from rgbmidic.correlation.residual import PrecisionMethod, Residual
 from rgbmidic.correlation.solution import Solution
-from rgbmidic.correlation.start import Start, nodal_slopes, track
+from rgbmidic.correlation.start import TrackingState, nodal_slopes, track
 from rgbmidic.errors import InputError
 from rgbmidic.mesh import Region, Tri3Mesh
 from rgbmidic.settings import SolverSettings
@@ -70,7 +70,7 @@ class ReferenceUpdate:
         return cls(first=first, reference=first, displacement=np.zeros_like(first.mesh.nodes))
 
     def track(
-        self, deformed: Deformed, start: Start, options: SolverSettings, method: PrecisionMethod | None
+        self, deformed: Deformed, state: TrackingState, options: SolverSettings, method: PrecisionMethod | None
     ) -> Solution:
         """Solve for the displacement of a later frame on the first one, from a start on the first one; see `track`.
 
@@ -78,7 +78,7 @@ class ReferenceUpdate:
         ----------
         deformed
             Images of the later frame.
-        start
+        state
             Initial guess on the first frame.
         options
             Settings of the solver.
@@ -90,9 +90,9 @@ class ReferenceUpdate:
         Solution
             On the first frame.
         """
-        last = start.displacement
-        own = replace(start, displacement=None if last is None else last - self.displacement)
-        return self.accumulated(track(self.reference, deformed, own, options, method), deformed)
+        last = state.displacement
+        relative_state = replace(state, displacement=None if last is None else last - self.displacement)
+        return self.accumulated(track(self.reference, deformed, relative_state, options, method), deformed)
 
     def accumulated(self, step: Solution, deformed: Deformed) -> Solution:
         """Return the solution on the first frame from that on this reference.
@@ -120,15 +120,15 @@ class ReferenceUpdate:
         if self.solution is None or self.scores is None or not step.measured.any():
             return step
         last, mesh = self.solution, self.first.mesh
-        before, after = self.scores, _scores(self.reference, deformed, step.displacement, step.rigid)
-        both = np.isfinite(before + after)
-        before, after = before[both], after[both]
-        squares = float((before**2 + after**2).sum())
-        in_common = 1 + 2 * float((before * after).sum()) / squares if squares > 0 else 1.0
+        reference_scores, step_scores = self.scores, _scores(self.reference, deformed, step.displacement, step.rigid)
+        valid = np.isfinite(reference_scores + step_scores)
+        reference_scores, step_scores = reference_scores[valid], step_scores[valid]
+        squares = float((reference_scores**2 + step_scores**2).sum())
+        in_common = 1 + 2 * float((reference_scores * step_scores).sum()) / squares if squares > 0 else 1.0
         slope = nodal_slopes(self.reference.mesh, step.displacement, step.measured, self.first.constants)[0]
         deformation = np.moveaxis(np.eye(2) + slope, 0, -1)
 
-        def carried(std: FloatArray) -> FloatArray:
+        def propagated(std: FloatArray) -> FloatArray:
             """Variance (N, 2) along x and y of what has this standard uncertainty in frame r."""
             (u, v), uv = (std**2).T, self.uv_correlation * std.prod(axis=1)
             return np.stack([a**2 * u + b**2 * v + 2 * a * b * uv for a, b in deformation], axis=1)
@@ -137,7 +137,7 @@ class ReferenceUpdate:
             return np.asarray(np.sqrt(in_common * (of_reference + of_step**2)))
 
         strain = _single(last.strain_std)
-        normal, slopes = carried(strain[:, :2]), np.maximum((strain[:, :2] ** 2).sum(axis=1), 1e-300)
+        normal, slopes = propagated(strain[:, :2]), np.maximum((strain[:, :2] ** 2).sum(axis=1), 1e-300)
         # slopes along x and along y are alike: half the shear strain's are those of u, half those of v
         shear = strain[:, 2] ** 2 * normal.sum(axis=1) / slopes
         # what is missed near edges is found anew from the whole displacement
@@ -147,8 +147,8 @@ class ReferenceUpdate:
             nodes=mesh.nodes,
             elements=mesh.elements,
             displacement=self.displacement + step.displacement,
-            displacement_std=total(carried(before_std), step.displacement_std),
-            bias_std=total(carried(_single(last.bias_std)), step.bias_std),
+            displacement_std=total(propagated(before_std), step.displacement_std),
+            bias_std=total(propagated(_single(last.bias_std)), step.bias_std),
             strain=_single(last.strain) + step.strain,
             strain_std=total(np.column_stack([normal, shear]), step.strain_std),
             rigid=last.rigid + step.rigid if step.rigid.size else step.rigid,
@@ -176,15 +176,15 @@ class ReferenceUpdate:
         ndarray, shape (E,)
             From -1 to 1.
         """
-        residual, known = _residual(self.reference, deformed, *self._step(solution.displacement, solution))
+        residual, has_displacement = _residual(self.reference, deformed, *self._step(solution.displacement, solution))
         lights = zip(*residual.centred_products(), strict=True)
-        own = np.array([correlation(fg, ff, gg) for fg, ff, gg in lights])
-        best = np.where(residual.moments[..., 0] > 0, own, -np.inf).max(axis=0)
-        return np.where(known & (best > -np.inf), best, np.nan)
+        coefficients = np.array([correlation(fg, ff, gg) for fg, ff, gg in lights])
+        best = np.where(residual.moments[..., 0] > 0, coefficients, -np.inf).max(axis=0)
+        return np.where(has_displacement & (best > -np.inf), best, np.nan)
 
     @staticmethod
     def is_due(match: FloatArray, best: float, poor: float = 0.95, fraction: float = 0.1) -> bool:
-        """Whether a frame should become the next reference: a tenth of its measured elements match poorly.
+        """Tell whether a frame should become the next reference: a tenth of its measured elements match poorly.
 
         Nodes without data call for none: they would be lost for good, where a glare passes and a crack closes.
 
@@ -206,8 +206,8 @@ class ReferenceUpdate:
         -------
         bool
         """
-        known = np.isfinite(match)
-        return bool(known.any() and (match[known] < poor * best).mean() > fraction)
+        measured = np.isfinite(match)
+        return bool(measured.any() and (match[measured] < poor * best).mean() > fraction)
 
     def updated(
         self,
@@ -246,13 +246,13 @@ class ReferenceUpdate:
         displacement = solution.displacement[mesh.nearest_nodes(measured)[1]]
         origin, prefilter = self.first.origin if origin is None else origin, self.first.prefilter
         motion = displacement - np.subtract(origin, self.first.origin)
-        moved = Tri3Mesh(nodes=mesh.nodes + motion, elements=mesh.elements)
-        region = _region(self.first, moved, measured, images.shape[1:])
+        deformed_mesh = Tri3Mesh(nodes=mesh.nodes + motion, elements=mesh.elements)
+        region = _region(self.first, deformed_mesh, measured, images.shape[1:])
         reference = Reference.prepare(
             images,
             region,
             weights,
-            mesh=moved,
+            mesh=deformed_mesh,
             material=self.first.material,
             prefilter=prefilter,
             origin=origin,
@@ -296,19 +296,19 @@ def _region(first: Reference, mesh: Tri3Mesh, measured: BoolArray, shape: tuple[
     Where the first region is a rectangle without cracks, the paint goes on beyond it: as many pixels are added there as
     `Reference.prepare` takes off.
     """
-    whole, cracks = np.asarray(measured[mesh.elements].all(axis=1)), first.mesh.crack_edges
-    mask = _covered(mesh, whole, shape) & ~drawn(mesh.nodes[cracks], shape)
+    measured_elements, cracks = np.asarray(measured[mesh.elements].all(axis=1)), first.mesh.crack_edges
+    mask = _covered(mesh, measured_elements, shape) & ~rasterise_lines(mesh.nodes[cracks], shape)
     if first.pixels.local_x.size == first.pixels.bounds[2] * first.pixels.bounds[3] and not len(cracks):
         side = 2 * usable_reach(first.prefilter) + 1
         grown = cv2.dilate(mask.astype(np.uint8), np.ones((side, side), dtype=np.uint8)) > 0
-        mask |= grown & ~_covered(mesh, ~whole, shape)
+        mask |= grown & ~_covered(mesh, ~measured_elements, shape)
     return Region.from_mask(mask)
 
 
-def _covered(mesh: Tri3Mesh, chosen: BoolArray, shape: tuple[int, ...]) -> BoolArray:
+def _covered(mesh: Tri3Mesh, elements: BoolArray, shape: tuple[int, ...]) -> BoolArray:
     """Pixels (H, W) of the chosen elements (E,)."""
     owner = np.full(shape, -1, dtype=np.int32)
-    claim_pixels(mesh.nodes, mesh.elements[chosen], owner)
+    claim_pixels(mesh.nodes, mesh.elements[elements], owner)
     return owner >= 0
 
 
@@ -317,10 +317,10 @@ def _scores(reference: Reference, deformed: Deformed, displacement: FloatArray, 
 
     The sums are NaN where a node has no displacement.
     """
-    residual, known = _residual(reference, deformed, displacement, rigid)
+    residual, has_displacement = _residual(reference, deformed, displacement, rigid)
     lights = zip(residual.weights, residual.difference, reference.gradient.swapaxes(0, 1), strict=True)
     total = np.sum([reference.projected(*light).sum(axis=1) for light in lights], axis=0)
-    return np.where(known[:, None], total, np.nan)
+    return np.where(has_displacement[:, None], total, np.nan)
 
 
 def _residual(
@@ -330,10 +330,10 @@ def _residual(
 
     The lights' rigid coefficients are (k, m), NaN for a light that sees nothing.
     """
-    found = np.asarray(np.isfinite(displacement).all(axis=1))
+    finite = np.asarray(np.isfinite(displacement).all(axis=1))
     functions = rigid_functions(reference.mesh.nodes, "translation+rotation")[:, : rigid.shape[1]]
-    own = (np.nan_to_num(rigid) @ functions.T).reshape(len(rigid), *displacement.shape)
-    motion = list(np.nan_to_num(displacement) + own)
-    known = np.asarray(found[reference.mesh.elements].all(axis=1))
+    rigid_motions = (np.nan_to_num(rigid) @ functions.T).reshape(len(rigid), *displacement.shape)
+    motion = list(np.nan_to_num(displacement) + rigid_motions)
+    has_displacement = np.asarray(finite[reference.mesh.elements].all(axis=1))
     filtered = reference.filtered_as(np.nan_to_num(displacement))
-    return Residual.at(filtered, deformed, motion), known
+    return Residual.at(filtered, deformed, motion), has_displacement

@@ -20,9 +20,11 @@ from rgbmidic._kernels.owned_pixels import subtract_quadratic
 from rgbmidic.correlation.brightness import Brightness
 from rgbmidic.correlation.reference import Deformed, Reference
 from rgbmidic.mesh import Tri3Mesh
+from rgbmidic.renamed import state_new_names
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Residual:
     """Both states at the owned pixels of the reference.
@@ -66,13 +68,13 @@ class Residual:
         difference, weights = np.empty_like(values), np.empty_like(values)
         moments = np.empty((len(values), len(reference.mesh.elements), 6))
         for light, displacement in enumerate(displacements):
-            there = reference.warp(deformed, light, displacement)
-            differences(deformed.coefficients[light], values[light], *there, difference[light])
-            images = deformed.weights[light], deformed.partial[light], values[light], difference[light]
-            warped_weights(*images, reference.pixel_weights[light], *there, weights[light], moments[light])
+            warp = reference.warp(deformed, light, displacement)
+            differences(deformed.coefficients[light], values[light], *warp, difference[light])
+            images = deformed.weights[light], deformed.nonuniform_weight_blocks[light], values[light], difference[light]
+            warped_weights(*images, reference.pixel_weights[light], *warp, weights[light], moments[light])
         brightness = reference.brightness_of(weights, moments)
-        for light, one in enumerate(difference):
-            brightness.correct(light, one)
+        for light, light_difference in enumerate(difference):
+            brightness.correct(light, light_difference)
         return cls(reference=reference, brightness=brightness, weights=weights, difference=difference, moments=moments)
 
     @property
@@ -112,17 +114,17 @@ class Residual:
         total, f, g, ff, fg, gg = np.moveaxis(self.moments, -1, 0)
         total, rounding = np.maximum(total, 1e-30), 2e-7  # three units of single precision
         beyond_f, beyond_g = (
-            np.where(beyond > rounding * square, beyond, 0.0)
-            for beyond, square in ((ff - f * f / total, ff), (gg - g * g / total, gg))
+            np.where(deviation > rounding * square, deviation, 0.0)
+            for deviation, square in ((ff - f * f / total, ff), (gg - g * g / total, gg))
         )
         return fg - f * g / total, beyond_f, beyond_g
 
-    def without(self, carried: FloatArray, curvature: FloatArray) -> Residual:
+    def subtract_curvature(self, nodal_offset: FloatArray, curvature: FloatArray) -> Residual:
         """Take out what a curved field has over its own linear fit.
 
         Parameters
         ----------
-        carried : ndarray, shape (N, 2)
+        nodal_offset : ndarray, shape (N, 2)
             What the fit has at the nodes beyond the field, px, in the axes of the reference.
         curvature : ndarray, shape (N, 2, 3)
             Second derivatives xx, xy, yy of the field at the nodes, 1/px, in the axes of the reference.
@@ -131,13 +133,14 @@ class Residual:
         -------
         Residual
         """
-        known, pixels, out = self.reference, self.reference.pixels, np.empty_like(self.difference)
-        deviation = curved_deviation(known.material, pixels.barycentric, carried, curvature)
-        place = pixels.local_x, pixels.local_y, pixels.offsets
-        subtract_quadratic(self.difference, *known.gradient, deviation, *place, out)
+        reference, pixels, out = self.reference, self.reference.pixels, np.empty_like(self.difference)
+        deviation = curved_deviation(reference.material, pixels.barycentric, nodal_offset, curvature)
+        pixel_positions = pixels.local_x, pixels.local_y, pixels.offsets
+        subtract_quadratic(self.difference, *reference.gradient, deviation, *pixel_positions, out)
         return replace(self, difference=out)
 
 
+@state_new_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Precision:
     """Precision of the lights, from their residuals.
@@ -146,12 +149,12 @@ class Precision:
     ----------
     factor : ndarray, shape (k, P), float32
         Factor on the weights that are given, in any unit.
-    bend : ndarray, shape (P,), float32
+    loss_curvature : ndarray, shape (P,), float32
         Second derivative of the robust loss over `factor`, 1 for a loss that is not robust.
     """
 
     factor: FloatImage
-    bend: FloatImage
+    loss_curvature: FloatImage
 
     def robust_loss(self, reference: Reference, weights: FloatImage) -> FloatArray:
         """Factor (N,) on the uncertainty with the solve's `weights` (k, P): a robust loss bends less.
@@ -167,7 +170,9 @@ class Precision:
         -------
         ndarray, shape (N,)
         """
-        total, bent = (reference.mesh.to_nodes(part) for part in reference.sums(weights, self.bend).sum(axis=0).T)
+        total, bent = (
+            reference.mesh.to_nodes(sums) for sums in reference.sums(weights, self.loss_curvature).sum(axis=0).T
+        )
         # 0.1, so that the quotient exists: up to twice of it nothing changes
         return np.divide(total, np.maximum(bent, 0.1 * total), out=np.ones_like(total), where=total > 0)
 
@@ -190,7 +195,9 @@ class PrecisionMethod(Protocol):
         ...
 
 
-def curved_deviation(mesh: Tri3Mesh, barycentric: FloatArray, carried: FloatArray, curvature: FloatArray) -> FloatImage:
+def curved_deviation(
+    mesh: Tri3Mesh, barycentric: FloatArray, nodal_offset: FloatArray, curvature: FloatArray
+) -> FloatImage:
     """Polynomials of what a curved field has over its own linear fit in every element.
 
     Along an edge the second derivative is the mean of its ends. Over its linear interpolant the field has the
@@ -202,7 +209,7 @@ def curved_deviation(mesh: Tri3Mesh, barycentric: FloatArray, carried: FloatArra
         N nodes, E elements.
     barycentric : ndarray, shape (E, 3, 3)
         Shape functions, see `PixelMap`.
-    carried : ndarray, shape (N, 2)
+    nodal_offset : ndarray, shape (N, 2)
         What the linear fit has at the nodes beyond the field, px.
     curvature : ndarray, shape (N, 2, 3)
         Second derivatives xx, xy, yy of the field at the nodes, 1/px.
@@ -213,16 +220,19 @@ def curved_deviation(mesh: Tri3Mesh, barycentric: FloatArray, carried: FloatArra
         Coefficients of 1, x, y, x^2, x y, y^2 of the local position.
     """
     first, second = mesh.elements, np.roll(mesh.elements, -1, axis=1)
-    (x, y), bend = np.moveaxis(mesh.nodes[first] - mesh.nodes[second], -1, 0), curvature[first] + curvature[second]
-    sag = -0.25 * (bend @ np.stack([x * x, 2 * x * y, y * y], axis=-1)[..., None])[..., 0]
+    (x, y), second_derivative = (
+        np.moveaxis(mesh.nodes[first] - mesh.nodes[second], -1, 0),
+        curvature[first] + curvature[second],
+    )
+    sag = -0.25 * (second_derivative @ np.stack([x * x, 2 * x * y, y * y], axis=-1)[..., None])[..., 0]
     (a0, a1, a2), (b0, b1, b2) = (np.moveaxis(phi, -1, 0) for phi in (barycentric, np.roll(barycentric, -1, axis=1)))
     products = np.stack([a0 * b0, a0 * b1 + a1 * b0, a0 * b2 + a2 * b0, a1 * b1, a1 * b2 + a2 * b1, a2 * b2], axis=-1)
     deviation = sag.transpose(0, 2, 1) @ products
-    deviation[..., :3] -= carried[first].transpose(0, 2, 1) @ barycentric
+    deviation[..., :3] -= nodal_offset[first].transpose(0, 2, 1) @ barycentric
     return np.asarray(deviation, dtype=np.float32)
 
 
-_KNOWN = 12
+_MIN_PIXELS = 12
 """Pixels of an element that must be known in both states: a contrast of 12 values is known to 20 % (derived)."""
 
 
@@ -250,67 +260,70 @@ def brightness_change(
         Gain and offset (grey levels); NaN where no element is seen in both states.
     """
     mesh, pixels = reference.mesh, reference.pixels
-    many, enough = 400, 36  # elements: their median is known to 6 % of the scatter; pixels: a contrast to 12 %
-    chosen = np.arange(0, len(mesh.elements), max(1, len(mesh.elements) // many))
-    motion, size = displacement[mesh.elements[chosen]].mean(axis=1), np.diff(pixels.offsets)[chosen]
-    seen = np.isfinite(motion).all(axis=1) & (size >= _KNOWN)
-    chosen, step, size = chosen[seen], np.round(motion[seen]).astype(np.int64), size[seen]
-    slots = pixels.offsets[chosen, None] + np.arange(enough) * size[:, None] // enough
-    columns = pixels.local_x[slots].astype(np.int64) + pixels.origin[chosen, :1]
-    rows = pixels.local_y[slots].astype(np.int64) + pixels.origin[chosen, 1:]
+    max_elements, sample_count = (
+        400,
+        36,
+    )  # elements: their median is known to 6 % of the scatter; pixels: a contrast to 12 %
+    elements = np.arange(0, len(mesh.elements), max(1, len(mesh.elements) // max_elements))
+    motion, size = displacement[mesh.elements[elements]].mean(axis=1), np.diff(pixels.offsets)[elements]
+    usable = np.isfinite(motion).all(axis=1) & (size >= _MIN_PIXELS)
+    elements, step, size = elements[usable], np.round(motion[usable]).astype(np.int64), size[usable]
+    slots = pixels.offsets[elements, None] + np.arange(sample_count) * size[:, None] // sample_count
+    columns = pixels.local_x[slots].astype(np.int64) + pixels.origin[elements, :1]
+    rows = pixels.local_y[slots].astype(np.int64) + pixels.origin[elements, 1:]
     height, width = second.shape[1:]
     across, down = columns + step[:, :1], rows + step[:, 1:]
     inside = (down >= 0) & (down < height) & (across >= 0) & (across < width)
-    there = np.clip(down, 0, height - 1) * width + np.clip(across, 0, width - 1)
+    target_index = np.clip(down, 0, height - 1) * width + np.clip(across, 0, width - 1)
     f, g = (
         np.take(images.reshape(len(images), -1), at, axis=1)
-        for images, at in ((first, rows * first.shape[2] + columns), (second, there))
+        for images, at in ((first, rows * first.shape[2] + columns), (second, target_index))
     )
     return np.array([_gain_and_offset(*pair, inside) for pair in zip(f, g, strict=True)])
 
 
 def _gain_and_offset(f: FloatImage, g: FloatImage, inside: BoolArray) -> tuple[float, float]:
-    """From the samples (E, n) of elements."""
-    known = inside & np.isfinite(f) & np.isfinite(g)
-    known &= known.sum(axis=1, keepdims=True) >= _KNOWN
-    seen = np.asarray(known.any(axis=1))
-    known, number = known[seen], known[seen].sum(axis=1)
+    """Estimate gain and offset of one light from the samples (E, n) of elements."""
+    valid = inside & np.isfinite(f) & np.isfinite(g)
+    valid &= valid.sum(axis=1, keepdims=True) >= _MIN_PIXELS
+    has_data = np.asarray(valid.any(axis=1))
+    valid, number = valid[has_data], valid[has_data].sum(axis=1)
 
     def moments(values: FloatImage) -> tuple[FloatArray, FloatArray]:
-        exact = np.where(known, values[seen], 0).astype(np.float64)
+        exact = np.where(valid, values[has_data], 0).astype(np.float64)
         mean = exact.sum(axis=1) / number
         return mean, np.maximum((exact**2).sum(axis=1) / number - mean**2, 0)
 
     (mean_f, contrast_f), (mean_g, contrast_g) = moments(f), moments(g)
-    textured = contrast_f > 0.05 * np.median(contrast_f) if seen.any() else seen[:0]
+    textured = contrast_f > 0.05 * np.median(contrast_f) if has_data.any() else has_data[:0]
     if not textured.any():
         return float("nan"), float("nan")
     gain = float(np.median(np.sqrt(contrast_g[textured] / contrast_f[textured])))
     return gain, float(np.median(mean_g[textured] - gain * mean_f[textured]))
 
 
-_FITTED = 12
+_FITTED_PAIRS = 12
 """Pairs to which the motion around a node is fitted: four times the three that determine an affine motion. With half or
 twice of it results differ by 5e-6 px at most (measured)."""
 
 
-def follow(points: FloatArray, motion: FloatArray, mesh: Tri3Mesh, scale: float) -> FloatArray:
-    """Follow the motion (P, 2) of points (P, 2) at the nodes (N, 2): one affine field, and what a local one adds to it.
+def interpolate_motion(points: FloatArray, motion: FloatArray, mesh: Tri3Mesh, scale: float) -> FloatArray:
+    """Interpolate motion (P, 2) of points (P, 2) at the nodes (N, 2): one affine field, and what a local one adds.
 
-    Both are robust fits, with Cauchy weights of `scale` px. Around a node it is that of the nearest `_FITTED` points,
-    around the nodes at a crack of those on their own side.
+    Both are robust fits, with Cauchy weights of `scale` px. Around a node it is that of the nearest `_FITTED_PAIRS`
+    points, around the nodes at a crack of those on their own side.
     """
     nodes = mesh.nodes
     middle, size = points.mean(axis=0), np.ptp(points, axis=0).max() + 1.0
-    basis, at_nodes = (np.c_[np.ones(len(where)), (where - middle) / size] for where in (points, nodes))
+    basis, at_nodes = (np.c_[np.ones(len(positions)), (positions - middle) / size] for positions in (points, nodes))
     affine = _robust_fit(basis[None], motion[None], 1e-6, 4 * scale)[0]
-    rest = motion - basis @ affine
+    remainder = motion - basis @ affine
     distance, near = map(
-        np.asarray, cKDTree(points).query(mesh.observation_points, k=[*range(1, min(_FITTED, len(points)) + 1)])
+        np.asarray, cKDTree(points).query(mesh.observation_points, k=[*range(1, min(_FITTED_PAIRS, len(points)) + 1)])
     )
     step = (points[near] - nodes[:, None]) / np.maximum(distance[:, -1:, None], 1.0)
     local = np.concatenate([np.ones((*step.shape[:2], 1)), step], axis=2)
-    return np.asarray(at_nodes @ affine + _robust_fit(local, rest[near], 0.3, scale)[:, 0])
+    return np.asarray(at_nodes @ affine + _robust_fit(local, remainder[near], 0.3, scale)[:, 0])
 
 
 def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: float) -> FloatArray:
@@ -318,23 +331,25 @@ def _robust_fit(basis: FloatArray, motion: FloatArray, ridge: float, scale: floa
 
     The first function of the basis is 1; `ridge` holds the slopes back where the points do not determine them.
     """
-    basis, motion = (np.ascontiguousarray(part.T) for part in (basis, motion))  # one fit beside the other in memory
+    basis, motion = (np.ascontiguousarray(values.T) for values in (basis, motion))  # one fit beside the other in memory
     weight, held = np.ones(basis.shape[1:]), np.diag([1e-6, ridge, ridge])
     for _ in range(5):  # until the weights have settled: twice as many change results by 1e-11 px
         # no BLAS, whose sums may depend on the number of threads
-        sums = np.array([[(part * side).sum(axis=0) for side in (*basis, *motion)] for part in basis * weight])
-        found = np.linalg.solve(sums[:, :3].T + held, sums[:, 3:].transpose(2, 0, 1))
-        fitted = sum(part * slope[:, None] for part, slope in zip(basis, found.transpose(1, 2, 0), strict=True))
+        sums = np.array([[(values * side).sum(axis=0) for side in (*basis, *motion)] for values in basis * weight])
+        coefficients = np.linalg.solve(sums[:, :3].T + held, sums[:, 3:].transpose(2, 0, 1))
+        fitted = sum(
+            values * slope[:, None] for values, slope in zip(basis, coefficients.transpose(1, 2, 0), strict=True)
+        )
         weight = 1 / (1 + ((motion - fitted) ** 2).sum(axis=0) / scale**2)
-    return found
+    return coefficients
 
 
-def brought_nearer(residual: Residual, displacement: FloatArray) -> FloatArray:
+def refine_by_patch_matching(residual: Residual, displacement: FloatArray) -> FloatArray:
     """Bring an initial guess to within some tenths of a pixel by matching patches around the nodes.
 
     Both states are compared as the residual holds them, in the reference's axes, so that turn and strain of the guess
-    are no hindrance. What the patches move by beyond the guess is followed as in `follow`: nodes whose patch is not
-    found move as those around them.
+    are no hindrance. What the patches move by beyond the guess is followed as in `interpolate_motion`: nodes whose
+    patch is not found move as those around them.
 
     Parameters
     ----------
@@ -352,32 +367,34 @@ def brought_nearer(residual: Residual, displacement: FloatArray) -> FloatArray:
     # each side of its node there: 26 px hold some 40 speckles, of which chance reaches a correlation of .3 in 81 places
     # (derived). Its largest shift is 8 px of the image, two speckles: twice as many cost 3 times as much. It has been
     # found from a correlation coefficient as in `Search.confidence`.
-    reduction, half, most, least = 2, 6, 4, 0.5
-    mesh, pixels, reach = residual.reference.mesh, residual.reference.pixels, half + most
+    reduction, half, max_shift, min_score = 2, 6, 4, 0.5
+    mesh, pixels, reach = residual.reference.mesh, residual.reference.pixels, half + max_shift
     f, g = _reduced(residual, reduction, reach)
-    top, left = pixels.bounds[:2]
-    at = np.round((mesh.nodes - (left, top) - (reduction - 1) / 2) / reduction).astype(int) + reach
+    first_row, first_column = pixels.bounds[:2]
+    at = np.round((mesh.nodes - (first_column, first_row) - (reduction - 1) / 2) / reduction).astype(int) + reach
     at = np.clip(at, reach, np.array(f.shape)[::-1] - reach - 1)
-    found = np.zeros((len(at), 2 * most + 1, 2 * most + 1), dtype=np.float32)
-    for out, (x, y) in zip(found, at, strict=True):
+    scores = np.zeros((len(at), 2 * max_shift + 1, 2 * max_shift + 1), dtype=np.float32)
+    for out, (x, y) in zip(scores, at, strict=True):
         patch = f[y - half : y + half + 1, x - half : x + half + 1]
         if patch.min() < patch.max():  # of a blank patch OpenCV says that it is everywhere
-            around = g[y - reach : y + reach + 1, x - reach : x + reach + 1]
-            out[:] = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
-    score, (i, j) = found.max(axis=(1, 2)), np.divmod(found.reshape(len(at), -1).argmax(axis=1), 2 * most + 1)
-    node = np.flatnonzero((score >= least) & (i > 0) & (i < 2 * most) & (j > 0) & (j < 2 * most))
-    if len(node) < _FITTED:
+            search_window = g[y - reach : y + reach + 1, x - reach : x + reach + 1]
+            out[:] = cv2.matchTemplate(search_window, patch, cv2.TM_CCOEFF_NORMED)
+    score, (i, j) = scores.max(axis=(1, 2)), np.divmod(scores.reshape(len(at), -1).argmax(axis=1), 2 * max_shift + 1)
+    node = np.flatnonzero((score >= min_score) & (i > 0) & (i < 2 * max_shift) & (j > 0) & (j < 2 * max_shift))
+    if len(node) < _FITTED_PAIRS:
         return displacement
-    i, j, here = i[node], j[node], score[node]
-    shift = np.stack([j, i], axis=1) - float(most)
+    i, j, peak = i[node], j[node], score[node]
+    shift = np.stack([j, i], axis=1) - float(max_shift)
     for axis, (di, dj) in enumerate(((0, 1), (1, 0))):
-        before, after = found[node, i - di, j - dj], found[node, i + di, j + dj]
-        bend = before - 2 * here + after
+        previous_score, next_score = scores[node, i - di, j - dj], scores[node, i + di, j + dj]
+        curvature = previous_score - 2 * peak + next_score
         # the crest of the parabola through three values, of which the middle one is the largest
-        shift[:, axis] += np.divide((before - after) / 2, bend, out=np.zeros_like(bend), where=bend < 0)
+        shift[:, axis] += np.divide(
+            (previous_score - next_score) / 2, curvature, out=np.zeros_like(curvature), where=curvature < 0
+        )
     shift *= reduction
-    beyond = shift + np.einsum("nij,nj->ni", mesh.nodal_gradient(displacement)[node], shift)
-    return displacement + follow(mesh.nodes[node], beyond, mesh, 1.0)
+    motion = shift + np.einsum("nij,nj->ni", mesh.nodal_gradient(displacement)[node], shift)
+    return displacement + interpolate_motion(mesh.nodes[node], motion, mesh, 1.0)
 
 
 def _reduced(residual: Residual, side: int, border: int) -> FloatImage:

@@ -116,24 +116,25 @@ class Solution(HtmlRepr):
 
     def __repr__(self) -> str:
         """Return how the solve ended and what was found, in a few lines."""
-        there = self.node_status == NodeStatus.MEASURED
+        measured = self.node_status == NodeStatus.MEASURED
         lines = [
             f"<rgbmidic.Solution {self.status.name.lower()}, {len(self.history)} iterations>",
-            f"mesh:   {len(self.nodes)} nodes, {len(self.elements)} elements; {there.mean():.1%} of the nodes measured",
+            f"mesh:   {len(self.nodes)} nodes, {len(self.elements)} elements; "
+            f"{measured.mean():.1%} of the nodes measured",
             f"lights: {self.light_fraction.shape[1]}",
         ]
         if self.reason:
             lines.insert(1, f"reason: {self.reason}")
         for name, values, std in zip("uv", self.displacement.T, self.displacement_std.T, strict=True):
-            if (known := values[np.isfinite(values)]).size:
+            if (finite := values[np.isfinite(values)]).size:
                 spread = float(np.median(std[np.isfinite(std)])) if np.isfinite(std).any() else np.nan
-                least, most = format_value(known.min(), spread), format_with_std(known.max(), spread, "px")
-                lines.append(f"{name}:      {least} to {most} (median)")
+                minimum, maximum = format_value(finite.min(), spread), format_with_std(finite.max(), spread, "px")
+                lines.append(f"{name}:      {minimum} to {maximum} (median)")
         return "\n".join(lines)
 
     @property
     def disagreement(self) -> str:
-        """Where the lights show displacements that their agreement does not settle; empty if they do not."""
+        """Report where the lights show displacements that their agreement does not settle; empty if they do not."""
         mainly = self.bias_std**2 > 0.8 * self.displacement_std**2  # twice of all else together
         std, measured = np.where(mainly, self.bias_std, 0).max(axis=1), int(self.measured.sum())
         disputed, (x, y) = int((std > DISPUTED).sum()), self.nodes[std.argmax()]
@@ -251,12 +252,12 @@ def fill(mesh: Tri3Mesh, solution: Solution, longest: float) -> Solution:
     filled = ~measured & (distance <= longest)
     if not filled.any():
         return solution
-    trend, rest = _quadratic_trend(mesh.nodes, solution.displacement, measured)
+    trend, remainder = _quadratic_trend(mesh.nodes, solution.displacement, measured)
     i, j = mesh.neighbours[measured[mesh.neighbours].all(axis=1)].T
-    step = np.sqrt(np.mean((rest[i] - rest[j]) ** 2, axis=0)) if len(i) else np.zeros(2)
+    step = np.sqrt(np.mean((remainder[i] - remainder[j]) ** 2, axis=0)) if len(i) else np.zeros(2)
     size = float(np.sqrt(2 * mesh.areas.mean()))
     std = np.hypot(solution.displacement_std[nearest], step * np.sqrt(np.minimum(distance, longest) / size)[:, None])
-    displacement = trend + _smooth(mesh, rest, measured)
+    displacement = trend + _smooth(mesh, remainder, measured)
     return replace(
         solution,
         displacement=np.where(filled[:, None], displacement, solution.displacement),
@@ -274,8 +275,8 @@ def _quadratic_trend(nodes: FloatArray, displacement: FloatArray, measured: Bool
     return trend, np.where(measured[:, None], displacement - trend, 0.0)
 
 
-def _smooth(mesh: Tri3Mesh, rest: FloatArray, measured: BoolArray) -> FloatArray:
-    """`rest` (N, 2) at the measured nodes, and the field of least squared Laplacian through them elsewhere."""
+def _smooth(mesh: Tri3Mesh, values: FloatArray, measured: BoolArray) -> FloatArray:
+    """`values` (N, 2) at the measured nodes, and the field of least squared Laplacian through them elsewhere."""
     from scipy.sparse.linalg import spsolve
 
     count = len(mesh.nodes)
@@ -285,8 +286,8 @@ def _smooth(mesh: Tri3Mesh, rest: FloatArray, measured: BoolArray) -> FloatArray
     degree = np.asarray(adjacency.sum(axis=1)).ravel()
     laplacian = sp.eye(count, format="csr") - sp.diags(1 / np.maximum(degree, 1)) @ adjacency
     energy = sp.csc_matrix(laplacian.T @ laplacian + 1e-8 * sp.eye(count))
-    free, known = np.flatnonzero(~measured), np.flatnonzero(measured)
-    out = rest.copy()
-    right = -(energy[free][:, known] @ rest[known])
+    free, fixed = np.flatnonzero(~measured), np.flatnonzero(measured)
+    out = values.copy()
+    right = -(energy[free][:, fixed] @ values[fixed])
     out[free] = np.asarray(spsolve(energy[free][:, free].tocsc(), right)).reshape(-1, 2)
     return out

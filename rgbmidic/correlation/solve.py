@@ -28,13 +28,13 @@ from rgbmidic.correlation.equations import (
     compare,
     iterate,
 )
-from rgbmidic.correlation.light_bias import light_bias, settled_gradient
-from rgbmidic.correlation.nodes import judge, matching_elements, misfit, one_sided_texture
+from rgbmidic.correlation.light_bias import light_bias, with_consistent_gradient
+from rgbmidic.correlation.nodes import classify_nodes, matching_elements, misfit, one_sided_texture
 from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual, brought_nearer
+from rgbmidic.correlation.residual import Precision, PrecisionMethod, Residual, refine_by_patch_matching
 from rgbmidic.correlation.solution import NO_MATCH, NodeStatus, Solution, Status
-from rgbmidic.correlation.uncertainty import beyond_chance, gradient_step, standard_uncertainty
+from rgbmidic.correlation.uncertainty import excess_over_chance, gradient_step, standard_uncertainty
 from rgbmidic.errors import InputError
 from rgbmidic.settings import SolverSettings
 from rgbmidic.timing import stage
@@ -53,24 +53,24 @@ class Weighting:
         Elements that take part.
     precision
         Of the lights; None: not learnt.
-    returned : int
+    reweight_until : int
         Number of the pass after the last one in which elements took part again.
-    learnt_at : ndarray, shape (N, 2)
+    weighting_displacement : ndarray, shape (N, 2)
         Displacement at which precision and grey levels were learnt, px.
     """
 
     residual: Residual
     matched: BoolArray
     precision: Precision | None = None
-    returned: int = 0
-    learnt_at: FloatArray
+    reweight_until: int = 0
+    weighting_displacement: FloatArray
 
     def weights(self, pixels: slice = slice(None)) -> FloatImage:
         """Weights (k, P) of pixels in the next pass."""
-        given = self.given(pixels)
-        return given if self.precision is None else given * self.precision.factor[:, pixels]
+        weights = self.prior_weights(pixels)
+        return weights if self.precision is None else weights * self.precision.factor[:, pixels]
 
-    def given(self, pixels: slice = slice(None)) -> FloatImage:
+    def prior_weights(self, pixels: slice = slice(None)) -> FloatImage:
         """Weights (k, P) of pixels without the precision of the lights."""
         weights = self.residual.weights[:, pixels]
         if self.matched.all():
@@ -84,8 +84,8 @@ def first_weighting(problem: Problem, estimate: Estimate, residual: Residual | N
     residual = residual or compare(problem, estimate)
     return Weighting(
         residual=residual,
-        matched=matching_elements(residual, estimate.displacement, least=problem.constants.begun),
-        learnt_at=estimate.displacement,
+        matched=matching_elements(residual, estimate.displacement, min_zncc=problem.constants.min_initial_zncc),
+        weighting_displacement=estimate.displacement,
     )
 
 
@@ -98,19 +98,19 @@ def next_weighting(
     # without the precision of the lights, which the first pass has not, an element half on another body may match
     precision = last.precision if number or method is None else method.precision(residual)
     matched = matching_elements(residual, estimate.displacement, precision)
-    if not matched.all() or estimate.longest > problem.constants.first_pass:
+    if not matched.all() or estimate.longest > problem.constants.first_pass_tolerance:
         lost = _lost_nodes(problem, last, equations, residual, estimate, number)
         matched &= ~lost[problem.reference.mesh.elements].any(axis=1)
-    if number >= problem.constants.returns:
+    if number >= problem.constants.max_reactivation_passes:
         matched &= last.matched
-    returned = _learnt_anew(last, matched, equations, estimate, number)
-    weighting = replace(last, residual=residual, matched=matched, returned=returned)
-    if not refining(problem, weighting, number + 1):
+    reweight_until = _reweight_until(last, matched, equations, estimate, number)
+    weighting = replace(last, residual=residual, matched=matched, reweight_until=reweight_until)
+    if not is_reweighting(problem, weighting, number + 1):
         return weighting
     return replace(
         weighting,
         precision=precision if number == 0 or method is None else method.precision(residual),
-        learnt_at=estimate.displacement,
+        weighting_displacement=estimate.displacement,
     )
 
 
@@ -120,15 +120,18 @@ def _lost_nodes(
     """Find the nodes (N,) that leave the next pass; a one-sided texture does not hold a node either, but matches."""
     table = BlockTable.of_all(residual, equations.weights)
     std = standard_uncertainty(residual, table, equations, last.precision)
-    unheld = std.max(axis=1) > problem.constants.lost
+    unheld = std.max(axis=1) > problem.constants.max_std
     wanders = np.zeros(len(unheld), dtype=bool)
-    if number >= problem.constants.returns and len(estimate.increments) < problem.options.max_iterations:
+    if (
+        number >= problem.constants.max_reactivation_passes
+        and len(estimate.increments) < problem.options.max_iterations
+    ):
         before, motion = estimate.increments[-2:]
-        wanders = motion > np.maximum(problem.constants.wandering, before / 2)
+        wanders = motion > np.maximum(problem.constants.divergence_step, before / 2)
     return np.asarray((unheld | wanders) & ~one_sided_texture(equations, residual))
 
 
-def _learnt_anew(last: Weighting, matched: BoolArray, equations: Equations, estimate: Estimate, number: int) -> int:
+def _reweight_until(last: Weighting, matched: BoolArray, equations: Equations, estimate: Estimate, number: int) -> int:
     """Return the pass up to which the weights are learnt anew.
 
     Where elements take part again, what was learnt from their wrong match must be learnt anew, and once more: in the
@@ -137,23 +140,28 @@ def _learnt_anew(last: Weighting, matched: BoolArray, equations: Equations, esti
     if (matched & ~last.matched).any():
         return number + 1
     constants = last.residual.reference.constants
-    motion = np.hypot(*(estimate.displacement - last.learnt_at).T)[equations.textured]
-    elsewhere = number == 1 < len(last.residual.weights) and (motion > constants.elsewhere).mean() > constants.swinging
-    return max(last.returned, number) if elsewhere else last.returned
+    motion = np.hypot(*(estimate.displacement - last.weighting_displacement).T)[equations.textured]
+    has_moved = (
+        number == 1 < len(last.residual.weights)
+        and (motion > constants.reweight_motion).mean() > constants.max_oscillating_fraction
+    )
+    return max(last.reweight_until, number) if has_moved else last.reweight_until
 
 
-def settled(weighting: Weighting, equations: Equations) -> bool:
-    """Whether the next pass would have the weights of the last one."""
+def weights_converged(weighting: Weighting, equations: Equations) -> bool:
+    """Return True if the next pass would have the weights of the last one."""
     constants = weighting.residual.reference.constants
-    some = slice(None, None, equations.weights.shape[1] // constants.looked_at + 1)
-    weights = weighting.weights(some)
+    sample = slice(None, None, equations.weights.shape[1] // constants.sample_count + 1)
+    weights = weighting.weights(sample)
     total = float(weights.sum())
-    return total > 0 and float(np.abs(weights - equations.weights[:, some]).sum()) <= constants.settled * total
+    return (
+        total > 0 and float(np.abs(weights - equations.weights[:, sample]).sum()) <= constants.weight_tolerance * total
+    )
 
 
-def refining(problem: Problem, weighting: Weighting, number: int) -> bool:
-    """Whether the residual of a pass still changes weights or grey levels."""
-    return problem.method is not None and number <= weighting.returned + 1
+def is_reweighting(problem: Problem, weighting: Weighting, number: int) -> bool:
+    """Return True if the residual of a pass still changes weights or grey levels."""
+    return problem.method is not None and number <= weighting.reweight_until + 1
 
 
 def solve(
@@ -217,28 +225,34 @@ def _passes(
 ) -> tuple[Problem, Estimate, Equations, Weighting]:
     """Run passes until the weights have settled; the problem is returned with the lights' gradients decided."""
     tolerance = problem.options.tolerance
-    estimate, weighting = _begin(problem, estimate, residual)
+    estimate, weighting = _refine_initial_guess(problem, estimate, residual)
     equations: Equations | None = None
-    for number in range(problem.constants.passes):
-        if equations is not None and not refining(problem, weighting, number) and settled(weighting, equations):
+    for number in range(problem.constants.max_passes):
+        if (
+            equations is not None
+            and not is_reweighting(problem, weighting, number)
+            and weights_converged(weighting, equations)
+        ):
             break
         equations = _equations(problem, weighting, estimate)
-        reached = max(tolerance, problem.constants.first_pass) if number == 0 else tolerance
-        estimate = iterate(problem, equations, weighting.residual, estimate, reached)
+        pass_tolerance = max(tolerance, problem.constants.first_pass_tolerance) if number == 0 else tolerance
+        estimate = iterate(problem, equations, weighting.residual, estimate, pass_tolerance)
         weighting = next_weighting(problem, weighting, equations, estimate, number)
         if number == 0:
-            found = settled_gradient(weighting.residual, weighting.weights()).filtered_as(estimate.displacement)
-            if found is not problem.reference:
-                same, problem = found.values is problem.reference.values, replace(problem, reference=found)
-                residual = replace(weighting.residual, reference=found) if same else compare(problem, estimate)
+            reference = with_consistent_gradient(weighting.residual, weighting.weights()).filtered_as(
+                estimate.displacement
+            )
+            if reference is not problem.reference:
+                same, problem = reference.values is problem.reference.values, replace(problem, reference=reference)
+                residual = replace(weighting.residual, reference=reference) if same else compare(problem, estimate)
                 weighting, equations = replace(weighting, residual=residual), None
     assert equations is not None
     if estimate.longest > tolerance:
         estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
-        swinging = equations.textured & (estimate.increments[-1] > tolerance)
-        matched = weighting.matched & ~swinging[problem.reference.mesh.elements].any(axis=1)
-        few = 0 < swinging.mean() < problem.constants.swinging and matched.any()
-        if few and len(estimate.increments) < problem.options.max_iterations:
+        oscillating = equations.textured & (estimate.increments[-1] > tolerance)
+        matched = weighting.matched & ~oscillating[problem.reference.mesh.elements].any(axis=1)
+        is_minority = 0 < oscillating.mean() < problem.constants.max_oscillating_fraction and matched.any()
+        if is_minority and len(estimate.increments) < problem.options.max_iterations:
             weighting = replace(weighting, residual=compare(problem, estimate), matched=matched)
             equations = _equations(problem, weighting, estimate)
             estimate = iterate(problem, equations, weighting.residual, estimate, tolerance)
@@ -247,16 +261,18 @@ def _passes(
 
 
 @stage("search")
-def _begin(problem: Problem, estimate: Estimate, residual: Residual | None) -> tuple[Estimate, Weighting]:
+def _refine_initial_guess(
+    problem: Problem, estimate: Estimate, residual: Residual | None
+) -> tuple[Estimate, Weighting]:
     """Bring the initial guess nearer where elements do not match there; what does not match then is left out."""
     weighting = first_weighting(problem, estimate, residual)
     if weighting.matched.all():
         return estimate, weighting
-    moved = replace(estimate, displacement=brought_nearer(weighting.residual, estimate.displacement))
-    nearer = first_weighting(problem, moved)
+    refined = replace(estimate, displacement=refine_by_patch_matching(weighting.residual, estimate.displacement))
+    nearer = first_weighting(problem, refined)
     if nearer.matched.sum() <= weighting.matched.sum():
         return estimate, weighting
-    return moved, replace(nearer, matched=matching_elements(nearer.residual, moved.displacement))
+    return refined, replace(nearer, matched=matching_elements(nearer.residual, refined.displacement))
 
 
 @stage("equations")
@@ -268,19 +284,19 @@ def _equations(problem: Problem, weighting: Weighting, estimate: Estimate) -> Eq
     UnsolvableError
         Nothing is left to be measured.
     """
-    seen = np.any(weighting.residual.moments[:, weighting.matched, 0] > 0, axis=1)
-    if not seen.any():
+    has_data = np.any(weighting.residual.moments[:, weighting.matched, 0] > 0, axis=1)
+    if not has_data.any():
         raise UnsolvableError(_nothing_left(weighting), estimate)
-    if problem.functions.shape[1] and not seen[0]:
+    if problem.functions.shape[1] and not has_data[0]:
         raise UnsolvableError(
             "the first light sees nothing, and the rigid motions of the others are counted from it: "
             "put a light first that sees, or measure without rigid motions",
             estimate,
         )
-    given = None if weighting.precision is None else weighting.given()
+    prior_weights = None if weighting.precision is None else weighting.prior_weights()
     try:
         equations = Equations.build(
-            problem.reference, weighting.weights(), problem.functions, estimate.displacement, given
+            problem.reference, weighting.weights(), problem.functions, estimate.displacement, prior_weights
         )
     except np.linalg.LinAlgError as error:
         raise UnsolvableError(f"the equations cannot be solved: {error}", estimate) from None
@@ -301,25 +317,25 @@ def _nothing_left(weighting: Weighting) -> str:
 def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weighting: Weighting) -> Solution:
     """Conclude the solve: which nodes count as measured, their values and uncertainty."""
     reference, mesh = problem.reference, problem.reference.mesh
-    used = weighting.matched & equations.textured[mesh.elements].all(axis=1)
-    recovery = Recovery.over(reference.material, used, equations.information(reference))
+    active = weighting.matched & equations.textured[mesh.elements].all(axis=1)
+    recovery = Recovery.over(reference.material, active, equations.information(reference))
     fitted = estimate.displacement
-    residual = weighting.residual.without(*map(equations.turned_back, recovery.bend(fitted)))
+    residual = weighting.residual.subtract_curvature(*map(equations.turned_back, recovery.offset_and_curvature(fitted)))
     table = BlockTable.of_all(residual, equations.weights)
     std = standard_uncertainty(residual, table, equations, weighting.precision, recovery)
     if len(equations.weights) > 1:
         step = recovery.field(*gradient_step(weighting.residual, equations).T)
-        std = np.hypot(std, beyond_chance(step, std, residual, table, equations.weights))
+        std = np.hypot(std, excess_over_chance(step, std, residual, table, equations.weights))
     bias, bias_std = np.zeros_like(fitted), np.zeros_like(std)
     if weighting.precision is not None:
-        lights = BlockTable.of_lights(residual, equations.weights, problem.constants.block)
+        lights = BlockTable.of_lights(residual, equations.weights, problem.constants.min_block_side)
         bias, bias_std = light_bias(lights, equations)
     sensitivity = table.sensitivity(mesh.nodes)
     scale = 1 / np.maximum(sensitivity, 1e-3)[:, None]
     fitted, std, bias_std = fitted + bias, np.hypot(std, bias_std) * scale, bias_std * scale
     field = recovery.field(*fitted.T)
     inside = problem.deformed.contains(mesh.nodes + field[:, :2] - reference.offset(problem.deformed))
-    node_status = judge(equations, weighting.residual, weighting.matched, std[:, :2], sensitivity, inside)
+    node_status = classify_nodes(equations, weighting.residual, weighting.matched, std[:, :2], sensitivity, inside)
     measured = np.asarray(node_status == NodeStatus.MEASURED)
     if not measured.any() and np.isnan(std[equations.textured]).all():
         raise UnsolvableError(
@@ -329,20 +345,20 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         along = one_sided_texture(equations, weighting.residual) & (node_status == NodeStatus.NOT_SEEN)
         one_sided = "the texture runs in one direction only: what lies along it cannot be measured"
         raise UnsolvableError(one_sided if along.any() else NO_MATCH, estimate)
-    if equations.rigid is not None and equations.rigid.hidden.any():
-        numbers = [str(number) for number in np.flatnonzero(equations.rigid.hidden)]
-        named = f"lights {', '.join(numbers)} share" if len(numbers) > 1 else f"light {numbers[0]} shares"
+    if equations.rigid is not None and equations.rigid.unobservable.any():
+        numbers = [str(number) for number in np.flatnonzero(equations.rigid.unobservable)]
+        subject = f"lights {', '.join(numbers)} share" if len(numbers) > 1 else f"light {numbers[0]} shares"
         raise UnsolvableError(
-            f"{named} too little seen texture with light 0 (the first), directly or through others, to tell a rigid "
+            f"{subject} too little seen texture with light 0 (the first), directly or through others, to tell a rigid "
             "motion from displacement: widen what is seen (region, weights), measure the bodies apart, or set "
             'solver.rigid = "none"',
             estimate,
         )
-    inner = measured & ~mesh.adjacent_nodes(~measured) & (mesh.to_nodes(used.astype(np.float64)) > 0)
+    inner = measured & ~mesh.adjacent_nodes(~measured) & (mesh.to_nodes(active.astype(np.float64)) > 0)
     squares = weighting.residual.squares(equations.weights)
     square, total, _ = squares.sum(axis=1).T
-    some = equations.weights[:, :: max(1, equations.weights.shape[1] // 100_000)]
-    seen, history = some.sum(axis=0), estimate.history(measured)
+    sample = equations.weights[:, :: max(1, equations.weights.shape[1] // 100_000)]
+    total_weight, history = sample.sum(axis=0), estimate.history(measured)
     converged = bool(history[-1] <= problem.options.tolerance)
     return replace(
         Solution.failed(mesh, len(reference.images), "", history),
@@ -359,7 +375,9 @@ def _conclude(problem: Problem, estimate: Estimate, equations: Equations, weight
         reason="" if converged else _unsettled(problem, estimate, measured),
         rigid=np.where(total[:, None] > 0, estimate.rigid, np.nan),
         residual=np.sqrt(np.divide(square, total, out=np.full(total.size, np.nan), where=total > 0)),
-        weight_fraction=np.mean(some / np.where(seen > 0, seen, np.float32(1)), axis=1, dtype=np.float64),
+        weight_fraction=np.mean(
+            sample / np.where(total_weight > 0, total_weight, np.float32(1)), axis=1, dtype=np.float64
+        ),
     )
 
 

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from rgbmidic.correlation.constants import USUAL, SolverConstants
 from rgbmidic.correlation.nodes import correlation_around, torn_elements
 from rgbmidic.correlation.reference import Deformed, Reference
-from rgbmidic.correlation.residual import PrecisionMethod, Residual, follow
+from rgbmidic.correlation.residual import PrecisionMethod, Residual, interpolate_motion
 from rgbmidic.correlation.solution import NO_MATCH, Solution, Status, rank
 from rgbmidic.correlation.solve import solve
 from rgbmidic.mesh import Tri3Mesh
@@ -32,7 +32,7 @@ from rgbmidic.typing import BoolArray, FloatArray, FloatImage, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FoundStart:
+class InitialGuess:
     """An initial guess of the displacement, and its confidence.
 
     Attributes
@@ -91,12 +91,12 @@ class Search:
         to one in 1000 by chance.
     tolerance
         Disagreement over distance that angle and size of a keypoint are good for, strains of 20 % included.
-    sure
+    sufficient_confidence
         Confidence from which finer pictures are not looked at: at .9, speckles of 3 px may be off by 1.2 px (measured).
-    agrees
+    min_correlation
         Correlation coefficient from which the images around a node agree: noise is half of their variance then
         (derived).
-    still
+    min_correlation_at_rest
         The same at rest, which is not asked of a search: at 0.5, speckles of 7 px were off by 2.6 px.
     reductions
         How many times pictures are reduced in turn.
@@ -104,12 +104,12 @@ class Search:
         Side (px) of regions up to which pictures of full size are looked at: larger ones have keypoints enough at half.
     keypoints
         Most keypoints of the reference: 1500 cost half again as much and were no surer on 1024 px (measured).
-    most
+    max_deformed_keypoints
         Most keypoints of the deformed image, where there are as many per area.
     context
         Surroundings (px) of the region in which keypoints are looked for too. Chosen; with half or twice of it results
         differ by 2e-5 px at most (benchmarks/constants.py).
-    needed
+    min_confidence
         Confidence from which an initial guess is worth a solve: another specimen gives at most .1
         (benchmarks/starts.py).
     loss
@@ -126,19 +126,21 @@ class Search:
     voters: int = 30
     votes: int = 4
     tolerance: float = 0.3
-    sure: float = 0.95
-    agrees: float = 0.5
-    still: float = 0.8
+    sufficient_confidence: float = 0.95
+    min_correlation: float = 0.5
+    min_correlation_at_rest: float = 0.8
     reductions: tuple[int, ...] = (8, 4, 2, 1)
     small: float = 300.0
     keypoints: int = 1000
-    most: int = 5000
+    max_deformed_keypoints: int = 5000
     context: float = 24.0
-    needed: float = 0.15
+    min_confidence: float = 0.15
     loss: float = 0.04
     turn: float = 30.0
 
-    def starts(self, reference: Reference, deformed: Deformed, last: FloatArray | None = None) -> Iterator[FoundStart]:
+    def candidates(
+        self, reference: Reference, deformed: Deformed, last: FloatArray | None = None
+    ) -> Iterator[InitialGuess]:
         """Search for initial guesses in ever finer pictures, each surer than the one before, until one is sure.
 
         They are looked for within `search_reach` of rest and of the last displacement.
@@ -152,30 +154,36 @@ class Search:
 
         Yields
         ------
-        FoundStart
+        InitialGuess
             Rest alone, if that is sure.
         """
         nodes, offset = reference.mesh.nodes, reference.offset(deformed)
-        known = np.zeros_like(nodes) if last is None else last
+        predicted = np.zeros_like(nodes) if last is None else last
 
         def compared(displacement: FloatArray) -> Residual:
             return Residual.at(reference, deformed, [displacement] * len(reference.images))
 
         if last is None:
-            residual = compared(known)
-            if (sure := self.confidence(residual, self.still)) >= self.sure:
-                yield FoundStart(displacement=known, confidence=sure, residual=residual)
+            residual = compared(predicted)
+            if (
+                rest_confidence := self.confidence(residual, self.min_correlation_at_rest)
+            ) >= self.sufficient_confidence:
+                yield InitialGuess(displacement=predicted, confidence=rest_confidence, residual=residual)
                 return
         small = float(np.ptp(nodes, axis=0).max()) <= self.small
-        slopes = reference.mesh.nodal_gradient(known)
-        here = _part_around(nodes, self.context, reference.images.shape[1:])
-        places = np.concatenate([nodes, nodes + known]) - offset
-        there = _part_around(places, search_reach(nodes), deformed.weights.shape[1:])
-        as_dense = self.keypoints * deformed.weights[0][there].size / reference.weights[0][here].size
-        best, (images, weights) = 0.0, deformed.pictures(reference.registration)
+        slopes = reference.mesh.nodal_gradient(predicted)
+        reference_window = _window_around(nodes, self.context, reference.images.shape[1:])
+        positions = np.concatenate([nodes, nodes + predicted]) - offset
+        deformed_window = _window_around(positions, search_reach(nodes), deformed.weights.shape[1:])
+        as_dense = (
+            self.keypoints * deformed.weights[0][deformed_window].size / reference.weights[0][reference_window].size
+        )
+        best, (images, weights) = 0.0, deformed.images_on_first_light(reference.registration)
         for reduction in self.reductions if small else self.reductions[:-1]:
-            f = self._keypoints(reference.images, reference.weights, here, reduction, self.keypoints)
-            g = self._keypoints(images, weights, there, reduction, int(min(as_dense, self.most)))
+            f = self._keypoints(reference.images, reference.weights, reference_window, reduction, self.keypoints)
+            g = self._keypoints(
+                images, weights, deformed_window, reduction, int(min(as_dense, self.max_deformed_keypoints))
+            )
             if f is None or g is None:
                 continue
             points, motion = self._pairs(f, replace(g, points=g.points + offset), 2.0 * reduction)
@@ -183,50 +191,50 @@ class Search:
                 continue
             # what moves beyond the last displacement is smooth where parts of the specimen turn on their own
             nearest = np.asarray(cKDTree(nodes).query(points)[1])
-            before = known[nearest] + np.einsum("pij,pj->pi", slopes[nearest], points - nodes[nearest])
-            displacement = known + follow(points, motion - before, reference.mesh, float(reduction))
+            before = predicted[nearest] + np.einsum("pij,pj->pi", slopes[nearest], points - nodes[nearest])
+            displacement = predicted + interpolate_motion(points, motion - before, reference.mesh, float(reduction))
             residual = compared(displacement)
-            found = self.confidence(residual)
-            if found > best:
-                best = found
-                yield FoundStart(displacement=displacement, confidence=found, residual=residual)
-            if best >= self.sure:
+            confidence = self.confidence(residual)
+            if confidence > best:
+                best = confidence
+                yield InitialGuess(displacement=displacement, confidence=confidence, residual=residual)
+            if best >= self.sufficient_confidence:
                 return
 
-    def confidence(self, residual: Residual, least: float | None = None) -> float:
-        """Fraction of the nodes around which the images correlate by `least` (`agrees`), from their residual.
+    def confidence(self, residual: Residual, min_correlation: float | None = None) -> float:
+        """Fraction of the nodes around which the images correlate by `min_correlation`, from their residual.
 
         Nodes count that see something in both states, and at least a tenth of those that do in the reference, so that
         a few speckles alone make no start.
         """
-        reference, around = residual.reference, correlation_around(residual)
+        reference, coefficients = residual.reference, correlation_around(residual)
         weight = reference.sums(reference.pixel_weights, reference.pixel_weights[0])[..., 0].sum(axis=0)
-        seen = reference.mesh.to_nodes(weight) > 0
-        agrees = around >= (self.agrees if least is None else least)
-        return float(agrees.sum() / max(int(np.isfinite(around).sum()), 0.1 * seen.sum(), 1))
+        has_texture = reference.mesh.to_nodes(weight) > 0
+        is_matched = coefficients >= (self.min_correlation if min_correlation is None else min_correlation)
+        return float(is_matched.sum() / max(int(np.isfinite(coefficients).sum()), 0.1 * has_texture.sum(), 1))
 
     def _keypoints(
-        self, images: FloatImage, weights: FloatImage, part: tuple[slice, slice], reduction: int, most: int
+        self, images: FloatImage, weights: FloatImage, window: tuple[slice, slice], reduction: int, max_count: int
     ) -> Keypoints | None:
-        """The `most` strongest keypoints in a part of a state's picture, where a weight (k, H, W) is not 0, if any."""
-        if min(side.stop - side.start for side in part) // reduction < 2 * self.normalise:
+        """Find the `max_count` strongest keypoints in a window of a state's picture, where a weight is not 0."""
+        if min(side.stop - side.start for side in window) // reduction < 2 * self.normalise:
             return None
-        picture, seen = self._picture(images, weights, part, reduction)
+        picture, weight_sum = self._picture(images, weights, window, reduction)
         grey = np.clip(128 + self.grey * picture, 0, 255).astype(np.uint8)
         # the precise upscale keeps positions free of a bias of a quarter of a pixel
         sift = cv2.SIFT.create(contrastThreshold=self.contrast, enable_precise_upscale=True)
-        found = sift.detect(grey, None)
-        columns, rows = np.round(cv2.KeyPoint.convert(found)).astype(int).reshape(-1, 2).T
-        strength = np.where(seen[rows, columns] > 0, [key.response for key in found], 0.0)
-        strongest = np.argsort(-strength, kind="stable")[: min(most, np.count_nonzero(strength))]
+        detected = sift.detect(grey, None)
+        columns, rows = np.round(cv2.KeyPoint.convert(detected)).astype(int).reshape(-1, 2).T
+        strength = np.where(weight_sum[rows, columns] > 0, [key.response for key in detected], 0.0)
+        strongest = np.argsort(-strength, kind="stable")[: min(max_count, np.count_nonzero(strength))]
         if not len(strongest):
             return None
-        chosen, descriptors = sift.compute(grey, [found[number] for number in strongest])
-        points = np.asarray(cv2.KeyPoint.convert(chosen), dtype=np.float64) * reduction + (reduction - 1) / 2
+        selected, descriptors = sift.compute(grey, [detected[number] for number in strongest])
+        points = np.asarray(cv2.KeyPoint.convert(selected), dtype=np.float64) * reduction + (reduction - 1) / 2
         return Keypoints(
-            points=np.add(points, (part[1].start, part[0].start)),
-            size=np.array([key.size for key in chosen]),
-            angle=np.radians([key.angle for key in chosen]),
+            points=np.add(points, (window[1].start, window[0].start)),
+            size=np.array([key.size for key in selected]),
+            angle=np.radians([key.angle for key in selected]),
             descriptors=np.asarray(descriptors, dtype=np.float32),
         )
 
@@ -239,37 +247,42 @@ class Search:
         # sums of products of whole numbers under 2^24: exact in float32, hence the same in any order, on any threads
         likeness = first.descriptors @ second.descriptors.T
         nearest, back = likeness.argmax(axis=1), np.asarray(likeness.argmax(axis=0))
-        here = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
-        there = nearest[here]
-        points, motion = first.points[here], second.points[there] - first.points[here]
-        if len(here) <= self.votes:
+        first_index = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
+        second_index = nearest[first_index]
+        points, motion = first.points[first_index], second.points[second_index] - first.points[first_index]
+        if len(first_index) <= self.votes:
             return points[:0], motion[:0]
-        around = np.asarray(cKDTree(points).query(points, k=min(self.voters + 1, len(points)))[1])[:, 1:]
-        step = points[around] - points[:, None]
-        scale, turn = second.size[there] / first.size[here], second.angle[there] - first.angle[here]
+        neighbours = np.asarray(cKDTree(points).query(points, k=min(self.voters + 1, len(points)))[1])[:, 1:]
+        step = points[neighbours] - points[:, None]
+        scale, turn = (
+            second.size[second_index] / first.size[first_index],
+            second.angle[second_index] - first.angle[first_index],
+        )
         cos, sin = (scale * np.cos(turn))[:, None], (scale * np.sin(turn))[:, None]
         turned = np.stack([cos * step[..., 0] - sin * step[..., 1], sin * step[..., 0] + cos * step[..., 1]], axis=-1)
-        off = np.linalg.norm(motion[around] - motion[:, None] - (turned - step), axis=-1)
+        off = np.linalg.norm(motion[neighbours] - motion[:, None] - (turned - step), axis=-1)
         votes = (off <= tolerance + self.tolerance * np.linalg.norm(step, axis=-1)).sum(axis=1)
         return points[votes >= self.votes], motion[votes >= self.votes]
 
     def _picture(
-        self, images: FloatImage, weights: FloatImage, part: tuple[slice, slice], reduction: int
+        self, images: FloatImage, weights: FloatImage, window: tuple[slice, slice], reduction: int
     ) -> tuple[FloatImage, FloatImage]:
         """Mean over the lights of the locally normalised images of a part, reduced, and the sum of the weights."""
-        height, width = (size // reduction for size in images[0][part].shape)
-        total, seen = np.zeros((2, height, width), dtype=np.float32)
+        height, width = (size // reduction for size in images[0][window].shape)
+        total, weight_sum = np.zeros((2, height, width), dtype=np.float32)
 
         def reduced(image: FloatImage) -> FloatImage:
-            whole = image[: height * reduction, : width * reduction]
-            return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
+            cropped = image[: height * reduction, : width * reduction]
+            return np.asarray(cv2.resize(cropped, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
         for image, weight in zip(images, weights, strict=True):
-            used = reduced(weight[part])
-            values = reduced(image[part] * weight[part])
-            total += used * self._normalised(np.asarray(values / np.maximum(used, np.float32(1e-6))), used)
-            seen += used
-        return np.asarray(total / np.maximum(seen, np.float32(1e-6))), seen
+            reduced_weight = reduced(weight[window])
+            values = reduced(image[window] * weight[window])
+            total += reduced_weight * self._normalised(
+                np.asarray(values / np.maximum(reduced_weight, np.float32(1e-6))), reduced_weight
+            )
+            weight_sum += reduced_weight
+        return np.asarray(total / np.maximum(weight_sum, np.float32(1e-6))), weight_sum
 
     def _normalised(self, image: FloatImage, weight: FloatImage) -> FloatImage:
         """Return an image (H, W) less its local mean, over its local standard deviation."""
@@ -281,23 +294,23 @@ class Search:
         norm = blur(weight) + np.float32(1e-6)
         centred = image - blur(image * weight) / norm
         contrast = np.sqrt(blur(centred * centred * weight) / norm)
-        least = np.float32(self.flat * np.quantile(contrast, 0.9) + 1e-20)
-        return np.asarray(centred / (contrast + least), dtype=np.float32)
+        floor = np.float32(self.flat * np.quantile(contrast, 0.9) + 1e-20)
+        return np.asarray(centred / (contrast + floor), dtype=np.float32)
 
 
-def _part_around(points: FloatArray, margin: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+def _window_around(points: FloatArray, margin: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
     """Rows and columns of an image of `shape` (H, W) within `margin` px of points (N, 2) in x and y."""
     low = np.clip(np.floor(points.min(axis=0) - margin).astype(int)[::-1], 0, shape)
     high = np.clip(np.ceil(points.max(axis=0) + margin).astype(int)[::-1] + 1, 0, shape)
     return slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
 
 
-def search_reach(nodes: FloatArray, least: float = 128.0) -> float:
+def search_reach(nodes: FloatArray, min_reach: float = 128.0) -> float:
     """Distance (px) up to which nodes (N, 2) are looked for: the longer side of the region, 30 speckles at least."""
-    return max(float(np.ptp(nodes, axis=0).max()), least)
+    return max(float(np.ptp(nodes, axis=0).max()), min_reach)
 
 
-def find_start(reference: Reference, deformed: Deformed) -> FoundStart:
+def find_initial_guess(reference: Reference, deformed: Deformed) -> InitialGuess:
     """Search for an initial guess.
 
     Parameters
@@ -307,11 +320,11 @@ def find_start(reference: Reference, deformed: Deformed) -> FoundStart:
 
     Returns
     -------
-    FoundStart
-        The surest of `Search.starts`; rest, with the confidence 0, where there is none.
+    InitialGuess
+        The surest of `Search.candidates`; rest, with the confidence 0, where there is none.
     """
-    rest = FoundStart(displacement=np.zeros_like(reference.mesh.nodes), confidence=0.0)
-    return max(Search().starts(reference, deformed), key=lambda found: found.confidence, default=rest)
+    no_guess = InitialGuess(displacement=np.zeros_like(reference.mesh.nodes), confidence=0.0)
+    return max(Search().candidates(reference, deformed), key=lambda guess: guess.confidence, default=no_guess)
 
 
 def nodal_slopes(
@@ -335,19 +348,19 @@ def nodal_slopes(
     tuple of ndarray
         The gradient (N, 2, 2), and the node (N,) that it is from.
     """
-    known = np.where(measured[:, None], displacement, 0.0)
-    gradient = mesh.element_gradient(known)
-    intact = measured[mesh.elements].all(axis=1) & ~torn_elements(mesh, known, constants)
+    values = np.where(measured[:, None], displacement, 0.0)
+    gradient = mesh.element_gradient(values)
+    intact = measured[mesh.elements].all(axis=1) & ~torn_elements(mesh, values, constants)
     weight = np.where(intact, mesh.areas, 0.0)
-    around = mesh.to_nodes(weight)
-    nearest = mesh.nearest_nodes(measured & (around > 0) if intact.any() else measured)[1]
-    parts = [mesh.to_nodes(weight * part) for part in gradient.reshape(-1, 4).T]
-    slope = np.stack(parts, axis=1) / np.maximum(around, 1e-300)[:, None]
+    nodal_area = mesh.to_nodes(weight)
+    nearest = mesh.nearest_nodes(measured & (nodal_area > 0) if intact.any() else measured)[1]
+    components = [mesh.to_nodes(weight * component) for component in gradient.reshape(-1, 4).T]
+    slope = np.stack(components, axis=1) / np.maximum(nodal_area, 1e-300)[:, None]
     return slope.reshape(-1, 2, 2)[nearest], nearest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Start:
+class TrackingState:
     """Initial guess of a frame, and the references so far.
 
     Attributes
@@ -367,9 +380,9 @@ class Start:
     reference_updates: tuple[int, ...] = ()
     best_match: float = 0.0
 
-    def after(
+    def extrapolate(
         self, mesh: Tri3Mesh, displacement: FloatArray, measured: BoolArray, constants: SolverConstants = USUAL
-    ) -> Start:
+    ) -> TrackingState:
         """Return the start of the frame after one that started here.
 
         Nodes without data go on with the displacement, turn and strain of the nearest measured one. Where a frame has
@@ -388,20 +401,20 @@ class Start:
 
         Returns
         -------
-        Start
+        TrackingState
         """
         if not measured.any():
             return self
         slope, nearest = nodal_slopes(mesh, displacement, measured, constants)
-        beyond = displacement[nearest] + np.einsum("nij,nj->ni", slope, mesh.nodes - mesh.nodes[nearest])
-        filled = np.where(measured[:, None], displacement, beyond)
+        extrapolated = displacement[nearest] + np.einsum("nij,nj->ni", slope, mesh.nodes - mesh.nodes[nearest])
+        filled = np.where(measured[:, None], displacement, extrapolated)
         return replace(self, displacement=filled, unmeasured=float((~measured).mean()))
 
 
 def track(
     reference: Reference,
     deformed: Deformed,
-    start: Start,
+    state: TrackingState,
     options: SolverSettings,
     method: PrecisionMethod | None,
     search: Search = Search(),
@@ -412,7 +425,7 @@ def track(
     ----------
     reference, deformed
         The two states.
-    start
+    state
         The last frame's end; without a displacement the initial guess is searched for.
     options, method
         How to solve, see `solve`.
@@ -426,27 +439,30 @@ def track(
     """
     best: Solution | None = None
     surest = 0.0
-    last = [] if start.displacement is None else [FoundStart(displacement=start.displacement, confidence=np.nan)]
-    searched = timed_items("search", search.starts(reference, deformed, start.displacement))
-    for number, found in enumerate(chain(last, searched)):
-        surest = float(np.fmax(surest, found.confidence))
-        if found.confidence < search.needed:
+    last = [] if state.displacement is None else [InitialGuess(displacement=state.displacement, confidence=np.nan)]
+    candidates = timed_items("search", search.candidates(reference, deformed, state.displacement))
+    for number, guess in enumerate(chain(last, candidates)):
+        surest = float(np.fmax(surest, guess.confidence))
+        if guess.confidence < search.min_confidence:
             continue
-        trial = solve(reference, deformed, found.displacement, options, method, found.residual)
+        trial = solve(reference, deformed, guess.displacement, options, method, guess.residual)
         if best is None or rank(trial.status, trial.node_status) < rank(best.status, best.node_status):
             best = trial
-        acceptable = start.unmeasured + (number + 0.5) * search.loss
+        acceptable = state.unmeasured + (number + 0.5) * search.loss
         if best.status is Status.CONVERGED and best.unmeasured_fraction <= acceptable:
             break
     if best is None:  # from rest, for the reason why there is no start
         best = solve(reference, deformed, np.zeros_like(reference.mesh.nodes), options, method)
     if best.reason != NO_MATCH:
         return best
-    why = (
-        f"no start found: at the best one the images agree around {surest:.0%} of the nodes, of {search.needed:.0%} "
-        "needed. Looked for were motions up to the region's longer side, at least 128 px, and turns up to about "
+    explanation = (
+        f"no start found: at the best one the images agree around {surest:.0%} of the nodes, of "
+        f"{search.min_confidence:.0%} needed. Looked for were motions up to the region's longer side, at least 128 px, "
+        "and turns up to about "
         f"{search.turn:g} degrees: take frames in between"
     )
-    if surest >= search.needed:
-        why = f"at the start found they agree around {surest:.0%} of the nodes, but the solve did not hold one of them"
-    return replace(best, reason=f"{NO_MATCH}; {why}")
+    if surest >= search.min_confidence:
+        explanation = (
+            f"at the start found they agree around {surest:.0%} of the nodes, but the solve did not hold one of them"
+        )
+    return replace(best, reason=f"{NO_MATCH}; {explanation}")

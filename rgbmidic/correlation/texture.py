@@ -39,7 +39,7 @@ class TextureGradient:
         Contrast of a light in the sum of the others.
     in_all : ndarray, shape (k, h, w), float32
         In the sum of all.
-    together : ndarray, shape (k, h, w), float32
+    mean_fraction : ndarray, shape (k, h, w), float32
         Fraction, 0 to 1, of the mean of all lights in the gradient that a light is matched with, if what it alone shows
         is not displaced.
     """
@@ -48,36 +48,43 @@ class TextureGradient:
     texture: FloatImage
     in_others: FloatImage
     in_all: FloatImage
-    together: FloatImage
+    mean_fraction: FloatImage
 
     @classmethod
     def of_images(
-        cls, gradient: FloatImage, weights: FloatImage, pixels: PixelMap, shared: tuple[float, float]
+        cls, gradient: FloatImage, weights: FloatImage, pixels: PixelMap, correlation_bounds: tuple[float, float]
     ) -> TextureGradient:
         """Find the common texture of the `gradient` (2, k, P) of images with weights (k, P).
 
-        `shared` is the correlation of a light's gradient with that of the others up to which all lights are averaged,
-        and from which the others are. Of two lights both are: a single other one may be the one that reflects.
+        `correlation_bounds` is the correlation of a light's gradient with that of the others up to which all lights are
+        averaged, and from which the others are. Of two lights both are: a single other one may be the one that
+        reflects.
         """
-        seen, lights = (weights > 0).astype(np.float32), len(weights)
-        scale = np.float32(lights) / np.maximum(seen.sum(axis=0), np.float32(1))
-        texture = np.einsum("akp,kp->ap", gradient, seen) * scale if lights > 1 else gradient[:, 0]
+        has_weight, lights = (weights > 0).astype(np.float32), len(weights)
+        scale = np.float32(lights) / np.maximum(has_weight.sum(axis=0), np.float32(1))
+        texture = np.einsum("akp,kp->ap", gradient, has_weight) * scale if lights > 1 else gradient[:, 0]
         grids = []
-        for light, weight in zip(gradient.swapaxes(0, 1), seen, strict=True):
+        for light, weight in zip(gradient.swapaxes(0, 1), has_weight, strict=True):
             products = np.stack(
                 [(a * b).sum(axis=0) for a, b in ((light, light), (light, texture), (texture, texture))]
             )
             square, along, total = WINDOW.ratios(
                 pixels, np.concatenate([products, np.ones_like(products[:1])]) * weight
             )
-            others, beside = along - square, total - 2 * along + square  # products with the sum of the others
-            correlation = _quotient(others, np.sqrt(np.maximum(square * beside, 0)))
-            together = np.clip((shared[1] - correlation) / (shared[1] - shared[0]), 0, 1)
-            grids.append(
-                (_quotient(others, beside), _quotient(along, total), together if lights > 2 else 0 * together + 1)
+            along_others, beside = along - square, total - 2 * along + square  # products with the sum of the others
+            correlation = _quotient(along_others, np.sqrt(np.maximum(square * beside, 0)))
+            mean_fraction = np.clip(
+                (correlation_bounds[1] - correlation) / (correlation_bounds[1] - correlation_bounds[0]), 0, 1
             )
-        in_others, in_all, together = np.array(grids).swapaxes(0, 1)
-        return cls(images=gradient, texture=texture, in_others=in_others, in_all=in_all, together=together)
+            grids.append(
+                (
+                    _quotient(along_others, beside),
+                    _quotient(along, total),
+                    mean_fraction if lights > 2 else 0 * mean_fraction + 1,
+                )
+            )
+        in_others, in_all, mean_fraction = np.array(grids).swapaxes(0, 1)
+        return cls(images=gradient, texture=texture, in_others=in_others, in_all=in_all, mean_fraction=mean_fraction)
 
     def matched(self, pixels: PixelMap, consistency: FloatArray | None = None, side: int = 1) -> FloatImage:
         """Gradient (2, k, P) that the lights are matched with.
@@ -93,13 +100,15 @@ class TextureGradient:
         """
         if len(self.in_all) == 1:
             return self.images
-        together = self.together
+        mean_fraction = self.mean_fraction
         if consistency is not None:
-            blocks = (np.indices(together.shape[1:]) + 0.5) * (WINDOW.step / side) - 0.5
-            together = together * [map_coordinates(one, blocks, order=1, mode="nearest") for one in consistency]
-        others, both = (1 - together) * self.in_others, together * self.in_all
+            blocks = (np.indices(mean_fraction.shape[1:]) + 0.5) * (WINDOW.step / side) - 0.5
+            mean_fraction = mean_fraction * [
+                map_coordinates(grid, blocks, order=1, mode="nearest") for grid in consistency
+            ]
+        of_others, of_all = (1 - mean_fraction) * self.in_others, mean_fraction * self.in_all
         out = np.empty_like(self.images)
-        for light, grids in enumerate(zip(others + both, others, strict=True)):
+        for light, grids in enumerate(zip(of_others + of_all, of_others, strict=True)):
             of_texture, of_own = pixels.from_blocks(np.stack(grids), WINDOW.step)
             np.multiply(self.texture, of_texture, out=out[:, light])
             out[:, light] -= of_own * self.images[:, light]

@@ -22,7 +22,7 @@ from rgbmidic.mesh.tri3 import with_data
 from rgbmidic.typing import BoolArray, FloatArray, FloatImage
 
 
-def displacing_fraction(reference: Reference, difference: FloatImage, weight: FloatImage) -> FloatImage:
+def design_effect(reference: Reference, difference: FloatImage, weight: FloatImage) -> FloatImage:
     """Return the variance of a residual's scores over what white noise of the same variance would give, (P,).
 
     Parameters
@@ -34,7 +34,7 @@ def displacing_fraction(reference: Reference, difference: FloatImage, weight: Fl
     weight : ndarray, shape (P,), float32
         Its inverse variance.
     """
-    block = reference.constants.block
+    block = reference.constants.min_block_side
     table = BlockTable.of(reference, block, [(difference[None], weight[None], *reference.texture.texture[:, None])])
     xx, _, yy = table.design_effect()[0]
     # at least 0.01: of images without noise it is not 0 (up to twice of it nothing changes)
@@ -52,7 +52,7 @@ def score_covariance(table: BlockTable, texture: FloatArray) -> FloatArray:
     texture : ndarray, shape (E, 3, 3, 3)
         Element blocks of its Hessian.
     """
-    along_x, along_y = _axis_ratios(table, table.design_effect()[0], texture) / table.reference.unfitted
+    along_x, along_y = _axis_ratios(table, table.design_effect()[0], texture) / table.reference.residual_leverage
     scale = np.stack([along_x, np.sqrt(along_x * along_y), along_y], axis=-1)
     return np.asarray(texture * scale[:, None, None])
 
@@ -61,8 +61,8 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
     """Covariance of the right-hand sides of each two lights a and b >= a.
 
     A light's own is as in `score_covariance`; that of two is the root of both, times the correlation of their scores
-    where both see. Of what the lights have in common the fit leaves the fraction `unfitted`, which is put back before
-    the scores are summed; it takes nothing of what they differ by.
+    where both see. Of what the lights have in common the fit leaves the fraction `residual_leverage`, which is put back
+    before the scores are summed; it takes nothing of what they differ by.
 
     Parameters
     ----------
@@ -81,12 +81,12 @@ def light_covariances(residual: Residual, weights: FloatImage) -> Iterator[tuple
     score = np.einsum("kp,kp,akp->ap", weights, residual.difference, slopes)
     information = np.einsum("kp,akp,akp->p", weights, slopes, slopes)
     common = np.divide(score, information, out=np.zeros_like(score), where=information > 0)
-    lost = np.asarray(1 / np.sqrt(reference.unfitted) - 1, dtype=np.float32)
+    lost = np.asarray(1 / np.sqrt(reference.residual_leverage) - 1, dtype=np.float32)
     if lost.ndim:
         lost = np.repeat(lost, np.diff(pixels.offsets))
-    whole = residual.difference + lost * np.einsum("akp,ap->kp", slopes, common)
+    full_difference = residual.difference + lost * np.einsum("akp,ap->kp", slopes, common)
     table = BlockTable.of_lights(
-        replace(residual, difference=whole), weights, block_side(pixels, mesh.size, reference.constants)
+        replace(residual, difference=full_difference), weights, block_side(pixels, mesh.size, reference.constants)
     )
     effects, correlation = table.design_effect(), table.correlation()
     blocks = map(reference.blocks, weights, slopes.swapaxes(0, 1))
@@ -111,26 +111,29 @@ def _axis_ratios(table: BlockTable, effect: FloatArray, texture: FloatArray) -> 
     mesh = table.reference.mesh
     along_x, along_y = table.at(effect[::2], mesh.centres)
     xx, _, yy = texture.sum(axis=(1, 2)).T
-    x, y = (mesh.to_nodes(part)[mesh.elements].sum(axis=1) for part in (xx, yy))
+    x, y = (mesh.to_nodes(component)[mesh.elements].sum(axis=1) for component in (xx, yy))
     fraction = np.divide(x, x + y, out=np.full_like(x, 0.5), where=x + y > 0)
-    least = table.reference.constants.seen  # nodes with less of the texture are not measured
-    fraction = np.clip(fraction, least, 1 - least)
+    min_fraction = table.reference.constants.min_texture  # nodes with less of the texture are not measured
+    fraction = np.clip(fraction, min_fraction, 1 - min_fraction)
     return np.stack([along_x / fraction, along_y / (1 - fraction)])
 
 
 def _in_reference_axes(functional: Functional, deformation: FloatArray) -> Functional:
     """Return a quantity linear in the displacement as one of the motion in axes that follow the surface."""
-    parts = [part for part in functional if part is not None]  # of one structure
-    axes = [axis for axis, part in enumerate(functional) if part is not None]
+    matrices = [matrix for matrix in functional if matrix is not None]  # of one structure
+    axes = [axis for axis, matrix in enumerate(functional) if matrix is not None]
     along_x, along_y = (
-        with_data(parts[0], sum(part.data * row[axis][part.indices] for part, axis in zip(parts, axes, strict=True)))
+        with_data(
+            matrices[0],
+            sum(matrix.data * row[axis][matrix.indices] for matrix, axis in zip(matrices, axes, strict=True)),
+        )
         for row in deformation.T
     )
     return along_x, along_y
 
 
 def _rigid_variance(
-    residual: Residual, equations: Equations, rigid: RigidMotions, asked: Sequence[Functional]
+    residual: Residual, equations: Equations, rigid: RigidMotions, functionals: Sequence[Functional]
 ) -> FloatArray:
     """Variance (N, F) that the error of the rigid coefficients adds to quantities linear in the displacement.
 
@@ -139,7 +142,7 @@ def _rigid_variance(
     the covariance of q_j and q_l a quantity ``a^T u`` gets ``(a^T X) Cov(e) (X^T a) - 2 (a^T M^-1 Cov(q, e)) (X^T a)``,
     where ``Cov(e) = sum G_j^T S_jl G_l`` and ``Cov(q, e) = sum S_jl G_l``.
     """
-    gains, assembly = rigid.moves @ rigid.inverse, residual.reference.assembly
+    gains, assembly = rigid.relative_modes @ rigid.inverse, residual.reference.assembly
     products = np.zeros_like(gains)
     for a, b, blocks in light_covariances(residual, equations.weights):
         covariance = assembly.matrix(blocks)
@@ -148,17 +151,17 @@ def _rigid_variance(
             products[b] += covariance @ gains[a]
     coefficients = np.einsum("jnc,jnd->cd", gains, products)
     shared, variance = equations.solve(products.sum(axis=0)), []
-    for along_x, along_y in asked:
-        follows, common = (
+    for along_x, along_y in functionals:
+        response, common = (
             sum(matrix @ column[axis::2] for axis, matrix in enumerate((along_x, along_y)) if matrix is not None)
-            for column in (rigid.follows, shared)
+            for column in (rigid.response, shared)
         )
-        variance.append(((follows @ coefficients - 2 * common) * follows).sum(axis=1))
+        variance.append(((response @ coefficients - 2 * common) * response).sum(axis=1))
     return np.stack(variance, axis=1)
 
 
 def _probed_std(
-    equations: Equations, scores: FloatArray, reference: Reference, asked: list[tuple[Functional, BoolArray]]
+    equations: Equations, scores: FloatArray, reference: Reference, quantities: list[tuple[Functional, BoolArray]]
 ) -> FloatArray:
     """Evaluate `functional_std` for element blocks of `scores` (E, 3, 3, 3) without what lost nodes do to others.
 
@@ -167,21 +170,23 @@ def _probed_std(
     when the others are evaluated again. Beside them the least is what the information allows (Cramer and Rao): the
     uncertainty with the scores' variance over their information as small as it is in any element around.
     """
-    mesh, assembly, lost = reference.material, reference.assembly, reference.constants.lost
-    limits, covariance = [lost] * 2 + [lost / mesh.size] * (len(asked) - 2), assembly.matrix(scores)
-    found = functional_std(equations.solve, covariance, mesh, asked)
-    far = np.zeros(found.shape, dtype=bool)
-    while ((found > limits) & ~far).any():
-        far |= found > limits
-        others = [(functional, nodes & ~beyond) for (functional, nodes), beyond in zip(asked, far.T, strict=True)]
-        found = np.where(far, found, functional_std(equations.solve, covariance, mesh, others))
+    mesh, assembly, lost = reference.material, reference.assembly, reference.constants.max_std
+    limits, covariance = [lost] * 2 + [lost / mesh.size] * (len(quantities) - 2), assembly.matrix(scores)
+    std = functional_std(equations.solve, covariance, mesh, quantities)
+    far = np.zeros(std.shape, dtype=bool)
+    while ((std > limits) & ~far).any():
+        far |= std > limits
+        remaining = [
+            (functional, nodes & ~excluded) for (functional, nodes), excluded in zip(quantities, far.T, strict=True)
+        ]
+        std = np.where(far, std, functional_std(equations.solve, covariance, mesh, remaining))
     if not far.any():
-        return found
+        return std
     score, information = (np.einsum("eaad->ed", blocks)[:, ::2].sum(axis=1) for blocks in (scores, equations.blocks))
-    ratio, least = score / np.maximum(information, 1e-300), np.full(len(found), np.inf)
-    np.minimum.at(least, mesh.elements[information > 0], ratio[information > 0, None])
-    allowed = functional_std(equations.solve, assembly.matrix(equations.blocks), mesh, others)
-    return np.maximum(found, allowed * np.sqrt(np.where(least < np.inf, least, 0))[:, None])
+    ratio, min_ratio = score / np.maximum(information, 1e-300), np.full(len(std), np.inf)
+    np.minimum.at(min_ratio, mesh.elements[information > 0], ratio[information > 0, None])
+    allowed = functional_std(equations.solve, assembly.matrix(equations.blocks), mesh, remaining)
+    return np.maximum(std, allowed * np.sqrt(np.where(min_ratio < np.inf, min_ratio, 0))[:, None])
 
 
 def standard_uncertainty(
@@ -211,14 +216,14 @@ def standard_uncertainty(
     """
     reference, textured = residual.reference, equations.textured
     value = sp.eye(len(textured), format="csr") if recovery is None else recovery.value
-    asked: list[tuple[Functional, BoolArray]] = [((value, None), textured), ((None, value), textured)]
+    quantities: list[tuple[Functional, BoolArray]] = [((value, None), textured), ((None, value), textured)]
     if recovery is not None:
         inner = textured & ~reference.mesh.adjacent_nodes(~textured)
-        asked += [(one, inner) for one in recovery.strain_functionals]
-    asked = [(_in_reference_axes(functional, equations.deformation), nodes) for functional, nodes in asked]
-    std = _probed_std(equations, score_covariance(table, equations.blocks), reference, asked)
+        quantities += [(functional, inner) for functional in recovery.strain_functionals]
+    quantities = [(_in_reference_axes(functional, equations.deformation), nodes) for functional, nodes in quantities]
+    std = _probed_std(equations, score_covariance(table, equations.blocks), reference, quantities)
     if equations.rigid is not None:
-        rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in asked])
+        rigid = _rigid_variance(residual, equations, equations.rigid, [functional for functional, _ in quantities])
         std = np.sqrt(np.maximum(std**2 + rigid, 0))
     if precision is not None:
         std = std * precision.robust_loss(reference, equations.weights)[:, None]
@@ -234,7 +239,7 @@ def gradient_step(residual: Residual, equations: Equations) -> FloatArray:
     return equations.increment(pull, np.zeros_like(pull), rigid_pull)[0]
 
 
-def beyond_chance(
+def excess_over_chance(
     step: FloatArray, std: FloatArray, residual: Residual, table: BlockTable, weights: FloatImage
 ) -> FloatArray:
     """Return what the recovered step (N, 5) of `gradient_step` has beyond chance, (N, 5).
@@ -255,7 +260,9 @@ def beyond_chance(
     """
     reference = table.reference
     images = BlockTable.of(reference, table.side, [(residual.difference, weights, *reference.texture.images)])
-    chance = np.nan_to_num(reference.unfitted).mean() * table.typical_ratio((images.sums - table.sums[:, :4])[0, :2])
+    chance = np.nan_to_num(reference.residual_leverage).mean() * table.typical_ratio(
+        (images.sums - table.sums[:, :4])[0, :2]
+    )
     square = ((step[:, :2] / np.maximum(std[:, :2], 1e-30)) ** 2).mean(axis=1)
     excess = 1 - chance / np.maximum(square, 1e-30)
     return np.asarray(step * np.sqrt(np.maximum(excess, 0))[:, None])

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from rgbmidic._kernels.threads import set_threads, threads
-from rgbmidic.correlation import NodeStatus, Start, Status
+from rgbmidic.correlation import NodeStatus, Status, TrackingState
 from rgbmidic.correlation.solution import rank
 from rgbmidic.errors import ConfigurationError, FrameError, RgbmidicError, import_optional
 from rgbmidic.pipeline.frame import Measured, Updated, attempt, failed_frame
@@ -36,13 +36,13 @@ class Sink(Protocol):
     def is_finished(self, place: int) -> bool:
         """Whether a frame is there already."""
 
-    def start_after(self, place: int) -> Start:
+    def start_after(self, place: int) -> TrackingState:
         """Initial guess of the frames that follow a finished one."""
 
     def updated(self, places: Sequence[int]) -> Updated:
         """Frames that became the reference, or the reference that they make."""
 
-    def keep(self, place: int, found: Measured, after: Start) -> None:
+    def keep(self, place: int, found: Measured, after: TrackingState) -> None:
         """Take a frame, and the initial guess of those that follow it."""
 
 
@@ -55,7 +55,7 @@ class Schedule:
 
     def __init__(self, plan: Plan, sink: Sink, places: Iterable[int] = ()) -> None:
         self._plan, self._sink = plan, sink
-        self._ready, self._wanted = list[tuple[int, Start]](), set[int]()
+        self._ready, self._wanted = list[tuple[int, TrackingState]](), set[int]()
         self._waiting: dict[int, list[int]] = {}
         self._first_tries: dict[int, Measured] = {}
         for place in places:
@@ -75,7 +75,7 @@ class Schedule:
     def _start_from(self, before: int | None, place: int) -> None:
         """Have a frame measured as soon as the frame `before` it is; None: from a search."""
         if before is None:
-            self._ready.append((place, Start(displacement=None)))
+            self._ready.append((place, TrackingState(displacement=None)))
         elif self._sink.is_finished(before):
             self._ready.append((place, self._sink.start_after(before)))
         else:
@@ -92,7 +92,7 @@ class Schedule:
         FrameError
             All files of the frames are gone.
         """
-        running: dict[Future[Measured], tuple[int, Start]] = {}
+        running: dict[Future[Measured], tuple[int, TrackingState]] = {}
         while self._ready or running:
             while self._ready and len(running) < workers.slots:
                 place, start = self._next(workers.slots)
@@ -104,7 +104,7 @@ class Schedule:
                 place, start = running.pop(future)
                 self._take(place, start, self._outcome(future, self._plan.series.selected[place]))
 
-    def _next(self, slots: int) -> tuple[int, Start]:
+    def _next(self, slots: int) -> tuple[int, TrackingState]:
         """Take the frame that is to be measured next out of those that can be.
 
         Of the earliest chains, one more than several frames are measured at a time, it is that of the chain which is
@@ -128,7 +128,7 @@ class Schedule:
             logger.log(level, "%s", text)
         return found
 
-    def _take(self, place: int, start: Start, found: Measured) -> None:
+    def _take(self, place: int, start: TrackingState, found: Measured) -> None:
         """Keep a frame, or have it measured again, and release what waits for it."""
         if found.record.unread and (gone := self._plan.series.missing_lights()):
             raise FrameError(f"the frames are gone: {gone}; go on with --resume when they are there again")
@@ -152,13 +152,13 @@ def rank_of(record: FrameRecord) -> tuple[bool, float]:
     return rank(int(record.status), record.node_status)
 
 
-def following(plan: Plan, kept: Mapping[str, Any], start: Start) -> Start:
+def following(plan: Plan, kept: Mapping[str, Any], start: TrackingState) -> TrackingState:
     """Where a frame starts that follows one that started from `start` and of which this is kept."""
     measured = kept["node_status"] == NodeStatus.MEASURED
     if not measured.any():
         return start
     reference, displacement = plan.reference, np.stack([kept["u"], kept["v"]], axis=1)
-    after = start.after(reference.mesh, displacement, measured, reference.constants)
+    after = start.extrapolate(reference.mesh, displacement, measured, reference.constants)
     updates, best = tuple(kept["reference_updates"].tolist()), float(kept["best_match"])
     return replace(after, reference_updates=updates, best_match=best)
 
@@ -178,7 +178,7 @@ class Threads:
         self._lock, self._before = threading.Lock(), (threads(), cv2.getNumThreads())
         self._executor = ThreadPoolExecutor(count, thread_name_prefix="rgbmidic-frames") if count > 1 else None
 
-    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
+    def submit(self, index: int, start: TrackingState, updated: Updated = ()) -> Future[Measured]:
         """Have one frame measured, at once where there is one thread."""
         if self._executor is None:
             done: Future[Measured] = Future()
@@ -236,7 +236,7 @@ class Cluster:
         with _answering():
             return max(sum(map(int, self._client.nthreads().values())), 1)
 
-    def submit(self, index: int, start: Start, updated: Updated = ()) -> Future[Measured]:
+    def submit(self, index: int, start: TrackingState, updated: Updated = ()) -> Future[Measured]:
         """Have one frame measured by some worker."""
         with _answering():
             future: Future[Measured] = self._executor.submit(_measure_elsewhere, self._plan, index, start, updated)
@@ -271,7 +271,7 @@ def open_workers(plan: Plan, count: int, scheduler: str | None = None) -> Thread
     return Threads(plan, count) if scheduler is None else Cluster(plan, scheduler)
 
 
-def _measure_elsewhere(plan: Plan, index: int, start: Start, updated: Updated) -> Measured:
+def _measure_elsewhere(plan: Plan, index: int, start: TrackingState, updated: Updated) -> Measured:
     """Measure a frame in a worker of a cluster, on one thread; nobody reads its log."""
     cv2.setNumThreads(1)
     set_threads(1)

@@ -20,8 +20,8 @@ from rgbmidic._kernels.threads import machine
 from rgbmidic.correlation import (
     Deformed,
     Solution,
-    Start,
     Status,
+    TrackingState,
     discretisation_error,
     fill,
     unresolved_strain,
@@ -75,7 +75,7 @@ Updated = Sequence[tuple[int, Solution]] | ReferenceUpdate
 """Index and solution of the last frame that became the reference, all that it depends on; or the reference."""
 
 
-def measure_frame(plan: Plan, index: int, start: Start, updated: Updated = ()) -> FrameRecord:
+def measure_frame(plan: Plan, index: int, start: TrackingState, updated: Updated = ()) -> FrameRecord:
     """Measure one frame of a test.
 
     A frame that cannot be read or measured gives a record with the reason, an error that is not one of rgbmidic's own
@@ -100,7 +100,7 @@ def measure_frame(plan: Plan, index: int, start: Start, updated: Updated = ()) -
     return attempt(plan, index, start, updated).record
 
 
-def attempt(plan: Plan, index: int, start: Start, updated: Updated = ()) -> Measured:
+def attempt(plan: Plan, index: int, start: TrackingState, updated: Updated = ()) -> Measured:
     """Measure a frame as `measure_frame`, which gives the record alone."""
     try:
         with record_stages(plan.timings) as seconds:
@@ -166,7 +166,7 @@ def read_state(plan: Plan, index: int, window: Window | None = None) -> tuple[Ra
         raise _UnreadError(str(error)) from error
 
 
-def solve_frame(plan: Plan, index: int, start: Start, reference_update: ReferenceUpdate) -> dict[str, Any]:
+def solve_frame(plan: Plan, index: int, start: TrackingState, reference_update: ReferenceUpdate) -> dict[str, Any]:
     """What `FrameRecord.from_solution` is given: the ``solution`` of a frame, and what else its record holds.
 
     Parameters
@@ -297,7 +297,12 @@ def prepared_frame(plan: Plan, index: int, window: Window) -> tuple[FloatImage, 
 
 
 def _compared(
-    plan: Plan, index: int, start: Start, reference_update: ReferenceUpdate, deformed: Deformed, solution: Solution
+    plan: Plan,
+    index: int,
+    start: TrackingState,
+    reference_update: ReferenceUpdate,
+    deformed: Deformed,
+    solution: Solution,
 ) -> tuple[float, float, tuple[int, ...]]:
     """How well a frame matches its reference, the best match of the frames on it, and who follows as the reference."""
     if not (plan.settings.frames.update_reference and solution.measured.any()):
@@ -331,7 +336,7 @@ def exposure_warnings(plan: Plan, state: RawState) -> list[str]:
     return warnings
 
 
-def _blur_warning(plan: Plan, index: int, start: Start, solution: Solution) -> list[str]:
+def _blur_warning(plan: Plan, index: int, start: TrackingState, solution: Solution) -> list[str]:
     """Warn of motion blur: of a frame that starts from the one before it, which is known to be exposed for how long."""
     place = plan.series.selected.index(index)
     if parent(place) != place - 1 or start.displacement is None or not solution.measured.any() or not plan.exposure:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rgbmidic.correlation import Deformed, Solution, Start, Status, discretisation_error, track
+from rgbmidic.correlation import Deformed, Solution, Status, TrackingState, discretisation_error, track
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, RegionError, RgbmidicError
 from rgbmidic.fields import NodalCovariance, Places, StrainGauges
 from rgbmidic.fields.strain import SHORTEST
@@ -152,7 +152,7 @@ def rms(values: FloatArray) -> float:
 
 def solved(plan: Plan, deformed: Deformed, start: FloatArray | None) -> Solution:
     """Solution of a frame from an initial guess (N, 2), or from a search."""
-    return track(plan.reference, deformed, Start(displacement=start), plan.solver, plan.method)
+    return track(plan.reference, deformed, TrackingState(displacement=start), plan.solver, plan.method)
 
 
 def _field_at(mesh: Tri3Mesh, solution: Solution, points: FloatArray) -> tuple[FloatArray, FloatArray]:

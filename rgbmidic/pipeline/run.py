@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rgbmidic._kernels.threads import threads
-from rgbmidic.correlation import NodeStatus, Solution, Start, Status
+from rgbmidic.correlation import NodeStatus, Solution, Status, TrackingState
 from rgbmidic.errors import FrameError, InputError, ResultError
 from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Tri3Mesh
@@ -193,7 +193,7 @@ class _Folder:
         """Whether a frame is in the folder."""
         return bool(self._finished[place])
 
-    def start_after(self, place: int) -> Start:
+    def start_after(self, place: int) -> TrackingState:
         """Initial guess after a finished frame: from the last that is measured up to there.
 
         Where a frame failed all before it are finished, since a key frame that fails waits for the one before it.
@@ -201,8 +201,8 @@ class _Folder:
         names = ("u", "v", "node_status", "reference_updates", "best_match")
         for kept in self._store.table().iterate(names, range(place, -1, -1)):
             if (kept["node_status"] == NodeStatus.MEASURED).any():
-                return following(self._plan, kept, Start(displacement=None))
-        return Start(displacement=None)
+                return following(self._plan, kept, TrackingState(displacement=None))
+        return TrackingState(displacement=None)
 
     def updated(self, places: Sequence[int]) -> Updated:
         """Indices and solutions of the frames that became the reference, as the folder holds them."""
@@ -218,7 +218,7 @@ class _Folder:
             found.append((chosen[place], replace(blank, **arrays)))
         return found
 
-    def keep(self, place: int, found: Measured, after: Start) -> None:
+    def keep(self, place: int, found: Measured, after: TrackingState) -> None:
         """Write a frame, and report what became of it."""
         record, places = found.record, self._places
         self._store.write_frame(place, record)

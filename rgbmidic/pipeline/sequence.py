@@ -21,7 +21,7 @@ from rgbmidic.correlation import (
     Deformed,
     Reference,
     Solution,
-    Start,
+    TrackingState,
     discretisation_error,
     fill,
     track,
@@ -125,7 +125,7 @@ def correlate(
     first = Reference.prepare(f, region, given[0], mesh=mesh, prefilter=solver.prefilter, brightness=solver.brightness)
     method = (Statistics() if statistics else None) if isinstance(statistics, bool) else statistics
     check_object("statistics", method, "precision")
-    start = Start(displacement=initial_displacement(initial, len(mesh.nodes)))
+    start = TrackingState(displacement=initial_displacement(initial, len(mesh.nodes)))
     solution = track(first, second.result(), start, solver, method)
     if solution.disagreement:
         logger.warning("%s", solution.disagreement)
@@ -311,7 +311,7 @@ class _Live:
     """The sink of a sequence: the latest solution, and of all states before it what a later one may start from."""
 
     def __init__(self, plan: Plan) -> None:
-        self._plan, self._starts, self._checksum = plan, dict[int, Start](), NO_CHECKSUM
+        self._plan, self._starts, self._checksum = plan, dict[int, TrackingState](), NO_CHECKSUM
         self._of_reference = set[int]()
         self._updates: dict[tuple[int, ...], ReferenceUpdate] = {(): ReferenceUpdate.none(plan.reference)}
         self.solution: Solution
@@ -320,7 +320,7 @@ class _Live:
         """Whether it is one of those that are kept."""
         return place in self._starts
 
-    def start_after(self, place: int) -> Start:
+    def start_after(self, place: int) -> TrackingState:
         """Initial guess of the states that follow one."""
         return self._starts[place]
 
@@ -328,7 +328,7 @@ class _Live:
         """The reference that states made, while they were there."""
         return self._updates[tuple(places)]
 
-    def keep(self, place: int, found: Measured, after: Start) -> None:
+    def keep(self, place: int, found: Measured, after: TrackingState) -> None:
         """Take a state's solution, and forget what no later state starts from."""
         plan, record = self._plan, found.record
         mesh, lights = plan.reference.mesh, len(plan.images.names)

@@ -87,7 +87,7 @@ def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -
     area = mesh.to_nodes(mesh.areas)
     density = mesh.to_nodes(information * mesh.areas) / area
     positive = density[density > 0]
-    is_visible = density > USUAL.seen * np.median(positive) if positive.size else np.zeros(len(density), bool)
+    is_visible = density > USUAL.min_texture * np.median(positive) if positive.size else np.zeros(len(density), bool)
     if not is_visible.any():
         return np.full((len(scores), len(density)), np.nan)
     assembly = Assembly.from_mesh(mesh)
@@ -97,12 +97,14 @@ def expected_std(mesh: Tri3Mesh, information: FloatArray, *scores: FloatArray) -
         return assembly.matrix((values * mesh.areas)[:, None, None, None] * mass)
 
     # elements that no light sees must not make the system singular
-    solve = assembly.factorise(assemble(np.maximum(information, 1e-3 * USUAL.seen * np.median(density[is_visible]))))
+    solve = assembly.factorise(
+        assemble(np.maximum(information, 1e-3 * USUAL.min_texture * np.median(density[is_visible])))
+    )
     is_used = np.asarray(is_visible[mesh.elements].all(axis=1))
     recovery = Recovery.over(mesh, is_used, density)
     along_x = [((recovery.value, None), is_visible)]
     std = np.stack([functional_std(solve, assemble(score), mesh, along_x)[:, 0] for score in scores])
-    return np.where(is_visible & (std < USUAL.lost), std, np.nan)
+    return np.where(is_visible & (std < USUAL.max_std), std, np.nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -24,7 +24,7 @@ from rgbmidic._kernels.weights import best_mean, robust_weights
 from rgbmidic.correlation import PrecisionMethod
 from rgbmidic.correlation.images import WINDOW, SlidingWindow, unmasked
 from rgbmidic.correlation.residual import Precision, Residual
-from rgbmidic.correlation.uncertainty import displacing_fraction
+from rgbmidic.correlation.uncertainty import design_effect
 from rgbmidic.errors import ConfigurationError, InputError
 from rgbmidic.frames import read_mask
 from rgbmidic.illumination.images import IlluminationImages
@@ -395,17 +395,17 @@ class Statistics(ValidPixels):
         lights = range(len(weights))
         typical = _typical(covariance[lights, lights])
         if typical <= 0:
-            return Precision(factor=np.ones_like(weights), bend=np.ones_like(weights[0]))
+            return Precision(factor=np.ones_like(weights), loss_curvature=np.ones_like(weights[0]))
         floor = np.float32(max(self.least_variance * typical, self.rounding * residual.contrast))
         factor = pixels.from_blocks(_best_fractions(covariance, floor, self.own), self.window.step)
         mean, used, bend = (np.empty_like(factor[0]) for _ in range(3))  # the last one stays
         best_mean(factor, weights, residual.difference, mean, used)
         variance, least = self.window.covariance(pixels, mean[None], used[None])[0], floor / len(factor)
         around = pixels.from_blocks(np.maximum(variance, least), self.window.step)[0]
-        displacing = displacing_fraction(residual.reference, mean, used / around)
+        displacing = design_effect(residual.reference, mean, used / around)
         unit = max(np.float32(_typical(variance)), least)
         robust_weights(mean, around, displacing, unit, np.float32(self.freedom), factor, bend)
-        return Precision(factor=factor, bend=bend)
+        return Precision(factor=factor, loss_curvature=bend)
 
 
 def _typical(variance: FloatImage) -> float:

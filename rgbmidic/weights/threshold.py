@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from scipy.special import chdtri
 
-from rgbmidic.correlation import Deformed, Reference, Start, Status, track
+from rgbmidic.correlation import Deformed, Reference, Status, TrackingState, track
 from rgbmidic.errors import InputError, RgbmidicError
 from rgbmidic.fields import at_pixels, high_pass
 from rgbmidic.illumination.images import IlluminationImages
@@ -361,7 +361,7 @@ def automatic_threshold(
             reference.values[light : light + 1], region, mesh=mesh, prefilter=prefilter, brightness="none"
         )
         after = Deformed.prepare(deformed.values[light : light + 1], prefilter=prefilter)
-        solution = track(before, after, Start(displacement=None), SolverSettings(), None)
+        solution = track(before, after, TrackingState(displacement=None), SolverSettings(), None)
         if solution.status is Status.FAILED:
             logger.info("%s alone, without weights: %s", name, solution.reason)
             continue

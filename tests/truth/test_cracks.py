@@ -28,7 +28,7 @@ from crack_scene import (
 from textures import Texture
 
 from rgbmidic import NodeStatus, Region, Tri3Mesh, correlate, measure_sequence
-from rgbmidic.correlation import Deformed, Reference, Start, fill, track
+from rgbmidic.correlation import Deformed, Reference, TrackingState, fill, track
 from rgbmidic.correlation.images import as_light_stack
 from rgbmidic.fields import crack_jump, stress_intensity
 from rgbmidic.settings import SolverSettings
@@ -97,7 +97,7 @@ def test_filled_nodes_take_their_uncertainty_from_their_own_side():
     filled = fill(mesh, gaps, 100.0)
     assert (filled.node_status[hole] == NodeStatus.FILLED).all()
     assert filled.displacement_std[hole].max() < 5
-    start = Start(displacement=None).after(mesh, gaps.displacement, gaps.measured).displacement
+    start = TrackingState(displacement=None).extrapolate(mesh, gaps.displacement, gaps.measured).displacement
     assert np.abs(start - truth(mesh.nodes, above, 5.0))[hole].max() < 1.5
 
 
@@ -142,11 +142,11 @@ def followed(frames):
     reference = Reference.prepare(
         as_light_stack(noisy(reference_image(), 1), ""), region, mesh=mesh, prefilter="binomial"
     )
-    start, solutions = Start(displacement=None), []
+    start, solutions = TrackingState(displacement=None), []
     for number, image in enumerate(frames):
         deformed = Deformed.prepare(as_light_stack(noisy(image, 2 + number), ""), prefilter="binomial")
         solutions.append(track(reference, deformed, start, SolverSettings(), Statistics()))
-        start = start.after(reference.mesh, solutions[-1].displacement, solutions[-1].measured)
+        start = start.extrapolate(reference.mesh, solutions[-1].displacement, solutions[-1].measured)
     return solutions
 
 

@@ -14,7 +14,7 @@ import tifffile
 from small_tests import REGION, SHAPE, colour_test, grey_frame, toml
 
 from rgbmidic import Calibration, NodeStatus, Result, Status, measure, read_frame, read_test
-from rgbmidic.correlation import Start
+from rgbmidic.correlation import TrackingState
 from rgbmidic.correlation import reference_update as reference_update
 from rgbmidic.errors import (
     CalibrationError,
@@ -369,12 +369,12 @@ def test_a_reference_that_no_light_sees_is_one_error(bayer, tmp_path):
 def test_a_frame_measured_with_a_plan_from_another_process_gives_the_same_bits(bayer, bayer_result):
     plan = Plan.from_settings(bayer.settings())
     again = pickle.loads(pickle.dumps(plan))
-    start = Start(displacement=None)
+    start = TrackingState(displacement=None)
     record, twin = (measure_frame(one, 1, start) for one in (plan, again))
     np.testing.assert_equal(record.values, twin.values)
     # nothing but the start ties a frame to the one before it
     at_rest = measure_frame(plan, 0, start)
-    rest = start.after(
+    rest = start.extrapolate(
         plan.reference.mesh, np.stack([at_rest.u, at_rest.v], axis=1), at_rest.node_status == NodeStatus.MEASURED
     )
     np.testing.assert_equal(measure_frame(plan, 1, rest).values, bayer_result.frame(1).values)

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from results import make_result
 
-from rgbmidic import frames, mesh, renamed, report, results
+from rgbmidic import correlation, frames, mesh, renamed, report, results
 from rgbmidic.illumination import IlluminationImages
 from rgbmidic.lab import inspection
 from rgbmidic.results import comparison, simulation
 
 CLASSES = {
     "IlluminationImages": IlluminationImages,
+    **vars(correlation),
     **vars(frames),
     **vars(mesh),
     **vars(inspection),

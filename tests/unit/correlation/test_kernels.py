@@ -12,7 +12,7 @@ from bits import assert_same_on_threads
 from rgbmidic._kernels import correlation as kernels
 from rgbmidic._kernels import owned_pixels
 from rgbmidic._kernels.splines import PAD, bspline_coefficients, pixel_gradient, sample_with_gradient
-from rgbmidic.correlation.reference import _partial_blocks
+from rgbmidic.correlation.reference import _count_nonuniform_blocks
 from rgbmidic.correlation.residual import curved_deviation
 from rgbmidic.mesh import PixelMap, Region, Tri3Mesh
 
@@ -176,7 +176,7 @@ def compared(case, given, weight):
     difference, found = np.full((2, case.pixels.rows.size), 7, dtype=np.float32)
     moments = np.full((len(case.mesh.elements), 6), 7.0)
     kernels.differences(case.coefficients, case.reference, *moved(case), difference)
-    images = given, _partial_blocks(given), case.reference, difference, weight
+    images = given, _count_nonuniform_blocks(given), case.reference, difference, weight
     kernels.warped_weights(*images, *moved(case), found, moments)
     return difference, found, moments
 

@@ -8,7 +8,7 @@ from textures import Texture
 
 from rgbmidic import Region, Tri3Mesh, correlate
 from rgbmidic.correlation import Deformed, Reference
-from rgbmidic.correlation.light_bias import settled_gradient
+from rgbmidic.correlation.light_bias import with_consistent_gradient
 from rgbmidic.correlation.residual import Residual
 
 SHAPE = (192, 192)
@@ -93,7 +93,7 @@ def test_a_light_keeps_its_own_gradient_as_far_as_it_moves_with_the_texture(move
     reference = Reference.prepare(f, region, mesh=mesh, prefilter="binomial")
     motion = np.tile([MOTION, 0.0], (len(mesh.nodes), 1))
     residual = Residual.at(reference, Deformed.prepare(g, prefilter="binomial"), [motion] * 3)
-    found = settled_gradient(residual, residual.weights)
+    found = with_consistent_gradient(residual, residual.weights)
     others = reference.texture.matched(reference.pixels, np.zeros((3, 1, 1)))[0]
 
     def with_images(gradient):

@@ -10,7 +10,7 @@ import pytest
 from textures import Affine, Texture
 
 from rgbmidic import NodeStatus, Region, Tri3Mesh
-from rgbmidic.correlation import Deformed, Reference, ReferenceUpdate, Start, Status, track
+from rgbmidic.correlation import Deformed, Reference, ReferenceUpdate, Status, TrackingState, track
 from rgbmidic.errors import InputError
 from rgbmidic.settings import SolverSettings
 from rgbmidic.weights import Statistics
@@ -39,18 +39,18 @@ def prepared(image):
 def chained(images, update_reference):
     """Solutions of the images after the first; `update_reference` says who follows: frame, update, deformed, step."""
     reference_update = ReferenceUpdate.none(first_reference(images[0]))
-    start, solutions, updated = Start(displacement=np.zeros_like(reference_update.displacement)), [], []
+    start, solutions, updated = TrackingState(displacement=np.zeros_like(reference_update.displacement)), [], []
     for number, image in enumerate(images[1:], start=1):
         deformed = prepared(image)
         step = track(
             reference_update.reference,
             deformed,
-            Start(displacement=start.displacement - reference_update.displacement),
+            TrackingState(displacement=start.displacement - reference_update.displacement),
             OPTIONS,
             Statistics(),
         )
         solutions.append(reference_update.accumulated(step, deformed))
-        start = start.after(reference_update.first.mesh, solutions[-1].displacement, solutions[-1].measured)
+        start = start.extrapolate(reference_update.first.mesh, solutions[-1].displacement, solutions[-1].measured)
         if solutions[-1].measured.any() and update_reference(number, reference_update, deformed, step):
             reference_update = reference_update.updated(solutions[-1], stack(image))
             updated.append(number)
@@ -84,7 +84,7 @@ def test_before_any_renewal_a_frame_is_measured_as_without():
         first_reference(texture.image(SHAPE)),
         prepared(texture.image(SHAPE, Affine(shift=(1.3, 0.4)))),
     )
-    start = Start(displacement=np.zeros_like(reference.mesh.nodes))
+    start = TrackingState(displacement=np.zeros_like(reference.mesh.nodes))
     found = ReferenceUpdate.none(reference).track(deformed, start, OPTIONS, Statistics())
     expected = track(reference, deformed, start, OPTIONS, Statistics())
     np.testing.assert_array_equal(found.displacement, expected.displacement)
@@ -171,7 +171,7 @@ def pair(motion, change=0.0, noise=2.0):
         first_reference(noisy(Texture.random(0).image(SHAPE), noise, random)),
         noisy(image, noise, random),
     )
-    start = Start(displacement=motion.displacement(reference.mesh.nodes, SHAPE))
+    start = TrackingState(displacement=motion.displacement(reference.mesh.nodes, SHAPE))
     return reference, prepared(deformed), track(reference, prepared(deformed), start, OPTIONS, Statistics())
 
 
@@ -212,7 +212,7 @@ def test_a_renewal_from_stored_numbers_is_the_same_to_the_bit():
     first = ReferenceUpdate.none(first_reference(texture.image(SHAPE)))
     image = texture.image(SHAPE, Affine(shift=(0.7, 0.2)))
     solution = first.track(
-        prepared(image), Start(displacement=np.zeros_like(first.displacement)), OPTIONS, Statistics()
+        prepared(image), TrackingState(displacement=np.zeros_like(first.displacement)), OPTIONS, Statistics()
     )
     stored = replace(
         solution,
@@ -222,7 +222,7 @@ def test_a_renewal_from_stored_numbers_is_the_same_to_the_bit():
         pickle.dumps(
             first.updated(kept, stack(image)).track(
                 prepared(texture.image(SHAPE, Affine(shift=(1.1, 0.2)))),
-                Start(displacement=solution.displacement),
+                TrackingState(displacement=solution.displacement),
                 OPTIONS,
                 Statistics(),
             )
@@ -244,11 +244,11 @@ def test_both_sides_of_an_open_crack_are_followed_on_a_renewed_reference():
 
     reference_update = ReferenceUpdate.none(first_reference(opened(0.0), [path]))
     mesh = reference_update.first.mesh
-    start = Start(displacement=np.zeros_like(mesh.nodes))
+    start = TrackingState(displacement=np.zeros_like(mesh.nodes))
     for width in (4.0, 8.0):
         solution = reference_update.track(prepared(opened(width)), start, OPTIONS, Statistics())
         reference_update = reference_update.updated(solution, stack(opened(width)))
-        start = start.after(reference_update.first.mesh, solution.displacement, solution.measured)
+        start = start.extrapolate(reference_update.first.mesh, solution.displacement, solution.measured)
     half = 8.0 * np.clip(1 - mesh.nodes[:, 0] / 110, 0, None) / 2
     expected = np.where(mesh.observation_points[:, 1] < middle, -half, half)
     assert solution.measured.all()
@@ -259,7 +259,10 @@ def test_a_frame_in_which_nothing_is_measured_is_no_reference():
     texture = Texture.random(0)
     first = ReferenceUpdate.none(first_reference(texture.image(SHAPE)))
     solution = first.track(
-        prepared(texture.image(SHAPE)), Start(displacement=np.zeros_like(first.displacement)), OPTIONS, Statistics()
+        prepared(texture.image(SHAPE)),
+        TrackingState(displacement=np.zeros_like(first.displacement)),
+        OPTIONS,
+        Statistics(),
     )
     lost = replace(solution, node_status=np.full_like(solution.node_status, NodeStatus.DECORRELATED))
     with pytest.raises(InputError, match="no element is measured"):
@@ -276,7 +279,7 @@ def test_a_light_that_moves_for_itself_calls_for_no_reference():
     mesh = Tri3Mesh.from_region(region, 25)
     reference_update = ReferenceUpdate.none(Reference.prepare(first, region, weights, mesh=mesh))
     deformed = Deformed.prepare(then, weights)
-    start = Start(displacement=np.full(mesh.nodes.shape, 0.2))
+    start = TrackingState(displacement=np.full(mesh.nodes.shape, 0.2))
     solution = reference_update.track(
         deformed, start, replace(OPTIONS, rigid="translation", prefilter="none"), Statistics()
     )

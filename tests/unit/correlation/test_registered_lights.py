@@ -9,10 +9,10 @@ import pytest
 from textures import Affine, Texture
 
 from rgbmidic import Region, Tri3Mesh
-from rgbmidic.correlation import Deformed, Reference, Start
+from rgbmidic.correlation import Deformed, Reference, TrackingState
 from rgbmidic.correlation.reference_update import ReferenceUpdate
 from rgbmidic.correlation.solve import solve
-from rgbmidic.correlation.start import find_start
+from rgbmidic.correlation.start import find_initial_guess
 from rgbmidic.illumination.images import Registration
 from rgbmidic.settings import SolverSettings
 
@@ -96,17 +96,17 @@ def test_lights_far_apart_are_searched_together():
     """At a turn pictures of lights 10 px apart, one over the other, no longer match (confidence 0)."""
     far, turned = OFF + np.outer([0, 9, -8], [1, -0.8, 0, 0, 0]), Affine.strain_and_rotation(0.004, 15.0, (14.3, -9.6))
     first, second = (images(registered(far), motion) for motion in (None, turned))
-    found = find_start(prepared(first, registered(far)), Deformed.prepare(second, prefilter="binomial"))
+    found = find_initial_guess(prepared(first, registered(far)), Deformed.prepare(second, prefilter="binomial"))
     assert found.confidence > 0.95
 
 
 def test_a_reference_update_reads_the_lights_where_they_lie(pair):
     first, second = pair
     options, none = SolverSettings(), ReferenceUpdate.none(prepared(first, registered()))
-    start = Start(displacement=MOTION.displacement(none.first.mesh.nodes, SHAPE))
+    start = TrackingState(displacement=MOTION.displacement(none.first.mesh.nodes, SHAPE))
     before = none.track(Deformed.prepare(second, prefilter="binomial"), start, options, None)
     later = none.updated(before, second, np.ones_like(second))
     moved = Affine(gradient=MOTION.gradient, shift=(MOTION.shift[0] + 0.5, MOTION.shift[1] + 20.4))
     third = Deformed.prepare(images(registered(), moved), prefilter="binomial")
-    start = Start(displacement=moved.displacement(none.first.mesh.nodes, SHAPE))
+    start = TrackingState(displacement=moved.displacement(none.first.mesh.nodes, SHAPE))
     assert error(later.track(third, start, options, None), moved) < 2 * ERROR

@@ -37,7 +37,7 @@ def test_the_bordered_equations_are_those_of_dense_algebra():
     rigid = RigidMotions.eliminate(
         assembly, per_light, functions, with_data(assembly.smoothness, hold), solve, textured, USUAL
     )
-    assert not rigid.hidden.any()
+    assert not rigid.unobservable.any()
 
     hessians = [assembly.matrix(blocks).toarray() for blocks in per_light]
     border = np.concatenate([hessian @ functions for hessian in hessians[1:]], axis=1)
@@ -55,7 +55,7 @@ def test_the_bordered_equations_are_those_of_dense_algebra():
         pull = -smooth @ found[:free]
         moved = solve(rest[:free] + pull)
         coefficients = rigid.increment(moved, pull, rest[free:])
-        found += np.concatenate([moved - rigid.follows @ coefficients, coefficients])
+        found += np.concatenate([moved - rigid.response @ coefficients, coefficients])
     np.testing.assert_allclose(found[free:], wanted[free:], atol=1e-4)
     np.testing.assert_allclose(solve(rest[:free] + pull), 0, atol=1e-6)
 

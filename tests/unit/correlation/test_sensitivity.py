@@ -75,7 +75,7 @@ def test_what_has_no_uncertainty_is_not_measured(part):
     f, g = (noisy(texture.image(SHAPE), seed)[None].astype(np.float32) for seed in range(2))
     reference = Reference.prepare(f, region, mesh=mesh, prefilter="binomial")
     unknown = mesh.centres[:, 0] < (75 if part == "half" else 150)
-    reference = replace(reference, unfitted=np.where(unknown, np.nan, reference.unfitted))
+    reference = replace(reference, residual_leverage=np.where(unknown, np.nan, reference.residual_leverage))
     found = solve(reference, Deformed.prepare(g, prefilter="binomial"), 0 * mesh.nodes, SolverSettings(), None)
     assert not (found.measured & np.isnan(found.displacement_std).any(axis=1)).any()
     assert not found.measured[mesh.nodes[:, 0] < 50].any()
@@ -92,7 +92,7 @@ def test_lost_nodes_take_nothing_from_the_uncertainty_of_those_probed_with_them(
     reference = Reference.prepare(image, region, mesh=mesh, prefilter="none")
     seen = reference.pixels.gather(weights[0])[None]
     equations = Equations.build(reference, seen, np.zeros((2 * len(mesh.nodes), 0)), 0 * mesh.nodes)
-    nodes = equations.observability > USUAL.informed / USUAL.seen
+    nodes = equations.observability > USUAL.min_information / USUAL.min_texture
     recovery = Recovery.over(mesh, nodes[mesh.elements].all(axis=1), equations.information(reference))
     few = reference.sums(seen, seen[0])[0, :, 0] < 25
     scores = 10 / reference.level.mean() ** 2 * equations.blocks * np.where(few, variance, 1)[:, None, None, None]
@@ -103,6 +103,6 @@ def test_lost_nodes_take_nothing_from_the_uncertainty_of_those_probed_with_them(
     column = equations.solve(column.reshape(2 * len(mesh.nodes), -1))
     covariance = reference.assembly.matrix(scores)
     exact = np.sqrt((column * (covariance @ column)).sum(axis=0))
-    measured, plain = exact < USUAL.lost, functional_std(equations.solve, covariance, mesh, asked)[nodes, 0]
+    measured, plain = exact < USUAL.max_std, functional_std(equations.solve, covariance, mesh, asked)[nodes, 0]
     assert ((plain / exact)[measured].min() < 0.1) == (variance > 1)
     assert 0.75 < (found / exact)[measured].min() < (found / exact)[measured].max() < 1.2

@@ -11,7 +11,7 @@ from rgbmidic import Region, Tri3Mesh
 from rgbmidic.correlation import Deformed, Reference
 from rgbmidic.correlation.residual import Residual
 from rgbmidic.correlation.solve import solve
-from rgbmidic.correlation.start import Search, find_start
+from rgbmidic.correlation.start import Search, find_initial_guess
 from rgbmidic.settings import SolverSettings
 from rgbmidic.weights import Statistics
 
@@ -63,7 +63,7 @@ def largest_error(reference, found, motion):
 def test_motions_are_found_on_speckles_of_any_size(name, speckle):
     texture, motion = Texture.random(1, speckle), MOTIONS[name]
     reference, deformed = prepared(texture.image(SHAPE), texture.image(SHAPE, motion))
-    found = find_start(reference, deformed)
+    found = find_initial_guess(reference, deformed)
     assert found.confidence > 0.8
     assert largest_error(reference, found, motion) < WITHIN
 
@@ -72,7 +72,7 @@ def test_motions_are_found_on_speckles_of_any_size(name, speckle):
 def test_a_lattice_without_coarse_content_is_found(name):
     image, motion = lattice(2), MOTIONS[name]
     reference, deformed = prepared(image(Affine()), image(motion))
-    found = find_start(reference, deformed)
+    found = find_initial_guess(reference, deformed)
     assert found.confidence > 0.8
     assert largest_error(reference, found, motion) < WITHIN
 
@@ -88,7 +88,7 @@ def test_three_lights_with_reflections_that_stay_behind_are_found():
         stacks.append(lights)
         weights.append(used)
     reference, deformed = prepared(*stacks, *weights)
-    found = find_start(reference, deformed)
+    found = find_initial_guess(reference, deformed)
     assert largest_error(reference, found, motion) < 2 * WITHIN
 
 
@@ -98,7 +98,7 @@ def test_two_bodies_may_move_apart():
     for motion, body in zip(motions, (np.s_[:, : middle - 30], np.s_[:, middle + 25 :]), strict=True):
         moved[body] = texture.image(SHAPE, motion)[body]
     reference, deformed = prepared(texture.image(SHAPE), moved)
-    found = find_start(reference, deformed)
+    found = find_initial_guess(reference, deformed)
     nodes = reference.mesh.nodes
     for motion, side in zip(motions, (nodes[:, 0] < middle - 25, nodes[:, 0] > middle + 25), strict=True):
         assert np.abs(found.displacement - motion.shift)[side].max() < WITHIN
@@ -106,7 +106,7 @@ def test_two_bodies_may_move_apart():
 
 def test_another_specimen_gives_no_confidence():
     reference, deformed = prepared(Texture.random(5).image(SHAPE), Texture.random(6).image(SHAPE))
-    assert find_start(reference, deformed).confidence < 0.15
+    assert find_initial_guess(reference, deformed).confidence < 0.15
 
 
 def test_confidence_is_the_share_that_correlates():
@@ -137,7 +137,7 @@ def test_starts_are_surer_and_surer_and_the_same_on_any_threads():
     try:
         for count in (1, 4):
             cv2.setNumThreads(count)
-            every.append(list(Search().starts(reference, deformed)))
+            every.append(list(Search().candidates(reference, deformed)))
     finally:
         cv2.setNumThreads(threads)
     for one, four in zip(*every, strict=True):

@@ -9,7 +9,7 @@ import pytest
 from textures import Affine, Texture
 
 from rgbmidic import Region, Status, Tri3Mesh
-from rgbmidic.correlation import Deformed, NodeStatus, Reference, Start, solve, track
+from rgbmidic.correlation import Deformed, NodeStatus, Reference, TrackingState, solve, track
 from rgbmidic.correlation.nodes import torn_elements
 from rgbmidic.correlation.solution import rank
 from rgbmidic.settings import SolverSettings
@@ -36,7 +36,7 @@ def moved(texture, motion):
 
 
 def test_a_jump_of_100_px_is_found(texture, reference):
-    last = Start(displacement=np.full((len(reference.mesh.nodes), 2), (60.0, 0.0)))
+    last = TrackingState(displacement=np.full((len(reference.mesh.nodes), 2), (60.0, 0.0)))
     found = track(reference, moved(texture, Affine(shift=(160.0, 0.0))), last, OPTIONS, Statistics())
     assert found.status is Status.CONVERGED
     assert np.abs(found.displacement - (160.0, 0.0)).max() < 1e-6
@@ -71,7 +71,7 @@ def test_an_exact_copy_that_has_turned_is_found_exactly(texture, turns, blank):
     height, width = SHAPE
     (x, y), nodes = reference.mesh.nodes.T, reference.mesh.nodes
     truth = (np.stack([height - 1 - y, x]) if turns == 1 else np.stack([width - 1 - x, height - 1 - y])).T - nodes
-    start = Start(displacement=None)
+    start = TrackingState(displacement=None)
     found = track(reference, Deformed.prepare(turned[None], prefilter="binomial"), start, OPTIONS, Statistics())
     seen = nodes[:, 0] >= blank
     assert found.measured[seen].all()
@@ -120,7 +120,7 @@ def test_a_fragment_that_has_turned_is_followed_as_the_specimen_jumps(texture, t
         return np.where(away[:, None] < 0, *(one.displacement(mesh.nodes, SHAPE) for one in (turned, rigid)))
 
     second = Deformed.prepare(np.asarray(state(turn, jump), dtype=np.float32)[None], prefilter="binomial")
-    found = track(reference, second, Start(displacement=motion(turn - 0.3, (0.0, 0.0))), OPTIONS, Statistics())
+    found = track(reference, second, TrackingState(displacement=motion(turn - 0.3, (0.0, 0.0))), OPTIONS, Statistics())
     assert found.status is Status.CONVERGED
     assert found.iterations <= 20
     for part in (inner, outer):
@@ -129,11 +129,11 @@ def test_a_fragment_that_has_turned_is_followed_as_the_specimen_jumps(texture, t
 
 
 def test_a_specimen_that_leaves_is_found_again_and_a_restored_start_gives_the_same_bits(texture, reference):
-    start, statuses = Start(displacement=None), []
+    start, statuses = TrackingState(displacement=None), []
     for shift in (0.0, -110.0, -400.0, 60.0):
         solution = track(reference, moved(texture, Affine(shift=(shift, 0.0))), start, OPTIONS, Statistics())
         restored = replace(start, displacement=None if start.displacement is None else start.displacement.copy())
-        start = start.after(reference.mesh, solution.displacement, solution.measured)
+        start = start.extrapolate(reference.mesh, solution.displacement, solution.measured)
         statuses.append(solution.status)
     assert statuses[2] is Status.FAILED
     assert statuses[3] is Status.CONVERGED
@@ -143,7 +143,9 @@ def test_a_specimen_that_leaves_is_found_again_and_a_restored_start_gives_the_sa
 
 
 def test_a_frame_without_a_start_says_how_near_it_came(reference):
-    failed = track(reference, moved(Texture.random(4), Affine()), Start(displacement=None), OPTIONS, Statistics())
+    failed = track(
+        reference, moved(Texture.random(4), Affine()), TrackingState(displacement=None), OPTIONS, Statistics()
+    )
     assert failed.status is Status.FAILED
     assert "do not match anywhere" in failed.reason
     assert "of 15% needed" in failed.reason

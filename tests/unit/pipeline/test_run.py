@@ -22,7 +22,7 @@ from results import corrupt
 from textures import Affine, Texture
 
 from rgbmidic._kernels.threads import set_threads, threads
-from rgbmidic.correlation import Start, Status
+from rgbmidic.correlation import Status, TrackingState
 from rgbmidic.errors import ConfigurationError, FrameError, InputError, ResultError, RgbmidicError
 from rgbmidic.fields import CameraCalibration
 from rgbmidic.frames import read_frame, write_tiff
@@ -96,7 +96,7 @@ def test_a_frame_that_kills_every_worker_of_a_cluster_fails_and_the_rest_goes_on
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Dying(engine.Threads):
-        def submit(self, index: int, start: Start, updated: Any = ()) -> Future[frame.Measured]:
+        def submit(self, index: int, start: TrackingState, updated: Any = ()) -> Future[frame.Measured]:
             if index != 5:
                 return super().submit(index, start, updated)
             dead: Future[frame.Measured] = Future()
@@ -119,13 +119,13 @@ def test_frames_share_the_threads_that_share_a_kernel(movie: Path, monkeypatch: 
         return measured
 
     plan = Plan.from_settings(settings(movie))
-    measured = frame.attempt(plan, 0, Start(displacement=None))
+    measured = frame.attempt(plan, 0, TrackingState(displacement=None))
     before = threads()
     set_threads(4)
     monkeypatch.setattr(engine, "attempt", watched)
     try:
         with closing(engine.Threads(plan, 2)) as pool:
-            running = [pool.submit(index, Start(displacement=None)) for index in range(2)]
+            running = [pool.submit(index, TrackingState(displacement=None)) for index in range(2)]
             assert all(one.result(60) is measured for one in running)
         assert seen == [2, 2]
         assert threads() == 4
@@ -158,7 +158,7 @@ def test_the_frames_of_chains_are_measured_in_step(
     order = list[int]()
 
     class Watching(engine.Threads):
-        def submit(self, index: int, start: Start, updated: Any = ()) -> Future[frame.Measured]:
+        def submit(self, index: int, start: TrackingState, updated: Any = ()) -> Future[frame.Measured]:
             order.append(index)
             return super().submit(index, start, updated)
 
@@ -358,7 +358,7 @@ def test_a_finished_result_is_gone_on_with_only_where_it_is_damaged(
 def test_frames_that_failed_otherwise_are_measured_again_where_that_is_asked(
     movie: Path, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def failing(plan: Any, index: int, start: Start, updated: Any) -> Any:
+    def failing(plan: Any, index: int, start: TrackingState, updated: Any) -> Any:
         failed = frame.Measured(record=frame.failed_frame(plan, index, "out of memory"))
         return failed if index == 33 else frame.attempt(plan, index, start, updated)
 
@@ -421,7 +421,7 @@ def test_a_key_frame_that_is_lost_is_measured_from_the_frame_before_it(
 ) -> None:
     starts: list[tuple[int, float]] = []
 
-    def watched(plan: Any, index: int, start: Start, updated: Any) -> Any:
+    def watched(plan: Any, index: int, start: TrackingState, updated: Any) -> Any:
         moved = np.inf if start.displacement is None else float(start.displacement[:, 1].mean())
         starts.append((index, moved))
         lost = frame.Measured(record=frame.failed_frame(plan, index, "lost"))

@@ -34,7 +34,7 @@ class OneLight:
     def precision(self, residual):
         factor = np.ones_like(residual.weights)
         factor[1] = 0
-        return Precision(factor=factor, bend=np.ones_like(factor[0]))
+        return Precision(factor=factor, loss_curvature=np.ones_like(factor[0]))
 
 
 class Nothing:
