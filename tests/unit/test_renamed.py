@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 from results import make_result
 
-from rgbmidic import frames, mesh, renamed, report, results
+from rgbmidic import fields as rgbmidic_fields
+from rgbmidic import frames, mesh, renamed, report, results, weights
 from rgbmidic.lab import inspection
 from rgbmidic.results import comparison, simulation
 
 CLASSES = {
     **vars(frames),
+    **vars(rgbmidic_fields),
+    **vars(weights),
     **vars(mesh),
     **vars(inspection),
     **vars(comparison),

@@ -180,7 +180,7 @@ def test_motion_of_more_than_a_pixel_during_the_exposure_is_told(exposed_us, sai
     stated = TestSettings.from_mapping(
         {"frames": {"path": [], "kind": "monochrome", "white_level": 4095}, "region": {"rectangle": [20, 20, 109, 99]}}
     )
-    source = Exposed(source=frames, stated=stated.frames, selected=range(3), shape=SHAPE)
+    source = Exposed(source=frames, user_metadata=stated.frames, selected=range(3), shape=SHAPE)
     measure(stated, tmp_path / "out", source=source)
     assert len(told()) == said
     assert all(
