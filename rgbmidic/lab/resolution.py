@@ -23,8 +23,8 @@ from rgbmidic.correlation.recovery import Recovery
 from rgbmidic.fields import NodalCovariance, StrainGauges
 from rgbmidic.lab import format_number, schema_document, write_findings
 from rgbmidic.mesh import Region, Tri3Mesh
+from rgbmidic.pipeline.frame_quality import SPECKLES
 from rgbmidic.pipeline.size_figures import GaugeFigures, ResolutionStudy
-from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.typing import FloatArray
 
 if TYPE_CHECKING:

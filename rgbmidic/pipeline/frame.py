@@ -33,8 +33,7 @@ from rgbmidic.errors import FrameError, RgbmidicError
 from rgbmidic.frames.data import Window
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState, light_images
-from rgbmidic.pipeline.plan import STRIDE, Plan, parent
-from rgbmidic.pipeline.suitability import (
+from rgbmidic.pipeline.frame_quality import (
     SUITABILITY,
     clipping,
     exposure_fault,
@@ -42,6 +41,7 @@ from rgbmidic.pipeline.suitability import (
     too_small,
     unsteady,
 )
+from rgbmidic.pipeline.plan import STRIDE, Plan, parent
 from rgbmidic.results import FrameRecord
 from rgbmidic.timing import record_stages, stage
 from rgbmidic.typing import FloatArray, FloatImage

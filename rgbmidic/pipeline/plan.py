@@ -43,9 +43,9 @@ from rgbmidic.illumination.separation import (
 )
 from rgbmidic.mesh import FiniteElementMesh, Placement, Region, Tri3Mesh, read_mesh
 from rgbmidic.mesh.placement import place_on_image
-from rgbmidic.pipeline import suitability
-from rgbmidic.pipeline.objects import check_user_objects
+from rgbmidic.pipeline import frame_quality
 from rgbmidic.pipeline.source import FrameSequence, Series, open_frames
+from rgbmidic.pipeline.user_objects import check_user_objects
 from rgbmidic.settings import RegionSettings, SolverSettings, TestSettings
 from rgbmidic.typing import FloatArray, FloatImage
 from rgbmidic.weights import LightWeights, as_weights, precision_method, prepare_weights
@@ -234,9 +234,9 @@ class Plan:
             weights=weights,
             images=images,
             reference=_reference(images, weights, region, mesh, settings.solver),
-            speckle=suitability.speckle_size(images, region),
-            saturated=suitability.saturated_fraction(state, region.mask),
-            clipped_at=None if (clipping := suitability.clipping(state)) is None else clipping[0],
+            speckle=frame_quality.speckle_size(images, region),
+            saturated=frame_quality.saturated_fraction(state, region.mask),
+            clipped_at=None if (clipping := frame_quality.clipping(state)) is None else clipping[0],
             reference_motion=motion,
             exposure=1e-9 * (series.recording.exposure_ns or 0),
             window=window,
@@ -347,11 +347,11 @@ def _read_reference(
     Raw frames that contradict the stated levels or their calibration are refused; doubts are warned of.
     """
     indices, name = settings.frames.reference, ", ".join(map(series.name, settings.frames.reference))
-    motion = suitability.ReferenceMotion(region.mask)
+    motion = frame_quality.ReferenceMotion(region.mask)
     states = list(motion.watch(series.read(index, window) for index in indices[:2]))
     raw = [state for state in states if not isinstance(state, IlluminationImages)]
     for frame in raw[0] if raw else ():
-        if shifted := suitability.shifted_levels(samples := frame.values[..., region.mask], frame.white_level):
+        if shifted := frame_quality.shifted_levels(samples := frame.values[..., region.mask], frame.white_level):
             raise FrameError(f"the reference ({name}): {shifted}")
         # twice as much has a bit more than the level: it is not the camera's, or deliberately low
         if (largest := samples.max()) > 2 * frame.white_level:
@@ -359,18 +359,18 @@ def _read_reference(
                 f"the samples of the reference ({name}) reach {largest}, far above white_level {frame.white_level:g}: "
                 "is it that of the camera, and is the order of the bytes (frames.dtype) right?"
             )
-    saturated = suitability.saturated_fraction(states[0], region.mask)
+    saturated = frame_quality.saturated_fraction(states[0], region.mask)
     # with .985 lights were still separated, with .99 no texture was left in two of three frames (measured)
     if saturated > 0.98:
-        fault = suitability.exposure_fault(states[0], region.mask)
+        fault = frame_quality.exposure_fault(states[0], region.mask)
         raise FrameError(f"no light sees the region in the reference ({name}): {fault}")
-    if saturated > suitability.SUITABILITY.clipped:
+    if saturated > frame_quality.SUITABILITY.clipped:
         text = f"{100 * saturated:.2g} % of the samples in the region of the reference ({name}) are saturated"
         logger.warning("%s and will not be measured", text)
     if calibration is not None and raw:
         window_calibration = calibration if window.is_whole else calibration.cropped(window.origin, window.shape)
         # a camera that shakes adds to the difference of two frames: it is not the noise that is calibrated
-        repeat = raw[1] if len(raw) > 1 and motion.largest < suitability.SUITABILITY.shake else None
+        repeat = raw[1] if len(raw) > 1 and motion.largest < frame_quality.SUITABILITY.shake else None
         for check in check_state(
             raw[0], window_calibration, region.mask, name, accept=settings.calibration.accept, repeat=repeat
         ):
@@ -395,25 +395,25 @@ def _check_reference(plan: Plan, state: RawState, noise: NoiseModel | None) -> N
             'weights.method = "statistics"'
         )
     if plan.finite_elements is not None:
-        suitability.warn_small_elements(plan.reference.mesh, plan.speckle, plan.finite_elements)
-    elif small := suitability.too_small(plan.element_size, plan.speckle, suitability.SUITABILITY.hardly_enough):
+        frame_quality.warn_small_elements(plan.reference.mesh, plan.speckle, plan.finite_elements)
+    elif small := frame_quality.too_small(plan.element_size, plan.speckle, frame_quality.SUITABILITY.hardly_enough):
         logger.warning("%s", small)
     if not plan.reference.pixel_weights.any():
-        fault = suitability.exposure_fault(state, inside) or "it is saturated, dark or excluded by the weights"
+        fault = frame_quality.exposure_fault(state, inside) or "it is saturated, dark or excluded by the weights"
         raise FrameError(f"no light sees the region in the reference ({name}): {fault}")
-    suitability.check_texture(state, inside, name)
-    if plan.reference_motion > suitability.SUITABILITY.motion:
-        logger.warning("%s", suitability.unsteady(plan.reference_motion))
-    if clipping := suitability.clipping(state):
+    frame_quality.check_texture(state, inside, name)
+    if plan.reference_motion > frame_quality.SUITABILITY.motion:
+        logger.warning("%s", frame_quality.unsteady(plan.reference_motion))
+    if clipping := frame_quality.clipping(state):
         logger.warning("the reference (%s): %s", name, clipping[1])
-    if repeated := suitability.repetition(images, region, plan.speckle):
+    if repeated := frame_quality.repetition(images, region, plan.speckle):
         logger.warning("the reference (%s): %s", name, repeated)
-    for doubt in suitability.separation_doubts(images, region):
+    for doubt in frame_quality.separation_doubts(images, region):
         logger.warning("the reference (%s): %s", name, doubt.text)
-    dark = suitability.background_fraction(images, region, plan.speckle, noise)
+    dark = frame_quality.background_fraction(images, region, plan.speckle, noise)
     if dark > CONTRAST.hidden:
         logger.warning(f"the region holds dark background ({dark:.1%}) in the reference: draw it inside the specimen")
-    levels = suitability.light_levels(images, region).items()
+    levels = frame_quality.light_levels(images, region).items()
     off = [f"{light} ({level:.1%})" for light, level in levels if level < DARK]
     if off and not isinstance(state, IlluminationImages):
         logger.warning(

@@ -22,9 +22,9 @@ from rgbmidic.fields.strain import SHORTEST
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.mesh.tri3 import refine_elements
 from rgbmidic.pipeline.frame import prepared_frame
+from rgbmidic.pipeline.frame_quality import SPECKLES
 from rgbmidic.pipeline.plan import Plan
 from rgbmidic.pipeline.size_figures import CONSTANTS, Choice, ErrorFigures, GaugeFigures, ResolutionStudy, SizeFigures
-from rgbmidic.pipeline.suitability import SPECKLES
 from rgbmidic.settings import ELEMENT_SIZE, TestSettings
 from rgbmidic.typing import FloatArray
 

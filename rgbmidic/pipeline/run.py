@@ -19,11 +19,11 @@ from rgbmidic.illumination.separation import LightSeparation
 from rgbmidic.mesh import Tri3Mesh
 from rgbmidic.pipeline.engine import Schedule, next_start, open_workers, rank_of
 from rgbmidic.pipeline.frame import FrameOutcome, ReferenceHistory, checksum, messages, read_state
-from rgbmidic.pipeline.objects import check_object, check_type, describe
+from rgbmidic.pipeline.frame_quality import light_levels
 from rgbmidic.pipeline.plan import Plan, dependants
 from rgbmidic.pipeline.resolution import Progress, choose, refine
 from rgbmidic.pipeline.source import FrameSequence
-from rgbmidic.pipeline.suitability import light_levels
+from rgbmidic.pipeline.user_objects import check_object, check_type, describe
 from rgbmidic.results import QUANTITIES, Origin, Result, ResultStore
 from rgbmidic.results.provenance import PROVENANCE, read_provenance
 from rgbmidic.results.quantities import NO_CHECKSUM

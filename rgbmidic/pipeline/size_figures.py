@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rgbmidic.pipeline.suitability import SPECKLES
+from rgbmidic.pipeline.frame_quality import SPECKLES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

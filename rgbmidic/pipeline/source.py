@@ -24,7 +24,7 @@ from rgbmidic.frames.metadata import CameraMetadata, StoredFrame, raw_frame
 from rgbmidic.frames.series import FrameSeries, open_series, selected_frames
 from rgbmidic.illumination.images import IlluminationImages
 from rgbmidic.illumination.separation import RawState
-from rgbmidic.pipeline.objects import class_name, describe
+from rgbmidic.pipeline.user_objects import class_name, describe
 from rgbmidic.settings import FrameSettings, TestSettings
 
 logger = logging.getLogger(__name__)

@@ -57,7 +57,7 @@ class SuitabilityConstants:
     repeated
         Correlation of the texture with itself, displaced by more than a speckle, from which it repeats itself. Of 360
         random speckles of 2 to 10 px in regions of 70 to 300 px none exceeds .35; dots on a grid reach 1, with a jitter
-        of a tenth of their pitch .7 (tests/unit/pipeline/test_suitability.py).
+        of a tenth of their pitch .7 (tests/unit/pipeline/test_frame_quality.py).
     enough_speckles
         Number of speckles in the overlap of the texture with itself from which their correlation counts: it then
         scatters by .1.

@@ -18,8 +18,7 @@ from rgbmidic.illumination.texture import TextureModel
 from rgbmidic.lab.inspection import inspect_frame
 from rgbmidic.mesh import Region
 from rgbmidic.pipeline import Plan, measure
-from rgbmidic.pipeline.source import SourceSeries
-from rgbmidic.pipeline.suitability import (
+from rgbmidic.pipeline.frame_quality import (
     ReferenceMotion,
     background_fraction,
     clipping,
@@ -27,6 +26,7 @@ from rgbmidic.pipeline.suitability import (
     separation_doubts,
     speckle_size,
 )
+from rgbmidic.pipeline.source import SourceSeries
 from rgbmidic.settings import TestSettings
 
 SHAPE = (120, 140)
